@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.scene import MID, CellNoise, grid
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
-from calibrate.kinematics import MODELS, DhDeltas, forward, inverse_nearest
+from calibrate.kinematics import MODELS, forward, inverse_nearest
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
@@ -145,7 +145,7 @@ def _poses(
     else:
         towards = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
         X, Y = pose(towards @ rotation_exp(0.15 * rng.normal(size=3)), [1.15, 0.2, 0.6]), held
-    arm = _ARM.calibrated(table_errors(rng, wrong.table))
+    arm = _ARM.calibrated(*table_errors(rng, wrong.table))
     joints: list[Array] = []
     while len(joints) < views:
         C = _look(rng, lens, board)
@@ -179,13 +179,13 @@ def _look(rng: np.random.Generator, lens: CameraModel, board: Array) -> Array:
             return C
 
 
-def table_errors(rng: np.random.Generator, size: float) -> DhDeltas:
-    """Without the errors that X and Y take; those of d2 and d3, whose axes are parallel to d4's, in d4."""
+def table_errors(rng: np.random.Generator, size: float) -> list[list[float]]:
+    """Errors of a, d, alpha, theta without those that X and Y take; those of d2 and d3 lie in d4."""
     a, d, alpha, theta = 1e-3 * size * rng.normal(size=(4, 6))
     d[3] += d[1] + d[2]
     d[:3] = 0.0
     theta[0] = a[5] = d[5] = alpha[5] = theta[5] = 0.0
-    return DhDeltas(tuple(a), tuple(d), tuple(alpha), tuple(theta))
+    return [column.tolist() for column in (a, d, alpha, theta)]
 
 
 def _real_points(rng: np.random.Generator, wrong: Imperfection, stated: Array) -> Array:

@@ -89,7 +89,7 @@ def _row(size_mm: float, count: int) -> list[str]:
 
 def worn_cell(rng: np.random.Generator, size_mm: float) -> Worn:
     joints, Y = _reachable(rng, 50)
-    true = forward(_MODEL.calibrated(table_errors(rng, size_mm)), joints)
+    true = forward(_MODEL.calibrated(*table_errors(rng, size_mm)), joints)
     C = inverse(PAPER_X) @ inverse(true) @ Y
     error = difference(true, forward(_MODEL, joints))[:, :3]
     camera, board = make_cell(rng, 1, CellNoise(0, 0, 0)).camera, grid(7, 6, 0.025)

@@ -16,7 +16,7 @@ from benchmarks.imperfect_cells import BOARD, Imperfection, Known, imperfect_cel
 from benchmarks.scene import LOW, make_cell, pose_arrays
 from benchmarks.trials import percentiles, table, trials
 from calibrate.geometry import Array
-from calibrate.handeye.axxb.evolution import Evaluate, evolve, rotations_from_vectors
+from calibrate.handeye.axxb.evolution import Evaluate, evolve
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs
 from calibrate.handeye.axxb.paper import BOX, SETTINGS, paper_evaluate, solve_paper
@@ -67,7 +67,7 @@ def pair_loops(pairs: Pairs) -> Evaluate:
     D, b_A, b_B = pairs.A[:, :3, :3] - np.eye(3), pairs.A[:, :3, 3], pairs.B[:, :3, 3]
 
     def evaluate(x: Array) -> Array:
-        R = rotations_from_vectors(x[:, :3])
+        R = Rotation.from_rotvec(x[:, :3]).as_matrix()
         total = np.zeros(len(x))
         for i in range(len(pairs)):
             turn = pairs.alpha[i] - R @ pairs.beta[i]

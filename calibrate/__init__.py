@@ -43,32 +43,22 @@ if TYPE_CHECKING:
     from calibrate.quality.gates import GateLimits as GateLimits
 
 _MODULES = {
-    "InstallationChange": "files.loader",
-    "Calibration": "files.calibration",
-    "CalibrationError": "errors",
-    "Gate": "files.calibration",
-    "GateLimits": "quality.gates",
-    "InstalledCalibration": "files.loader",
-    "JobOptions": "pipeline",
-    "ValidityReason": "files.validity",
-    "SolvedRecording": "pipeline",
-    "Transform": "geometry",
-    "Validity": "files.validity",
-    "ValidityState": "files.validity",
-    "export": "files.exports",
-    "install": "files.install",
-    "load_installed": "files.loader",
-    "read_calibration": "files.calibration",
-    "rollback": "files.install",
-    "set_validity": "files.install",
-    "solve_recording": "pipeline",
-    "watch": "files.loader",
-    "write_calibration": "files.calibration",
+    "errors": "CalibrationError",
+    "files.calibration": "Calibration Gate read_calibration write_calibration",
+    "files.exports": "export",
+    "files.install": "install rollback set_validity",
+    "files.loader": "InstallationChange InstalledCalibration load_installed watch",
+    "files.validity": "Validity ValidityReason ValidityState",
+    "geometry": "Transform",
+    "pipeline": "JobOptions SolvedRecording solve_recording",
+    "quality.gates": "GateLimits",
 }
-__all__ = list(_MODULES)
+"""Module → names that it gives."""
+_HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> object:
-    if name not in _MODULES:
+    if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -127,7 +127,7 @@ def rotation_log(R: ArrayLike) -> Array:
     """Convert rotation matrices (..., 3, 3) to rotation vectors (..., 3), radians, angle in [0, π].
 
     At exactly π the axis sign is ambiguous; either one is returned. What is not quite orthogonal is projected
-    first; ValueError for what mirrors. (Written out: SciPy's takes half a millisecond a call.)
+    first; ValueError for what mirrors. (Written out: SciPy's takes two to three times as long.)
     """
     M = np.asarray(R, dtype=float)
     four_qq = _four_qq(M)

@@ -22,15 +22,7 @@ _ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 JOINT_NAMES = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
 
 
-@dataclass(frozen=True)
-class DhDeltas:
-    """Factory or estimated corrections to the nominal table: each (6,), metres or radians."""
-
-    a_m: tuple[float, ...] = (0.0,) * 6
-    d_m: tuple[float, ...] = (0.0,) * 6
-    alpha_rad: tuple[float, ...] = (0.0,) * 6
-    theta_rad: tuple[float, ...] = (0.0,) * 6
-    beta_rad: tuple[float, ...] = (0.0,) * 6
+_NONE = (0.0,) * 6
 
 
 @dataclass(frozen=True)
@@ -50,19 +42,26 @@ class RobotModel:
     link_radius_m: tuple[float, ...] = field(default=(0.09, 0.075, 0.06, 0.05, 0.05, 0.045))
     """Rough capsule radii of the links, for clearance; generous."""
 
-    def calibrated(self, deltas: DhDeltas) -> RobotModel:
-        """Add deltas to the model; the analytic inverse stays that of the nominal table."""
+    def calibrated(
+        self,
+        a_m: Sequence[float] = _NONE,
+        d_m: Sequence[float] = _NONE,
+        alpha_rad: Sequence[float] = _NONE,
+        theta_rad: Sequence[float] = _NONE,
+        beta_rad: Sequence[float] = _NONE,
+    ) -> RobotModel:
+        """Add factory or estimated corrections (6,) each; the analytic inverse stays the nominal table's."""
 
-        def add(nominal: tuple[float, ...], delta: tuple[float, ...]) -> tuple[float, ...]:
+        def add(nominal: Sequence[float], delta: Sequence[float]) -> tuple[float, ...]:
             return tuple(n + d for n, d in zip(nominal, delta, strict=True))
 
         return replace(
             self,
-            a_m=add(self.a_m, deltas.a_m),
-            d_m=add(self.d_m, deltas.d_m),
-            alpha_rad=add(self.alpha_rad, deltas.alpha_rad),
-            theta_offset_rad=add(self.theta_offset_rad, deltas.theta_rad),
-            beta_rad=add(self.beta_rad, deltas.beta_rad),
+            a_m=add(self.a_m, a_m),
+            d_m=add(self.d_m, d_m),
+            alpha_rad=add(self.alpha_rad, alpha_rad),
+            theta_offset_rad=add(self.theta_offset_rad, theta_rad),
+            beta_rad=add(self.beta_rad, beta_rad),
         )
 
 
@@ -116,14 +115,10 @@ def with_near_axes(model: RobotModel) -> RobotModel:
     """
     if not any(model.d_m[1:3]):
         return model
-    a, d, alpha = list(model.a_m), list(model.d_m), list(model.alpha_rad)
-    theta, beta = list(model.theta_offset_rad), list(model.beta_rad)
     for i in (1, 2):
-        zero = replace(
-            model, a_m=tuple(a), d_m=tuple(d), alpha_rad=tuple(alpha), theta_offset_rad=tuple(theta),
-            beta_rad=tuple(beta),
-        )  # fmt: skip
-        frames = link_frames(zero, np.zeros(6))
+        a, d, alpha = list(model.a_m), list(model.d_m), list(model.alpha_rad)
+        theta, beta = list(model.theta_offset_rad), list(model.beta_rad)
+        frames = link_frames(model, np.zeros(6))
         step = np.linalg.inv(frames[i]) @ frames[i + 1]
         axis, point = step[:3, 2], step[:3, 3]
         along = point[2] / axis[2]
@@ -139,10 +134,11 @@ def with_near_axes(model: RobotModel) -> RobotModel:
         rest = tilt.T @ turned  # a turn about the next axis
         theta[i + 1] += float(np.arctan2(rest[1, 0], rest[0, 0]))
         d[i + 1] += float(along)
-    return replace(
-        model, a_m=tuple(a), d_m=tuple(d), alpha_rad=tuple(alpha), theta_offset_rad=tuple(theta),
-        beta_rad=tuple(beta),
-    )  # fmt: skip
+        model = replace(
+            model, a_m=tuple(a), d_m=tuple(d), alpha_rad=tuple(alpha), theta_offset_rad=tuple(theta),
+            beta_rad=tuple(beta),
+        )  # fmt: skip
+    return model
 
 
 def _turn_z(angle: float) -> Array:

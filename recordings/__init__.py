@@ -48,36 +48,26 @@ if TYPE_CHECKING:
     from recordings.writer import RecordingWriter as RecordingWriter
 
 _MODULES = {
-    "BadImageError": "errors",
-    "BoardKind": "schema.messages",
-    "BoardSpec": "schema.messages",
-    "CameraModel": "schema.messages",
-    "CodedError": "errors",
-    "CorruptRecordingError": "errors",
-    "Image": "schema.messages",
-    "MissingSegmentError": "errors",
-    "Recorder": "recorder",
-    "Recording": "reader",
-    "RecordingError": "errors",
-    "RecordingSegment": "segment",
-    "RecordingWriter": "writer",
-    "RobotState": "schema.messages",
-    "SessionInfo": "schema.messages",
-    "Stamps": "schema.messages",
-    "UnfinishedRecordingError": "errors",
-    "View": "schema.messages",
-    "export_recording": "exporters.folder",
-    "import_bag": "importers.bag",
-    "import_folder": "importers.folder",
-    "open_recording": "reader",
-    "recording_info": "info",
-    "recover_recording": "recover",
-    "write_excerpt": "exporters.excerpt",
+    "errors": "BadImageError CodedError CorruptRecordingError MissingSegmentError RecordingError "
+    "UnfinishedRecordingError",
+    "exporters.excerpt": "write_excerpt",
+    "exporters.folder": "export_recording",
+    "importers.bag": "import_bag",
+    "importers.folder": "import_folder",
+    "info": "recording_info",
+    "reader": "Recording open_recording",
+    "recorder": "Recorder",
+    "recover": "recover_recording",
+    "schema.messages": "BoardKind BoardSpec CameraModel Image RobotState SessionInfo Stamps View",
+    "segment": "RecordingSegment",
+    "writer": "RecordingWriter",
 }
-__all__ = list(_MODULES)
+"""Module → names that it gives."""
+_HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> object:
-    if name not in _MODULES:
+    if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

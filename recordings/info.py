@@ -11,7 +11,7 @@ from recordings.schema.frame_ids import frames_between, guess_ids
 from recordings.schema.messages import SINGLE_TAGS, BoardSpec
 from recordings.schema.topics import Topic
 from recordings.segment import RecordingSegment
-from recordings.streams import Arrivals, Steps
+from recordings.streams import Arrivals, Steps, stamps_tables
 
 _SHORTEST_SPAN_S = 0.01
 """Messages that all came at once have no rate."""
@@ -26,9 +26,9 @@ def recording_info(recording: Recording) -> dict[str, Any]:
     steps = Steps()
     for segment in recording.segments:
         steps.begin()
-        for table in segment.state_stamps():
-            steps.add(table.controller_s)
-            arrivals[segment].add(table.controller_s, table.host_monotonic_ns)
+        for table in stamps_tables(segment.parsed(Topic.ROBOT_STATE)):
+            steps.add(table["controller_s"])
+            arrivals[segment].add(table["controller_s"], table["host_monotonic_ns"])
     longest = max(recording.segments, key=lambda segment: len(segment.messages(Topic.ROBOT_STATE)))
     attempts = sum(len(segment.views) for segment in recording.segments)
     views = recording.views()
@@ -147,6 +147,6 @@ def _image_stream(recording: Recording) -> dict[str, Any] | None:
 
 def _camera_clock(segment: RecordingSegment) -> dict[str, float | None] | None:
     arrivals = Arrivals()
-    for table in segment.image_stamps():
-        arrivals.add(table.device_ns / 1e9, table.host_monotonic_ns)
+    for table in stamps_tables(segment.parsed(Topic.PICTURE_FACTS)):
+        arrivals.add(table["device_ns"] / 1e9, table["host_monotonic_ns"])
     return arrivals.fit()

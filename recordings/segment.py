@@ -9,10 +9,6 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
 from recordings.errors import BadImageError, CorruptRecordingError
@@ -42,9 +38,8 @@ from recordings.schema.messages import (
     SessionInfo,
     View,
 )
-from recordings.schema.topics import Topic, schema_bytes, schema_name
+from recordings.schema.topics import Topic, parse, schema_bytes, schema_name
 from recordings.schema.viewing import camera_model_of, matrix_of
-from recordings.streams import StampsTable, stamps_tables
 
 VIEWS_LIMIT = 10_000
 _RIGID_TOLERANCE = 1e-6
@@ -93,42 +88,21 @@ class RecordingSegment:
     def robot_states(self) -> Iterator[RobotState]:
         return self._decoded(Topic.ROBOT_STATE, RobotState)
 
-    def state_stamps(self) -> Iterator[StampsTable]:
-        """The clocks of all robot states, many at once."""
-        return self._stamps(Topic.ROBOT_STATE, RobotState)
-
-    def image_stamps(self) -> Iterator[StampsTable]:
-        """The clocks of all images, many at once."""
-        return self._stamps(Topic.PICTURE_FACTS, PictureFacts)
-
-    def _stamps(self, topic: Topic, struct: type[RobotState] | type[PictureFacts]) -> Iterator[StampsTable]:
-        addresses = np.frombuffer(self.messages(topic).addresses, np.uint64)
-        return stamps_tables(
-            self._source, addresses, lambda address: self._message(topic, address, struct).stamps
-        )
-
     @property
     def camera_model(self) -> CameraModel | None:
         """The newest intrinsics for viewers: the solved ones in an annotated recording."""
         last = None
-        for message in self.stored(Topic.CAMERA_CALIBRATION):
-            last = camera_model_of(self._viewer_message(CameraCalibration, message))
+        for message in self.parsed(Topic.CAMERA_CALIBRATION):
+            last = camera_model_of(message)
         return last
 
     @property
     def fixed_frames(self) -> dict[tuple[str, str], Matrix4]:
         """(parent, child) → parent_from_child of what does not move, as it was known last."""
         found = {}
-        for message in self.stored(Topic.FIXED_TRANSFORM):
-            frame = self._viewer_message(FrameTransform, message)
+        for frame in self.parsed(Topic.FIXED_TRANSFORM):
             found[frame.parent_frame_id, frame.child_frame_id] = matrix_of(frame)
         return found
-
-    def _viewer_message(self, kind: Any, message: Message) -> Any:
-        try:
-            return kind.FromString(message.data)
-        except DecodeError as error:
-            raise self._unusable("a message for viewers cannot be parsed") from error
 
     def events(self) -> Iterator[CaptureEvent]:
         return self._decoded(Topic.EVENT, CaptureEvent)
@@ -166,7 +140,7 @@ class RecordingSegment:
         return Image(pixels=image, **told)
 
     def _decoded_image(self, topic: Topic, address: int, width: int, height: int) -> Pixels:
-        message = self._image_message(topic, address)
+        message = self._parsed(topic, address)
         data = message.data
         if topic is Topic.COMPRESSED_IMAGE:
             del message  # it holds a second copy of the bytes
@@ -179,7 +153,7 @@ class RecordingSegment:
         """(format, file bytes) of an image that is kept compressed; None when it is kept raw."""
         if sequence not in self._compressed:
             return None
-        message = self._image_message(Topic.COMPRESSED_IMAGE, self._compressed[sequence])
+        message = self._parsed(Topic.COMPRESSED_IMAGE, self._compressed[sequence])
         return str(message.format), bytes(message.data)
 
     def _corrupt(self, topic: Topic, address: int, reason: str) -> CorruptRecordingError:
@@ -190,12 +164,15 @@ class RecordingSegment:
             at_byte=place,
         )
 
-    def _image_message(self, topic: Topic, address: int) -> Any:
-        kind: Any = CompressedImage if topic is Topic.COMPRESSED_IMAGE else RawImage
+    def parsed(self, topic: Topic) -> Iterator[Any]:
+        """A topic's protobuf messages, in file order; their values are not checked."""
+        return (self._parsed(topic, address) for address in self.messages(topic).addresses)
+
+    def _parsed(self, topic: Topic, address: int) -> Any:
         try:
-            return kind.FromString(self._read(topic, address).data)
+            return parse(topic, self._read(topic, address).data)
         except DecodeError as error:
-            raise self._corrupt(topic, address, "the image message cannot be parsed") from error
+            raise self._corrupt(topic, address, "the message cannot be parsed") from error
 
     def _read(self, topic: Topic, address: int) -> Message:
         try:

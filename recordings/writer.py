@@ -26,7 +26,7 @@ from recordings.mcap.records import with_crc
 from recordings.mcap.writer import McapFile, Piece
 from recordings.scene import Entity, scene_update
 from recordings.schema import viewing
-from recordings.schema.definitions import FORMATS, SESSION_RECORDS, PictureFacts, encode, encode_robot_state
+from recordings.schema.definitions import FORMATS, SESSION_RECORDS, PictureFacts, encode
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
@@ -94,7 +94,7 @@ class RecordingWriter:
 
     def robot_state(self, state: RobotState) -> None:
         time_ns = self._time_ns(state.stamps)
-        self._add(Topic.ROBOT_STATE, [encode_robot_state(state)], time_ns)
+        self._add(Topic.ROBOT_STATE, [encode(state)], time_ns)
         due = not 0 <= time_ns - self._shown_ns < SHOWN_PERIOD_NS  # a clock that was set back counts, too
         if due and all(map(math.isfinite, state.tcp_pose)):
             self._shown_ns = time_ns

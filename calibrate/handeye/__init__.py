@@ -35,23 +35,20 @@ if TYPE_CHECKING:
     from calibrate.views import ViewSet as ViewSet
 
 _MODULES = {
-    "BoardTolerance": "calibrate.handeye.priors",
-    "BoardView": "calibrate.views",
-    "MeasurementNoise": "calibrate.handeye.information",
-    "PeerResult": "calibrate.results",
-    "Solution": "calibrate.handeye.solution",
-    "SolveOptions": "calibrate.handeye.solution",
-    "ViewSet": "calibrate.views",
-    "compare_all": "calibrate.handeye.peers",
-    "covariance_of": "calibrate.handeye.information",
-    "prior_information": "calibrate.handeye.information",
-    "solve_views": "calibrate.handeye.solve",
-    "view_information": "calibrate.handeye.information",
+    "calibrate.handeye.information": "MeasurementNoise covariance_of prior_information view_information",
+    "calibrate.handeye.peers": "compare_all",
+    "calibrate.handeye.priors": "BoardTolerance",
+    "calibrate.handeye.solution": "Solution SolveOptions",
+    "calibrate.handeye.solve": "solve_views",
+    "calibrate.results": "PeerResult",
+    "calibrate.views": "BoardView ViewSet",
 }
-__all__ = list(_MODULES)
+"""Module → names that it gives."""
+_HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> object:
-    if name not in _MODULES:
+    if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+    return getattr(import_module(_HOME[name]), name)

@@ -5,20 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import special
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.arm import (
     RELATIVE_SIGMA,
     ArmPostures,
-    allow_for_table,
     arm_postures,
     by_parameters,
     flex_motion,
 )
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
-from calibrate.handeye.estimate import Estimate, estimate
+from calibrate.handeye.estimate import Estimate, corner_weights, estimate
+from calibrate.handeye.linear import Linear
 from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.observations import SHAPE, CellState, Moved, Observations, Places, observe_views
 from calibrate.handeye.poses import BoardPoses, PoseViews, agreed_start, fit_poses
@@ -75,7 +76,10 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     if with_table and len(views) >= FEWEST_FOR_TABLE:
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
         flex = flex_motion(views.mount, views.base_from_flange, held)
-        motion = flex if arm is None else np.concatenate([_table_motion(arm), flex], axis=2)
+        motion = flex
+        if arm is not None:
+            by_table = by_parameters(arm.model, arm.joints_rad) * RELATIVE_SIGMA
+            motion = np.concatenate([by_table, flex], axis=2)
         try:
             found, log_bayes = allow_for_table(replace(observed, table=motion), found, priors)
             observed = replace(observed, table=motion)
@@ -86,8 +90,53 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     return CellFit(views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified)
 
 
-def _table_motion(arm: ArmPostures) -> Array:
-    return np.asarray(by_parameters(arm.model, arm.joints_rad) * RELATIVE_SIGMA)
+_SIZES = np.array([1e-6, 0.05, 0.12, 0.3, 0.7, 1.5])
+"""1σ of the errors, mm and mrad; the first stands for none."""
+_BEFOREHAND = np.array([0.5, 0.1, 0.1, 0.1, 0.1, 0.1])
+_TABLE_STEPS = 2
+
+
+def allow_for_table(observed: Observations, plain: Estimate, priors: Priors) -> tuple[Estimate, float]:
+    """Estimate anew with the `table` of the observations, from the estimate without it.
+
+    The size of its errors is not fitted but averaged over: one solution for each of a grid, weighed by its
+    evidence; no errors at all count as much beforehand as all other sizes together. So the price for an arm
+    without errors is small, and the stated uncertainty of one with errors is not.
+
+    The second value is the log evidence of errors of any size against none; above 3 they are worth saying.
+    Raises LinAlgError where it fails.
+    """
+    state = replace(plain.state, table=np.zeros(np.asarray(observed.table).shape[2]))
+    scales, weights = plain.scales, plain.corner_weights
+    for _ in range(_TABLE_STEPS):
+        linear = Linear.at(observed, state, weights)
+        solutions = [linear.solve(priors.linearise(state, s), scales, "robot") for s in _SIZES]
+        log_evidence = np.array([s.log_evidence for s in solutions])
+        chances = special.softmax(log_evidence + np.log(_BEFOREHAND))
+        step = chances @ np.array([s.step for s in solutions])
+        by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
+        before, state = state, state.moved(step, by_view)
+        weights = corner_weights(observed, state, scales.sigma_px)
+    covariance = sum(
+        chance * (linear.covariance(s) + np.outer(s.step - step, s.step - step))
+        for chance, s in zip(chances, solutions, strict=True)
+        if chance > 1e-6
+    )
+    best = solutions[int(chances.argmax())]
+    found = special.logsumexp(log_evidence[1:]) - np.log(len(_SIZES) - 1)
+    with_table = replace(
+        plain,
+        state=state,
+        scales=replace(best.scales, table=float(chances @ _SIZES)),
+        chances=np.einsum("s,snk->nk", chances, [s.chances for s in solutions]),
+        covariance=np.asarray(covariance),
+        robot=linear.m + linear.J @ step,
+        robot_covariance=linear.predicted(best.scales, np.asarray(covariance)),
+        board_poses=linear.seen_boards(before.C),
+        corner_weights=weights,
+        log_evidence=float(special.logsumexp(log_evidence, b=_BEFOREHAND)),
+    )
+    return with_table, float(found - log_evidence[0])
 
 
 def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Estimate:

@@ -100,13 +100,6 @@ class Source:
     def messages(self, addresses: Iterable[int]) -> Iterator[Message]:
         return map(self.message, addresses)
 
-    def room(self, address: int) -> int:
-        """Bytes from here to the end of the file, or of the unpacked chunk."""
-        if address < UNPACKED_START:
-            return self.size_bytes - address
-        place = bisect_right(self._starts, address) - 1
-        return self._starts[place] + self._packed[place].size - address
-
     def place(self, address: int) -> int:
         """The byte of the file, for people: of its chunk's data where that is compressed."""
         if address < UNPACKED_START:

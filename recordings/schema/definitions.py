@@ -8,7 +8,6 @@ travels inside every file, and the reader refuses one that says something else t
 
 from __future__ import annotations
 
-import struct as binary
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -138,11 +137,6 @@ _CLASSES: dict[type[msgspec.Struct], Any] = {
 }
 
 
-_STATE_AFTER_STAMPS = binary.Struct("<" + 4 * "BB6d" + 5 * "BB" + 2 * "Bd")
-"""Fields 2 … 12 of a RobotState: four vectors (tag, length, numbers), five small integers, two fractions."""
-_VECTOR_BYTES = 48
-
-
 def message_class(struct: type[msgspec.Struct]) -> Any:
     """The protobuf class of a struct."""
     return _CLASSES[struct]
@@ -151,38 +145,6 @@ def message_class(struct: type[msgspec.Struct]) -> Any:
 def encode(value: msgspec.Struct) -> bytes:
     """Any of the structs above → protobuf bytes."""
     return bytes(_to_proto(value).SerializeToString())
-
-
-def encode_robot_state(state: RobotState) -> bytes:
-    """The bytes of `encode` in a third of the time: a cell records 500 states a second.
-
-    Protobuf leaves out zeros and takes more bytes for large integers: states with such go through `encode`.
-    """
-    mode, safety, bits = state.robot_mode, state.safety_mode, state.safety_status_bits
-    program, status = state.runtime_state, state.robot_status_bits
-    scaling, fraction = state.speed_scaling, state.target_speed_fraction
-    small = 0 < mode < 128 and 0 < safety < 128 and 0 < bits < 128 and 0 < program < 128 and 0 < status < 128
-    if not (small and scaling and fraction):
-        return encode(state)
-    clocks = state.stamps
-    stamps: bytes = _CLASSES[Stamps](
-        host_monotonic_ns=clocks.host_monotonic_ns,
-        host_wall_ns=clocks.host_wall_ns,
-        controller_s=clocks.controller_s,
-        device_ns=clocks.device_ns,
-    ).SerializeToString()
-    return b"\x0a%c%b%b" % (
-        len(stamps),
-        stamps,
-        _STATE_AFTER_STAMPS.pack(
-            *(0x12, _VECTOR_BYTES, *state.joints_rad),
-            *(0x1A, _VECTOR_BYTES, *state.joint_speeds_rad_s),
-            *(0x22, _VECTOR_BYTES, *state.target_joints_rad),
-            *(0x2A, _VECTOR_BYTES, *state.tcp_pose),
-            *(0x30, mode, 0x38, safety, 0x40, bits, 0x48, program, 0x50, status),
-            *(0x59, scaling, 0x61, fraction),
-        ),
-    )
 
 
 def _to_proto(value: msgspec.Struct) -> Any:

@@ -58,6 +58,11 @@ _MESSAGES: dict[Topic, Any] = {
 }
 
 
+def parse(topic: Topic, data: bytes) -> Any:
+    """Protobuf message of a topic. Raises google.protobuf's DecodeError."""
+    return _MESSAGES[topic].FromString(data)
+
+
 def schema_name(topic: Topic) -> str:
     """Full protobuf name of the topic's message."""
     return str(_MESSAGES[topic].DESCRIPTOR.full_name)
@@ -86,7 +91,7 @@ def identify(samples: list[bytes]) -> tuple[str, str, str, bytes] | None:
 
 def _fits(topic: Topic, data: bytes) -> bool:
     try:
-        message = _MESSAGES[topic].FromString(data)
+        message = parse(topic, data)
     except (DecodeError, UnicodeDecodeError):
         return False
     size = message.ByteSize()

@@ -137,29 +137,15 @@ def frame_transform(parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
 
 def base_from_flange(tcp_pose: Vector6, tcp_offset: Vector6) -> Matrix4:
     """The controller's tool pose without the tool: base_from_tcp and flange_from_tcp → base_from_flange."""
-    # Numbers, no arrays: NumPy's calls took longer than all the rest of a message, 25 times a second.
-    base_from_tcp, (a, b, c) = _rotation(*tcp_pose[3:]), _rotation(*tcp_offset[3:])
-    x, y, z = tcp_offset[:3]
-    rows: list[tuple[float, ...]] = []
-    for (u, v, w), at in zip(base_from_tcp, tcp_pose[:3], strict=True):
-        i = u * a[0] + v * a[1] + w * a[2]
-        j = u * b[0] + v * b[1] + w * b[2]
-        k = u * c[0] + v * c[1] + w * c[2]
-        rows.append((i, j, k, at - i * x - j * y - k * z))
-    return (*rows, (0.0, 0.0, 0.0, 1.0))
+    T = _matrix(tcp_pose) @ np.linalg.inv(_matrix(tcp_offset))
+    return tuple(tuple(row) for row in T.tolist())
 
 
-def _rotation(x: float, y: float, z: float) -> tuple[tuple[float, float, float], ...]:
-    """Rotation matrix of a rotation vector [rad] by Rodrigues' formula, row by row."""
-    angle = math.sqrt(x * x + y * y + z * z)
-    s = math.sin(angle) / angle if angle else 1.0
-    h = math.sin(angle / 2) / angle if angle else 0.5
-    c = 2 * h * h  # (1 - cos) / angle², without its cancellation
-    return (
-        (1 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y),
-        (c * x * y + s * z, 1 - c * (x * x + z * z), c * y * z - s * x),
-        (c * x * z - s * y, c * y * z + s * x, 1 - c * (x * x + y * y)),
-    )
+def _matrix(pose: Vector6) -> NDArray[np.float64]:
+    """Position and rotation vector → 4×4."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(np.array(pose[3:]))[0], pose[:3]
+    return T
 
 
 def joint_states(state: RobotState, time_ns: int) -> Any:

@@ -18,7 +18,7 @@ from calibrate.geometry import (
     quaternion_from_matrix,
     transform_points,
 )
-from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
+from calibrate.kinematics import MODELS, RobotModel, forward
 from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
 from station.cell.collision import CellGeometry, gap_to_arm, plate
 from station.cell.config import Capsule, PoseGuess, RobotConfig, StationConfig, Vector3, vector3
@@ -145,7 +145,7 @@ def arm_model(robot: RobotConfig) -> RobotModel:
     """The configured arm, with its factory calibration where it is given."""
     model = MODELS[robot.model]
     if (k := robot.kinematics) is not None:
-        model = model.calibrated(DhDeltas(k.a_m, k.d_m, k.alpha_rad, k.theta_rad))
+        model = model.calibrated(k.a_m, k.d_m, k.alpha_rad, k.theta_rad)
     return model
 
 

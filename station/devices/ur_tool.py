@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from calibrate.geometry import Array, difference, inverse, pose_from_rotvec, rotation_log
-from calibrate.kinematics import DhDeltas, RobotModel, forward
+from calibrate.kinematics import RobotModel, forward
 from recordings.schema.messages import ArmKinematics, RobotState, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError
@@ -144,12 +144,10 @@ def _stated_model(nominal: RobotModel, dh: DhParameters) -> RobotModel:
         return tuple(s - t for s, t in zip(stated, table, strict=True))
 
     return nominal.calibrated(
-        DhDeltas(
-            a_m=minus(dh.a_m, nominal.a_m),
-            d_m=minus(dh.d_m, nominal.d_m),
-            alpha_rad=minus(dh.alpha_rad, nominal.alpha_rad),
-            theta_rad=minus(dh.theta_rad, nominal.theta_offset_rad),
-        )
+        a_m=minus(dh.a_m, nominal.a_m),
+        d_m=minus(dh.d_m, nominal.d_m),
+        alpha_rad=minus(dh.alpha_rad, nominal.alpha_rad),
+        theta_rad=minus(dh.theta_rad, nominal.theta_offset_rad),
     )
 
 

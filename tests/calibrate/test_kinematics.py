@@ -13,7 +13,6 @@ from scipy.linalg import expm
 from calibrate.geometry import Array, rotation_angle, rotation_log, skew
 from calibrate.kinematics import (
     MODELS,
-    DhDeltas,
     RobotModel,
     forward,
     inverse_all,
@@ -194,11 +193,11 @@ def test_a_wrist_over_the_shoulder_measures_zero() -> None:
 
 
 def test_deltas_move_the_flange_by_what_they_say() -> None:
-    longer = UR10.calibrated(DhDeltas(d_m=(0.01, 0, 0, 0, 0, 0)))
+    longer = UR10.calibrated(d_m=(0.01, 0, 0, 0, 0, 0))
     q = [0.3, -1.2, 1.6, -1.0, -1.3, 0.4]
     shift = forward(longer, q)[:3, 3] - forward(UR10, q)[:3, 3]
     assert shift == pytest.approx([0, 0, 0.01], abs=1e-12)
-    turned = UR10.calibrated(DhDeltas(theta_rad=(0, 0, 0, 0, 0, 0.02)))
+    turned = UR10.calibrated(theta_rad=(0, 0, 0, 0, 0, 0.02))
     angle = rotation_angle(forward(turned, q)[:3, :3] @ forward(UR10, q)[:3, :3].T)
     assert angle == pytest.approx(0.02)
 

@@ -38,7 +38,7 @@ class QuadraticObjective:
         np.subtract(R.reshape(-1, 9), self.R0.reshape(9), out=z[:, :9])
         np.subtract(b, self.b0, out=z[:, 9:12])
         z[:, 12] = 1.0
-        return np.asarray(((z @ self.gram) * z).sum(axis=1))
+        return np.asarray(np.einsum("mi,mi->m", z @ self.gram, z))
 
     def value(self, X: Array) -> float:
         """Evaluate f at one X (4, 4)."""

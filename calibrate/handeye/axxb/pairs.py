@@ -39,12 +39,12 @@ class Pairs:
     @cached_property
     def alpha(self) -> Array:
         """(n, 3) logarithms of A's rotations (eq. 12), rad."""
-        return _logarithms(self.A[:, :3, :3])
+        return rotation_log(self.A[:, :3, :3])
 
     @cached_property
     def beta(self) -> Array:
         """(n, 3) logarithms of B's rotations, rad."""
-        return _logarithms(self.B[:, :3, :3])
+        return rotation_log(self.B[:, :3, :3])
 
     def select(self, places: Places | NDArray[np.bool_] | slice) -> Pairs:
         return Pairs(self.A[places], self.B[places], self.first[places], self.second[places])
@@ -81,25 +81,13 @@ def all_pairs(H: Array, camera_from_board: Array, limit: int = MAX_PAIRS) -> Pai
     return make_pairs(H, camera_from_board, first, second)
 
 
-def _logarithms(R: Array) -> Array:
-    """rotation_log at a tenth of its cost: atan2 on the skew part, the general map only beyond 170°."""
-    v = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
-    sine = np.sqrt(np.einsum("ni,ni->n", v, v))
-    angle = np.arctan2(sine, R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0)
-    log = v * np.where(sine < 1e-10, 0.5, angle / np.maximum(sine, 1e-10))[:, None]
-    far = np.flatnonzero(angle > 2.97)
-    if len(far):
-        log[far] = rotation_log(R[far])
-    return np.asarray(log)
-
-
 def screw_invariants(motion: Array) -> tuple[Array, Array]:
     """Compute angle (n,) rad and translation along the axis (n,) m of motions (n, 4, 4).
 
     Both are the same for A and B of a right pair, whatever X is (Chen 1991). The pitch of a motion that
     does not rotate is its length.
     """
-    log = _logarithms(motion[:, :3, :3])
+    log = rotation_log(motion[:, :3, :3])
     angle = np.linalg.norm(log, axis=1)
     axis = log / np.maximum(angle, 1e-12)[:, None]
     along = np.einsum("ni,ni->n", axis, motion[:, :3, 3])

@@ -9,15 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calibrate.geometry import Array, pose, project_to_rotation, skew
 from calibrate.handeye.axxb.certificate import Certificate, certify
-from calibrate.handeye.axxb.evolution import (
-    EvolutionSettings,
-    evolve,
-    rotations_from_quaternions,
-    rotations_from_vectors,
-)
+from calibrate.handeye.axxb.evolution import EvolutionSettings, evolve
 from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pairs import Pairs
 
@@ -67,11 +63,11 @@ def _evolve_rotations(objective: QuadraticObjective, rng: np.random.Generator) -
 
     def evaluate(q: Array) -> Array:
         z = np.ones((len(q), 10))
-        z[:, :9] = rotations_from_quaternions(q).reshape(-1, 9) - centre
+        z[:, :9] = Rotation.from_quat(q).as_matrix().reshape(-1, 9) - centre
         return np.asarray(((z @ S) * z).sum(axis=1))
 
     evolved = evolve(evaluate, -np.ones(4), np.ones(4), rng, SETTINGS)
-    return rotations_from_quaternions(evolved.population)
+    return np.asarray(Rotation.from_quat(evolved.population).as_matrix())
 
 
 def _best_of(objective: QuadraticObjective, starts: Array) -> tuple[Array, float]:
@@ -109,7 +105,7 @@ def polish(objective: QuadraticObjective, R: Array) -> tuple[Array, Array]:
         gradient = np.einsum("mki,mi->mk", P, gamma.reshape(-1, 9))
         step = -np.einsum("mij,mj->mi", V, np.einsum("mji,mj->mi", V, gradient) / curvature)
         step *= np.minimum(1.0, 1.0 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
-        trial = rotations_from_vectors(step) @ R
+        trial = Rotation.from_rotvec(step).as_matrix() @ R
         trial_f = value(trial)
         lower = trial_f <= f
         R[lower], f[lower] = trial[lower], trial_f[lower]

@@ -36,7 +36,7 @@ from calibrate.files.loader import InstalledCalibration, check_result, proven_pl
 from calibrate.files.validity import unrecorded
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_from_rotvec, rotation_exp
 from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
-from calibrate.kinematics import MODELS, DhDeltas, base_from_flange, forward, with_near_axes
+from calibrate.kinematics import MODELS, base_from_flange, forward, with_near_axes
 from calibrate.pipeline import SolvedRecording
 
 FOLLOWED = FrameNames(follow=("calibrate", "follow"))
@@ -112,11 +112,9 @@ def test_ur_kinematics_is_the_corrected_arm_by_the_driver_s_rule(
     if factory:  # parallel axes: a common normal a hundred metres away
         model = with_near_axes(
             MODELS["UR10e"].calibrated(
-                DhDeltas(
-                    alpha_rad=(1e-4, 2e-4, -1e-4, 0, 3e-4, 0),
-                    d_m=(0, 120.0, -70.0, -50.0, 0, 0),
-                    theta_rad=(0, 0.4, -0.1, -0.3, 1e-4, 0),
-                )
+                alpha_rad=(1e-4, 2e-4, -1e-4, 0, 3e-4, 0),
+                d_m=(0, 120.0, -70.0, -50.0, 0, 0),
+                theta_rad=(0, 0.4, -0.1, -0.3, 1e-4, 0),
             )
         )
         arm = msgspec.structs.replace(calibration.arm_table, corrected=DhTable.of(model))

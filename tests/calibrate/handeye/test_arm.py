@@ -12,7 +12,7 @@ from benchmarks.kinematics import worn_cell
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye.arm import PARAMETERS, arm_postures, by_parameters
 from calibrate.handeye.solve import SolveOptions, solve_views
-from calibrate.kinematics import MODELS, DhDeltas, forward, link_frames
+from calibrate.kinematics import MODELS, forward, link_frames
 from calibrate.views import ViewSet
 from tests.calibrate.cells import changed, inside
 
@@ -100,7 +100,7 @@ def with_error(name: str, size: float, joints: Array) -> Array:
         after = frames[:, joint + 1]
         return after @ pose(rotation_exp([0, size, 0]), np.zeros(3)) @ inverse(after) @ frames[:, 6]
     field = {"a": "a_m", "d": "d_m", "alpha": "alpha_rad", "theta": "theta_rad"}[parameter]
-    return forward(UR10.calibrated(DhDeltas(**{field: tuple(size * np.eye(6)[joint])})), joints)
+    return forward(UR10.calibrated(**{field: tuple(size * np.eye(6)[joint])}), joints)
 
 
 @settings(max_examples=10, deadline=None)

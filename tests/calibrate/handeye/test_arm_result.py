@@ -18,16 +18,14 @@ from calibrate.handeye.linear import inverse_of
 from calibrate.handeye.solution import Solution, TableResult
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.handeye.workspace import Workspace, sample_workspace
-from calibrate.kinematics import MODELS, DhDeltas, forward, with_near_axes
+from calibrate.kinematics import MODELS, forward, with_near_axes
 
 UR10 = MODELS["UR10"]
 FACTORY = UR10.calibrated(
-    DhDeltas(
-        a_m=(0.0, 8e-4, -6e-4, 4e-4, 0.0, 0.0),
-        d_m=(0.0, 40.0, -15.0, -25.0, 0.0, 0.0),
-        alpha_rad=(3e-4, 1e-5, -2e-5, 4e-4, -3e-4, 0.0),
-        theta_rad=(0.0, 1e-3, -2e-3, 1e-3, 5e-4, 0.0),
-    )
+    a_m=(0.0, 8e-4, -6e-4, 4e-4, 0.0, 0.0),
+    d_m=(0.0, 40.0, -15.0, -25.0, 0.0, 0.0),
+    alpha_rad=(3e-4, 1e-5, -2e-5, 4e-4, -3e-4, 0.0),
+    theta_rad=(0.0, 1e-3, -2e-3, 1e-3, 5e-4, 0.0),
 )
 """Parallel axes to within 0.02 mrad, their common normals tens of metres off, as makers state them."""
 
@@ -109,12 +107,10 @@ def test_far_axes_are_restated_and_the_flange_stays(seed: int) -> None:
     rng = np.random.default_rng(seed)
     far = 100 * rng.normal()
     arm = UR10.calibrated(
-        DhDeltas(
-            tuple(1e-3 * rng.normal(size=6)),
-            (0.0, far, -0.7 * far, -0.3 * far, 0.0, 0.0),
-            tuple(1e-5 * rng.normal(size=6)),
-            (0.0, *rng.uniform(-0.5, 0.5, 3), 0.0, 0.0),
-        )
+        tuple(1e-3 * rng.normal(size=6)),
+        (0.0, far, -0.7 * far, -0.3 * far, 0.0, 0.0),
+        tuple(1e-5 * rng.normal(size=6)),
+        (0.0, *rng.uniform(-0.5, 0.5, 3), 0.0, 0.0),
     )
     near, joints = with_near_axes(arm), rng.uniform(-3, 3, (10, 6))
     assert near.d_m[1:3] == (0.0, 0.0) and abs(near.d_m[3]) < 0.5

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import pose_from_rotvec, rotation_log
-from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
+from calibrate.kinematics import MODELS, RobotModel, forward
 from recordings.schema.messages import RobotState, Vector6
 from station.devices.ur_primary import (
     PACKED_HEADER_BYTES,
@@ -24,7 +24,9 @@ NO_TOOL: Vector6 = (0.0,) * 6
 TOOL: Vector6 = (0.01, -0.02, 0.15, 0.1, 0.0, 0.5)
 HERE: Vector6 = (0.3, -1.2, 1.4, -1.5, -1.4, 0.2)
 THERE: Vector6 = (-0.8, -1.7, 1.9, -0.9, 1.2, 2.0)
-FACTORY = DhDeltas(a_m=(0.0, 0.0008, -0.0006, 0.0, 0.0, 0.0), theta_rad=(0.0, 0.001, -0.002, 0.001, 0.0, 0.0))
+FACTORY = UR10.calibrated(
+    a_m=(0.0, 0.0008, -0.0006, 0.0, 0.0, 0.0), theta_rad=(0.0, 0.001, -0.002, 0.001, 0.0, 0.0)
+)
 
 
 def sample(arm: RobotModel, joints_rad: Vector6, tool: Vector6) -> RobotState:
@@ -51,12 +53,12 @@ def test_the_controllers_words_are_taken_when_they_fit() -> None:
 
 
 def test_the_factory_calibration_is_told_where_it_explains_the_poses() -> None:
-    own = UR10.calibrated(FACTORY)
+    own = FACTORY
     told = TcpCheck(UR10, False, sample(own, HERE, TOOL), stated(own, TOOL)).kinematics
     assert told is not None and (told.model, told.source) == ("UR10", "controller")
     assert told.a_m == own.a_m and told.theta_rad == own.theta_offset_rad
     # Stated untruly: the poses follow another table than the one on the wire.
-    far = UR10.calibrated(DhDeltas(a_m=(0.0, 0.003, 0.0, 0.0, 0.0, 0.0)))
+    far = UR10.calibrated(a_m=(0.0, 0.003, 0.0, 0.0, 0.0, 0.0))
     assert TcpCheck(UR10, False, sample(far, HERE, TOOL), stated(UR10, TOOL)).kinematics is None
     assert TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation()).kinematics is None
     configured = TcpCheck(own, True, sample(own, HERE, TOOL), Installation()).kinematics
@@ -82,7 +84,7 @@ def test_a_tool_that_is_not_the_stated_one_is_noticed() -> None:
 
 
 def test_factory_calibration_is_no_mix_up_and_makes_the_check_fine() -> None:
-    arm = UR10.calibrated(FACTORY)
+    arm = FACTORY
     check = TcpCheck(UR10, False, sample(arm, HERE, TOOL), stated(arm, TOOL))
     check.check(sample(arm, THERE, TOOL), stated(arm, TOOL))
     moved = (TOOL[0] + 0.001, *TOOL[1:])
@@ -91,7 +93,7 @@ def test_factory_calibration_is_no_mix_up_and_makes_the_check_fine() -> None:
 
 
 def test_with_the_nominal_table_alone_the_check_is_coarse_but_there() -> None:
-    arm = UR10.calibrated(FACTORY)
+    arm = FACTORY
     check = TcpCheck(UR10, False, sample(arm, HERE, TOOL), Installation())
     check.check(sample(arm, THERE, TOOL), Installation())
     with raises("tcp-changed"):
@@ -105,7 +107,7 @@ def test_the_coarse_check_sees_a_turned_tool_too() -> None:
 
 
 def test_with_a_configured_table_the_check_is_fine_without_the_controllers_words() -> None:
-    arm = UR10.calibrated(FACTORY)
+    arm = FACTORY
     check = TcpCheck(arm, True, sample(arm, HERE, TOOL), Installation())
     check.check(sample(arm, THERE, TOOL), Installation())
     for moved in ((TOOL[0] + 0.001, *TOOL[1:]), (*TOOL[:5], TOOL[5] + 0.003)):
@@ -126,7 +128,7 @@ def test_a_changed_statement_is_noticed_before_the_arm_shows_it() -> None:
 
 
 def test_statements_survive_the_wire() -> None:
-    said = stated(UR10.calibrated(FACTORY), TOOL)
+    said = stated(FACTORY, TOOL)
     message = pack_state(NO_TOOL, TOOL, said.dh)
     assert read_state(message[PACKED_HEADER_BYTES:]) == said
     assert len(message) == PACKED_HEADER_BYTES + 101 + 225  # sizes by Universal Robots' document

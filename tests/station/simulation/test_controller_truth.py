@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import perturb
-from calibrate.kinematics import MODELS, DhDeltas
+from calibrate.kinematics import MODELS
 from calibrate.kinematics import forward as station_forward
 from station.simulation.controller.arm import SPAN_S, History
 from station.simulation.controller.kinematics import forward, inverse_nearest
@@ -39,13 +39,10 @@ def test_history_keeps_its_span_and_no_more() -> None:
 
 
 def test_the_true_flange_has_the_true_lengths_and_the_miss(context) -> None:
-    deltas = DhDeltas(
-        a_m=(0, 1e-3, 0, 0, 0, 0), d_m=(0, 0, 0, 2e-3, 0, 0), alpha_rad=(1e-3, 0, 0, 0, 0, 0),
-        theta_rad=(0, 0, 2e-3, 0, 0, 0),
-    )  # fmt: skip
-    made = context(dh_delta=(deltas.a_m, deltas.d_m, deltas.alpha_rad, deltas.theta_rad))
+    deltas = ((0, 1e-3, 0, 0, 0, 0), (0, 0, 0, 2e-3, 0, 0), (1e-3, 0, 0, 0, 0, 0), (0, 0, 2e-3, 0, 0, 0))
+    made = context(dh_delta=deltas)
     miss = (1e-4, -2e-4, 3e-4, 1e-3, 2e-3, -1e-3)
-    expected = perturb(station_forward(MODELS["UR10"].calibrated(deltas), Q), np.array(miss))
+    expected = perturb(station_forward(MODELS["UR10"].calibrated(*deltas), Q), np.array(miss))
     found = np.array(made.robot.true_flange(Q, miss)).reshape(3, 4)
     assert np.allclose(found, expected[:3], atol=1e-12)
 
@@ -71,14 +68,14 @@ def test_a_factory_calibration_is_what_poses_follow_and_is_stated_or_not(context
     )
     made = context(factory=far, states_factory=true, dh_delta=((0.0, 1e-3, 0, 0, 0, 0),) + ((0.0,) * 6,) * 3)
     made.run(0.1)
-    own = MODELS["UR10"].calibrated(DhDeltas(*far))
+    own = MODELS["UR10"].calibrated(*far)
     reported = made.robot.outputs.vector("actual_TCP_pose")[:3]
     assert reported == pytest.approx(station_forward(own, made.robot.arm.actual)[:3, 3], abs=1e-12)
     expected = own if true else MODELS["UR10"]
     assert made.robot.stated_table.d_m == pytest.approx(expected.d_m)
     assert made.robot.stated_table.a_m == pytest.approx(expected.a_m)
     flange = np.array(made.robot.true_flange(Q, (0.0,) * 6)).reshape(3, 4)
-    worn = own.calibrated(DhDeltas(a_m=(0.0, 1e-3, 0, 0, 0, 0)))
+    worn = own.calibrated(a_m=(0.0, 1e-3, 0, 0, 0, 0))
     assert np.allclose(flange, station_forward(worn, Q)[:3], atol=1e-12)
     # The controller's own inverse goes where its poses say.
     goal = forward(made.robot.table, tuple(Q))

@@ -11,8 +11,6 @@ from calibrate.handeye.axxb.evolution import (
     EvolutionSettings,
     _partners,
     evolve,
-    rotations_from_quaternions,
-    rotations_from_vectors,
 )
 from calibrate.handeye.axxb.pairs import consecutive_pairs
 from calibrate.handeye.axxb.paper import BOX, SETTINGS, solve_paper
@@ -92,13 +90,3 @@ def test_mutants_are_rounded_to_the_box_and_ties_are_accepted():
     everything = np.concatenate(seen)
     assert np.abs(everything).max() == 1.0
     np.testing.assert_array_equal(evolved.population, seen[-1])  # f equal: the trial replaces its parent
-
-
-def test_rotation_maps_agree_with_the_general_ones():
-    rng = np.random.default_rng(0)
-    gamma = np.vstack([rng.normal(size=(20, 3)), np.zeros((1, 3)), 1e-9 * np.ones((1, 3))])
-    np.testing.assert_allclose(
-        rotations_from_vectors(gamma), Rotation.from_rotvec(gamma).as_matrix(), atol=1e-14
-    )
-    q = rng.normal(size=(20, 4))
-    np.testing.assert_allclose(rotations_from_quaternions(q), Rotation.from_quat(q).as_matrix(), atol=1e-14)

@@ -175,8 +175,7 @@ def unlock(machine: Machine) -> dict[str, object]:
 
 def run(machine: Machine) -> None:
     """A person powers the arm on and releases the brakes."""
-    machine.robot.power_on()
-    machine.robot.release_brakes()
+    machine.robot.run()
 
 
 def stop_program(machine: Machine) -> None:
@@ -192,6 +191,24 @@ def pause(machine: Machine) -> dict[str, object]:
 def play(machine: Machine) -> dict[str, object]:
     """Play pressed on the pendant: a paused program goes on."""
     return {"playing": machine.robot.play_program()}
+
+
+def program(machine: Machine) -> dict[str, object]:
+    """The text of the program that plays."""
+    return {"text": getattr(machine.robot.program, "text", "")}
+
+
+def contact(machine: Machine, cycles: int = 10) -> None:
+    """The tool touches something: `tool_contact` answers that it has for so many cycles (0: nothing)."""
+    machine.robot.contact_cycles = int(number("cycles", cycles, 0))
+
+
+def wires(machine: Machine, digital: int = 0, analog: list[float] | None = None) -> None:
+    """Inputs: digital bits (standard 0-7, configurable 8-15, tool 16-17), analog 0 and 1 (V or A)."""
+    out = machine.robot.outputs
+    out.set("actual_digital_input_bits", int(number("digital", digital, 0, 2**18 - 1)))
+    for i, value in enumerate(numbers("analog", analog, 2)):
+        out.set(f"standard_analog_input{i}", value)
 
 
 def foreign(machine: Machine, name: str = "palletising.urp") -> None:
@@ -316,7 +333,8 @@ def list_commands(_: Machine) -> dict[str, object]:
 _NAMED: tuple[Command, ...] = (
     pstop, estop, safeguard, power_off, drop, stall, freeze, mute, stall_dash, black_hole, restart, late,
     delay, lose, in_use, vibrate, offset, dh,
-    unlock, run, stop_program, pause, play, foreign, slider, remote, tcp, payload, jog, hand_move,
+    unlock, run, stop_program, pause, play, program, foreign, contact, wires,
+    slider, remote, tcp, payload, jog, hand_move,
     truth, state, stats, log,
 )  # fmt: skip
 COMMANDS: dict[str, Command] = {command.__name__: command for command in _NAMED} | {"help": list_commands}

@@ -4,10 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import exp, pi, sin
+from math import exp, inf, pi, sin
 
-from station.simulation.controller.kinematics import DhTable, Rigid, Six, compose, forward
-from station.simulation.controller.paths import Braking, Path, Profile, Trapezoid, UnreachableError
+from station.simulation.controller.kinematics import (
+    JOINT_LIMIT_RAD,
+    DhTable,
+    Rigid,
+    Six,
+    compose,
+    forward,
+)
+from station.simulation.controller.paths import (
+    Braking,
+    Path,
+    PolylinePath,
+    Profile,
+    Trapezoid,
+    UnreachableError,
+)
 
 LAG_S = 0.015
 """Time constant with which the true joints follow the commanded ones."""
@@ -17,8 +31,13 @@ PROGRAM_END_RAD_S2 = 4.0
 """Deceleration when the program ends under a motion."""
 ZERO: Six = (0.0,) * 6
 
+JOINT_SPEED_RAD_S = pi
+"""No joint goes faster, whatever a script asks for."""
+
 MakePath = Callable[[Six], Path]
 """Joints where the motion begins → its path."""
+Speeds = Callable[[Six, float], Six]
+"""Commanded joints and the cycle's length [s] → the joint speeds wanted now. Raises UnreachableError."""
 SPAN_S = 15.0
 
 
@@ -34,6 +53,29 @@ class JointMotion:
         self.elapsed_s = 0.0
         self.braking = False
         self.done = False
+
+
+class Stream(JointMotion):
+    """A motion without an end, whose speeds are asked for in every cycle: servoj, speedj and their kin."""
+
+    def __init__(self, wanted: Speeds, acceleration: float, speeds: Six) -> None:
+        super().__init__(lambda start: PolylinePath([start]), 0.0, acceleration)
+        self.wanted = wanted
+        self.speeds = speeds
+
+    def step(self, joints: Six, dt_s: float, scale: float) -> Six:
+        """The next joints: all speeds change together, the leading one by at most the acceleration."""
+        wanted = ZERO if self.braking else self.wanted(joints, dt_s)
+        fastest = max(map(abs, wanted))
+        if fastest > JOINT_SPEED_RAD_S:
+            wanted = tuple(v * JOINT_SPEED_RAD_S / fastest for v in wanted)
+        change = max(abs(w - v) for w, v in zip(wanted, self.speeds, strict=True))
+        share = 1.0 if change <= self.acceleration * dt_s else self.acceleration * dt_s / change
+        self.speeds = tuple(v + share * (w - v) for w, v in zip(wanted, self.speeds, strict=True))
+        moved = tuple(q + v * dt_s * scale for q, v in zip(joints, self.speeds, strict=True))
+        if any(abs(q) > JOINT_LIMIT_RAD for q in moved):
+            raise UnreachableError("a joint reaches its limit")
+        return moved
 
 
 @dataclass
@@ -96,6 +138,21 @@ class SimulatedArm:
         self._offset_now = self.offset
         self._misses = (self.miss, self._draw_miss())
 
+    @property
+    def stream_speeds(self) -> Six:
+        """Joint speeds a stream goes on from: those of the running one, before the slider scales them."""
+        flows = isinstance(self.motion, Stream) and not self.motion.braking
+        return self.motion.speeds if flows else self.command_speed  # type: ignore[union-attr]
+
+    def stream(self, wanted: Speeds, acceleration: float) -> JointMotion:
+        """Goes on from where and how fast the arm is now; a running motion ends here."""
+        self._drop_next()
+        stream = Stream(wanted, acceleration, self.stream_speeds)
+        if self.motion is not None:
+            self.motion.done = True
+        self.motion = stream
+        return stream
+
     def brake(self, deceleration_rad_s2: float) -> None:
         """Comes to rest on its path, the leading joint at this deceleration."""
         self._brake_in(max(map(abs, self.command_speed)) / deceleration_rad_s2)
@@ -118,6 +175,13 @@ class SimulatedArm:
     def _brake_in(self, duration_s: float) -> None:
         self._drop_next()
         motion = self.motion
+        if isinstance(motion, Stream):
+            if not motion.braking:
+                motion.speeds = tuple(v * self.scale for v in motion.speeds)
+                motion.acceleration = 0.0
+            slower = max(map(abs, motion.speeds)) / duration_s if duration_s > 0 else inf
+            motion.acceleration, motion.braking = max(slower, motion.acceleration), True
+            return
         if motion is None or motion.profile is None:
             return
         s, speed = motion.profile.at(motion.elapsed_s)
@@ -154,6 +218,9 @@ class SimulatedArm:
         self._lag(dt_s)
 
     def _follow(self, motion: JointMotion, dt_s: float) -> None:
+        if isinstance(motion, Stream):
+            self._flow(motion, dt_s)
+            return
         assert motion.path is not None and motion.profile is not None
         motion.elapsed_s += dt_s * (1.0 if motion.braking else self.scale)
         profile = motion.profile
@@ -169,6 +236,17 @@ class SimulatedArm:
         before, after = self._misses
         self.miss = tuple(a + share * (b - a) for a, b in zip(before, after, strict=True))
         if motion.elapsed_s >= profile.duration_s:
+            self._end(motion)
+
+    def _flow(self, motion: Stream, dt_s: float) -> None:
+        try:
+            joints = motion.step(self.command, dt_s, 1.0 if motion.braking else self.scale)
+        except UnreachableError:
+            self.freeze()
+            raise
+        self.command_speed = tuple((b - a) / dt_s for a, b in zip(self.command, joints, strict=True))
+        self.command = joints
+        if motion.braking and not any(motion.speeds):
             self._end(motion)
 
     def _end(self, motion: JointMotion) -> None:
@@ -231,6 +309,10 @@ class History:
         t1, q1, m1 = self._ring[high % self._size]
         u = (monotonic_ns - t0) / (t1 - t0) if t1 > t0 else 0.0
         return _between(q0, q1, u), _between(m0, m1, u)
+
+    def before(self, cycles: int) -> Six:
+        """Joints so many cycles ago, or as long ago as is known."""
+        return self._ring[(self._count - 1 - min(cycles, self._count - 1, self._size - 1)) % self._size][1]
 
     def _time(self, index: int) -> int:
         return self._ring[index % self._size][0]

@@ -1,149 +1,382 @@
-"""Uploaded programs that run as they are written: URScript's interpreter joined to this controller's arm."""
+"""Uploaded programs: URScript's interpreter joined to this controller's arm.
+
+One table of builtins: what only computes (`script_pure`), registers, inputs, outputs and sockets
+(`script_io`), and here what moves the arm or asks for its state.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from contextlib import suppress
-from math import isfinite
+from collections.abc import Callable, Sequence
+from functools import wraps
+from math import hypot, inf, isfinite, sqrt
 
-from station.simulation.controller.arm import JointMotion
-from station.simulation.controller.kinematics import Six, from_pose
-from station.simulation.controller.paths import JointPath, LinePath, Path
-from station.simulation.controller.programs import ScriptError
-from station.simulation.controller.state import ControllerState
-from station.simulation.controller.urscript import (
-    Builtin,
-    Pose,
-    ScriptRun,
-    ScriptRuntimeError,
-    ScriptSyntaxError,
-    Thread,
+from station.simulation.controller.arm import JointMotion, Speeds
+from station.simulation.controller.kinematics import (
+    JOINT_LIMIT_RAD,
+    Rigid,
+    Six,
+    compose,
+    forward,
+    from_pose,
+    from_rotvec,
+    inverse_nearest,
+    invert,
+    to_pose,
+    to_rotvec,
 )
+from station.simulation.controller.paths import ArcPath, JointPath, LinePath, Path, UnreachableError
+from station.simulation.controller.script_io import Sockets, Wait, inputs_and_outputs, registers
+from station.simulation.controller.script_pure import PURE, pose_of, rigid, six, text_of
+from station.simulation.controller.state import ControllerState, twist_between
+from station.simulation.controller.urscript import Builtin, Pose, ScriptRun, ScriptRuntimeError, Thread
 from station.simulation.controller.urscript_parser import parse
 
 KILLED_RAD_S2 = 40.0
 """Deceleration of an arm whose moving thread was killed and that nobody stops: very sudden."""
 STEADY_RAD_S = 1e-3
-
-Wait = Generator[None, None, None]
+_QUIET = frozenset({"sync", "sleep", "textmsg", "force", "tool_contact"})
+ROTATION_WEIGHT_M = 0.1
+"""servoc turns a radian in the time in which it goes so far."""
+ARRIVED_M = 1e-5
 
 
 class InterpretedProgram:
     """A text from a script port. Raises ScriptSyntaxError for one that this interpreter cannot run."""
 
     def __init__(self, robot: ControllerState, name: str, text: str) -> None:
-        self.name = name
+        self.name, self.text = name, text
         self._robot = robot
-        self._run = ScriptRun(parse(text, self._builtins()))
+        self._sockets = Sockets(robot)
+        states = {**inputs_and_outputs(robot), **self._states()}
+        builtins = {
+            **PURE,
+            **registers(robot),
+            **self._sockets.builtins(),
+            **{name: self._logged(name, builtin) for name, builtin in states.items()},
+            **self._motions(),
+        }
+        self._run = ScriptRun(parse(text, builtins))
         self._mover: Thread | None = None
         """The thread that controls the arm."""
         self._orphan: JointMotion | None = None
-        """A motion whose thread was killed in this cycle."""
+        """A motion that no thread waits for any more: for whoever moves or stops in the same cycle."""
 
-    def begin(self) -> None:
-        pass
+    def _logged(self, name: str, builtin: Builtin) -> Builtin:
+        """With each call in the log, unless it only asks or waits. Motions log themselves."""
+        if name.startswith(("get_", "is_")) or name in _QUIET:
+            return builtin
+
+        @wraps(builtin)
+        def logged(*arguments: object, **named: object) -> object:
+            self._robot.journal.count("script", name)
+            return builtin(*arguments, **named)
+
+        return logged
 
     def step(self) -> bool:
-        try:
-            goes_on = self._run.step()
-        except ScriptRuntimeError as error:
-            raise ScriptError(str(error)) from None
-        if not goes_on:
-            self._run.end()
+        """One cycle; False when the program has ended. Raises ScriptRuntimeError, UnreachableError."""
+        goes_on = self._run.step()
         if self._orphan is not None and not self._orphan.done:
             self._robot.arm.brake(KILLED_RAD_S2)
         self._orphan = None
         return goes_on
 
-    def _builtins(self) -> dict[str, Builtin]:
-        """What can be called besides what only computes; arguments have the names of the manual."""
-        robot, arm = self._robot, self._robot.arm
+    def end(self) -> None:
+        """Kills every thread, closes what it opened and leaves its modes."""
+        self._run.end()
+        self._sockets.close()
+        self._robot.freedrive = self._robot.force_mode = False
+
+    # -- state ------------------------------------------------------------------------------------------
+
+    def _states(self) -> dict[str, Builtin]:
+        """Arguments have the names of the manual."""
+        robot, arm, out = self._robot, self._robot.arm, self._robot.outputs
+
+        def vector(name: str) -> Callable[[], list[float]]:
+            return lambda: list(out.vector(name))
+
+        def pose(name: str) -> Callable[[], Pose]:
+            return lambda: Pose(out.vector(name))
+
+        def mode(name: str, on: bool) -> Builtin:
+            return lambda *_, **__: setattr(robot, name, on)
+
+        def accepted(*_: object, **__: object) -> None:
+            """Without an effect here: there are no forces."""
+
         return {
             "sync": self._sync,
             "sleep": self._sleep,
             "get_steptime": lambda: robot.dt_s,
-            "movej": self._movej,
-            "movel": self._movel,
-            "stopj": self._stopj,
-            "stopl": self._stopl,
             "is_steady": lambda: not arm.moving and max(map(abs, arm.actual_speed)) < STEADY_RAD_S,
             "get_actual_joint_positions": lambda: list(arm.actual),
+            "get_joint_positions": lambda: list(arm.actual),
             "get_target_joint_positions": lambda: list(arm.command),
+            "get_actual_joint_positions_history": lambda steps=0: list(robot.history.before(int(steps))),
             "get_actual_joint_speeds": lambda: list(arm.actual_speed),
-            "get_actual_tcp_pose": lambda: Pose(robot.outputs.vector("actual_TCP_pose")),
+            "get_target_joint_speeds": lambda: list(arm.command_speed),
+            "get_joint_torques": vector("target_moment"),
+            "get_joint_temp": lambda j: out.vector("joint_temperatures")[int(j)],
+            "get_actual_tcp_pose": pose("actual_TCP_pose"),
+            "get_target_tcp_pose": pose("target_TCP_pose"),
+            "get_target_waypoint": pose("target_TCP_pose"),
+            "get_actual_tcp_speed": pose("actual_TCP_speed"),
+            "get_target_tcp_speed": pose("target_TCP_speed"),
+            "get_actual_tool_flange_pose": lambda: pose_of(forward(robot.table, arm.actual)),
+            "get_target_tool_flange_pose": lambda: pose_of(forward(robot.table, arm.command)),
+            "get_forward_kin": self._forward,
+            "get_inverse_kin": self._inverse,
+            "get_inverse_kin_has_solution": self._has_solution,
+            "is_within_safety_limits": self._within_limits,
             "get_tcp_offset": lambda: Pose(robot.tcp),
-            "read_input_integer_register": lambda address: int(self._input("int", address)),
-            "read_input_float_register": lambda address: self._input("double", address),
-            "read_output_integer_register": lambda address: int(self._output("int", address)),
-            "read_output_float_register": lambda address: self._output("double", address),
-            "write_output_integer_register": self._write_integer,
-            "write_output_float_register": self._write_float,
-            "textmsg": lambda s1, s2="": robot.journal.note("controller", "textmsg", text=f"{s1}{s2}"),
+            "set_tcp": self._set_tcp,
+            "get_target_payload": lambda: robot.payload_kg,
+            "get_target_payload_cog": lambda: list(robot.payload_cog),
+            "get_target_payload_inertia": lambda: list(robot.payload_inertia),
+            "set_payload": self._set_payload,
+            "set_target_payload": self._set_payload,
+            "set_payload_mass": lambda m: self._set_payload(m),
+            "set_payload_cog": lambda cog: self._set_payload(robot.payload_kg, cog),
+            "set_gravity": lambda d: out.set("target_gravity", *map(float, d)),
+            "get_tcp_force": vector("actual_TCP_force"),
+            "force": lambda: out.get("tcp_force_scalar"),
+            "zero_ftsensor": accepted,
+            "ft_rtde_input_enable": accepted,
+            "enable_external_ft_sensor": accepted,
+            "force_mode": mode("force_mode", True),
+            "end_force_mode": mode("force_mode", False),
+            "force_mode_set_damping": accepted,
+            "force_mode_set_gain_scaling": accepted,
+            "freedrive_mode": mode("freedrive", True),
+            "end_freedrive_mode": mode("freedrive", False),
+            "get_freedrive_status": lambda: 0,
+            "teach_mode": mode("freedrive", True),
+            "end_teach_mode": mode("freedrive", False),
+            "tool_contact": lambda direction=None: robot.contact_cycles,
+            "protective_stop": lambda: robot.protective_stop("the script asked for it"),
+            "rtde_set_watchdog": self._set_watchdog,
+            "textmsg": self._textmsg,
+            "popup": self._popup,
         }
-
-    # -- time -------------------------------------------------------------------------------------------
 
     def _sync(self) -> Wait:
         yield
 
     def _sleep(self, t: float) -> Wait:
-        for _ in range(max(1, round(t / self._robot.dt_s))):
+        for _ in range(self._cycles(t)):
             yield
 
-    # -- registers --------------------------------------------------------------------------------------
+    def _cycles(self, seconds: float) -> int:
+        return max(1, round(seconds / self._robot.dt_s))
 
-    def _input(self, kind: str, address: int) -> float:
-        return self._robot.inputs.get(self._register("input", kind, address))
+    def _textmsg(self, s1: object, s2: object = "") -> None:
+        text = text_of(s1) + text_of(s2)
+        self._robot.journal.note("controller", "textmsg", text=text)
+        self._robot.tell("text", text=text)
 
-    def _output(self, kind: str, address: int) -> float:
-        return self._robot.outputs.get(self._register("output", kind, address))
+    def _popup(
+        self,
+        s: object,
+        title: str = "Popup",
+        warning: bool = False,
+        error: bool = False,
+        blocking: bool = False,
+    ) -> Wait:
+        robot = self._robot
+        robot.popup = text_of(s)
+        robot.journal.note("controller", "popup", text=robot.popup, title=title)
+        robot.tell("popup", title=title, text=robot.popup, warning=warning, error=error)
+        while blocking and robot.popup is not None:
+            yield
 
-    def _register(self, side: str, kind: str, address: int) -> str:
-        name = f"{side}_{kind}_register_{address}"
-        if name not in self._robot.inputs.types and name not in self._robot.outputs.types:
-            raise ScriptRuntimeError(f"there is no {name}")
-        return name
+    def _set_tcp(self, pose: Pose, tcp_name: str = "") -> None:
+        self._robot.tcp = six(pose)
 
-    def _write_integer(self, address: int, value: int) -> None:
-        if type(value) is not int or not -(2**31) <= value < 2**31:
-            raise ScriptRuntimeError(f"{value!r} is no integer of 32 bits")
-        self._robot.outputs.set(self._register("output", "int", address), value)
+    def _set_payload(
+        self, m: float, cog: Sequence[float] = (), inertia: Sequence[float] = (), transition_time: float = 0
+    ) -> None:
+        robot = self._robot
+        robot.payload_kg = float(m)
+        robot.payload_cog = tuple(map(float, cog)) or robot.payload_cog
+        robot.payload_inertia = tuple(map(float, inertia)) or robot.payload_inertia
 
-    def _write_float(self, address: int, value: float) -> None:
-        self._robot.outputs.set(self._register("output", "double", address), float(value))
+    def _set_watchdog(self, variable_name: str, min_frequency: float = 10.0, action: str = "pause") -> None:
+        if variable_name not in self._robot.inputs.types or not 0 < min_frequency < inf:
+            raise ScriptRuntimeError(f"no watchdog on {variable_name} at {min_frequency} Hz")
+        if action not in ("ignore", "pause", "stop"):
+            raise ScriptRuntimeError(f"a watchdog's action is no {action}")
+        self._robot.watchdog_s = 0.0 if action == "ignore" else 1.0 / min_frequency
+        self._robot.watched, self._robot.watchdog_pauses = variable_name, action == "pause"
+
+    # -- kinematics -------------------------------------------------------------------------------------
+
+    def _tool(self, joints: Six) -> Rigid:
+        return compose(forward(self._robot.table, joints), from_pose(self._robot.tcp))
+
+    def _forward(self, q: list[float] | None = None, tcp: Pose | None = None) -> Pose:
+        joints = self._robot.arm.actual if q is None else six(q)
+        offset = self._robot.tcp if tcp is None else six(tcp)
+        return pose_of(compose(forward(self._robot.table, joints), from_pose(offset)))
+
+    def _solved(self, pose: Rigid, near: Six, tcp: list[float] | None = None) -> Six | None:
+        offset = from_pose(self._robot.tcp if tcp is None else six(tcp))
+        return inverse_nearest(self._robot.table, compose(pose, invert(offset)), near)
+
+    def _inverse(
+        self,
+        x: Pose,
+        qnear: list[float] | None = None,
+        maxPositionError: float = 1e-10,
+        maxOrientationError: float = 1e-10,
+        tcp: Pose | None = None,
+    ) -> list[float]:
+        joints = self._solved(rigid(x), self._robot.arm.command if qnear is None else six(qnear), tcp)
+        if joints is None:
+            raise ScriptRuntimeError(f"get_inverse_kin found no solution for {text_of(x)}")
+        return list(joints)
+
+    def _has_solution(self, *arguments: object, **named: object) -> bool:
+        try:
+            self._inverse(*arguments, **named)  # type: ignore[arg-type]
+        except ScriptRuntimeError:
+            return False
+        return True
+
+    def _within_limits(self, pose: list[float]) -> bool:
+        if isinstance(pose, Pose):
+            return self._has_solution(pose)
+        return all(abs(q) <= JOINT_LIMIT_RAD for q in pose)
 
     # -- motion -----------------------------------------------------------------------------------------
 
+    def _motions(self) -> dict[str, Builtin]:
+        return {
+            "movej": self._movej,
+            "movel": self._movel,
+            "movep": self._movep,
+            "movec": self._movec,
+            "servoj": self._servoj,
+            "servoc": self._servoc,
+            "speedj": self._speedj,
+            "speedl": self._speedl,
+            "stopj": self._stopj,
+            "stopl": self._stopl,
+        }
+
+    def _joints(self, target: list[float]) -> Six:
+        return tuple(self._inverse(target)) if isinstance(target, Pose) else six(target)
+
+    def _pose(self, target: list[float]) -> Rigid:
+        return rigid(target) if isinstance(target, Pose) else self._tool(six(target))
+
     def _movej(self, q: list[float], a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Wait:
-        if isinstance(q, Pose):
-            raise ScriptRuntimeError("movej to a pose is not simulated")
-        yield from self._move("movej", q, a, v, t)
+        goal = self._joints(q)
+        yield from self._move("movej", goal, lambda start: JointPath(start, goal), a, v, t)
 
     def _movel(self, pose: list[float], a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Wait:
-        if not isinstance(pose, Pose):
-            raise ScriptRuntimeError("movel to joints is not simulated")
-        yield from self._move("movel", pose, a, v, t)
+        goal, tcp = self._pose(pose), from_pose(self._robot.tcp)
+        make_path = lambda start: LinePath(self._robot.table, tcp, start, goal)  # noqa: E731
+        yield from self._move("movel", to_pose(goal), make_path, a, v, t)
 
-    def _move(self, name: str, values: list[float], a: float, v: float, t: float) -> Wait:
+    def _movep(self, pose: list[float], a: float = 1.2, v: float = 0.25, r: float = 0) -> Wait:
+        yield from self._movel(pose, a, v)
+
+    def _movec(
+        self,
+        pose_via: list[float],
+        pose_to: list[float],
+        a: float = 1.2,
+        v: float = 0.25,
+        r: float = 0,
+        mode: float = 0,
+    ) -> Wait:
+        via, goal, tcp = self._pose(pose_via), self._pose(pose_to), from_pose(self._robot.tcp)
+        make_path = lambda start: ArcPath(self._robot.table, tcp, start, via, goal)  # noqa: E731
+        yield from self._move("movec", to_pose(goal), make_path, a, v, 0)
+
+    def _move(
+        self, name: str, goal: Six, make_path: Callable[[Six], Path], a: float, v: float, t: float
+    ) -> Wait:
         """Until the arm rests at the goal. The thread that moves controls the arm as long."""
-        robot = self._robot
-        goal: Six = tuple(map(float, values))
-        if len(goal) != 6 or not all(map(isfinite, (*goal, a, v))) or a <= 0 or v <= 0 or t != 0:
-            raise ScriptRuntimeError(f"{name} to {goal} with a={a}, v={v}, t={t}")
-
-        def path(start: Six) -> Path:
-            if name == "movej":
-                return JointPath(start, goal)
-            return LinePath(robot.table, from_pose(robot.tcp), start, from_pose(goal))
-
+        arm = self._robot.arm
+        if not all(map(isfinite, (*goal, a, v, t))) or t < 0 or (t == 0 and (a <= 0 or v <= 0)):
+            raise ScriptRuntimeError(f"{name} to {text_of(list(goal))} with a={a}, v={v}, t={t}")
+        if t > 0:  # in this time, a quarter of it for each ramp
+            v = max(make_path(arm.command).length, 1e-9) / (0.75 * t)
+            a = v / (0.25 * t)
         self._take_arm(name)
-        robot.journal.note("script", name, goal=list(goal), a=a, v=v)
-        yield from self._hold(robot.arm.start(path, v, a))
+        self._robot.journal.note("script", name, goal=list(goal), a=a, v=v)
+        yield from self._hold(arm.start(make_path, v, a))
 
-    def _stopj(self, a: float) -> Wait:
+    def _servoj(
+        self,
+        q: list[float],
+        a: float = 0,
+        v: float = 0,
+        t: float = 0.002,
+        lookahead_time: float = 0.1,
+        gain: float = 300,
+    ) -> Wait:
+        """Follows the goal with the lookahead as its time constant; `gain` has no effect."""
+        goal, lag_s = six(q), max(0.03, min(0.2, lookahead_time))
+
+        def wanted(joints: Six, dt_s: float) -> Six:
+            return tuple((g - c) / max(lag_s, dt_s) for g, c in zip(goal, joints, strict=True))
+
+        yield from self._flow("servoj", wanted, inf, t, lambda: True)
+
+    def _speedj(self, qd: list[float], a: float = 1.4, t: float = 0) -> Wait:
+        speeds, arm = six(qd), self._robot.arm
+        yield from self._flow("speedj", lambda _, __: speeds, a, t, lambda: arm.stream_speeds == speeds)
+
+    def _speedl(self, xd: list[float], a: float = 1.2, t: float = 0, aRot: object = "a") -> Wait:
+        goal = six(xd)
+        tool = _ToolSpeed(self._robot, lambda _: goal, a)
+        yield from self._flow("speedl", tool.joint_speeds, inf, t, lambda: tool.twist == goal)
+
+    def _servoc(self, pose: Pose, a: float = 1.2, v: float = 0.25, r: float = 0) -> Wait:
+        """Straight towards the pose, until it is reached or as near as the blend radius."""
+        goal, robot = rigid(pose), self._robot
+
+        def way(tool: Rigid) -> tuple[Six, float]:
+            """What is left: a twist that would do it in 1 s, and its length [m]."""
+            move = tuple(goal[i] - tool[i] for i in (3, 7, 11))
+            turn = to_rotvec(compose(goal, invert(tool)))
+            return (*move, *turn), max(hypot(*move), ROTATION_WEIGHT_M * hypot(*turn))
+
+        def towards(tool: Rigid) -> Six:
+            twist, distance_m = way(tool)
+            speed = min(v, sqrt(2 * a * distance_m), distance_m / (4 * robot.dt_s))
+            return tuple(x * speed / distance_m for x in twist) if distance_m > 0 else twist
+
+        tool = _ToolSpeed(robot, towards, a)
+        near_m = max(r, ARRIVED_M)
+        yield from self._flow("servoc", tool.joint_speeds, inf, 0, lambda: way(tool.place)[1] < near_m)
+
+    def _flow(self, name: str, wanted: Speeds, a: float, t: float, arrived: Callable[[], bool]) -> Wait:
+        """Lets the arm follow: for the time t, else until it has arrived. The next call must take over."""
+        if not (a > 0 and isfinite(t)):
+            raise ScriptRuntimeError(f"{name} with a={a}, t={t}")
+        self._take_arm(name)
+        self._robot.journal.count("script", name)
+        motion = self._robot.arm.stream(wanted, a)
+        self._mover, self._orphan = self._run.thread, None
+        left = self._cycles(t) if t > 0 else 0
+        try:
+            while True:
+                yield
+                left -= 1
+                if motion.done or (left <= 0 if t > 0 else arrived()):
+                    return
+        finally:
+            self._mover = None
+            self._orphan = motion
+
+    def _stopj(self, a: float = 2.0) -> Wait:
         yield from self._stop("stopj", a)
 
-    def _stopl(self, a: float, aRot: float = 0) -> Wait:
+    def _stopl(self, a: float = 2.0, aRot: object = "a") -> Wait:
         yield from self._stop("stopl", a)
 
     def _stop(self, name: str, a: float) -> Wait:
@@ -172,8 +405,38 @@ class InterpretedProgram:
                 self._orphan = motion
 
 
-def interpreted(robot: ControllerState, name: str, text: str) -> InterpretedProgram | None:
-    """None for a text that the interpreter cannot run."""
-    with suppress(ScriptSyntaxError):
-        return InterpretedProgram(robot, name, text)
-    return None
+class _ToolSpeed:
+    """Joint speeds for a tool speed that changes by at most the acceleration (m/s² and rad/s²)."""
+
+    def __init__(self, robot: ControllerState, wanted: Callable[[Rigid], Six], acceleration: float) -> None:
+        if not (isfinite(acceleration) and acceleration > 0):
+            raise ScriptRuntimeError(f"an acceleration of {acceleration}")
+        self._robot, self._wanted, self._acceleration = robot, wanted, acceleration
+        self._flange_from_tcp = from_pose(robot.tcp)
+        step_s, arm = 1e-4, robot.arm
+        ahead = tuple(q + step_s * v for q, v in zip(arm.command, arm.stream_speeds, strict=True))
+        self.place = self._at(arm.command)
+        """base_from_tcp"""
+        self.twist = twist_between(self.place, self._at(ahead), 1 / step_s)
+        """m/s and rad/s, in base"""
+
+    def _at(self, joints: Six) -> Rigid:
+        return compose(forward(self._robot.table, joints), self._flange_from_tcp)
+
+    def joint_speeds(self, joints: Six, dt_s: float) -> Six:
+        """Raises UnreachableError."""
+        self.place = place = self._at(joints)
+        goal = self._wanted(place)
+        change = max(abs(g - x) for g, x in zip(goal, self.twist, strict=True))
+        most = self._acceleration * dt_s
+        share = most / change if change > most else 1.0
+        self.twist = goal if share == 1.0 else tuple(
+            x + share * (g - x) for g, x in zip(goal, self.twist, strict=True)
+        )  # fmt: skip
+        x, y, z, *turn = (v * dt_s for v in self.twist)
+        moved = compose(from_rotvec(*turn), place)
+        goes = (*moved[:3], place[3] + x, *moved[4:7], place[7] + y, *moved[8:11], place[11] + z)
+        solved = inverse_nearest(self._robot.table, compose(goes, invert(self._flange_from_tcp)), joints)
+        if solved is None:
+            raise UnreachableError("the tool's way leaves the arm's reach")
+        return tuple((b - a) / dt_s for a, b in zip(joints, solved, strict=True))

@@ -8,18 +8,12 @@ import os
 import time
 from collections.abc import Callable
 
-from station.devices.ur_primary import DhParameters, pack_state
 from station.simulation.controller.dashboard import dashboard_service
-from station.simulation.controller.network import Connection, Cut, Service
-from station.simulation.controller.programs import UploadReader
+from station.simulation.controller.network import Cut, Service
+from station.simulation.controller.primary import script_services
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.rtde_server import RtdeServer
 from station.simulation.controller.state import Journal, Settings
-
-PRIMARY_PORT = 30001
-"""Beside taking programs: the tool's pose and offset ten times a second, once the kinematics."""
-PRIMARY_PERIOD_S = 0.1
-SCRIPT_PORTS = (30002, 30003)
 
 CHUNK = 25
 """Cycles run at once when behind; sockets are read in between."""
@@ -111,8 +105,7 @@ class Machine:
         self.clock = Clock(self.robot.dt_s / (1 + drift_ppm * 1e-6), self._tick)
         self.rtde = RtdeServer(host, self.robot)
         self.dashboard = dashboard_service(host, self.robot)
-        scripts = (primary_service(host, self.robot), *script_services(host, self.robot))
-        self.services = [self.rtde.service, *scripts, self.dashboard]
+        self.services = [self.rtde.service, *script_services(host, self.robot), self.dashboard]
         self.lose_packets = 0
         self._rebooting: asyncio.Task[None] | None = None
 
@@ -179,41 +172,3 @@ class Machine:
         for service in self.services:
             service.close("fin")
         self.clock.stop()
-
-
-class ScriptConnection(Connection):
-    def __init__(self, robot: SimulatedRobot) -> None:
-        self._robot = robot
-        self._uploads = UploadReader()
-
-    def received(self, data: bytes) -> None:
-        try:
-            for upload in self._uploads.feed(data):
-                self._robot.upload(upload)
-        except ValueError as error:
-            self._robot.journal.note("upload", "refused", error=str(error))
-            self.transport.close()
-
-
-def script_services(host: str, robot: SimulatedRobot) -> list[Service]:
-    return [Service(f"script{port}", host, port, lambda: ScriptConnection(robot)) for port in SCRIPT_PORTS]
-
-
-class PrimaryConnection(ScriptConnection):
-    """States the controller's beliefs: its factory calibration, never the true arm's lengths."""
-
-    def opened(self) -> None:
-        table = self._robot.stated_table
-        self._send(DhParameters(table.theta_rad, table.a_m, table.d_m, table.alpha_rad))  # type: ignore[arg-type]
-
-    def _send(self, dh: DhParameters | None = None) -> None:
-        if self.transport.is_closing():
-            return
-        if not self.service.silent and not self.transport.get_write_buffer_size():
-            pose = self._robot.outputs.vector("actual_TCP_pose")
-            self.transport.write(pack_state(pose, self._robot.tcp, dh))
-        asyncio.get_running_loop().call_later(PRIMARY_PERIOD_S, self._send)
-
-
-def primary_service(host: str, robot: SimulatedRobot) -> Service:
-    return Service(f"script{PRIMARY_PORT}", host, PRIMARY_PORT, lambda: PrimaryConnection(robot))

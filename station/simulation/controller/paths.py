@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import sqrt
+from math import atan2, cos, pi, sin, sqrt
 from typing import Protocol
 
 from station.simulation.controller.kinematics import (
@@ -71,18 +71,62 @@ class LinePath:
         if goal is None:
             raise UnreachableError(f"no joints reach {base_from_goal}")
 
+    def _place(self, u: float) -> Six:
+        """The tool's point at this share of the way."""
+        return tuple(self._first[i] + u * w for i, w in zip((3, 7, 11), self._way, strict=True))
+
     def at(self, s: float) -> Six:
         u = min(s / self.length, 1.0) if self.length > 0 else 1.0
         x, y, z = self._turn
         turned = compose(self._first, from_rotvec(u * x, u * y, u * z))
-        wx, wy, wz = self._way
-        f = self._first
-        tcp = (*turned[:3], f[3] + u * wx, *turned[4:7], f[7] + u * wy, *turned[8:11], f[11] + u * wz)
+        px, py, pz = self._place(u)
+        tcp = (*turned[:3], px, *turned[4:7], py, *turned[8:11], pz)
         joints = inverse_nearest(self._table, compose(tcp, self._tcp_from_flange), self._joints)
         if joints is None:
             raise UnreachableError("the straight line leaves the arm's reach")
         self._joints = joints
         return joints
+
+
+class ArcPath(LinePath):
+    """The tool's point on a circle through a second point, the tool turning as on a line."""
+
+    def __init__(
+        self, table: DhTable, flange_from_tcp: Rigid, start: Six, base_from_via: Rigid, base_from_goal: Rigid
+    ) -> None:
+        super().__init__(table, flange_from_tcp, start, base_from_goal)
+        begin, via, end = (
+            tuple(T[i] for i in (3, 7, 11)) for T in (self._first, base_from_via, base_from_goal)
+        )
+        a, b = _minus(via, begin), _minus(end, begin)
+        normal = _cross(a, b)
+        area2 = _dot(normal, normal)
+        if area2 < 1e-12:
+            raise UnreachableError("three points on a line make no arc")
+        # the circumcentre of a triangle, seen from its first corner
+        away = _cross(tuple(_dot(a, a) * y - _dot(b, b) * x for x, y in zip(a, b, strict=True)), normal)
+        self._centre = tuple(p + w / (2 * area2) for p, w in zip(begin, away, strict=True))
+        self._u = _minus(begin, self._centre)
+        self._v = tuple(x / sqrt(area2) for x in _cross(normal, self._u))
+        last = _minus(end, self._centre)
+        self._angle = atan2(_dot(last, self._v), _dot(last, self._u)) % (2 * pi)
+        self.length = sqrt(_dot(self._u, self._u)) * self._angle
+
+    def _place(self, u: float) -> Six:
+        c, s = cos(u * self._angle), sin(u * self._angle)
+        return tuple(m + c * x + s * y for m, x, y in zip(self._centre, self._u, self._v, strict=True))
+
+
+def _minus(a: Six, b: Six) -> Six:
+    return tuple(x - y for x, y in zip(a, b, strict=True))
+
+
+def _dot(a: Six, b: Six) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def _cross(a: Six, b: Six) -> Six:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 class PolylinePath:

@@ -6,11 +6,12 @@ Knows no socket, so that every rule here can be tested without one.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from math import inf
 
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
 from station.simulation.controller.arm import PROGRAM_END_RAD_S2, JointMotion, MakePath
-from station.simulation.controller.interpreted import InterpretedProgram, interpreted
+from station.simulation.controller.interpreted import InterpretedProgram
 from station.simulation.controller.kinematics import (
     Rigid,
     Six,
@@ -19,9 +20,9 @@ from station.simulation.controller.kinematics import (
     from_rotvec,
 )
 from station.simulation.controller.paths import UnreachableError
-from station.simulation.controller.programs import CustomScript, ForeignProgram, Program, ScriptError, Upload
-from station.simulation.controller.script import ControlScript
+from station.simulation.controller.programs import Program, Upload
 from station.simulation.controller.state import ControllerState, Journal, Settings
+from station.simulation.controller.urscript import ScriptError, ScriptSyntaxError
 
 PROGRAM_START_S = 0.05
 UNLOCK_AFTER_S = 5.0
@@ -35,6 +36,8 @@ class SimulatedRobot(ControllerState):
         self._waiting: deque[tuple[int, tuple[str, ...], tuple[float, ...]]] = deque()
         """Inputs on their way: cycle in which they act, names, elements."""
         self.program: Program | None = None
+        self._secondary: list[InterpretedProgram] = []
+        """Run beside the program, without moving."""
         self._starting: tuple[int, Program] | None = None
         self._safety_since_s = -inf
         self._silence_s = 0.0
@@ -51,6 +54,9 @@ class SimulatedRobot(ControllerState):
             self._count_down()
         if self.program is not None and self.runtime_state == RuntimeState.PLAYING:
             self._step_program(late)
+        for secondary in list(self._secondary):
+            if not self._step(secondary):
+                self._secondary.remove(secondary)
         held = self.robot_mode != RobotMode.RUNNING or not self.safe
         by_hand = self._hands is not None and not self._hands.done
         held |= self.runtime_state == RuntimeState.PAUSED and not by_hand
@@ -71,29 +77,39 @@ class SimulatedRobot(ControllerState):
         self._starting = None
         self.program = program
         self.runtime_state = RuntimeState.PLAYING
-        program.begin()
+        self.tell("key", title="PROGRAM_XXX_STARTED", text=program.name)
 
     def _step_program(self, late: bool) -> None:
         assert self.program is not None
         if self.watchdog_s > 0 and not late:
             self._silence_s += self.dt_s
             if self._silence_s > self.watchdog_s:
-                self.stop_program("watchdog: the command register was silent")
+                self._silence_s = 0.0
+                if self.watchdog_pauses:
+                    self.pause_program()
+                else:
+                    self.stop_program(f"watchdog: {self.watched} was silent")
                 return
         if late and isinstance(self.program, InterpretedProgram):
             return  # it counts its own time
-        try:
-            running = self.program.step()
-        except (ScriptError, UnreachableError) as error:
-            self.stop_program(f"runtime error: {error}")
-            return
-        if not running:
+        if not self._step(self.program):
             self.stop_program("the program ended")
 
-    def command_register_written(self, index: int) -> None:
-        """A data packet carried this input_int_register."""
-        if isinstance(self.program, ControlScript) and index == self.program.offset_int:
-            self._silence_s = 0.0
+    def _step(self, program: Program) -> bool:
+        """False when it has ended, by itself or by an error."""
+        try:
+            if program.step():
+                return True
+        except (ScriptError, UnreachableError) as error:
+            line = error.line if isinstance(error, ScriptError) else 0
+            self.tell("exception", text=getattr(error, "text", str(error)), line=line)
+            if program is self.program:
+                self.stop_program(f"runtime error: {error}")
+            else:
+                self.journal.note("controller", "secondary program", error=str(error))
+        if program in self._secondary:
+            program.end()
+        return False
 
     def receive_inputs(self, names: tuple[str, ...], elements: tuple[float, ...]) -> None:
         """A data packet: it acts in the next cycle, or `input_delay_cycles` later."""
@@ -104,19 +120,29 @@ class SimulatedRobot(ControllerState):
 
     def _write_inputs(self, names: tuple[str, ...], elements: tuple[float, ...]) -> None:
         self.inputs.write(names, elements)
+        get = self.inputs.get
         for name in names:
-            if name.startswith("input_int_register_"):
-                self.command_register_written(int(name.rpartition("_")[2]))
-        if "speed_slider_mask" in names and self.inputs.get("speed_slider_mask"):
-            self.slider = max(0.0, min(1.0, self.inputs.get("speed_slider_fraction")))
+            if name in self.outputs.types:  # input registers can be read back
+                self.outputs.set(name, *self.inputs.vector(name))
+        if self.watched in names:
+            self._silence_s = 0.0
+        if "speed_slider_mask" in names and get("speed_slider_mask"):
+            self.slider = max(0.0, min(1.0, get("speed_slider_fraction")))
             self.journal.note("rtde", "speed slider", fraction=self.slider)
         for kind, first_bit in _DIGITAL_OUTPUTS.items():
             if f"{kind}_output_mask" in names:
-                mask = int(self.inputs.get(f"{kind}_output_mask")) << first_bit
-                wanted = int(self.inputs.get(f"{kind}_output")) << first_bit
-                before = int(self.outputs.get("actual_digital_output_bits"))
-                self.outputs.set("actual_digital_output_bits", before & ~mask | wanted & mask)
-                self.journal.note("rtde", f"{kind}_output", mask=mask >> first_bit, value=wanted >> first_bit)
+                mask, wanted = int(get(f"{kind}_output_mask")), int(get(f"{kind}_output"))
+                self.set_digital_outputs(mask << first_bit, wanted << first_bit)
+                self.journal.note("rtde", f"{kind}_output", mask=mask, value=wanted)
+        if "standard_analog_output_mask" in names:
+            mask = int(get("standard_analog_output_mask"))
+            kept = int(self.outputs.get("analog_io_types")) & ~(mask << 2)
+            kinds = int(get("standard_analog_output_type")) & mask
+            self.outputs.set("analog_io_types", kept | kinds << 2)
+            for n in (0, 1):
+                if mask >> n & 1:
+                    self.set_analog_output(n, get(f"standard_analog_output_{n}"))
+            self.journal.note("rtde", "standard_analog_output", mask=mask)
 
     @property
     def safe(self) -> bool:
@@ -130,7 +156,7 @@ class SimulatedRobot(ControllerState):
     @property
     def free_for_hands(self) -> bool:
         """The pendant's arrows or free-drive may move the arm."""
-        playing = self.runtime_state == RuntimeState.PLAYING
+        playing = self.runtime_state == RuntimeState.PLAYING and not self.freedrive
         return self.safe and self.robot_mode == RobotMode.RUNNING and not playing
 
     def lead(self, make_path: MakePath, speed_rad_s: float, acceleration_rad_s2: float) -> bool:
@@ -148,15 +174,38 @@ class SimulatedRobot(ControllerState):
         self.journal.note(
             "upload", upload.name or upload.text[:200], characters=len(upload.text), accepted=accepted
         )
-        if not accepted or upload.secondary:
+        if upload.text in self._bare:
+            self._bare[upload.text]()
+        elif accepted:
+            self._start_upload(upload)
+
+    @property
+    def _bare(self) -> dict[str, Callable[[], object]]:
+        """Lines that are no script but commands to the controller, as the dashboard has them."""
+        return {
+            "power on": self.power_on,
+            "power off": self.power_off,
+            "set robotmode run": self.run,
+            "set unlock protective stop": self.unlock,
+            "stop program": lambda: self.stop_program("a line on a script port"),
+            "pause program": self.pause_program,
+            "resume program": self.play_program,
+        }
+
+    def _start_upload(self, upload: Upload) -> None:
+        name = upload.name or "line"
+        try:
+            program = InterpretedProgram(self, name, upload.text)
+        except ScriptSyntaxError as error:
+            self.journal.note("controller", "syntax error", name=name, error=str(error))
+            self.tell("exception", text=error.text, line=error.line)
+            if not upload.secondary:
+                self.stop_program("replaced by a program that cannot start")
             return
-        if upload.is_control_script:
-            self.start_program(ControlScript(self, upload))
-        elif upload.is_custom_script:
-            self.start_program(CustomScript(self, upload))
+        if upload.secondary:
+            self._secondary.append(program)
         else:
-            foreign = ForeignProgram(upload.name or "line", 1 if not upload.name else None)
-            self.start_program(interpreted(self, foreign.name, upload.text) or foreign)
+            self.start_program(program)
 
     def start_program(self, program: Program) -> None:
         self.stop_program(f"replaced by {program.name}")
@@ -167,6 +216,9 @@ class SimulatedRobot(ControllerState):
         if self.program is not None or self._starting is not None:
             name = self.program.name if self.program is not None else "program"
             self.journal.note("controller", "program stopped", name=name, reason=reason)
+        if self.program is not None:
+            self.program.end()
+            self.tell("key", title="PROGRAM_XXX_STOPPED", text=self.program.name)
         self.program = self._starting = None
         self.runtime_state = RuntimeState.STOPPED
         self.watchdog_s = self._silence_s = 0.0
@@ -233,6 +285,11 @@ class SimulatedRobot(ControllerState):
     def release_brakes(self) -> None:
         if self.safe and self.robot_mode == RobotMode.IDLE:
             self.robot_mode = RobotMode.RUNNING
+
+    def run(self) -> None:
+        """Power on and brakes released, in one."""
+        self.power_on()
+        self.release_brakes()
 
     def reset(self, running: bool) -> None:
         """After a reboot."""

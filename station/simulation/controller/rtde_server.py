@@ -22,7 +22,6 @@ from station.devices.rtde import (
 )
 from station.simulation.controller.network import Connection, Service
 from station.simulation.controller.robot import SimulatedRobot
-from station.simulation.controller.variables import E_SERIES_ONLY
 
 ADMIN = "admin"
 
@@ -107,7 +106,7 @@ class RtdeConnection(Connection):
     def _output_setup(self, payload: bytes) -> bytes:
         (frequency_hz,) = struct.unpack_from(">d", payload)
         names = split_names(payload[8:])
-        types = [self._output_type(name) for name in names]
+        types = [self._robot.outputs.types.get(name, NOT_FOUND) for name in names]
         if not names or NOT_FOUND in types:
             return b"\x00" + join_names(types)
         base_hz = self._robot.settings.rate_hz
@@ -115,11 +114,6 @@ class RtdeConnection(Connection):
         self._output = Recipe(1, names, tuple(types))
         self._elements = itemgetter(*self._robot.outputs.indices(names), 0)
         return b"\x01" + join_names(types)
-
-    def _output_type(self, name: str) -> str:
-        if name in E_SERIES_ONLY and not self._robot.settings.is_e_series:
-            return NOT_FOUND
-        return self._robot.outputs.types.get(name, NOT_FOUND)
 
     def _input_setup(self, payload: bytes) -> bytes:
         names = split_names(payload)

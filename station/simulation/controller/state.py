@@ -9,6 +9,7 @@ import random
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from station.devices.rtde import RobotMode, RobotStatusBits, RuntimeState, SafetyMode, SafetyStatus
@@ -23,7 +24,7 @@ from station.simulation.controller.kinematics import (
     from_pose,
     to_pose,
 )
-from station.simulation.controller.variables import INPUT_TYPES, OUTPUT_TYPES, VariableStore
+from station.simulation.controller.variables import VARIABLES, VariableStore
 
 ENTRIES = 20_000
 CB3_VERSION = (3, 15, 8, 106339)
@@ -119,8 +120,17 @@ class ControllerState(ABC):
         self.safety_mode = SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.remote = settings.remote
+        self.payload_inertia: Six = (0.0,) * 6
+        self.freedrive = self.force_mode = False
+        self.popup: str | None = None
+        self.contact_cycles = 0
+        """What `tool_contact` answers: for so many cycles the tool has been touching something."""
         self.watchdog_s = 0.0
-        """Longest silence of the command register that is allowed; 0 = none."""
+        """Longest silence of `watched`, an input variable, that is allowed; 0 = none."""
+        self.watched = ""
+        self.watchdog_pauses = False
+        self.tell: Callable[..., None] = lambda kind, **details: None
+        """Says something to the clients of the primary interface."""
         self.clear()
 
     def clear(self) -> None:
@@ -129,18 +139,28 @@ class ControllerState(ABC):
         self.history = History(self.dt_s)
         self._seen: dict[str, tuple[Six, Six, Rigid]] = {}
         """Per tool pose: joints, TCP and pose it was last computed for."""
-        self.inputs, self.outputs = VariableStore(INPUT_TYPES), VariableStore(OUTPUT_TYPES)
-        out = self.outputs
-        out.set("joint_temperatures", *(28.0, 29.0, 30.0, 31.0, 32.0, 33.0))
-        out.set("actual_main_voltage", 48.0)
-        out.set("actual_robot_voltage", 48.0)
-        out.set("actual_joint_voltage", *(48.0,) * 6)
-        out.set("actual_execution_time", 0.0004)
-        out.set("actual_tool_accelerometer", 0.0, 0.0, -9.81)
+        e, version = self.settings.is_e_series, self.settings.version
+        self.inputs, self.outputs = (
+            VariableStore({n: v for n, v in VARIABLES[side].items() if v.known_to(e, version)})
+            for side in ("input", "output")
+        )
 
     @abstractmethod
     def protective_stop(self, reason: str) -> None:
         """The arm rests at once."""
+
+    def set_digital_outputs(self, mask: int, values: int) -> None:
+        """Bits of `actual_digital_output_bits`."""
+        before = int(self.outputs.get("actual_digital_output_bits"))
+        self.outputs.set("actual_digital_output_bits", before & ~mask | values & mask)
+
+    def set_analog_output(self, n: int, f: float) -> None:
+        """f: share of 10 V, or of 4–20 mA, whichever its domain is."""
+        if n not in (0, 1):
+            raise ValueError(f"there is no analog output {n}")
+        share = max(0.0, min(1.0, float(f)))
+        volts = int(self.outputs.get("analog_io_types")) >> 2 + int(n) & 1
+        self.outputs.set(f"standard_analog_output{int(n)}", 10 * share if volts else 0.004 + 0.016 * share)
 
     def _draw_miss(self) -> Six:
         m, rad = self.settings.sigma_m, self.settings.sigma_rad
@@ -160,6 +180,8 @@ class ControllerState(ABC):
         out.set("speed_scaling", min(1.0, arm.scale / self.slider) if self.slider > 0 else 1.0)
         out.set("payload", self.payload_kg)
         out.set("payload_cog", *self.payload_cog)
+        out.set("payload_inertia", *self.payload_inertia)
+        out.set("tcp_offset", *self.tcp)
         out.set("robot_mode", self.robot_mode)
         out.set("safety_mode", self.safety_mode)
         out.set("safety_status", self.safety_mode)
@@ -185,10 +207,10 @@ class ControllerState(ABC):
         self._seen[name] = (joints, self.tcp, T)
         if before is not None and before[1] is self.tcp:
             per_s = 1 / (self.dt_s * self.settings.time_scale)
-            self.outputs.set(f"{name}_speed", *_speed(before[2], T, per_s))
+            self.outputs.set(f"{name}_speed", *twist_between(before[2], T, per_s))
 
 
-def _speed(last: Rigid, now: Rigid, per_s: float) -> Six:
+def twist_between(last: Rigid, now: Rigid, per_s: float) -> Six:
     """Velocity (6,) between two neighbouring poses: m/s, then rad/s, both in base."""
     l0, l1, l2, lx, l4, l5, l6, ly, l8, l9, l10, lz = last
     turn = compose(now, (l0, l4, l8, 0.0, l1, l5, l9, 0.0, l2, l6, l10, 0.0))

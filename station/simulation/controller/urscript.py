@@ -4,16 +4,16 @@
 goes on until it waits. What a call does is one table of builtins: a Python function each, with the
 script's own argument names. One that takes controller time is a generator which yields once per cycle.
 
-Rules (Universal Robots, "The URScript Programming Language"): a name without `local` or `global` is the
-global of that name where there is one, else local. Inner functions read the variables of those around them.
-Lists are copied by assignment. A condition must be a boolean. That a division of integers gives a float was
+Rules (Universal Robots, "The URScript Programming Language"): a name without `local` or `global` is that of
+the nearest function around that has it, else the global one where there is one, else local. (The manual does
+not speak of functions around; Universal Robots' script for outside control relies on it.)
+Lists are copied by assignment. That a division of integers gives a float was
 not checked on a real controller. Imports nothing of the station and knows no robot.
 """
 
 from __future__ import annotations
 
 import inspect
-import math
 import operator
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,12 +32,20 @@ STATEMENTS_PER_CYCLE = 20_000
 CALL_DEPTH = 40
 
 
-class ScriptSyntaxError(Exception):
+class ScriptError(Exception):
+    """What the controller does not start, or stops, a program for."""
+
+    def __init__(self, text: str, line: int = 0) -> None:
+        super().__init__(f"line {line}: {text}" if line else text)
+        self.text, self.line = text, line
+
+
+class ScriptSyntaxError(ScriptError):
     """The text is no program that this interpreter can run."""
 
 
-class ScriptRuntimeError(Exception):
-    """What the controller would stop the program for."""
+class ScriptRuntimeError(ScriptError):
+    """The program did what it may not."""
 
 
 class Pose(list[float]):
@@ -93,9 +101,10 @@ class ScriptRun:
         return not (main.done or self.halted)
 
     def end(self) -> None:
-        """Kills every thread."""
+        """Kills every thread, except the one whose turn it is: it ends where it next waits."""
+        self.halted = True
         for thread in self._threads:
-            if not thread.done:
+            if not thread.done and thread is not self.thread:
                 thread.kill()
 
     def start(self, frame: Frame) -> Thread:
@@ -129,10 +138,14 @@ class Frame:
         raise ScriptRuntimeError(f"{name} has no value")
 
     def write(self, name: str, value: Value, scope: str = "") -> None:
-        is_global = scope == "global" or (
-            not scope and name not in self.variables and name in self.run.variables
-        )
-        variables = self.run.variables if is_global else self.variables
+        variables = self.run.variables if scope == "global" else self.variables
+        frame: Frame | None = None if scope else self
+        while frame is not None and name not in frame.variables:
+            frame = frame.outer
+        if frame is not None:
+            variables = frame.variables
+        elif not scope and name in self.run.variables:
+            variables = self.run.variables
         variables[name] = type(value)(value) if isinstance(value, list) else value
 
     def inner(self, function: Function) -> Frame:
@@ -197,9 +210,9 @@ class Call:
             except TypeError:
                 fits = False
         else:
-            raise ScriptSyntaxError(f"line {self.line}: {self.name} is not known here")
+            raise ScriptSyntaxError(f"compile_error_name_not_found:{self.name}:", self.line)
         if not fits:
-            raise ScriptSyntaxError(f"line {self.line}: {self.name} does not take these arguments")
+            raise ScriptSyntaxError(f"{self.name} does not take these arguments", self.line)
 
     def value(self, frame: Frame) -> Steps:
         if self.function is not None:
@@ -209,14 +222,16 @@ class Call:
         arguments, named = yield from self._evaluated(frame)
         try:
             found = self.builtin(*arguments, **named)
+            return (yield from found) if isinstance(found, GeneratorType) else found
         except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
-            raise ScriptRuntimeError(f"line {self.line}: {self.name}: {error}") from None
-        return (yield from found) if isinstance(found, GeneratorType) else found
+            raise ScriptRuntimeError(f"{self.name}: {error}", self.line) from None
+        except ScriptRuntimeError as error:
+            raise ScriptRuntimeError(error.text, error.line or self.line) from None
 
     def enter(self, frame: Frame) -> Generator[None, None, Frame]:
         """The frame of the function that is called, its arguments in place."""
         if self.function is None:
-            raise ScriptRuntimeError(f"line {self.line}: {self.name} is no thread")
+            raise ScriptRuntimeError(f"{self.name} is no thread", self.line)
         arguments, named = yield from self._evaluated(frame)
         inner = frame.inner(self.function)
         for (name, _), value in zip(self.function.parameters, arguments, strict=False):
@@ -227,7 +242,7 @@ class Call:
             elif default is not None:
                 inner.write(name, (yield from default(inner)), "local")
             else:
-                raise ScriptRuntimeError(f"line {self.line}: {self.name} needs {name}")
+                raise ScriptRuntimeError(f"{self.name} needs {name}", self.line)
         return inner
 
     def _evaluated(self, frame: Frame) -> Generator[None, None, tuple[list[Value], dict[str, Value]]]:
@@ -265,9 +280,10 @@ _ORDER: dict[str, Callable[[float, float], bool]] = {
 
 
 def truth(value: Value) -> bool:
-    if not isinstance(value, bool):
+    """Of a condition; a number other than 0 is true (Universal Robots' own scripts rely on it)."""
+    if not isinstance(value, bool | int | float):
         raise ScriptRuntimeError(f"{value!r} is no boolean")
-    return value
+    return bool(value)
 
 
 def _number(value: Value) -> float:
@@ -300,25 +316,3 @@ def place_of(items: Value, index: Value) -> int:
     if not isinstance(index, int) or not 0 <= index < len(items):
         raise ScriptRuntimeError(f"there is no item {index} of {len(items)}")
     return index
-
-
-PURE: dict[str, Builtin] = {
-    "norm": lambda a: math.hypot(*a) if isinstance(a, list) else abs(a),
-    "sqrt": lambda f: math.sqrt(f),
-    "sin": lambda f: math.sin(f),
-    "cos": lambda f: math.cos(f),
-    "tan": lambda f: math.tan(f),
-    "asin": lambda f: math.asin(f),
-    "acos": lambda f: math.acos(f),
-    "atan": lambda f: math.atan(f),
-    "atan2": lambda x, y: math.atan2(x, y),
-    "pow": lambda base, exponent: math.pow(base, exponent),
-    "floor": lambda f: math.floor(f),
-    "ceil": lambda f: math.ceil(f),
-    "d2r": lambda d: math.radians(d),
-    "r2d": lambda r: math.degrees(r),
-    "length": lambda v: len(v),
-    "to_str": lambda val: str(val),
-    "str_cat": lambda op1, op2: f"{op1}{op2}",
-}
-"""Builtins that only compute."""

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from station.simulation.controller.urscript import (
-    PURE,
     Builtin,
     Call,
     Frame,
@@ -62,7 +61,7 @@ def tokens(text: str) -> list[Token]:
     while place < len(text):
         match = _TOKEN.match(text, place)
         if match is None:
-            raise ScriptSyntaxError(f"line {line}: {text[place]!r} begins nothing")
+            raise ScriptSyntaxError(f"{text[place]!r} begins nothing", line)
         kind, word = str(match.lastgroup), match.group()
         depth += (word in ("(", "[")) - (word in (")", "]"))
         if kind == "name" and word in _WORDS:
@@ -81,7 +80,7 @@ def parse(text: str, builtins: Mapping[str, Builtin]) -> Function:
     except RecursionError:
         raise ScriptSyntaxError("nested too deeply") from None
     for call in program.all_calls():
-        call.resolve({**PURE, **builtins})
+        call.resolve(builtins)
     return program
 
 
@@ -107,7 +106,7 @@ class _Parser:
         token = self._tokens[self._place]
         if not (token.kind == kind if kind or not words else self._is(*words)):
             wanted = " or ".join(words) or kind or "nothing more"
-            raise ScriptSyntaxError(f"line {token.line}: {token.text!r} where {wanted} was expected")
+            raise ScriptSyntaxError(f"{token.text!r} where {wanted} was expected", token.line)
         self._place += 1
         return token
 
@@ -166,15 +165,13 @@ class _Parser:
                 self._inside.functions[function.name] = function
             elif not self._take("pass", "enter_critical", "exit_critical"):  # no thread is interrupted here
                 found.append(self._statement())
-            if not self._is(*ends):
+            if not self._is(*ends, *_STATEMENTS):  # a keyword begins a statement without a new line
                 self._need(kind="line")
             self._skip_lines()
         return found
 
     def _statement(self) -> Node:
-        word = self._take(
-            "if", "while", "return", "kill", "join", "break", "continue", "halt", "global", "local"
-        )
+        word = self._take(*_STATEMENTS)
         if word is None:
             return self._assignment()
         if word.text in ("global", "local"):
@@ -279,6 +276,7 @@ class _Parser:
     # -- expressions ------------------------------------------------------------------------------------
 
     def _expression(self, level: int = 0) -> Node:
+        self._skip_lines()  # what was begun goes on in the next line
         if level == len(_LEVELS):
             return self._unary()
         if level == _NOT_LEVEL and self._take("not"):
@@ -310,9 +308,10 @@ class _Parser:
         elif (token.kind, token.text) == ("sign", "["):
             found = _items(self._list("]")[0], list)
         elif token.text == "p" and self._take("["):
-            found = _items(self._list("]")[0], Pose)
+            items = self._list("]")[0]  # a single one is an index into a variable of that name
+            found = _item(_name("p"), items[0]) if len(items) == 1 else _items(items, Pose)
         elif token.kind != "name":
-            raise ScriptSyntaxError(f"line {token.line}: {token.text!r} where a value was expected")
+            raise ScriptSyntaxError(f"{token.text!r} where a value was expected", token.line)
         else:
             found = self._call(token).value if self._is("(") else _name(token.text)
         while self._take("["):

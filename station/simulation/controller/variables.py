@@ -1,68 +1,63 @@
-"""The RTDE variables this controller has, and the flat store of their present values.
+"""The RTDE variables this controller has (`variables.csv`), and the flat store of their present values.
 
-Names and types: Universal Robots, "Real-Time Data Exchange (RTDE) Guide".
+Names and types: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". A row's `cb3` and `e_series` say
+from which version a controller of that series has it; where the guide states none, the oldest one of RTDE;
+empty: never.
 """
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 from station.devices.rtde import DATA_TYPES
 
-REGISTERS = 48
-"""Per kind: 0–23 for field buses, 24–47 for RTDE clients; both halves are writable here."""
 
-_OUTPUTS = {
-    "DOUBLE": """timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum
-        actual_main_voltage actual_robot_voltage actual_robot_current standard_analog_input0
-        standard_analog_input1 standard_analog_output0 standard_analog_output1 io_current payload
-        tcp_force_scalar tool_analog_input0 tool_analog_input1 tool_output_current""",
-    "VECTOR6D": """target_q target_qd target_qdd target_current target_moment actual_q actual_qd
-        actual_current joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force
-        target_TCP_pose target_TCP_speed joint_temperatures actual_joint_voltage ft_raw_wrench
-        payload_inertia""",
-    "VECTOR3D": "actual_tool_accelerometer payload_cog elbow_position elbow_velocity",
-    "UINT64": "actual_digital_input_bits actual_digital_output_bits",
-    "INT32": "robot_mode safety_mode safety_status tool_output_voltage",
-    "UINT32": "runtime_state robot_status_bits safety_status_bits output_bit_registers0_to_31 "
-    "output_bit_registers32_to_63 tool_mode",
-    "VECTOR6INT32": "joint_mode",
-}
-OUTPUT_TYPES: dict[str, str] = {n: t for t, names in _OUTPUTS.items() for n in names.split()}
-OUTPUT_TYPES |= {f"output_int_register_{i}": "INT32" for i in range(REGISTERS)}
-OUTPUT_TYPES |= {f"output_double_register_{i}": "DOUBLE" for i in range(REGISTERS)}
+@dataclass(frozen=True)
+class Variable:
+    type: str
+    since: dict[bool, tuple[int, ...]]
+    """e-Series or not → its first version."""
+    rest: tuple[float, ...]
+    """Its value while nothing else is known; () is zero."""
 
-E_SERIES_ONLY = frozenset({"ft_raw_wrench"})
+    def known_to(self, e_series: bool, version: tuple[int, ...]) -> bool:
+        return e_series in self.since and self.since[e_series] <= version
 
-INPUT_TYPES: dict[str, str] = {
-    "speed_slider_mask": "UINT32",
-    "speed_slider_fraction": "DOUBLE",
-    "external_force_torque": "VECTOR6D",
-    "standard_analog_output_0": "DOUBLE",
-    "standard_analog_output_1": "DOUBLE",
-    "input_bit_registers0_to_31": "UINT32",
-    "input_bit_registers32_to_63": "UINT32",
-}
-INPUT_TYPES |= {
-    f"{name}_output{mask}": "UINT8"
-    for name in ("standard_digital", "configurable_digital", "tool_digital")
-    for mask in ("_mask", "")
-}
-INPUT_TYPES |= {f"standard_analog_output_{name}": "UINT8" for name in ("mask", "type")}
-INPUT_TYPES |= {f"input_int_register_{i}": "INT32" for i in range(REGISTERS)}
-INPUT_TYPES |= {f"input_double_register_{i}": "DOUBLE" for i in range(REGISTERS)}
+
+def _read() -> dict[str, dict[str, Variable]]:
+    found: dict[str, dict[str, Variable]] = {"input": {}, "output": {}}
+    with Path(__file__).with_name("variables.csv").open(newline="") as stream:
+        for row in csv.DictReader(stream):
+            columns = ((False, row["cb3"]), (True, row["e_series"]))
+            since = {e: tuple(map(int, v.split("."))) for e, v in columns if v}
+            variable = Variable(row["type"], since, tuple(map(float, row["rest"].split())))
+            stem, _, span = row["name"].rpartition("_")
+            first, dash, last = span.partition("-")
+            numbers = range(int(first), int(last) + 1) if dash else ()
+            names = [f"{stem}_{i}" for i in numbers] or [row["name"]]
+            found[row["direction"]] |= dict.fromkeys(names, variable)
+    return found
+
+
+VARIABLES = _read()
+"""input and output → name → what it is. Registers 0–23 are for field buses, 24–47 for RTDE clients; here
+both halves are writable."""
 
 
 class VariableStore:
     """Values of named variables in one flat list, so that a recipe is packed by one index lookup."""
 
-    def __init__(self, types: dict[str, str]) -> None:
-        self.types = types
+    def __init__(self, variables: dict[str, Variable]) -> None:
+        self.types = {name: variable.type for name, variable in variables.items()}
         self._slots: dict[str, slice] = {}
         self.elements: list[float] = []
-        for name, type_name in types.items():
-            start = len(self.elements)
-            self.elements += [0.0 if DATA_TYPES[type_name].code == "d" else 0] * DATA_TYPES[type_name].count
+        for name, variable in variables.items():
+            start, kind = len(self.elements), DATA_TYPES[variable.type]
+            make = float if kind.code == "d" else int
+            self.elements += map(make, variable.rest or (0,) * kind.count)
             self._slots[name] = slice(start, len(self.elements))
 
     def indices(self, names: Sequence[str]) -> list[int]:

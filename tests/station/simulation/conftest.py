@@ -49,9 +49,6 @@ _AFTER = """
 print("RESULT", json.dumps(result), flush=True)
 os._exit(0)  # never the wheel's destructors
 """
-CONTROL_SCRIPT = Upload(
-    "rtde_control", "def rtde_control():\n reg_offset_float = 0\n reg_offset_int = 0\nend\n"
-)
 
 
 @pytest.fixture
@@ -191,17 +188,16 @@ class SessionContext:
             self.run(self.robot.dt_s)
         return (self.robot.ticks - start) * self.robot.dt_s
 
-    def start_script(self, upload: Upload = CONTROL_SCRIPT) -> None:
-        self.robot.upload(upload)
+    def start_script(self, text: str) -> None:
+        self.robot.upload(Upload("rtde_control", text))
         self.run(0.1)
 
     def write(self, command: int, doubles: list[float] | None = None, asynchronous: int = 0) -> None:
         """A command packet, as a client sends it."""
-        for i, value in enumerate(doubles or []):
-            self.robot.inputs.set(f"input_double_register_{i}", value)
-        self.robot.inputs.set("input_int_register_1", asynchronous)
-        self.robot.inputs.set("input_int_register_0", command)
-        self.robot.command_register_written(0)
+        numbers = doubles or []
+        names = ("input_int_register_0", "input_int_register_1")
+        names += tuple(f"input_double_register_{i}" for i in range(len(numbers)))
+        self.robot.receive_inputs(names, (command, asynchronous, *numbers))
 
     def command(self, command: int, doubles: list[float] | None = None, asynchronous: int = 0) -> float:
         """The client's handshake: waits for ready, sends, waits for done, clears. Seconds until done."""
@@ -235,9 +231,22 @@ def context() -> Callable[..., SessionContext]:
     return SessionContext
 
 
+@pytest.fixture(scope="session")
+def rtde_script() -> str:
+    """The control script that the unmodified wheel uploads to a UR10."""
+    if not library_installed():
+        pytest.skip("ur_rtde is not installed")
+    running = start_controller("UR10")
+    try:
+        code = "control = rtde_control.RTDEControlInterface(host)\nresult = admin.ask('program')"
+        return str(run_wheel(running, code)["text"])
+    finally:
+        running.stop()
+
+
 @pytest.fixture
-def script(context: Callable[..., SessionContext]) -> SessionContext:
-    """A UR10 whose control script runs."""
+def script(context: Callable[..., SessionContext], rtde_script: str) -> SessionContext:
+    """A UR10 on which ur_rtde's control script runs."""
     made = context()
-    made.start_script()
+    made.start_script(rtde_script)
     return made

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from station.devices.rtde import RuntimeState
-from station.simulation.controller.interpreted import InterpretedProgram
-from station.simulation.controller.programs import CustomScript, ForeignProgram, Upload
+from station.simulation.controller.programs import Upload
 
 GOAL = "[0.4, -1.5, 1.5, -1.5, -1.5, 0.1]"
 STOPS = """
@@ -132,20 +131,3 @@ def test_cycles_that_run_at_once_are_one_to_the_program(context) -> None:
     assert made.robot.runtime_state == RuntimeState.PLAYING
     made.run(0.5)
     assert made.robot.runtime_state == RuntimeState.STOPPED
-
-
-@pytest.mark.parametrize(
-    ("text", "kind"),
-    [
-        ("def a():\n  sync()\nend\n", InterpretedProgram),
-        ("def a():\n  write_output_integer_register(0, 1)\n  sync()\nend\n", InterpretedProgram),
-        ("def a():\n  some_gripper_call(3)\nend\n", ForeignProgram),
-        ("def a():\n  switch x:\nend\n", ForeignProgram),
-        ("def beep():\n\twrite_output_integer_register(0 +0, 1)\n\ttextmsg(1)\nend\n", CustomScript),
-    ],
-)
-def test_what_runs_an_upload(context, text: str, kind: type) -> None:
-    made = context()
-    made.robot.upload(Upload("a", text))
-    made.run_until(lambda: made.robot.program is not None)
-    assert type(made.robot.program) is kind

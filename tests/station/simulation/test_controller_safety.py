@@ -28,18 +28,18 @@ def test_protective_stop_rests_at_once_and_holds_the_word(script) -> None:
     assert script.robot.arm.actual == where
 
 
-def test_protective_stop_may_stop_the_program_instead(context) -> None:
+def test_protective_stop_may_stop_the_program_instead(context, rtde_script) -> None:
     made = context(paused_by_protective_stop=False)
-    made.start_script()
+    made.start_script(rtde_script)
     made.robot.protective_stop("test")
     made.run(0.02)
     assert made.output("runtime_state") == RuntimeState.STOPPED
 
 
 @pytest.mark.parametrize(("model", "mode"), [("UR10", RobotMode.POWER_OFF), ("UR10e", RobotMode.IDLE)])
-def test_emergency_stop_bits_and_way_back(context, model, mode) -> None:
+def test_emergency_stop_bits_and_way_back(context, model, mode, rtde_script) -> None:
     made = context(model=model)
-    made.start_script()
+    made.start_script(rtde_script)
     made.robot.emergency_stop(True)
     made.run(0.02)
     assert made.output("safety_status_bits") == 1 << 6 | 1 << 7 | 1 << 10
@@ -56,7 +56,7 @@ def test_emergency_stop_bits_and_way_back(context, model, mode) -> None:
     assert made.robot.robot_mode == RobotMode.RUNNING and made.output("robot_status_bits") == 1
 
 
-def test_programs_are_ignored_when_they_must_be(context) -> None:
+def test_programs_are_ignored_when_they_must_be(context, rtde_script) -> None:
     for spoil in (
         lambda robot: robot.power_off(),
         lambda robot: robot.protective_stop("test"),
@@ -64,14 +64,14 @@ def test_programs_are_ignored_when_they_must_be(context) -> None:
     ):
         made = context(model="UR10e")
         spoil(made.robot)
-        made.start_script()
+        made.start_script(rtde_script)
         assert made.robot.program is None
         assert made.robot.journal.entries()[-1]["accepted"] is False
 
 
-def test_cb3_has_no_local_mode(context) -> None:
+def test_cb3_has_no_local_mode(context, rtde_script) -> None:
     made = context(model="UR10", remote=False)
-    made.start_script()
+    made.start_script(rtde_script)
     assert made.robot.runtime_state == RuntimeState.PLAYING
 
 
@@ -110,10 +110,10 @@ def test_hands_move_the_arm_only_when_it_is_free(script) -> None:
     assert list(script.robot.arm.command) == GOAL, "the motion that was under way is lost"
 
 
-def test_time_scale_speeds_up_motion_and_nothing_else(context) -> None:
+def test_time_scale_speeds_up_motion_and_nothing_else(context, rtde_script) -> None:
     """Faster motion, same clock, and speeds as commanded."""
     fast = context(time_scale=4.0)
-    fast.start_script()
+    fast.start_script(rtde_script)
     fast.write(1, [2.0, *HOME[1:], 0.5, 2.0], 1)
     fast.run(0.5)
     assert fast.robot.outputs.vector("target_qd")[0] == pytest.approx(0.5, rel=0.01)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.simulation.controller.programs import LIMIT, PathStep, UploadReader
+from station.simulation.controller.programs import LIMIT, UploadReader
 
 SCRIPT = """def rtde_control():
   global reg_offset_float = # float register offset
@@ -36,22 +36,6 @@ def test_programs_are_found_in_any_segmentation(cuts: list[int]) -> None:
     assert [u.name for u in seen] == ["rtde_control", "", "note"]
     assert seen[0].text == SCRIPT and seen[1].text == "stopj(2.0)"
     assert [u.secondary for u in seen] == [False, False, True]
-
-
-def test_offsets_stand_on_the_line_after_their_comment() -> None:
-    (upload,) = UploadReader().feed(SCRIPT.encode())
-    assert upload.is_control_script
-    assert (upload.offset("float"), upload.offset("int")) == (0, 24)
-
-
-def test_the_moves_of_a_path() -> None:
-    (upload,) = UploadReader().feed(SCRIPT.encode())
-    assert upload.path() == (
-        PathStep(progress=0),
-        PathStep(None, "movej", False, (0.1, -1, 1, -1, -1, 0), 1.4, 1.05),
-        PathStep(progress=1),
-        PathStep(None, "movel", True, (0.3, -0.2, 0.4, 0, 3.14, 0), 0.5, 0.1),
-    )
 
 
 def test_a_program_without_end_is_bounded() -> None:

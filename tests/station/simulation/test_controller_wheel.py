@@ -189,11 +189,11 @@ def test_the_log_has_every_command(controller: Start, wheel: Wheel) -> None:
         control.stopScript()
         log = admin.ask("log")
         result["counts"] = log["counts"]
-        result["move"] = next(e for e in log["entries"] if e["verb"] == "moveJ")
+        result["move"] = next(e for e in log["entries"] if e["verb"] == "movej")
         """,
     )
     for verb in ("popup", "power on", "brake release", "close safety popup"):
         assert result["counts"][f"dashboard: {verb}"] == 1
-    assert result["counts"]["script: moveJ"] == 1 and result["counts"]["script: stopJ"] == 1
+    assert result["counts"]["script: movej"] == 1 and result["counts"]["script: stopj"] == 1
     assert result["counts"]["upload: rtde_control"] == 1
-    assert result["move"]["arguments"][:6] == pytest.approx([0.2, -1.5, 1.5, -1.5, -1.5, 0.1])
+    assert result["move"]["goal"] == pytest.approx([0.2, -1.5, 1.5, -1.5, -1.5, 0.1])

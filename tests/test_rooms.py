@@ -46,6 +46,7 @@ PLANTS = [
     ("station/session", "station.protocol.client"),
     ("station/server", "rtde_control"),
     ("station/simulation", "station.session"),
+    ("station/simulation/controller", "station.devices.ur"),
     ("station/tui", "station.devices"),
     ("station/cli", "gi"),
 ]

@@ -3,7 +3,6 @@
 RTDE tells the tool's pose but not the offset that is in it; here the controller states both, ten times a
 second. One message = int32 size, uint8 type (16 = robot state), then sub-packages of int32 size, uint8 type,
 payload; everything big-endian. Source: Universal Robots, "Remote control via TCP/IP: client interfaces".
-The packing half serves the simulated controller.
 """
 
 from __future__ import annotations
@@ -14,12 +13,9 @@ import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from recordings.schema.messages import Vector6
 from station.cell.errors import RobotError
-
-if TYPE_CHECKING:  # the simulated controller starts without numpy
-    from recordings.schema.messages import Vector6
 
 PORT = 30001
 ROBOT_STATE = 16
@@ -29,7 +25,6 @@ MESSAGE_LIMIT = 64 * 1024
 SILENCE_S = 3.0
 FIRST_S = 1.0
 _HEADER = struct.Struct(">iB")
-PACKED_HEADER_BYTES = _HEADER.size
 _CARTESIAN = struct.Struct(">12d")
 """TCP pose, then TCP offset: x y z [m], rotation vector [rad] each"""
 _KINEMATICS = struct.Struct(">6I24dI")
@@ -58,19 +53,6 @@ class PrimaryError(RobotError):
     """Port 30001 does not speak the primary interface."""
 
     code = "primary-interface"
-
-
-def pack_state(tcp_pose: Sequence[float], tcp_offset: Sequence[float], dh: DhParameters | None) -> bytes:
-    """A robot state message with these sub-packages only."""
-    parts = [_frame(CARTESIAN_INFO, _CARTESIAN.pack(*tcp_pose, *tcp_offset))]
-    if dh is not None:
-        numbers = (*dh.theta_rad, *dh.a_m, *dh.d_m, *dh.alpha_rad)
-        parts.append(_frame(KINEMATICS_INFO, _KINEMATICS.pack(*(0,) * 6, *numbers, 0)))
-    return _frame(ROBOT_STATE, b"".join(parts))
-
-
-def _frame(kind: int, payload: bytes) -> bytes:
-    return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
 
 
 def read_state(payload: bytes) -> Installation:

@@ -24,7 +24,7 @@ ports
   29999  dashboard                29990        admin: faults, hands, truth (JSON lines)
 
 examples
-  python -m station.simulation.controller --model UR10e --host 127.0.0.2
+  station-controller --model UR10e --host 127.0.0.2
   echo '{"cmd": "help"}'  | nc -N 127.0.0.2 29990      every admin command
   echo '{"cmd": "pstop"}' | nc -N 127.0.0.2 29990      a protective stop, now
   echo '{"cmd": "truth"}' | nc -N 127.0.0.2 29990      where the arm truly is
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m station.simulation.controller",
+        prog="station-controller",
         description="A simulated Universal Robots controller for unmodified RTDE, URScript and dashboard "
         "clients such as ur_rtde. It moves in time and can be told to fail.",
         epilog=_EPILOG,
@@ -67,6 +67,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on")
     parser.add_argument(
         "--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors, drift"
+    )
+    parser.add_argument(
+        "--program", action="append", default=[], metavar="NAME[=SCRIPT]",
+        help="a program that the dashboard can load; without a file of URScript it only waits",
+    )  # fmt: skip
+    parser.add_argument(
+        "--software", metavar="VERSION", help="answer with another version, for example 5.25.1"
     )
     parser.add_argument("--joints", type=float, nargs=6, metavar="RAD", help="start joints")
     parser.add_argument("--serial", help="answer to `get serial number`")
@@ -99,6 +106,10 @@ def _settings(options: argparse.Namespace) -> Settings:
     given["remote"] = not options.local
     given["input_delay_cycles"] = max(0, options.input_delay)
     given["paused_by_protective_stop"] = not options.protective_stop_ends_program
+    if options.software is not None:
+        given["software"] = tuple(map(int, options.software.split(".")))
+    named = (text.partition("=") for text in options.program)
+    given["programs"] = {name: Path(file).read_text() if file else None for name, _, file in named}
     options.drift_ppm = 0.0
     if options.truth is not None:
         from station.simulation.cell import read_truth  # loads numpy: only when it is asked for

@@ -20,7 +20,7 @@ from station.simulation.controller.kinematics import (
     from_rotvec,
 )
 from station.simulation.controller.paths import UnreachableError
-from station.simulation.controller.programs import Program, Upload
+from station.simulation.controller.programs import ForeignProgram, Program, Upload
 from station.simulation.controller.state import ControllerState, Journal, Settings
 from station.simulation.controller.urscript import ScriptError, ScriptSyntaxError
 
@@ -192,7 +192,8 @@ class SimulatedRobot(ControllerState):
             "resume program": self.play_program,
         }
 
-    def _start_upload(self, upload: Upload) -> None:
+    def _start_upload(self, upload: Upload) -> bool:
+        """False for one that cannot start; its clients are told why."""
         name = upload.name or "line"
         try:
             program = InterpretedProgram(self, name, upload.text)
@@ -201,11 +202,12 @@ class SimulatedRobot(ControllerState):
             self.tell("exception", text=error.text, line=error.line)
             if not upload.secondary:
                 self.stop_program("replaced by a program that cannot start")
-            return
+            return False
         if upload.secondary:
             self._secondary.append(program)
         else:
             self.start_program(program)
+        return True
 
     def start_program(self, program: Program) -> None:
         self.stop_program(f"replaced by {program.name}")
@@ -231,9 +233,15 @@ class SimulatedRobot(ControllerState):
         return True
 
     def play_program(self) -> bool:
-        """Resumes a paused program (there is nothing else to play here)."""
-        ready = self.program is not None and self.safe and self.robot_mode == RobotMode.RUNNING
-        if not ready or self.runtime_state != RuntimeState.PAUSED:
+        """Resumes a paused program, or starts the loaded one."""
+        ready = self.safe and self.robot_mode == RobotMode.RUNNING
+        if ready and self.runtime_state == RuntimeState.STOPPED and self.loaded:
+            text = self.settings.programs[self.loaded]
+            if text is None:
+                self.start_program(ForeignProgram(self.loaded))
+                return True
+            return self._start_upload(Upload(self.loaded, text))
+        if not ready or self.program is None or self.runtime_state != RuntimeState.PAUSED:
             return False
         self.runtime_state = RuntimeState.PLAYING
         self._silence_s = 0.0

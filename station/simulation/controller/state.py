@@ -9,8 +9,8 @@ import random
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 from station.devices.rtde import RobotMode, RobotStatusBits, RuntimeState, SafetyMode, SafetyStatus
 from station.simulation.controller.arm import History, SimulatedArm
@@ -63,13 +63,19 @@ class Settings:
     input_delay_cycles: int = 0
     """Registers act this many cycles later than the next one."""
 
+    programs: Mapping[str, str | None] = field(default_factory=dict)
+    """That the dashboard can load: name → URScript; None: one that only waits."""
+    software: tuple[int, ...] = ()
+    """Another version than the usual one."""
+
     @property
     def is_e_series(self) -> bool:
         return self.model.endswith("e")
 
     @property
-    def version(self) -> tuple[int, int, int, int]:
-        return E_SERIES_VERSION if self.is_e_series else CB3_VERSION
+    def version(self) -> tuple[int, ...]:
+        usual = E_SERIES_VERSION if self.is_e_series else CB3_VERSION
+        return (*self.software, *(0,) * (4 - len(self.software))) if self.software else usual
 
     @property
     def rate_hz(self) -> int:
@@ -123,6 +129,9 @@ class ControllerState(ABC):
         self.payload_inertia: Six = (0.0,) * 6
         self.freedrive = self.force_mode = False
         self.popup: str | None = None
+        self.loaded = ""
+        """The program that the dashboard loaded."""
+        self.user_role, self.operational_mode = "PROGRAMMER", "NONE"
         self.contact_cycles = 0
         """What `tool_contact` answers: for so many cycles the tool has been touching something."""
         self.watchdog_s = 0.0

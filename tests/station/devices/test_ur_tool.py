@@ -10,13 +10,14 @@ from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, RobotModel, forward
 from recordings.schema.messages import RobotState, Vector6
 from station.devices.ur_primary import (
-    PACKED_HEADER_BYTES,
     DhParameters,
     Installation,
-    pack_state,
     read_state,
 )
 from station.devices.ur_tool import TcpCheck
+from station.simulation.controller.primary import state
+from station.simulation.controller.robot import SimulatedRobot
+from station.simulation.controller.state import Journal, Settings
 from tests.codes import raises
 
 UR10 = MODELS["UR10"]
@@ -127,15 +128,23 @@ def test_a_changed_statement_is_noticed_before_the_arm_shows_it() -> None:
         check.check(sample(UR10, HERE, TOOL), stated(UR10, (*TOOL[:5], 0.5001)))
 
 
-def test_statements_survive_the_wire() -> None:
-    said = stated(FACTORY, TOOL)
-    message = pack_state(NO_TOOL, TOOL, said.dh)
-    assert read_state(message[PACKED_HEADER_BYTES:]) == said
-    assert len(message) == PACKED_HEADER_BYTES + 101 + 225  # sizes by Universal Robots' document
+def state_of(made: SimulatedRobot) -> bytes:
+    """The payload of its first robot state message."""
+    return state(made, first=True)[5:]
 
 
-@pytest.mark.parametrize("cut", range(1, 60, 7))
+def test_the_controllers_statements_are_understood() -> None:
+    factory = ((0.0, 1e-4, 0.0, 0.0, 0.0, 0.0), *((0.0,) * 6,) * 3)
+    made = SimulatedRobot(Settings(model="UR10", factory=factory), Journal())
+    made.tcp = TOOL
+    said = read_state(state_of(made))
+    table = made.stated_table
+    assert said.tcp_offset == TOOL
+    assert said.dh == DhParameters(table.theta_rad, table.a_m, table.d_m, table.alpha_rad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("cut", [1, 4, 10, 20, 40, 60])
 def test_a_damaged_message_is_refused(cut: int) -> None:
-    message = pack_state(NO_TOOL, TOOL, None)[PACKED_HEADER_BYTES:-cut]
+    message = state_of(SimulatedRobot(Settings(), Journal()))[:-cut]
     with raises("primary-interface"):
         read_state(message)

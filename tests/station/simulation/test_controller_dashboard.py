@@ -25,7 +25,7 @@ def dashboard(host: str, *commands: str) -> list[str]:
 
 def test_replies_of_the_dashboard(controller) -> None:
     questions = {
-        "PolyscopeVersion": "3.15.8.106339",
+        "PolyscopeVersion": "URSoftware 3.15.8.106339 (Mar 31 2020)",
         "get serial number": "20263000001",
         "get robot model": "UR10",
         "robotmode": "Robotmode: RUNNING",
@@ -43,12 +43,17 @@ def test_replies_of_the_dashboard(controller) -> None:
         "unlock protective stop": "Protective stop releasing",
         "dance": "could not understand: dance",
         "is in remote control": "could not understand: is in remote control",
+        "version": "could not understand: version",
+        "setUserRole operator": "Setting user role: operator",
+        "getUserRole": "operator",
+        "saveLog": "Log saved to disk",
         "quit": "Disconnected",
     }
     assert dashboard(controller("UR10").host, *questions) == [GREETING, *questions.values()]
 
 
 def test_e_series_in_local_control_refuses_changes_and_answers_questions(controller) -> None:
+    """And knows words that CB3 does not."""
     running = controller("UR10e", options=("--local", "--serial", "20195500001"))
     replies = dashboard(
         running.host,
@@ -58,7 +63,10 @@ def test_e_series_in_local_control_refuses_changes_and_answers_questions(control
         "stop",
         "power off",
         "robotmode",
+        "version",
+        "get operational mode",
     )
+    assert replies[7:] == ["5.11.1.108318", "NONE"]
     assert replies[1:3] == ["false", "20195500001"] and "5.11.1.108318" in replies[3]
     assert replies[4:6] == [LOCAL_REFUSAL] * 2 and replies[6] == "Robotmode: RUNNING"
 
@@ -77,3 +85,12 @@ def test_a_bare_line_on_a_script_port_replaces_the_program(controller, admin) ->
     while ask.ask("state")["program"] == "job.urp":
         assert time.monotonic() < deadline
         time.sleep(0.01)
+
+
+def test_a_program_of_the_pendant_is_loaded_and_played(controller, admin) -> None:
+    running = controller("UR10e", options=("--program", "wait.urp"))
+    replies = dashboard(running.host, "load wait.urp", "get loaded program", "play", "stop", "load other.urp")
+    assert replies[1:] == [
+        "Loading program: wait.urp", "Loaded program: wait.urp", "Starting program", "Stopped",
+        "File not found: other.urp",
+    ]  # fmt: skip

@@ -87,7 +87,7 @@ def test_asynchronous_moves_paths_and_stops(controller: Start, wheel: Wheel) -> 
         until(lambda: seen.append(control.getAsyncOperationProgress()) or max(seen) >= 1, 6.0)
         until(lambda: seen.append(control.getAsyncOperationProgress()) or seen[-1] < 0, 6.0)
         result["progress"] = sorted(set(seen))
-        time.sleep(0.15)
+        until(lambda: near(receive.getActualQ(), NEAR))
         result["at"] = receive.getActualQ()
         control.moveJ(FAR, 1.0, 2.0, True)
         time.sleep(0.2)

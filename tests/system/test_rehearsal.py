@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
 
 import station
-from station.cell.status import StationState
-from station.operate.motion import wait_until_idle
+from calibrate.files.calibration import read_calibration
+from calibrate.files.install import installed_calibration
+from calibrate.files.versions import installed_versions
+from calibrate.geometry import difference
+from recordings.schema.messages import BoardKind, BoardSpec
+from station.cell.status import MotionPreview, StationState
+from station.operate.motion import carry_out, wait_until_idle
+from station.operate.new_cell import write_config
 from station.protocol.client import Client
-from station.protocol.verbs import GetPlan, Lease, MakePlan
+from station.protocol.verbs import GetPlan, Lease, MakePlan, Purpose
+from station.simulation.cell import read_truth
+from station.simulation.scenes import make_cell
+from tests.station.operate.guided_views import draft_of
 
 pytestmark = pytest.mark.process
 ROBOT, CAMERA = "127.66.6.6", "127.66.6.7"
 PORTS = (29999, 30001, 30002, 30003, 30004)
 GVCP = 3956
+POSES = 10
 
 
 @pytest.fixture
@@ -49,23 +62,33 @@ def touched(trap: socket.socket) -> bool:
     return True
 
 
-async def test_nothing_of_the_configuration_is_connected_to(
-    traps: list[socket.socket], tmp_path: Path
-) -> None:
-    text = (Path(station.__file__).parent / "example.yaml").read_text()
-    text = text.replace("192.0.2.10", ROBOT).replace("device: ''", f"device: {CAMERA}")
-    text = text.replace("# serial:", "serial:").replace("speed_m_s: 0.25", "speed_m_s: 0.2")
-    config, control = tmp_path / "station.yaml", tmp_path / "s.sock"
-    config.write_text(text)
-    what = ("serve", "--config", str(config), "--rehearse", "--root", str(tmp_path), "--socket", str(control))
+@contextmanager
+def rehearsing(config: Path, root: Path) -> Iterator[Path]:
+    """Its control socket."""
+    control = root / "s.sock"
+    what = ("serve", "--config", str(config), "--rehearse", "--root", str(root), "--socket", str(control))
     daemon = subprocess.Popen(
         [sys.executable, "-m", "station.cli", *what, "--end-with-stdin"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
     try:
-        assert daemon.stdout is not None and daemon.stdin is not None
+        assert daemon.stdout is not None
         assert b"ready" in daemon.stdout.readline()
+        yield control
+    finally:
+        daemon.communicate(timeout=20)
+
+
+async def test_nothing_of_the_configuration_is_connected_to(
+    traps: list[socket.socket], tmp_path: Path
+) -> None:
+    text = (Path(station.__file__).parent / "example.yaml").read_text()
+    text = text.replace("192.0.2.10", ROBOT).replace("device: ''", f"device: {CAMERA}")
+    text = text.replace("# serial:", "serial:").replace("speed_m_s: 0.25", "speed_m_s: 0.2")
+    config = tmp_path / "station.yaml"
+    config.write_text(text)
+    with rehearsing(config, tmp_path) as control:
         async with await Client.connect(control) as client:
             status = await wait_until_idle(client)
             assert status.simulated and status.state is StationState.IDLE
@@ -74,11 +97,49 @@ async def test_nothing_of_the_configuration_is_connected_to(
             await client.call(MakePlan(4, 0), timeout_s=60.0)
             assert len((await client.call(GetPlan())).plan.poses) == 4
             assert client.root == tmp_path / "rehearsal"
-    finally:
-        daemon.communicate(timeout=20)
     assert not any(touched(trap) for trap in traps)
     assert (tmp_path / "rehearsal" / "simulation" / "truth.json").is_file()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rehearsal", "station.yaml"]
+
+
+def calibrate(*what: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "calibrate.cli", *map(str, what)]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path: Path) -> None:
+    """Mounting, board, lens and place are no default; the report says what the real run should reach."""
+    truth = make_cell("paper-binned", seed=11, noise="mid")
+    board = BoardSpec(kind=BoardKind.CHESSBOARD, columns=8, rows=5, square_m=0.023)
+    draft = draft_of(msgspec.structs.replace(truth, board=board))
+    write_config(draft, tmp_path / "station.yaml")
+    root, result, report = tmp_path / "rehearsal", tmp_path / "calibration.yaml", tmp_path / "report.html"
+
+    async def approved(preview: MotionPreview) -> bool:
+        return True
+
+    with rehearsing(tmp_path / "station.yaml", tmp_path) as control:
+        async with await Client.connect(control) as client:
+            await wait_until_idle(client)
+            await client.call(Lease("take"))
+            await client.call(MakePlan(POSES, 0), timeout_s=120.0)
+            outcome = await carry_out(
+                client, Purpose.RUN, approved, lambda _: None, finish_with_loss=True, headless=True
+            )
+            assert outcome.captured >= POSES - 2
+    solved = calibrate("solve", outcome.recording, "-o", result, "--report", report, "--json")
+    answer = json.loads(solved.stdout)
+    simulated = np.array(read_truth(root / "simulation" / "truth.json").camera_mount)
+    off = difference(np.array(answer["result"]["matrix"]), simulated)
+    # 22.5: the 99.9 % quantile of chi-square with 6 degrees of freedom.
+    assert answer["verdict"] == "pass" and off @ np.linalg.solve(np.array(answer["covariance"]), off) < 22.5
+    reached = f"{read_calibration(result).quality.predicted_error_mm:.2f} mm"
+    assert f"The real run should reach {reached}" in report.read_text()
+    assert calibrate("install", result, "--cell", "simulated", "--root", root).returncode == 0
+    assert installed_calibration(root).created == read_calibration(result).created
+    real = tmp_path / "real"
+    assert calibrate("install", result, "--root", real).returncode == 1
+    assert not installed_versions(real)
 
 
 def test_a_trap_sees_a_connection(traps: list[socket.socket]) -> None:

@@ -166,7 +166,7 @@ async def test_the_formats_say_who_reads_them(link: FakeLink, calibration: Path)
         shown = pilot.app.screen.query_one(OptionList)
         lines = [str(option.prompt) for option in shown.options]
         assert lines[0] == "ros-camera-info       ROS camera_info YAML: the intrinsics"
-        assert shown.size.height == len(FORMATS)  # a line each, none cut, on the smallest screen
+        assert shown.size.height >= min(12, len(FORMATS))  # the others come by scrolling; none is cut
         assert max(map(len, lines)) <= shown.content_size.width
         await pilot.press("enter")
         await until(pilot, lambda: "Written" in said(pilot))

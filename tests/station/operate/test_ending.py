@@ -1,0 +1,68 @@
+"""Every flow ends in a way on: install, keep, retake, solve, or look for a cause."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from calibrate.files.calibration import Calibration, Gate, RejectedView, Touch
+from calibrate.quality.checks import CheckEntry
+from recordings.schema.messages import CameraIdentity, RobotIdentity
+from station.cell.status import PoseStatus, SessionStatus
+from station.operate.ending import Way, after_capture, after_drift_check, after_solve, after_touches
+from tests.station.hover_cell import calibration_of
+from tests.station.session_rig import TRUTH
+
+GOOD = calibration_of(TRUTH, RobotIdentity(serial="1", model="UR10"), CameraIdentity(serial="2"))
+HIT = Touch(4, (0.0, 0.0), (0.1, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01T00:00:00+00:00")
+MISS = msgspec.structs.replace(HIT, offset_mm=(9.0, 0.0))
+REJECTED = RejectedView(6, "view 7", "the pose is wrong")
+
+
+def failed(*names: str, rejected: tuple[RejectedView, ...] = ()) -> Calibration:
+    gates = tuple(Gate(name, False, 1.0, 2.0, "mm", f"{name} FAIL", remedy=f"mend {name}") for name in names)
+    quality = msgspec.structs.replace(GOOD.quality, gates=gates)
+    views = msgspec.structs.replace(GOOD.views, rejected=rejected)
+    return msgspec.structs.replace(GOOD, quality=quality, views=views)
+
+
+@pytest.mark.parametrize(
+    ("calibration", "objections", "way"),
+    [
+        (GOOD, (), Way.INSTALL),
+        (GOOD, ("less certain than the installed one",), Way.LOOK_FOR),
+        (failed("predicted_error_m"), (), Way.LOOK_FOR),
+        (failed("weight", rejected=(REJECTED,)), (), Way.RETAKE),
+        (failed("coverage", rejected=(REJECTED,)), (), Way.LOOK_FOR),
+        (msgspec.structs.replace(GOOD, verification=[HIT]), (), Way.INSTALL),
+        (msgspec.structs.replace(GOOD, verification=[HIT, MISS]), (), Way.LOOK_FOR),
+    ],
+)
+def test_a_solve(calibration: Calibration, objections: tuple[str, ...], way: Way) -> None:
+    assert after_solve(calibration, objections).way is way
+
+
+def test_a_retake_names_the_view_as_screens_count() -> None:
+    assert "view 7" in after_solve(failed("weight", rejected=(REJECTED,))).text
+    assert "mend coverage" in after_solve(failed("coverage", rejected=(REJECTED,))).text
+
+
+def test_a_touch_test() -> None:
+    assert after_touches([HIT]).way is Way.INSTALL
+    end = after_touches([HIT, MISS])
+    assert end.way is Way.LOOK_FOR and "9.0 mm" in end.text
+
+
+def test_a_capture() -> None:
+    saved = PoseStatus(0, "p01", state="done")
+    missed = PoseStatus(1, "p02", state="failed", reason="the board is not seen")
+    assert after_capture(SessionStatus(poses=(saved,), recording="/r")).way is Way.SOLVE
+    end = after_capture(SessionStatus(poses=(saved, missed), recording="/r"))
+    assert end.way is Way.RETAKE and "2" in end.text and missed.reason in end.text
+
+
+def test_a_drift_check() -> None:
+    entry = CheckEntry(0.0, 1, "r", True, (0.0,) * 6, ((0.0,) * 6,) * 6, 1.0, 12.6)
+    assert after_drift_check(entry).way is Way.KEEP
+    assert after_drift_check(entry, "it wanders").way is Way.LOOK_FOR
+    assert after_drift_check(msgspec.structs.replace(entry, passed=False)).way is Way.LOOK_FOR

@@ -13,7 +13,6 @@ import numpy as np
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, MirroredImagesError, SquaresCountedError, TooFewViewsError
-from calibrate.geometry import is_rigid
 from calibrate.kinematics import MODELS, RobotModel
 from calibrate.results import RejectedView
 from calibrate.views import BoardView, ViewSet
@@ -213,18 +212,10 @@ def _check_size(view: View, width: int, height: int, camera: CameraModel) -> Non
 
 
 def _image_view(view: View, detection: Detection, spec: BoardSpec) -> BoardView:
-    base_from_flange = np.array(view.base_from_flange, dtype=float)
-    if base_from_flange.shape != (4, 4) or not is_rigid(base_from_flange, 1e-5):
-        raise BadViewsError(
-            f"View {view.index + 1} ({view.name}): base_from_flange is not a rigid transform.",
-            code="not-rigid",
-            remedy="Record it again, or leave the view out of the folder and import again.",
-            pose=view.index + 1,
-        )
     return BoardView(
         index=view.index,
         name=view.name,
-        base_from_flange=base_from_flange,
+        base_from_flange=np.array(view.base_from_flange, dtype=float),
         board_points=board_points(spec)[detection.indices],
         pixels=detection.pixels,
         joints_rad=None if view.joints_rad is None else np.array(view.joints_rad),

@@ -10,7 +10,6 @@ from recordings.reader import Recording
 from recordings.schema.frame_ids import frames_between, guess_ids
 from recordings.schema.messages import SINGLE_TAGS, BoardSpec
 from recordings.schema.topics import Topic
-from recordings.segment import RecordingSegment
 from recordings.streams import Arrivals, Steps, stamps_tables
 
 _SHORTEST_SPAN_S = 0.01
@@ -30,6 +29,9 @@ def recording_info(recording: Recording) -> dict[str, Any]:
             steps.add(table["controller_s"])
             arrivals[segment].add(table["controller_s"], table["host_monotonic_ns"])
     longest = max(recording.segments, key=lambda segment: len(segment.messages(Topic.ROBOT_STATE)))
+    camera_clock = Arrivals()
+    for table in stamps_tables(longest.parsed(Topic.PICTURE_FACTS)):
+        camera_clock.add(table["device_ns"] / 1e9, table["host_monotonic_ns"])
     attempts = sum(len(segment.views) for segment in recording.segments)
     views = recording.views()
     return {
@@ -56,7 +58,7 @@ def recording_info(recording: Recording) -> dict[str, Any]:
         "topics": _topics(recording),
         "robot_states": _robot_stream(steps),
         "pictures": _image_stream(recording),
-        "clocks": {"controller": arrivals[longest].fit(), "camera": _camera_clock(longest)},
+        "clocks": {"controller": arrivals[longest].fit(), "camera": camera_clock.fit()},
         "attachments": {name: len(content) for name, content in sorted(recording.attachments().items())},
         "software": dict(info.software),
         "note": info.note,
@@ -143,10 +145,3 @@ def _image_stream(recording: Recording) -> dict[str, Any] | None:
         "pixel_formats": sorted(formats),
         "time_bounds_s": bounds_s,
     }
-
-
-def _camera_clock(segment: RecordingSegment) -> dict[str, float | None] | None:
-    arrivals = Arrivals()
-    for table in stamps_tables(segment.parsed(Topic.PICTURE_FACTS)):
-        arrivals.add(table["device_ns"] / 1e9, table["host_monotonic_ns"])
-    return arrivals.fit()

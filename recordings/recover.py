@@ -130,20 +130,16 @@ def _recover_file(source: Path, output: Path | None) -> tuple[Recovery, SessionI
         if final != source and os.path.lexists(final):
             raise exists_error(final)
         try:
-            return _nothing_lost(RecordingSegment(source), source, final)
+            segment = RecordingSegment(source)
+            if source.name.endswith(PART_SUFFIX):  # only its last rename was missing
+                rename_new(source, final)
+            else:
+                final = source
+            return _report(final, segment, None, 0, ())
         except (UnfinishedRecordingError, CorruptRecordingError):
             return _rebuild(descriptor, source, final, in_place=output is None)
     finally:
         os.close(descriptor)
-
-
-def _nothing_lost(segment: RecordingSegment, source: Path, final: Path) -> tuple[Recovery, SessionInfo]:
-    """A file that is whole; at most its last rename was missing."""
-    if source.name.endswith(PART_SUFFIX):
-        rename_new(source, final)
-    else:
-        final = source
-    return _report(final, segment, None, 0, ())
 
 
 def _report(

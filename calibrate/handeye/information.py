@@ -66,7 +66,8 @@ def view_information(
         table,
         extent_of(board_points),
     )
-    state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), _no_errors(table))
+    errors = np.zeros(0 if table is None else table.shape[2])
+    state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), errors)
     linear = Linear.at(observed, state, observed.present, information=1.0)
     robot = np.repeat([noise.robot_m, noise.robot_rad], 3) ** 2
     W = np.linalg.inv(noise.pixel_px**2 * linear.B + np.diag(robot))
@@ -76,10 +77,6 @@ def view_information(
         shared = linear.modes.shared
         information[:, shared, shared] += linear.modes.information / noise.pixel_px**2
     return np.asarray(information)
-
-
-def _no_errors(table: Array | None) -> Array:
-    return np.zeros(0 if table is None else table.shape[2])
 
 
 def prior_information(

@@ -85,10 +85,7 @@ _FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL, Reading.REF
 def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
     """Find the best reading; AS_RECORDED unless another one's evidence is clear beyond chance."""
     as_recorded = _fit(views, seed)
-    if as_recorded is None:
-        base = -np.inf
-    else:
-        base = as_recorded.log_evidence
+    base = -np.inf if as_recorded is None else as_recorded.log_evidence
     best = Explanation(Reading.AS_RECORDED, 0.0, share=_share(as_recorded))
     winning = _CLEAR + np.log(max(len(views), 2))
     for reading, changed, at, charge in _readings(views, as_recorded):

@@ -89,21 +89,18 @@ def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
 
 def _write_tables(recording: Recording, folder: Path) -> None:
     """One CSV per kind of message, raw values in SI units, images only as their facts."""
+    modes = ["robot_mode", "safety_mode", "speed_scaling"]
     states = (
         [
             *_values(state.stamps),
-            *state.joints_rad,
-            *state.joint_speeds_rad_s,
-            *state.tcp_pose,
-            state.robot_mode,
-            state.safety_mode,
-            state.speed_scaling,
+            *(*state.joints_rad, *state.joint_speeds_rad_s, *state.tcp_pose),
+            *(getattr(state, name) for name in modes),
         ]
         for state in recording.robot_states()
     )
     pose = ["tcp_x_m", "tcp_y_m", "tcp_z_m", "tcp_rx_rad", "tcp_ry_rad", "tcp_rz_rad"]
     joints = [f"{joint}_rad" for joint in _JOINTS] + [f"{joint}_rad_s" for joint in _JOINTS]
-    header = [*_STAMPS, *joints, *pose, "robot_mode", "safety_mode", "speed_scaling"]
+    header = [*_STAMPS, *joints, *pose, *modes]
     _write_csv(folder / "robot_states.csv", header, states)
     facts = [fact for segment in recording.segments for fact in segment.image_facts()]
     columns = ["sequence", "frame_id", "width", "height", "exposure_us", "gain_db", "pixel_format"]
@@ -129,23 +126,14 @@ def _write_tables(recording: Recording, folder: Path) -> None:
 def _write_views(recording: Recording, folder: Path) -> None:
     """Every attempt; the last column tells which ones count."""
     counted = recording.views()
-    header = [
-        "index",
-        "attempt",
-        "part",
-        "name",
-        "picture_sequence",
-        *HEADER[1:],
-        *_STAMPS,
-        "time_bound_s",
-        "used",
-    ]
+    place = ["index", "attempt", "part", "name", "picture_sequence"]
+    header = [*place, *HEADER[1:], *_STAMPS, "time_bound_s", "used"]
     rows = []
     for view in (view for segment in recording.segments for view in segment.views):
         T = view.base_from_flange
         pose = [T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]
-        place = [view.index, view.attempt, view.part, view.name, view.picture_sequence]
-        rows.append([*place, *pose, *_values(view.stamps), view.time_bound_s, int(view in counted)])
+        values = [getattr(view, name) for name in place]
+        rows.append([*values, *pose, *_values(view.stamps), view.time_bound_s, int(view in counted)])
     _write_csv(folder / "views.csv", header, rows)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,12 +58,6 @@ class JointSource:
         speeds = joints.speeds_rad_s
         v = [speeds[place] for place in self.order] if len(speeds) == len(self.names) else [0.0] * 6
         return (q[0], q[1], q[2], q[3], q[4], q[5]), (v[0], v[1], v[2], v[3], v[4], v[5])
-
-
-@dataclass
-class _Speeds:
-    stamps_ns: list[int] = field(default_factory=list)
-    fastest: list[float] = field(default_factory=list)
 
 
 def select(bag: Bag, wanted: Wanted) -> Selection:
@@ -148,7 +142,9 @@ def _joints(bag: Bag) -> JointSource | None:
     for topic in _of(bag, Kind.JOINTS):
         order: tuple[int, ...] | None = None
         names: tuple[str, ...] = ()
-        speeds, has_speeds = _Speeds(), True
+        stamps_ns: list[int] = []
+        fastest: list[float] = []
+        has_speeds = True
         for value in bag.values(topic.name):
             assert isinstance(value, Joints)
             if order is None:
@@ -156,16 +152,14 @@ def _joints(bag: Bag) -> JointSource | None:
             if order is None or value.names != names:
                 continue
             if len(value.speeds_rad_s) == len(names):
-                speeds.fastest.append(max(abs(value.speeds_rad_s[place]) for place in order))
-                speeds.stamps_ns.append(value.stamp_ns)
+                fastest.append(max(abs(value.speeds_rad_s[place]) for place in order))
+                stamps_ns.append(value.stamp_ns)
             else:
                 has_speeds = False
         if order is not None:
-            by_time = np.argsort(speeds.stamps_ns, kind="stable")
-            stamps = np.array(speeds.stamps_ns, np.int64)[by_time]
-            return JointSource(
-                topic.name, order, names, stamps, np.array(speeds.fastest)[by_time], has_speeds
-            )
+            by_time = np.argsort(stamps_ns, kind="stable")
+            stamps, speeds = np.array(stamps_ns, np.int64)[by_time], np.array(fastest)[by_time]
+            return JointSource(topic.name, order, names, stamps, speeds, has_speeds)
     return None
 
 

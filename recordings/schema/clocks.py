@@ -52,12 +52,12 @@ class ClockFit:
     """Host monotonic minus device time."""
     drift: float
     """Host seconds per device second, minus 1."""
-    residual_s: float
-    """The shortest delay of each tenth of the window lies within this above the line."""
     drift_uncertainty: float
     latency_s: float
     samples: int
-    span_s: float
+    residual_s: float = 0.0
+    """The shortest delay of each tenth of the window lies within this above the line."""
+    span_s: float = 0.0
 
     @property
     def drift_ppm(self) -> float:

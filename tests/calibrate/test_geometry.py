@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from calibrate import geometry as g
@@ -31,21 +30,6 @@ def test_chains_touch_or_raise() -> None:
 def test_a_mirror_image_is_no_transform() -> None:
     with pytest.raises(ValueError):
         g.Transform("base", "flange", np.diag([1.0, 1.0, -1.0, 1.0]))
-
-
-@given(vectors)
-@settings(max_examples=50, deadline=None)
-def test_exponential_is_the_matrix_exponential(v: np.ndarray) -> None:
-    np.testing.assert_allclose(g.rotation_exp(v), expm(g.skew(v)), atol=1e-12)
-
-
-@given(vectors)
-@settings(max_examples=50, deadline=None)
-def test_logarithm_is_its_inverse_with_the_least_angle(v: np.ndarray) -> None:
-    R = g.rotation_exp(v)
-    log = g.rotation_log(R)
-    assert np.linalg.norm(log) <= np.pi + 1e-9
-    np.testing.assert_allclose(g.rotation_exp(log), R, atol=1e-9)
 
 
 @given(vectors, deltas)

@@ -1,4 +1,4 @@
-"""The public door: its example runs, its names exist, and nothing heavy is loaded before it is used."""
+"""The public doors: the example runs, its names exist, and nothing heavy is loaded before it is used."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import inspect
 import subprocess
 import sys
 import textwrap
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -26,14 +27,18 @@ def test_the_example_runs(
     assert len(capsys.readouterr().out.splitlines()) == 3
 
 
-def test_every_name_of_the_door_exists_and_says_what_it_is() -> None:
-    for name in recordings.__all__:
-        assert inspect.getdoc(getattr(recordings, name)), name
+@pytest.mark.parametrize("room", ["recordings", "calibrate", "calibrate.handeye"])
+def test_every_name_of_a_door_exists_and_says_what_it_is(room: str) -> None:
+    door = import_module(room)
+    for name in door.__all__:
+        assert inspect.getdoc(getattr(door, name)), name
     with pytest.raises(AttributeError):
-        recordings.nothing  # noqa: B018
+        door.nothing  # noqa: B018
 
 
-@pytest.mark.parametrize("program", ["import recordings", "from recordings.cli.app import RECORDINGS"])
+@pytest.mark.parametrize(
+    "program", ["import recordings, calibrate.handeye", "from recordings.cli.app import RECORDINGS"]
+)
 def test_what_is_not_used_is_not_loaded(program: str) -> None:
     heavy = ("numpy", "cv2", "google", "mcap_protobuf", "scipy", "rosbags")
     asked = f"{program}; import sys; print([name for name in {heavy} if name in sys.modules])"

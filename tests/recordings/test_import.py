@@ -112,20 +112,7 @@ def test_quaternions_of_three_digits_are_made_rotations(folder: Path, tmp_path: 
     np.testing.assert_allclose(view.base_from_flange, expected, atol=1e-12)
 
 
-def cut_picture(folder: Path) -> None:
-    path = folder / "images/1.png"
-    path.write_bytes(path.read_bytes()[:-40])
-
-
-def cut_jpeg(folder: Path) -> None:
-    data = cv2.imencode(".jpg", make_image(1))[1].tobytes()
-    (folder / "images/1.png").write_bytes(data[:-20])
-
-
-def flip_picture(folder: Path) -> None:
-    data = bytearray((folder / "images/1.png").read_bytes())
-    data[len(data) // 2] ^= 1
-    (folder / "images/1.png").write_bytes(data)
+PNG = cv2.imencode(".png", make_image(1))[1].tobytes()
 
 
 def replaced(make: Callable[[Path], object]) -> Change:
@@ -136,119 +123,107 @@ def replaced(make: Callable[[Path], object]) -> Change:
     return change
 
 
-def another_size(folder: Path) -> None:
-    cv2.imwrite(str(folder / "images/2.png"), make_image(2, 40, 30))
+Bad = tuple[Change, str, dict[str, object]]
+"""What is done to the folder, the code of the error, and values of it."""
 
 
-def huge_header(folder: Path) -> None:
-    data = bytearray((folder / "images/1.png").read_bytes())
-    data[16:24] = (30000).to_bytes(4, "big") * 2
-    (folder / "images/1.png").write_bytes(data)
+def pose(old: str, new: str, line: int = 3, code: str = "pose-row") -> Bad:
+    return edit("poses.csv", old, new), code, {"line": line}
 
 
-BAD: dict[str, tuple[Change, str, dict[str, object]]] = {
+def poses(content: str | bytes, code: str, **values: object) -> Bad:
+    raw = content.encode() if isinstance(content, str) else content
+    return lambda folder: (folder / "poses.csv").write_bytes(raw), code, values
+
+
+def joints(values: str, code: str = "pose-row") -> Bad:
+    return lambda folder: with_joints(folder, values), code, {"line": 2}
+
+
+def image(change: Change, code: str = "unreadable", line: int = 3) -> Bad:
+    return change, code, {"line": line}
+
+
+def content(data: bytes) -> Bad:
+    return image(lambda folder: (folder / "images/1.png").write_bytes(data), "bad-image")
+
+
+def key(old: str, new: str, key: str) -> Bad:
+    return edit("dataset.yaml", old, new), "dataset", {"key": key}
+
+
+def line(old: str, new: str, line: int) -> Bad:
+    return edit("dataset.yaml", old, new), "dataset", {"line": line}
+
+
+def dataset(text: str, code: str = "dataset", **values: object) -> Bad:
+    return lambda folder: (folder / "dataset.yaml").write_text(text), code, values
+
+
+HEADER = "image,x,y,z,qx,qy,qz,qw\n"
+HALF = "0.7071067811865476,0.7071067811865476"
+SINGULAR = "height: 24, matrix: [[0,0,0],[0,0,0],[0,0,1]]"
+BAD: dict[str, Bad] = {
     "no dataset": (lambda f: (f / "dataset.yaml").unlink(), "no-file", {}),
     "no poses": (lambda f: (f / "poses.csv").unlink(), "no-file", {}),
-    "wrong header": (edit("poses.csv", "qx,qy,qz,qw", "qw,qx,qy,qz"), "header", {"line": 1}),
-    "no header": (edit("poses.csv", "image,x,y,z,qx,qy,qz,qw\n", ""), "header", {"line": 1}),
-    "only a header": (
-        lambda f: (f / "poses.csv").write_text("image,x,y,z,qx,qy,qz,qw\n"),
-        "no-poses",
-        {"line": 1},
+    "wrong header": pose("qx,qy,qz,qw", "qw,qx,qy,qz", 1, "header"),
+    "no header": pose(HEADER, "", 1, "header"),
+    "only a header": poses(HEADER, "no-poses", line=1),
+    "empty": poses("", "header", line=1),
+    "binary poses": poses(b"\xff\xfe\x00", "poses"),
+    "column missing": pose("0.1,0.2,0.3,0,", "0.1,0.2,0.3,"),
+    "not a number": pose("0.1,0.2", "0.1,abc"),
+    "decimal comma": pose("0.1,0.2", '"0,1",0.2'),
+    "nan": pose("0.1,0.2", "nan,0.2"),
+    "infinite": pose("0.1,0.2", "inf,0.2"),
+    "zero quaternion": pose(HALF, "0,0", 2, "no-unit-quaternion"),
+    "rotation vector": pose(HALF, "1.57,0", 2, "no-unit-quaternion"),
+    "millimetres": pose("0.1,0.2", "612.3,0.2", code="not-metres"),
+    "twice": pose("images/2.png", "images/0.png", 4, "image-twice"),
+    "no image name": pose("images/1.png", ""),
+    "zero in the image name": pose("images/1.png", "images/\0.png"),
+    "picture's name too long": pose("images/1.png", "ü" * 3000, code="unreadable"),
+    "outside": pose("images/1.png", "../../secret.png", code="outside"),
+    "joints in degrees": joints("10,-90,90,-60,-90,180", "not-radians"),
+    "a joint missing": joints("0.1,,1.5,-1,-1.57,3.2"),
+    "five joints": joints("0.1,0.1,1.5,-1,-1.57"),
+    "picture missing": image(lambda f: (f / "images/1.png").unlink()),
+    "picture is a folder": image(replaced(Path.mkdir)),
+    "picture is a pipe": image(replaced(os.mkfifo)),
+    "picture is its own link": image(replaced(lambda p: p.symlink_to(p.name))),
+    "picture is a link to outside": image(replaced(lambda p: p.symlink_to("/etc/passwd")), "outside"),
+    "picture unreadable": content(b"no"),
+    "picture empty": content(b""),
+    "picture cut": content(PNG[:-40]),
+    "jpeg cut": content(cv2.imencode(".jpg", make_image(1))[1].tobytes()[:-20]),
+    "picture damaged": content(PNG[:400] + bytes([PNG[400] ^ 1]) + PNG[401:]),
+    "header of 30000×30000": content(PNG[:16] + (30000).to_bytes(4, "big") * 2 + PNG[24:]),
+    "mixed sizes": image(
+        lambda f: cv2.imwrite(str(f / "images/2.png"), make_image(2, 40, 30)), "image-size", 4
     ),
-    "empty": (lambda f: (f / "poses.csv").write_text(""), "header", {"line": 1}),
-    "column missing": (edit("poses.csv", "0.1,0.2,0.3,0,", "0.1,0.2,0.3,"), "pose-row", {"line": 3}),
-    "not a number": (edit("poses.csv", "0.1,0.2", "0.1,abc"), "pose-row", {"line": 3}),
-    "decimal comma": (edit("poses.csv", "0.1,0.2", '"0,1",0.2'), "pose-row", {"line": 3}),
-    "nan": (edit("poses.csv", "0.1,0.2", "nan,0.2"), "pose-row", {"line": 3}),
-    "infinite": (edit("poses.csv", "0.1,0.2", "inf,0.2"), "pose-row", {"line": 3}),
-    "zero quaternion": (
-        edit("poses.csv", "0.7071067811865476,0.7071067811865476", "0,0"),
-        "no-unit-quaternion",
-        {"line": 2},
-    ),
-    "rotation vector": (
-        edit("poses.csv", "0.7071067811865476,0.7071067811865476", "1.57,0"),
-        "no-unit-quaternion",
-        {"line": 2},
-    ),
-    "millimetres": (edit("poses.csv", "0.1,0.2", "612.3,0.2"), "not-metres", {"line": 3}),
-    "twice": (edit("poses.csv", "images/2.png", "images/0.png"), "image-twice", {"line": 4}),
-    "joints in degrees": (lambda f: with_joints(f, "10,-90,90,-60,-90,180"), "not-radians", {"line": 2}),
-    "a joint missing": (lambda f: with_joints(f, "0.1,,1.5,-1,-1.57,3.2"), "pose-row", {"line": 2}),
-    "five joints": (lambda f: with_joints(f, "0.1,0.1,1.5,-1,-1.57"), "pose-row", {"line": 2}),
-    "no image name": (edit("poses.csv", "images/1.png", ""), "pose-row", {"line": 3}),
-    "zero in the image name": (edit("poses.csv", "images/1.png", "images/\0.png"), "pose-row", {"line": 3}),
-    "binary poses": (lambda f: (f / "poses.csv").write_bytes(b"\xff\xfe\x00"), "poses", {}),
-    "picture missing": (lambda f: (f / "images/1.png").unlink(), "unreadable", {"line": 3}),
-    "picture is a folder": (replaced(Path.mkdir), "unreadable", {"line": 3}),
-    "picture is a pipe": (replaced(os.mkfifo), "unreadable", {"line": 3}),
-    "picture is its own link": (replaced(lambda p: p.symlink_to(p.name)), "unreadable", {"line": 3}),
-    "picture is a link to outside": (replaced(lambda p: p.symlink_to("/etc/passwd")), "outside", {"line": 3}),
-    "picture's name too long": (edit("poses.csv", "images/1.png", "ü" * 3000), "unreadable", {"line": 3}),
-    "picture unreadable": (lambda f: (f / "images/1.png").write_text("no"), "bad-image", {"line": 3}),
-    "picture empty": (lambda f: (f / "images/1.png").write_bytes(b""), "bad-image", {"line": 3}),
-    "picture cut": (cut_picture, "bad-image", {"line": 3}),
-    "jpeg cut": (cut_jpeg, "bad-image", {"line": 3}),
-    "picture damaged": (flip_picture, "bad-image", {"line": 3}),
-    "header of 30000×30000": (huge_header, "bad-image", {"line": 3}),
-    "mixed sizes": (another_size, "image-size", {"line": 4}),
-    "outside": (edit("poses.csv", "images/1.png", "../../secret.png"), "outside", {"line": 3}),
-    "unknown mount": (edit("dataset.yaml", "eye-in-hand", "on-hand"), "dataset", {"key": "mount"}),
-    "unknown key": (edit("dataset.yaml", "note:", "nota:"), "dataset", {"key": "nota"}),
-    "unknown camera key": (
-        edit("dataset.yaml", "height: 24", "height: 24, distorsion: [0.1]"),
-        "dataset",
-        {"key": "camera.distorsion"},
-    ),
-    "board kind": (edit("dataset.yaml", "kind: chessboard", "kind: chess"), "dataset", {"key": "board.kind"}),
-    "board size": (edit("dataset.yaml", "columns: 7", "columns: 0"), "dataset", {"key": "board.columns"}),
-    "rows forgotten": (edit("dataset.yaml", "rows: 6, ", ""), "dataset", {"key": "board.columns"}),
-    "size forgotten": (edit("dataset.yaml", ", square_m: 0.025", ""), "dataset", {"key": "board.square_m"}),
-    "tolerance in percent": (
-        edit("dataset.yaml", "0.025", "0.025, square_tolerance: 0.3"),
-        "dataset",
-        {"key": "board.square_tolerance"},
-    ),
-    "flatness in mm": (
-        edit("dataset.yaml", "0.025", "0.025, flatness_m: 0.2"),
-        "dataset",
-        {"key": "board.flatness_m"},
-    ),
-    "a tag of no dictionary": (
-        edit("dataset.yaml", "kind: chessboard, columns: 7, rows: 6", "kind: aruco, id: 3"),
-        "dataset",
-        {"key": "board.dictionary"},
-    ),
-    "a tag with columns": (
-        edit("dataset.yaml", "chessboard", "april-tag"),
-        "dataset",
-        {"key": "board.columns"},
-    ),
-    "square in mm": (edit("dataset.yaml", "0.025", "25"), "dataset", {"key": "board.square_m"}),
-    "no number": (edit("dataset.yaml", "0.025", "25 mm"), "dataset", {"key": "board.square_m"}),
-    "key twice": (edit("dataset.yaml", "note:", "mount: eye-in-hand\nnote:"), "dataset", {"key": "mount"}),
-    "alias": (edit("dataset.yaml", "made", "&a made\nx: *a #"), "dataset", {"line": 5}),
-    "tag": (edit("dataset.yaml", "made", "!!python/object:os.system made"), "dataset", {"line": 5}),
-    "brackets": (lambda f: (f / "dataset.yaml").write_text("[" * 100_000), "dataset", {"line": 1}),
-    "not yaml": (edit("dataset.yaml", "mount:", "mount: : :"), "dataset", {"line": 1}),
-    "a list": (lambda f: (f / "dataset.yaml").write_text("- 1\n"), "dataset", {"line": 1}),
-    "huge": (lambda f: (f / "dataset.yaml").write_text("#" * 300_000), "file-too-large", {}),
-    "singular camera": (
-        edit("dataset.yaml", "height: 24", "height: 24, matrix: [[0,0,0],[0,0,0],[0,0,1]]"),
-        "dataset",
-        {"key": "camera.matrix"},
-    ),
-    "distortion alone": (
-        edit("dataset.yaml", "height: 24", "height: 24, distortion: [0.1]"),
-        "dataset",
-        {"key": "camera.matrix"},
-    ),
-    "charuco without markers": (
-        edit("dataset.yaml", "chessboard", "charuco"),
-        "dataset",
-        {"key": "board.marker_m"},
-    ),
+    "unknown mount": key("eye-in-hand", "on-hand", "mount"),
+    "unknown key": key("note:", "nota:", "nota"),
+    "unknown camera key": key("height: 24", "height: 24, distorsion: [0.1]", "camera.distorsion"),
+    "board kind": key("kind: chessboard", "kind: chess", "board.kind"),
+    "board size": key("columns: 7", "columns: 0", "board.columns"),
+    "rows forgotten": key("rows: 6, ", "", "board.columns"),
+    "size forgotten": key(", square_m: 0.025", "", "board.square_m"),
+    "tolerance in percent": key("0.025", "0.025, square_tolerance: 0.3", "board.square_tolerance"),
+    "flatness in mm": key("0.025", "0.025, flatness_m: 0.2", "board.flatness_m"),
+    "a tag of no dictionary": key("chessboard, columns: 7, rows: 6", "aruco, id: 3", "board.dictionary"),
+    "a tag with columns": key("chessboard", "april-tag", "board.columns"),
+    "square in mm": key("0.025", "25", "board.square_m"),
+    "no number": key("0.025", "25 mm", "board.square_m"),
+    "key twice": key("note:", "mount: eye-in-hand\nnote:", "mount"),
+    "singular camera": key("height: 24", SINGULAR, "camera.matrix"),
+    "distortion alone": key("height: 24", "height: 24, distortion: [0.1]", "camera.matrix"),
+    "charuco without markers": key("chessboard", "charuco", "board.marker_m"),
+    "alias": line("made", "&a made\nx: *a #", 5),
+    "tag": line("made", "!!python/object:os.system made", 5),
+    "not yaml": line("mount:", "mount: : :", 1),
+    "brackets": dataset("[" * 100_000, line=1),
+    "a list": dataset("- 1\n", line=1),
+    "huge": dataset("#" * 300_000, "file-too-large"),
 }
 
 

@@ -36,8 +36,6 @@ class Evolved:
     value: float
     population: Array
     """(M, d) of the last generation."""
-    values: Array
-    """(M,)"""
 
 
 def evolve(
@@ -45,11 +43,10 @@ def evolve(
     lower: Array,
     upper: Array,
     rng: np.random.Generator,
-    settings: EvolutionSettings | None = None,
+    settings: EvolutionSettings,
 ) -> Evolved:
     """Minimise within the box; mutants outside are rounded to it, ties are accepted (eq. 20)."""
-    s = settings or EvolutionSettings()
-    d = len(lower)
+    s, d = settings, len(lower)
     x = lower + (upper - lower) * rng.random((s.population, d))
     partners = _partners(rng, s.generations, s.population)
     stays = rng.random((s.generations, s.population, d)) > s.crossover
@@ -68,7 +65,7 @@ def evolve(
         np.copyto(x, trial, where=better[:, None])
         np.copyto(values, trial_values, where=better)
     best = int(np.argmin(values))
-    return Evolved(x[best].copy(), float(values[best]), x, values)
+    return Evolved(x[best].copy(), float(values[best]), x)
 
 
 def _partners(rng: np.random.Generator, generations: int, population: int) -> NDArray[np.intp]:

@@ -58,13 +58,6 @@ def test_without_joints_the_poses_serve():
         assert inside(found, worn.X)
 
 
-@pytest.mark.parametrize("model", ["unknown", "UR3"])
-def test_of_an_unknown_arm_no_table_is_claimed(model):
-    views = replace(worn_cell(np.random.default_rng(2), 0.4).views, robot_model=model)
-    arm = solve_views(views, WITH).arm
-    assert arm is None or not set(arm.errors) & set(PARAMETERS)
-
-
 @pytest.mark.parametrize("options", [WITH, WITHOUT], ids=["arm", "no arm"])
 @pytest.mark.parametrize("count", [9, 20])
 def test_the_stated_region_is_wider_for_fewer_views_with_and_without_the_arm(count, options):

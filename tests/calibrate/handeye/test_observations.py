@@ -7,13 +7,9 @@ from hypothesis import strategies as st
 
 from calibrate.geometry import difference, perturb, pose, random_rotation
 from calibrate.handeye.observations import (
-    CellState,
-    Observations,
     flange_derivatives,
-    flange_residuals,
     implied_flange,
 )
-from recordings.schema.messages import CameraModel
 
 
 def anywhere(rng, count=None):
@@ -44,19 +40,3 @@ def test_derivatives_are_those_of_differences_near_and_far(mount, seed, far):
             np.testing.assert_allclose(
                 exact[which][:, :, k], numeric, atol=2e-7 * (1 + np.abs(numeric).max())
             )
-
-
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-@pytest.mark.parametrize("moved", ["camera", "board"])
-def test_a_moved_cell_has_two_places_and_no_residual_at_either(mount, moved):
-    rng = np.random.default_rng(1)
-    X, Y, second, C = anywhere(rng), anywhere(rng), anywhere(rng), anywhere(rng, 6)
-    later = np.arange(6) >= 4
-    places = [(second, Y) if moved == "camera" else (X, second), (X, Y)]
-    flange = np.array(
-        [implied_flange(mount, *places[0 if late else 1], C[i : i + 1])[0] for i, late in enumerate(later)]
-    )
-    empty = np.zeros((6, 1, 3)), np.zeros((6, 1, 2)), np.zeros((6, 1))
-    observed = Observations(mount, flange, *empty, later=later, moved=moved)
-    state = CellState(X, Y, C, CameraModel(640, 480), np.zeros(5), np.zeros(0), second)
-    np.testing.assert_allclose(flange_residuals(observed, state), 0, atol=1e-12)

@@ -112,6 +112,11 @@ STATION = LazyGroup(
             "Test how the arm stops: STOP, watchdog, pulled cable, slider.",
             ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.05"),
         ),
+        "trace": LazyCommand(
+            "station.cli.trace:trace_command",
+            "Record what a controller does in 32 scenarios, or compare two records.",
+            ("station trace record 192.168.56.101 -o ursim.json.gz", "station trace compare ursim.json.gz"),
+        ),
         "new": LazyCommand(
             "station.cli.new:new_command",
             "Set up a cell in a wizard that only reads.",

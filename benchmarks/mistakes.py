@@ -94,16 +94,17 @@ def what_is_said(folder: Path, output: Path) -> Said:
         hypothesis = str(getattr(error, "hypothesis", "") or "")
         return Said(hypothesis or error.code, hypothesis, (), str(error), answered=False)
     answer = solve_json(job)
-    hypothesis = answer["session"]["hypothesis"]
+    assert answer.session is not None
+    hypothesis = answer.session.hypothesis
     if hypothesis == Reading.AS_RECORDED.value:
         hypothesis = ""
     rejected = job.solution.rejected
     swapped = tuple(view.index for view in rejected if view.kind == "wrong-pose")
     inconsistent = tuple(view.index for view in rejected if view.kind != "wrong-pose")
-    failed = [gate for gate in answer["gates"] if not gate["passed"]]
-    texts = [answer["session"].get("text", ""), *(gate["text"] for gate in failed)]
+    failed = [gate for gate in answer.gates if not gate.passed]
+    texts = [answer.session.text, *(gate.text for gate in failed)]
     texts += [remark.text for remark in job.solution.warnings] + [view.reason for view in rejected]
-    verdict = "fail: " + ", ".join(gate["name"] for gate in failed) if failed else "pass"
+    verdict = "fail: " + ", ".join(gate.name for gate in failed) if failed else "pass"
     text = " ".join(filter(None, texts))
     return Said(hypothesis or verdict, hypothesis, swapped, text, inconsistent=inconsistent)
 

@@ -8,14 +8,30 @@ from typing import Any
 
 import msgspec
 
-from calibrate.cli.contracts import DiffJson, DriftCheckJson, FleetJson, InstalledJson, ListedJson, SolveJson
+from calibrate.batch.run import BatchResult
+from calibrate.cli.contracts import (
+    CompareJson,
+    DiffJson,
+    DriftCheckJson,
+    FleetJson,
+    InstalledJson,
+    ListedJson,
+    SolveJson,
+    SweepJson,
+)
 from calibrate.cli.follow import Followed
 from calibrate.files.calibration import Calibration
 from calibrate.files.validity import Validity
+from recordings.cli.importing import ImportJson
 from recordings.errors import ErrorReport
+from recordings.recover import Recovery
 from station.cell.config import StationConfig
 from station.cell.plan import Plan
 from station.cell.status import StationStatus
+from station.cli.control import DoctorJson
+from station.cli.demo import DemoJson
+from station.cli.plan import PlanJson
+from station.cli.session import SessionJson
 
 FOLDER = Path(__file__).resolve().parent / "schemas"
 TYPES: dict[str, tuple[str, Any]] = {
@@ -23,6 +39,9 @@ TYPES: dict[str, tuple[str, Any]] = {
     "plan": ("A plan of poses (YAML)", Plan),
     "calibration": ("A calibration file (YAML); `calibrate show --json` without `sha256`", Calibration),
     "solve": ("calibrate solve --json", SolveJson),
+    "compare": ("calibrate compare --json", CompareJson),
+    "sweep": ("calibrate sweep --json", SweepJson),
+    "batch": ("A line of calibrate batch --json, and of results.jsonl", BatchResult),
     "list": ("calibrate list --json", list[ListedJson]),
     "install": ("calibrate install --json, calibrate rollback --json", InstalledJson),
     "validity": ("calibrate withdraw --json; `validity` of other commands", Validity),
@@ -31,6 +50,12 @@ TYPES: dict[str, tuple[str, Any]] = {
     "drift-check": ("calibrate drift-check --json", DriftCheckJson),
     "fleet": ("calibrate fleet --json", FleetJson),
     "status": ("station status --json", StationStatus),
+    "doctor": ("station doctor --json", DoctorJson),
+    "demo": ("station demo --json", DemoJson),
+    "plan-report": ("station plan --json", PlanJson),
+    "capture": ("station capture | resume | replan --json", SessionJson),
+    "recover": ("recordings recover --json", list[Recovery]),
+    "import": ("recordings import --json", ImportJson),
     "error": ("Every command with --json that fails", ErrorReport),
 }
 
@@ -38,7 +63,9 @@ TYPES: dict[str, tuple[str, Any]] = {
 def schemas() -> Iterator[tuple[str, bytes]]:
     """(file name, content) of each."""
     for name, (title, kind) in TYPES.items():
-        (schema,), definitions = msgspec.json.schema_components((kind,), ref_template="#/$defs/{name}")
+        (schema,), definitions = msgspec.json.schema_components(
+            (kind,), schema_hook=lambda _: {"type": "string"}, ref_template="#/$defs/{name}"
+        )
         whole = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
             "title": title,

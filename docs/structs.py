@@ -39,9 +39,11 @@ def page(name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _structs(kind: kinds.Type, seen: tuple[type, ...] = ()) -> Iterator[kinds.StructType]:
+def _structs(
+    kind: kinds.Type, seen: tuple[type, ...] = ()
+) -> Iterator[kinds.StructType | kinds.DataclassType]:
     """Each struct in it, the outer one first."""
-    if isinstance(kind, kinds.StructType) and kind.cls not in seen:
+    if isinstance(kind, kinds.StructType | kinds.DataclassType) and kind.cls not in seen:
         yield kind
         for field in kind.fields:
             yield from _structs(field.type, (*seen, kind.cls))
@@ -51,7 +53,7 @@ def _structs(kind: kinds.Type, seen: tuple[type, ...] = ()) -> Iterator[kinds.St
             yield from _structs(part, seen)
 
 
-def _table(struct: kinds.StructType) -> list[str]:
+def _table(struct: kinds.StructType | kinds.DataclassType) -> list[str]:
     said = _said(struct.cls)
     lines = ["", f"### {struct.cls.__name__}", ""]
     own = inspect.getdoc(struct.cls) if struct.cls.__doc__ else ""
@@ -65,13 +67,15 @@ def _table(struct: kinds.StructType) -> list[str]:
 
 
 def _default(field: kinds.Field) -> str:
+    if field.default is field.default_factory is msgspec.NODEFAULT:
+        return "left out"
     value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
     return f"`{msgspec.json.encode(value).decode()}`" if not isinstance(value, msgspec.Struct) else "its own"
 
 
 def _named(kind: kinds.Type) -> str:
     match kind:
-        case kinds.StructType():
+        case kinds.StructType() | kinds.DataclassType():
             return f"[{kind.cls.__name__}](#{kind.cls.__name__.lower()})"
         case kinds.UnionType():
             return " or ".join(_named(part) for part in kind.types)
@@ -83,6 +87,8 @@ def _named(kind: kinds.Type) -> str:
             return f"list of {_named(kind.item_type)}"
         case kinds.TupleType():
             return f"{len(kind.item_types)} × {_named(kind.item_types[0])}"
+        case kinds.CustomType():
+            return "path"
         case kinds.DictType():
             return f"keys to {_named(kind.value_type)}"
     return type(kind).__name__.removesuffix("Type").lower().replace("none", "null")

@@ -21,7 +21,7 @@ from calibrate.batch.storage import Results, expand
 from calibrate.batch.trends import CellHistory, cells, trends_text
 from calibrate.batch.workers import Workers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
-from calibrate.cli.contracts import FleetJson
+from calibrate.cli.contracts import DoubtedJson, FleetJson
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
 from calibrate.cli.output import AsJson, OutputError, err, out, print_json, progress_bar
 from calibrate.load import Progress as LoadProgress
@@ -122,22 +122,10 @@ def fleet(
     doubted = [record for record in records if record.in_doubt]
     lost = sum(record.state == UNREADABLE for record in records)
     if as_json:
-        plain: FleetJson = {
-            "cameras": len(records),
-            "states": dict(Counter(record.state for record in records)),
-            "doubted": [
-                {
-                    "cell": record.cell,
-                    "camera": record.camera,
-                    "state": record.state,
-                    "since": record.since,
-                    "reason": record.reason,
-                    "drifting": record.trend is not None,
-                }
-                for record in doubted
-            ],
-        }
-        print_json(plain)
+        look = [
+            DoubtedJson(r.cell, r.camera, r.state, r.since, r.reason, r.trend is not None) for r in doubted
+        ]
+        print_json(FleetJson(len(records), dict(Counter(record.state for record in records)), look))
     else:
         for record in doubted:
             since = f" since {record.since}" if record.since else ""

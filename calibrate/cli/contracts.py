@@ -1,80 +1,117 @@
-"""Shapes of what the commands print with `--json`; docs/schemas/ is made from them."""
+"""What the commands print with `--json`; docs/schemas/ is made from these types."""
+# ruff: noqa: N815  (e_R is written as the paper writes it)
 
 from __future__ import annotations
 
-from typing import TypedDict
+from typing import Literal
 
-from calibrate.files.calibration import Arm, Folds, FramePose, Gate, SessionReading, Sigma
+import msgspec
+
+from calibrate.files.calibration import (
+    Arm,
+    CorrectedArm,
+    Folds,
+    FramePose,
+    Gate,
+    Lens,
+    Proof,
+    SessionReading,
+    Sigma,
+    ViewWeight,
+)
 from calibrate.files.hooks import HookRun
 from calibrate.files.validity import Validity
 from calibrate.results import BoardShape
-from recordings.schema.messages import Mount
+from recordings.schema.messages import Matrix4, Mount, TimeSource
 
 
-class RejectedJson(TypedDict):
+class RejectedJson(msgspec.Struct, frozen=True):
     index: int
     reason: str
     kind: str
 
 
-class WeightJson(TypedDict):
-    index: int
-    weight: float
-
-
-class ViewsJson(TypedDict):
+class ViewsJson(msgspec.Struct, frozen=True):
     used: list[int]
     rejected: list[RejectedJson]
-    weights: list[WeightJson]
+    weights: list[ViewWeight]
 
 
-class LensJson(TypedDict):
-    width: int
-    height: int
-    matrix: list[list[float]]
-    distortion: list[float]
-    rms_px: float | None
-
-
-class HoldoutJson(TypedDict):
+class HoldoutJson(msgspec.Struct, frozen=True):
     e_t_m: float
     e_R: float
 
 
-class CertificateJson(TypedDict):
-    certified: bool
-    relative_gap: float
-    objective: float
-    distance_sigma: float | None
-
-
-class WarningJson(TypedDict):
+class WarningJson(msgspec.Struct, frozen=True):
     code: str
     text: str
 
 
-class SolveJson(TypedDict):
+class SolveJson(msgspec.Struct, frozen=True):
     """`calibrate solve --json`"""
 
     mount: Mount
     result: FramePose
     sigma: Sigma
-    covariance: list[list[float]]
+    covariance: tuple[tuple[float, ...], ...]
     views: ViewsJson
-    intrinsics: LensJson
+    intrinsics: Lens
     holdout: HoldoutJson | None
-    certificate: CertificateJson
+    certificate: Proof
     gates: list[Gate]
-    verdict: str
+    verdict: Literal["pass", "fail"]
     warnings: list[WarningJson]
     cross_validation: Folds | None
     board: BoardShape | None
     session: SessionReading | None
     arm: Arm | None
+    arm_table: CorrectedArm | None
     solve_ms: float
 
 
-class ListedJson(TypedDict):
+class MethodJson(msgspec.Struct, frozen=True):
+    name: str
+    matrix: Matrix4 | None
+    """None where the method failed (see `note`)."""
+    e_t_m: float | None
+    e_R: float | None
+    board_spread_m: float | None
+    board_spread_rad: float | None
+    reprojection_px: float | None
+    distance_sigma: float | None
+    """Distance from the result of `solve`, in its own standard uncertainties."""
+    time_ms: float
+    note: str
+    on_box: tuple[str, ...]
+    """Components of X on the box of the paper's equation 22; such an X is wrong."""
+    rigid: bool
+    """False where the method's raw matrix is not a rigid transform."""
+
+
+class CompareJson(msgspec.Struct, frozen=True):
+    """`calibrate compare --json`"""
+
+    mount: Mount
+    views: list[int]
+    methods: list[MethodJson]
+
+
+class SweepJson(msgspec.Struct, frozen=True):
+    """`calibrate sweep --json`"""
+
+    offset_s: float
+    """A frame of time t was taken at t + offset on the robot's clock."""
+    sigma_s: float
+    agrees: bool
+    source: TimeSource | None
+    bound_s: float | None
+    derived_s: float | None
+    rms_deg: float
+    pairs: int
+    lost: tuple[str, ...]
+
+
+class ListedJson(msgspec.Struct, frozen=True):
     """One of the list that `calibrate list --json` prints."""
 
     camera: str
@@ -89,7 +126,7 @@ class ListedJson(TypedDict):
     validity: Validity | None
 
 
-class InstalledJson(TypedDict):
+class InstalledJson(msgspec.Struct, frozen=True):
     """`calibrate install --json`, `calibrate rollback --json`"""
 
     generation: int
@@ -99,7 +136,7 @@ class InstalledJson(TypedDict):
     hooks: tuple[HookRun, ...]
 
 
-class DiffJson(TypedDict):
+class DiffJson(msgspec.Struct, frozen=True):
     """`calibrate diff --json`"""
 
     translation_mm: float
@@ -108,12 +145,12 @@ class DiffJson(TypedDict):
     lens_matrix_px: float | None
 
 
-class DriftPowerJson(TypedDict):
+class DriftPowerJson(msgspec.Struct, frozen=True):
     translation_0_5_mm: float
     rotation_0_1_deg: float
 
 
-class DriftCheckJson(TypedDict):
+class DriftCheckJson(msgspec.Struct, frozen=True):
     """`calibrate drift-check --json`"""
 
     passed: bool
@@ -131,7 +168,7 @@ class DriftCheckJson(TypedDict):
     validity: Validity | None
 
 
-class DoubtedJson(TypedDict):
+class DoubtedJson(msgspec.Struct, frozen=True):
     """One camera that needs a look."""
 
     cell: str
@@ -142,7 +179,7 @@ class DoubtedJson(TypedDict):
     drifting: bool
 
 
-class FleetJson(TypedDict):
+class FleetJson(msgspec.Struct, frozen=True):
     """`calibrate fleet --json`"""
 
     cameras: int

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from calibrate.cli.contracts import DriftCheckJson
+from calibrate.cli.contracts import DriftCheckJson, DriftPowerJson
 from calibrate.cli.installed import Root, named_or_installed
 from calibrate.cli.job import Threads
 from calibrate.cli.output import AsJson, OutputError, detection_progress, out, print_json
@@ -230,18 +230,18 @@ def _more_text(result: DriftCheck, calibration: Calibration) -> str:
 
 
 def _plain(result: DriftCheck, trend: Trend | None, own: bool, validity: Validity | None) -> DriftCheckJson:
-    return {
-        "passed": result.passed and not own,
-        "own_views": own,
-        "validity": validity,
-        "shift": result.shift.tolist(),
-        "covariance": result.covariance.tolist(),
-        "statistic": result.statistic,
-        "threshold": result.threshold,
-        "p_value": result.p_value,
-        "power": {"translation_0_5_mm": result.power_translation, "rotation_0_1_deg": result.power_rotation},
-        "views_needed": result.views_needed,
-        "disagreement": result.disagreement,
-        "views": result.views,
-        "trend": "" if trend is None else trend.text,
-    }
+    return DriftCheckJson(
+        passed=result.passed and not own,
+        own_views=own,
+        shift=result.shift.tolist(),
+        covariance=result.covariance.tolist(),
+        statistic=result.statistic,
+        threshold=result.threshold,
+        p_value=result.p_value,
+        power=DriftPowerJson(result.power_translation, result.power_rotation),
+        views_needed=result.views_needed,
+        disagreement=result.disagreement,
+        views=result.views,
+        trend="" if trend is None else trend.text,
+        validity=validity,
+    )

@@ -82,13 +82,7 @@ def diff(
     millimetres, degrees, sigmas = pose_difference(a, b)
     lens_px = _lens_difference_px(a.intrinsics, b.intrinsics)
     if as_json:
-        apart: DiffJson = {
-            "translation_mm": millimetres,
-            "rotation_deg": degrees,
-            "sigmas": sigmas,
-            "lens_matrix_px": lens_px,
-        }
-        print_json(apart)
+        print_json(DiffJson(millimetres, degrees, sigmas, lens_px))
         return
     names = (Column(str(name), overflow="fold") for name in (first, second or "installed"))
     table = Table("", *names, box=None)
@@ -244,14 +238,8 @@ def _switched(version: InstalledVersion, as_json: bool) -> None:
     folder = version.path.parents[1]
     stable = folder / "current"
     if as_json:
-        made: InstalledJson = {
-            "generation": version.number,
-            "path": str(version.path),
-            "current": str(stable),
-            "validity": version.validity,
-            "hooks": version.hooks,
-        }
-        print_json(made)
+        place = str(version.path), str(stable)
+        print_json(InstalledJson(version.number, *place, version.validity, version.hooks))
         return
     log = read_lines(folder / LOG, LogEntry)
     out.print(f"Installed: version {version.number}, {stable}", soft_wrap=True)
@@ -320,16 +308,16 @@ def history_rows(root: Path | None, camera: str) -> list[tuple[str, str, str, st
 
 
 def _plain(camera: str, version: InstalledVersion) -> ListedJson:
-    calibration = version.calibration
-    return {
-        "camera": camera,
-        "generation": version.number,
-        "current": version.current,
-        "path": str(version.path),
-        "problem": version.problem,
-        "session": None if calibration is None else calibration.provenance.session,
-        "created": None if calibration is None else calibration.created,
-        "source": None if calibration is None else calibration.source,
-        "sigma": None if calibration is None else calibration.sigma,
-        "validity": version.validity,
-    }
+    found = version.calibration
+    return ListedJson(
+        camera=camera,
+        generation=version.number,
+        current=version.current,
+        path=str(version.path),
+        problem=version.problem,
+        session=None if found is None else found.provenance.session,
+        created=None if found is None else found.created,
+        source=None if found is None else found.source,
+        sigma=None if found is None else found.sigma,
+        validity=version.validity,
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -11,6 +11,15 @@ import typer
 from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
+from calibrate.cli.contracts import (
+    CompareJson,
+    HoldoutJson,
+    MethodJson,
+    RejectedJson,
+    SolveJson,
+    ViewsJson,
+    WarningJson,
+)
 from calibrate.cli.installed import Root, history_rows
 from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.cli.output import (
@@ -22,7 +31,7 @@ from calibrate.cli.output import (
     print_json,
 )
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Touch, write_calibration
+from calibrate.files.calibration import Touch, ViewWeight, write_calibration
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
 from calibrate.files.install import install_line, installed_calibration
 from calibrate.geometry import rotation_log
@@ -77,43 +86,36 @@ def solve(
         raise typer.Exit(GATE_FAILED)
 
 
-def solve_json(job: SolvedRecording) -> dict[str, Any]:
-    """The contract of `calibrate solve --json`: `contracts.SolveJson` as plain data."""
-    plain = msgspec.to_builtins(job.calibration)
-    views, quality, lens = plain["views"], plain["quality"], plain["intrinsics"]
-    holdout = quality.get("holdout")
-    proof = quality["certificate"]
-    return {
-        "mount": plain["mount"],
-        "result": plain["result"],
-        "sigma": plain["sigma"],
-        "covariance": plain["covariance"],
-        "views": {
-            "used": views["used"],
-            "rejected": [
-                {"index": r["index"], "reason": r["reason"], "kind": r.get("kind", "")}
-                for r in views.get("rejected", [])
-            ],
-            "weights": [{"index": i, "weight": w} for i, w in job.solution.weights.items()],
-        },
-        "intrinsics": {key: lens[key] for key in ("width", "height", "matrix", "distortion", "rms_px")},
-        "holdout": None if holdout is None else {"e_t_m": holdout["e_t_m"], "e_R": holdout["e_R"]},
-        "certificate": {
-            key: proof[key] for key in ("certified", "relative_gap", "objective", "distance_sigma")
-        },
-        "gates": quality["gates"],
-        "verdict": "pass" if job.passed else "fail",
-        "warnings": [
-            {"code": code, "text": text}
-            for code, text in zip(quality.get("warning_codes", []), quality.get("warnings", []), strict=True)
+def solve_json(job: SolvedRecording) -> SolveJson:
+    """What `calibrate solve --json` prints."""
+    found, quality = job.calibration, job.calibration.quality
+    score = quality.holdout
+    return SolveJson(
+        mount=found.mount,
+        result=found.result,
+        sigma=found.sigma,
+        covariance=found.covariance,
+        views=ViewsJson(
+            found.views.used,
+            [RejectedJson(view.index, view.reason, view.kind) for view in found.views.rejected],
+            [ViewWeight(index, weight) for index, weight in job.solution.weights.items()],
+        ),
+        intrinsics=found.intrinsics,
+        holdout=None if score is None else HoldoutJson(score.e_t_m, score.e_R),
+        certificate=quality.certificate,
+        gates=quality.gates,
+        verdict="pass" if job.passed else "fail",
+        warnings=[
+            WarningJson(code, text)
+            for code, text in zip(quality.warning_codes, quality.warnings, strict=True)
         ],
-        "cross_validation": quality.get("cross_validation"),
-        "board": quality.get("board"),
-        "session": quality.get("session"),
-        "arm": quality.get("arm"),
-        "arm_table": plain.get("arm_table"),
-        "solve_ms": sum(job.stage_ms.values()),
-    }
+        cross_validation=quality.cross_validation,
+        board=quality.board,
+        session=quality.session,
+        arm=quality.arm,
+        arm_table=found.arm_table,
+        solve_ms=sum(job.stage_ms.values()),
+    )
 
 
 @takes(job_options)
@@ -177,13 +179,8 @@ def compare(
         prepared = prepare_views(recording, options, progress)
         results = compare_all(prepared.views, solver_options(options, prepared))
     if as_json:
-        print_json(
-            {
-                "mount": prepared.views.mount,
-                "views": [view.index for view in prepared.views],
-                "methods": [peer_plain(peer) for peer in results],
-            }
-        )
+        views = [view.index for view in prepared.views]
+        print_json(CompareJson(prepared.views.mount, views, [_method(peer) for peer in results]))
         return
     table = Table(*PEER_HEAD, box=None)
     for peer in results:
@@ -205,10 +202,10 @@ def _table_of_X(results: list[PeerResult]) -> Table:
     return table
 
 
-def peer_plain(peer: Any) -> dict[str, Any]:
+def _method(peer: PeerResult) -> MethodJson:
+    plain = {name: getattr(peer, name) for name in MethodJson.__struct_fields__}
     plain = {
-        key: value.tolist() if isinstance(value, np.ndarray) else value
-        for key, value in vars(peer).items()
-        if not key.startswith("samples_")
+        name: value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+        for name, value in plain.items()
     }
-    return {key: float(value) if isinstance(value, np.floating) else value for key, value in plain.items()}
+    return msgspec.convert(plain, MethodJson)

@@ -10,6 +10,7 @@ from typing import Annotated
 import msgspec
 import typer
 
+from calibrate.cli.contracts import SweepJson
 from calibrate.cli.output import AsJson, OutputError, check_target, err, out, print_json
 from calibrate.files.calibration import read_calibration
 from calibrate.quality.sweep import TimeOffset, sweep_time_offset
@@ -43,19 +44,8 @@ def sweep(
     if output is not None:
         output.write_bytes(msgspec.yaml.encode({"time_offset": _correction(opened, found)}))
     if as_json:
-        print_json(
-            {
-                "offset_s": found.offset_s,
-                "sigma_s": found.sigma_s,
-                "agrees": found.agrees,
-                "source": found.source,
-                "bound_s": found.bound_s,
-                "derived_s": found.derived_s,
-                "rms_deg": math.degrees(found.rms_rad),
-                "pairs": found.pairs,
-                "lost": found.lost,
-            }
-        )
+        said = {name: getattr(found, name) for name in SweepJson.__struct_fields__ if name != "rms_deg"}
+        print_json(SweepJson(rms_deg=math.degrees(found.rms_rad), **said))
         return
     offset = f"{1000 * found.offset_s:+.2f} ± {1000 * found.sigma_s:.2f} ms"
     out.print(f"Image taken {offset} from its time, on the robot's clock ({found.pairs} turns compared).")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
 from recordings.exporters import Target
@@ -76,7 +76,7 @@ def recover_command(
     """Rebuild an unfinished, cut or damaged recording. Exit 3: it had to."""
     results = recover_recording(recording, output)
     if json_:
-        print(json.dumps([dataclasses.asdict(result) for result in results], default=str))
+        print(msgspec.json.encode(results, enc_hook=str).decode())
     else:
         for result in results:
             _print_recovery(result)

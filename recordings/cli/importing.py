@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
+import msgspec
 import typer
 
 from recordings.cli.console import plain_console
-from recordings.importers.bag import PAIR_WITHIN_S, import_bag
+from recordings.importers.bag import PAIR_WITHIN_S, BagPlan, import_bag
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE
 from recordings.importers.folder import import_folder
 from recordings.importers.selection import Wanted
@@ -65,34 +64,44 @@ def import_command(
     with _progress(not json_) as progress:
         if (source / DATASET_FILE).is_file() and (source / POSES_FILE).is_file():
             done = import_folder(source, target, progress)
-            facts = {"recording": str(target or ""), "views": done.images, "bytes": done.size_bytes}
+            facts = ImportJson(str(target or ""), done.images, done.size_bytes)
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg))
             plan = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
-            facts = {"recording": str(target or ""), "views": plan.stops, "bytes": plan.bytes_written}
-            facts["bag"] = dataclasses.asdict(plan)
+            facts = ImportJson(str(target or ""), plan.stops, plan.bytes_written, plan)
     if json_:
-        print(json.dumps(facts))
+        print(msgspec.json.encode(facts).decode())
     else:
         _print_import(facts)
 
 
-def _print_import(facts: dict[str, Any]) -> None:
+class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
+    """`recordings import --json`"""
+
+    recording: str
+    """Empty with --dry-run."""
+    views: int
+    bytes: int
+    bag: BagPlan | None = None
+    """Of a bag or an MCAP file."""
+
+
+def _print_import(facts: ImportJson) -> None:
     """Print what `recordings import` took, or would take."""
-    if bag := facts.get("bag"):
-        print(plain_text(f"images    {bag['image_topic']} ({bag['images']}), {bag['camera']}"))
-        print(plain_text(f"poses     {bag['poses_from']}, paired by stamp within {bag['bound_ms']:.2f} ms"))
-        print(plain_text(f"joints    {bag['joints_from'] or 'none of a six-axis arm'}"))
-        passed = ", ".join(f"{count} {reason}" for reason, count in bag["passed_over"].items() if count)
-        print(plain_text(f"stops     {bag['stops']}" + (f"; images passed over: {passed}" if passed else "")))
-        if bag["other_topics"]:
-            print(plain_text(f"not used  {', '.join(bag['other_topics'])}"))
-    if not facts["recording"]:
-        print(plain_text(f"{facts['views']} views would be taken; nothing was written"))
+    if bag := facts.bag:
+        print(plain_text(f"images    {bag.image_topic} ({bag.images}), {bag.camera}"))
+        print(plain_text(f"poses     {bag.poses_from}, paired by stamp within {bag.bound_ms:.2f} ms"))
+        print(plain_text(f"joints    {bag.joints_from or 'none of a six-axis arm'}"))
+        passed = ", ".join(f"{count} {reason}" for reason, count in bag.passed_over.items() if count)
+        print(plain_text(f"stops     {bag.stops}" + (f"; images passed over: {passed}" if passed else "")))
+        if bag.other_topics:
+            print(plain_text(f"not used  {', '.join(bag.other_topics)}"))
+    if not facts.recording:
+        print(plain_text(f"{facts.views} views would be taken; nothing was written"))
         return
-    print(plain_text(f"{facts['recording']}: {facts['views']} views, {facts['bytes'] / 1e6:.1f} MB"))
-    print(plain_text(f"next: calibrate solve {shlex.quote(facts['recording'])}"))
+    print(plain_text(f"{facts.recording}: {facts.views} views, {facts.bytes / 1e6:.1f} MB"))
+    print(plain_text(f"next: calibrate solve {shlex.quote(facts.recording)}"))
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from station.cli.console import AsJson, Socket, out
 from station.operate.motion import status_now
 from station.protocol.client import Client, ask
 from station.protocol.stop_client import stop_and_tell
-from station.protocol.verbs import Acknowledge, Doctor, Finish, Lease, Pause, Retake, Skip, Verb
+from station.protocol.verbs import Acknowledge, Check, Doctor, Finish, Lease, Pause, Retake, Skip, Verb
 
 PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
 _MARKS = {
@@ -143,6 +143,13 @@ def _why(socket: Path | None, pose: int) -> str:
     return next((p.reason for p in status_of(socket).session.poses if p.index == pose - 1), "")
 
 
+class DoctorJson(msgspec.Struct, frozen=True):
+    """`station doctor --json`"""
+
+    ok: bool
+    checks: list[Check]
+
+
 def doctor_command(
     socket: Socket = None,
     as_json: AsJson = False,
@@ -183,7 +190,7 @@ def doctor_command(
     checks = ask(socket or default_socket(), Doctor())
     good = all(check.state != "failed" for check in checks)
     if as_json:
-        print(msgspec.json.encode({"ok": good, "checks": checks}).decode())
+        print(msgspec.json.encode(DoctorJson(good, checks)).decode())
     else:
         from rich.table import Table
 

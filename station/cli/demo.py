@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
 import shutil
 import sys
@@ -21,17 +20,20 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from calibrate.files.calibration import read_calibration
+from calibrate.cli.contracts import HoldoutJson, SolveJson
+from calibrate.files.calibration import Sigma, read_calibration
 from calibrate.files.formatting import arm_sentences
 from calibrate.geometry import difference
 from recordings.errors import ErrorReport
 from recordings.files import state_root
 from recordings.reader import open_recording
+from recordings.schema.messages import Matrix4, Mount
 from station.cell.errors import ConfigError, StationError
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import MotionPreview
 from station.cli.console import AsJson, Headless, err, out
 from station.cli.progress import SessionProgress
+from station.cli.session import PosesJson
 from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
 from station.operate.motion import carry_out, wait_until_idle
 from station.plan.choose import Aim
@@ -45,7 +47,38 @@ START_TIMEOUT_S = 120.0
 END_TIMEOUT_S = 15.0
 SOLVE_TIMEOUT_S = 300.0
 _GATE_FAILED = 4
-Result = dict[str, Any]
+
+
+class ErrorJson(msgspec.Struct, frozen=True):
+    translation_mm: float
+    rotation_deg: float
+
+
+class DemoArmJson(msgspec.Struct, frozen=True):
+    offered: bool
+    with_table_mm: float | None
+    without_table_mm: float | None
+    sentences: list[str]
+
+
+class DemoJson(msgspec.Struct, frozen=True):
+    """`station demo --json`"""
+
+    seed: int
+    scene: str
+    mount: Mount
+    noise: str
+    truth_error: ErrorJson
+    sigma: Sigma
+    poses: PosesJson
+    recording: str
+    calibration: str
+    report: str
+    holdout: HoldoutJson | None
+    gates_passed: bool
+    arm: DemoArmJson
+
+
 """JSON: of `calibrate solve`, and our own."""
 
 
@@ -83,44 +116,45 @@ def demo_command(
         command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
         os.execv(command[0], command)
     folder = output or state_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
-    cell: Result = {"seed": seed, "scene": scene, "mount": mount, "noise": noise}
+    cell = {"seed": seed, "scene": scene, "mount": mount, "noise": noise}
     arguments = [part for name, value in cell.items() for part in (f"--{name}", str(value))]
     arguments += ["--time-scale", str(time_scale), *(["--gige"] if gige else [])]
     arguments += ["--control", control] if control else []
     progress, started_s = SessionProgress(err, quiet=headless or as_json), time.monotonic()
-    result = cell | asyncio.run(_run(folder, arguments, poses, seed, progress))
+    result = asyncio.run(_run(folder, arguments, poses, seed, progress, cell))
     if as_json:
-        print(json.dumps(result))
+        print(msgspec.json.encode(result).decode())
     else:
         _show_demo(result, time.monotonic() - started_s)
-    captured, planned = result["poses"]["captured"], result["poses"]["planned"]
-    if not result["gates_passed"]:
+    if not result.gates_passed:
         raise typer.Exit(4)
-    if captured < planned:
+    if result.poses.captured < result.poses.planned:
         raise typer.Exit(3)
 
 
-def _show_demo(result: Result, duration_s: float) -> None:
-    error, sigma, poses = result["truth_error"], result["sigma"], result["poses"]
-    table = Table(title=f"SIMULATED cell, seed {result['seed']}: {result['mount']}, {result['scene']} scene")
+def _show_demo(result: DemoJson, duration_s: float) -> None:
+    table = Table(title=f"SIMULATED cell, seed {result.seed}: {result.mount}, {result.scene} scene")
     for heading in ("", "translation", "rotation"):
         table.add_column(heading, justify="left" if not heading else "right")
-    for name, value in (("error against the truth", error), ("standard uncertainty", sigma)):
-        table.add_row(name, f"{value['translation_mm']:.3f} mm", f"{value['rotation_deg']:.4f}°")
+    for name, value in (
+        ("error against the truth", result.truth_error),
+        ("standard uncertainty", result.sigma),
+    ):
+        table.add_row(name, f"{value.translation_mm:.3f} mm", f"{value.rotation_deg:.4f}°")
     out.print(table)
-    verdict = "all gates passed" if result["gates_passed"] else ("a gate FAILED", "red")
-    taken = f"{poses['captured']} of {poses['planned']} poses, "
+    verdict = "all gates passed" if result.gates_passed else ("a gate FAILED", "red")
+    taken = f"{result.poses.captured} of {result.poses.planned} poses, "
     out.print(Text.assemble(taken, verdict, f", {duration_s:.0f} s in all"))
     for name in ("recording", "calibration", "report"):
-        out.print(f"{name:<12} {result[name]}")
-    for sentence in result["arm"]["sentences"]:
+        out.print(f"{name:<12} {getattr(result, name)}")
+    for sentence in result.arm.sentences:
         out.print(sentence)
 
 
 async def _run(
-    folder: Path, arguments: list[str], poses: int, seed: int, progress: SessionProgress
-) -> Result:
-    """Return what `--json` prints of it. `arguments`: of `station serve`. Raises StationError."""
+    folder: Path, arguments: list[str], poses: int, seed: int, progress: SessionProgress, cell: dict[str, Any]
+) -> DemoJson:
+    """Return what `--json` prints. `arguments`: of `station serve`; `cell`: the same. Raises StationError."""
     folder.mkdir(parents=True, exist_ok=True)
     progress.say(f"starting a simulated cell: {' '.join(arguments)}")
     # A worn arm is worth poses that tell its table from the rest.
@@ -143,26 +177,26 @@ async def _run(
     calibration, report = session / CALIBRATION_FILE, session / "report.html"
     progress.say("solving the recording, in a process of its own")
     solved = await _solve(recording, calibration, report)
-    arm = solved["arm_table"] or {}
+    arm = solved.arm_table
     # The camera's true pose is that on the true arm: the X of the corrected one is to be compared with it.
-    own = arm.get("result") or solved["result"]
-    translation_mm, rotation_deg = truth_error(recording, own["matrix"])
-    return {
-        "truth_error": {"translation_mm": translation_mm, "rotation_deg": rotation_deg},
-        "sigma": solved["sigma"],
-        "poses": {"planned": outcome.planned, "captured": outcome.captured},
-        "recording": str(recording),
-        "calibration": str(calibration),
-        "report": str(report),
-        "holdout": solved["holdout"],
-        "gates_passed": all(gate["passed"] for gate in solved["gates"]),
-        "arm": {
-            "offered": bool(arm.get("offered")),
-            "with_table_mm": arm.get("with_table_mm"),
-            "without_table_mm": arm.get("without_table_mm"),
-            "sentences": [*arm_sentences(read_calibration(calibration))],
-        },
-    }
+    own = solved.result if arm is None or arm.result is None else arm.result
+    return DemoJson(
+        **cell,
+        truth_error=ErrorJson(*truth_error(recording, own.matrix)),
+        sigma=solved.sigma,
+        poses=PosesJson(outcome.planned, outcome.captured),
+        recording=str(recording),
+        calibration=str(calibration),
+        report=str(report),
+        holdout=solved.holdout,
+        gates_passed=all(gate.passed for gate in solved.gates),
+        arm=DemoArmJson(
+            offered=arm is not None and arm.offered,
+            with_table_mm=None if arm is None else arm.with_table_mm,
+            without_table_mm=None if arm is None else arm.without_table_mm,
+            sentences=[*arm_sentences(read_calibration(calibration))],
+        ),
+    )
 
 
 async def approve_simulated(_: MotionPreview) -> bool:
@@ -207,7 +241,7 @@ async def simulated_daemon(root: Path, arguments: list[str]) -> AsyncIterator[Pa
         shutil.rmtree(place, ignore_errors=True)
 
 
-async def _solve(recording: Path, calibration: Path, report: Path) -> Result:
+async def _solve(recording: Path, calibration: Path, report: Path) -> SolveJson:
     """`calibrate solve` in a process of its own, as an operator's laptop would run it."""
     command = [sys.executable, "-m", "calibrate.cli", "solve", str(recording), "--json"]
     command += ["--output", str(calibration), "--report", str(report)]
@@ -228,11 +262,10 @@ async def _solve(recording: Path, calibration: Path, report: Path) -> Result:
             said = words.decode(errors="replace").strip()
             raise DemoError(said or f"`calibrate solve` ended with {child.returncode}.") from None
         raise DemoError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
-    result: Result = json.loads(out)
-    return result
+    return msgspec.json.decode(out, type=SolveJson)
 
 
-def truth_error(recording: Path, found: list[list[float]]) -> tuple[float, float]:
+def truth_error(recording: Path, found: Matrix4) -> tuple[float, float]:
     """Distance (mm) and angle (deg) of the found X from the truth that rides in a simulated recording."""
     attachment = open_recording(recording).attachments().get("truth.json")
     if attachment is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -17,11 +16,11 @@ from rich.text import Text
 
 from calibrate.handeye.solution import MEASURED
 from recordings.plain_text import printed
-from recordings.schema.messages import Vector6
+from recordings.schema.messages import Mount, Vector6
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, LimitError, StationError
-from station.cell.limits import PlanCheck, check_plan
+from station.cell.limits import PlanCheck, Problem, check_plan
 from station.cell.plan import Plan, plan_sha256
 from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
 from station.cell.socket_folder import default_socket
@@ -99,7 +98,7 @@ def plan_command(
     if shown is not None and foxglove is not None:
         save_scene(shown, plan, foxglove)
     if as_json:
-        typer.echo(json.dumps(_summary(plan, told, outcome) | _arm_summary(arm)))
+        typer.echo(msgspec.json.encode(_summary(plan, told, outcome, arm)).decode())
     else:
         drawn = sketch(shown, told) if shown is not None else ""
         _show(told, outcome, drawn, cut, output if check is None else None, cell.capture.goal_m)
@@ -120,16 +119,6 @@ def _criterion(purpose: str, d_optimal: bool) -> Criterion:
             f"--d-optimal is for the camera, not for --for {purpose}.", code="usage", remedy="Leave it out."
         )
     return "D" if d_optimal else criterion
-
-
-def _arm_summary(arm: ArmForecast | None) -> dict[str, float | list[str]]:
-    if arm is None:
-        return {}
-    return {
-        "workspace_mm": round(1000 * arm.with_table_m, 4),
-        "workspace_if_board_measured_mm": round(1000 * arm.if_measured_m, 4),
-        "open_parameters": list(arm.open),
-    }
 
 
 def _show_arm(arm: ArmForecast) -> None:
@@ -271,22 +260,50 @@ def _made(
         )
 
 
-def _summary(plan: Plan, told: Plan, outcome: PlanCheck) -> dict[str, object]:
+class PlanJson(msgspec.Struct, frozen=True):
+    """`station plan --json`"""
+
+    plan_sha256: str
+    poses: int
+    robot: str
+    mount: Mount
+    duration_s: float
+    path_m: float
+    largest_step_rad: float
+    top_speed_m_s: float
+    expected_sigma_mm: float | None
+    note: str
+    problems: list[Problem]
+    workspace_mm: float | msgspec.UnsetType = msgspec.UNSET
+    """With `--for arm` or `both`: 1σ of a point with the arm's table."""
+    workspace_if_board_measured_mm: float | msgspec.UnsetType = msgspec.UNSET
+    open_parameters: list[str] | msgspec.UnsetType = msgspec.UNSET
+
+
+def _summary(plan: Plan, told: Plan, outcome: PlanCheck, arm: ArmForecast | None) -> PlanJson:
     """`told`: the plan with its forecast."""
     last = told.poses[-1].predicted_sigma_m
-    return {
-        "plan_sha256": plan_sha256(plan),
-        "poses": len(plan.poses),
-        "robot": plan.robot,
-        "mount": plan.mount,
-        "duration_s": round(outcome.duration_s, 3),
-        "path_m": round(outcome.path_m, 4),
-        "largest_step_rad": round(outcome.largest_step_rad, 4),
-        "top_speed_m_s": round(outcome.top_speed_m_s, 4),
-        "expected_sigma_mm": None if last is None else round(1000 * last, 4),
-        "note": plan.note,
-        "problems": [msgspec.to_builtins(vars(problem)) for problem in outcome.problems],
-    }
+    said = PlanJson(
+        plan_sha256=plan_sha256(plan),
+        poses=len(plan.poses),
+        robot=plan.robot,
+        mount=plan.mount,
+        duration_s=round(outcome.duration_s, 3),
+        path_m=round(outcome.path_m, 4),
+        largest_step_rad=round(outcome.largest_step_rad, 4),
+        top_speed_m_s=round(outcome.top_speed_m_s, 4),
+        expected_sigma_mm=None if last is None else round(1000 * last, 4),
+        note=plan.note,
+        problems=list(outcome.problems),
+    )
+    if arm is None:
+        return said
+    return msgspec.structs.replace(
+        said,
+        workspace_mm=round(1000 * arm.with_table_m, 4),
+        workspace_if_board_measured_mm=round(1000 * arm.if_measured_m, 4),
+        open_parameters=list(arm.open),
+    )
 
 
 def _goal_text(plan: Plan, goal_m: float) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable
@@ -11,12 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 from rich.text import Text
 
 from station.cell.errors import ConfigError, RefusedError
 from station.cell.plan import Plan
-from station.cell.status import StationStatus
+from station.cell.status import StationState, StationStatus
 from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, Socket, err, out
 from station.operate.drift_check import POSES, check_arguments, judged, start_drift_check
@@ -160,11 +160,23 @@ async def session(
         return await shell.carry_out(purpose)
 
 
+class PosesJson(msgspec.Struct, frozen=True):
+    planned: int
+    captured: int
+
+
+class SessionJson(msgspec.Struct, frozen=True):
+    """`station capture --json`, `station resume --json`, `station replan --json`"""
+
+    state: StationState
+    poses: PosesJson
+    recording: str
+
+
 def _finish(outcome: SessionOutcome, as_json: bool) -> None:
     if as_json:
-        poses = {"planned": outcome.planned, "captured": outcome.captured}
-        state = outcome.status.state.value
-        print(json.dumps({"state": state, "poses": poses, "recording": outcome.recording}))
+        poses = PosesJson(outcome.planned, outcome.captured)
+        print(msgspec.json.encode(SessionJson(outcome.status.state, poses, outcome.recording)).decode())
     elif outcome.recording:
         out.print(f"{outcome.captured} of {outcome.planned} poses, finished: {outcome.recording}")
         out.print(str(after_capture(outcome.status.session)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -61,6 +62,31 @@ def test_what_the_commands_print(findings: Findings, tmp_path: Path) -> None:
     assert findings("drift-check", printed("drift-check", SAMPLE, *place)) == []
     assert findings("validity", printed("withdraw", "a trial of the schemas", *place)) == []
     assert findings("error", printed("rollback", "99", *place)) == []
+    assert findings("compare", printed("compare", SAMPLE)) == []
+    assert findings("batch", printed("batch", SAMPLE, "-o", tmp_path / "many")) == []
+    follow = [sys.executable, "-m", "calibrate.cli", "follow", *map(str, place)]
+    with subprocess.Popen(follow, stdout=subprocess.PIPE) as told:
+        assert told.stdout is not None
+        first = told.stdout.readline()
+        told.terminate()
+    assert findings("follow", json.loads(first)) == []
+
+
+def test_what_the_commands_of_recordings_and_plans_print(findings: Findings, tmp_path: Path) -> None:
+    def printed(program: str, *arguments: object) -> Any:
+        command = [sys.executable, "-m", f"{program}.cli", *map(str, arguments), "--json"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode in (0, 3), done.stderr
+        return json.loads(done.stdout)
+
+    sample = tmp_path / "sample.mcap"
+    sample.write_bytes(SAMPLE.read_bytes()[:-2000])
+    recovered = printed("recordings", "recover", sample)
+    assert findings("recover", recovered) == [] and recovered[0]["kept_original"]
+    printed("recordings", "export", SAMPLE, "--to", "folder", "-o", "folder")
+    assert findings("import", printed("recordings", "import", "folder", "-o", "again.mcap")) == []
+    made = printed("station", "plan", "--poses", "4", "-o", "plan.yaml")
+    assert findings("plan-report", made) == [] and "workspace_mm" not in made
 
 
 def test_files_that_people_write(findings: Findings) -> None:

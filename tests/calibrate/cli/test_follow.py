@@ -72,6 +72,8 @@ def ended() -> Iterator[list[subprocess.Popen[str]]]:
     for process in started:
         process.kill()
         process.wait()
+        for pipe in filter(None, (process.stdout, process.stderr)):
+            pipe.close()
 
 
 def started(ended: list[subprocess.Popen[str]], *words: object, **more: Any) -> subprocess.Popen[str]:

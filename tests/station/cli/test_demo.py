@@ -7,12 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from calibrate.files.calibration import read_calibration
 from recordings.reader import open_recording
-from station.cli.demo import DemoError, _solve
+from station.cli.demo import DemoError, DemoJson, _solve
 
 
 @pytest.mark.process
@@ -23,6 +24,7 @@ def test_the_demo_finds_the_truth(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     assert done.returncode in (0, 4), done.stderr  # 12 poses may be too few for a gate
     result = json.loads(done.stdout)
+    assert msgspec.json.encode(msgspec.convert(result, DemoJson, strict=True)).decode() == done.stdout.strip()
     assert result["poses"] == {"planned": 12, "captured": 12}
     assert result["truth_error"]["translation_mm"] <= 0.5
     assert result["truth_error"]["rotation_deg"] <= 0.05

@@ -22,12 +22,12 @@ _VARIANTS = 5
 def run() -> str:
     count = trials(200)
     with tempfile.TemporaryDirectory() as folder:
-        recordings = _recordings(Path(folder), count)
+        recordings = recordings_of(Path(folder), count)
         one_s, two_s = 0.0, 0.0
         same, killed = True, 0
         for k in range(_PARTS):
             part = recordings[k::_PARTS]
-            seconds, alone = _timed(part, Path(folder) / f"one-{k}", _in_this_process)
+            seconds, alone = _timed(part, Path(folder) / f"one-{k}", in_this_process)
             one_s += seconds
             seconds, pooled = _timed(part, Path(folder) / f"two-{k}", pool(2))
             two_s += seconds
@@ -37,7 +37,7 @@ def run() -> str:
         _, survived = _timed(part, Path(folder) / "killed", pool(2), kill)
         killed = len(kill.pids)
         lost = sum(not result.solved for result in survived)
-        same_after = _bits(survived) == _bits(_timed(part, Path(folder) / "one-0", _in_this_process)[1])
+        same_after = _bits(survived) == _bits(_timed(part, Path(folder) / "one-0", in_this_process)[1])
     what = f"{count} recordings of 12 pictures, 640×512 ({_VARIANTS} rendered, the others are copies)"
     bits = "the same" if same_after else "OTHERS"
     return "\n".join(
@@ -56,7 +56,7 @@ def run() -> str:
     )
 
 
-def _recordings(folder: Path, count: int) -> list[Path]:
+def recordings_of(folder: Path, count: int) -> list[Path]:
     rendered = [make_recording(folder / f"cell-{k}.mcap", 12, 0.5, k) for k in range(min(_VARIANTS, count))]
     paths = rendered.copy()
     for k in range(len(rendered), count):
@@ -65,7 +65,7 @@ def _recordings(folder: Path, count: int) -> list[Path]:
     return paths
 
 
-def _in_this_process(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
+def in_this_process(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
     for task in tasks:
         yield task, work(task)
 

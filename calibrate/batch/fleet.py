@@ -55,13 +55,15 @@ class CameraRecord(msgspec.Struct, frozen=True):
         return [entry for entry in self.checks if entry.generation == self.version]
 
     @property
-    def in_doubt(self) -> bool:
-        """A person should look: it does not hold, nothing can be said, or it drifts."""
+    def to_look_at(self) -> bool:
+        """It does not hold, nothing can be said, or it drifts."""
         return self.state not in (ValidityState.VALID, ValidityState.UNVERIFIED) or self.trend is not None
 
     @property
-    def name(self) -> str:
-        return f"{self.cell}, {self.camera}" if self.camera else self.cell
+    def why(self) -> str:
+        """What there is to look at, for people."""
+        said = "" if self.state == ValidityState.VALID else self.reason_text or self.reason
+        return f"{said} {'' if self.trend is None else self.trend.text}".strip()
 
 
 Progress = Callable[[int, int, str], None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
+from pathlib import PurePosixPath
 
 import matplotlib
 import numpy as np
@@ -116,44 +117,51 @@ def _shift_over_time(
 # --- validity and drift of a fleet ---
 _STATES = (*reversed(ValidityState), UNREADABLE)
 _FIGURES = 20
-"""Cameras in doubt that are drawn; all of them are in the table."""
+"""Cameras to look at that are drawn; all of them are in the table."""
 _FLEET_HEAD = ("cell", "camera", "state", "since (UTC)", "checks", "failed", "last shift", "last check (UTC)")
 
 
 def fleet_page(records: Sequence[CameraRecord], now: datetime) -> str:
-    """Which cameras are in doubt and since when, the drift of each over its checks, then all cameras."""
-    doubted = sorted((r for r in records if r.in_doubt), key=lambda r: (r.state != "in-doubt", r.since))
-    count = {state: sum(record.state == state for record in records) for state in _STATES}
-    drifting = sum(record.trend is not None for record in records)
-    cells = len({record.cell for record in records})
-    facts = [(str(number), state.replace("-", " ")) for state, number in count.items()]
+    """Which cameras to look at and since when, the drift of each over its checks, then all cameras."""
+    found = sorted((r for r in records if r.to_look_at), key=lambda r: (r.state != "in-doubt", r.since))
+    count = [(sum(record.state == state for record in records), state) for state in _STATES]
+    count.append((sum(record.trend is not None for record in records), "drifting"))
+    places = sorted({record.cell for record in records})
+    ends = {place: PurePosixPath(place).name for place in places}
+    shown = ends if len(set(ends.values())) == len(places) else dict(zip(places, places, strict=True))
+    rows = {id(record): _fleet_row(record, shown[record.cell]) for record in records}
     return html.page(
         "Calibrations of a fleet",
         [
             "<h1>Calibrations of a fleet</h1>",
-            html.paragraph(f"{cells} cells, {len(records)} cameras, {now:%Y-%m-%d %H:%M} UTC."),
-            _fleet_verdict(len(doubted), len(records)),
-            html.cards([*facts, (str(drifting), "drifting")]),
-            *_doubted_cells(doubted),
-            html.folded("All cameras", [html.table(_FLEET_HEAD, map(_fleet_row, records), (4, 5))]),
+            html.paragraph(f"{len(places)} cells, {len(records)} cameras, {now:%Y-%m-%d %H:%M} UTC."),
+            _fleet_verdict(len(found), len(records)),
+            html.cards((str(number), state.replace("-", " ")) for number, state in count),
+            html.heading("Cameras to look at") if found else "",
+            html.table((*_FLEET_HEAD[:4], "why"), [(*rows[id(r)][:4], r.why) for r in found])
+            if found
+            else "",
+            *(part for r in found[:_FIGURES] for part in _drift(r, ", ".join(rows[id(r)][:2]))),
+            html.folded("All cameras", [html.table(_FLEET_HEAD, rows.values(), (4, 5))]),
         ],
     )
 
 
-def _fleet_verdict(doubted: int, total: int) -> str:
-    kind = "bad" if doubted else "good"
-    said = f"{doubted} of {total} cameras need a look" if doubted else "No camera is in doubt"
+def _fleet_verdict(count: int, total: int) -> str:
+    kind = "bad" if count else "good"
+    said = f"{count} of {total} cameras to look at" if count else "No camera is in doubt"
     return f'<div class="verdict {kind}"><strong>{said}</strong></div>'
 
 
-def _doubted_cells(doubted: Sequence[CameraRecord]) -> Iterator[str]:
-    if doubted:
+def _to_look_at(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
+    if rows:
         yield html.heading("Cameras to look at")
-        head = ("cell", "camera", "state", "since (UTC)", "why")
-        yield html.table(head, [(*_fleet_row(record)[:4], _why(record)) for record in doubted])
-    for record in [record for record in doubted if record.current_checks][:_FIGURES]:
-        checks = record.current_checks
-        yield html.heading(record.name)
+        yield html.table((*_FLEET_HEAD[:4], "why"), rows)
+
+
+def _drift(record: CameraRecord, name: str) -> Iterator[str]:
+    if checks := record.current_checks:
+        yield html.heading(name)
         yield html.figure(
             _shift_over_time(
                 [entry.wall_s for entry in checks],
@@ -165,13 +173,7 @@ def _doubted_cells(doubted: Sequence[CameraRecord]) -> Iterator[str]:
         )
 
 
-def _why(record: CameraRecord) -> str:
-    trend = "" if record.trend is None else record.trend.text
-    said = record.reason_text or record.reason
-    return f"{said} {trend}".strip() if record.state != ValidityState.VALID else trend
-
-
-def _fleet_row(record: CameraRecord) -> tuple[str, ...]:
+def _fleet_row(record: CameraRecord, cell: str) -> tuple[str, ...]:
     checks = record.current_checks
     shift, last = "", ""
     if checks:
@@ -180,7 +182,7 @@ def _fleet_row(record: CameraRecord) -> tuple[str, ...]:
         last = f"{datetime.fromtimestamp(checks[-1].wall_s, UTC):%Y-%m-%d %H:%M}"
     since = parse_time(record.since)
     return (
-        record.cell,
+        cell,
         record.camera,
         record.state.replace("-", " "),
         "" if since is None else f"{since.astimezone(UTC):%Y-%m-%d %H:%M}",

@@ -21,7 +21,7 @@ from calibrate.batch.storage import Results, expand
 from calibrate.batch.trends import CellHistory, cells, trends_text
 from calibrate.batch.workers import Workers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
-from calibrate.cli.contracts import DoubtedJson, FleetJson
+from calibrate.cli.contracts import FleetCameraJson, FleetJson
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
 from calibrate.cli.output import AsJson, OutputError, err, out, print_json, progress_bar
 from calibrate.load import Progress as LoadProgress
@@ -119,22 +119,18 @@ def fleet(
     store.prepare()
     store.write("fleet.sqlite", fleet_table(records))
     store.write("fleet.html", fleet_page(records, now).encode())
-    doubted = [record for record in records if record.in_doubt]
+    found = [record for record in records if record.to_look_at]
     lost = sum(record.state == UNREADABLE for record in records)
     if as_json:
         look = [
-            DoubtedJson(r.cell, r.camera, r.state, r.since, r.reason, r.trend is not None) for r in doubted
+            FleetCameraJson(r.cell, r.camera, r.state, r.since, r.reason, r.trend is not None) for r in found
         ]
         print_json(FleetJson(len(records), dict(Counter(record.state for record in records)), look))
     else:
-        for record in doubted:
+        for record in found:
             since = f" since {record.since}" if record.since else ""
-            said = record.trend.text if record.trend else record.reason_text or record.reason
-            out.print(f"{record.name}: {record.state}{since}: {said}", soft_wrap=True)
-        out.print(
-            f"{len(records)} cameras: {len(doubted)} in doubt, {lost} unreadable. "
-            f"{output}/fleet.html, fleet.sqlite"
-        )
+            out.print(f"{record.cell} {record.camera}: {record.state}{since}. {record.why}", soft_wrap=True)
+        out.print(f"{len(records)} cameras, {len(found)} to look at. {output}/fleet.html, fleet.sqlite")
     if lost:
         raise typer.Exit(DONE_WITH_LOSS)
 

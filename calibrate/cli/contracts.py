@@ -168,8 +168,8 @@ class DriftCheckJson(msgspec.Struct, frozen=True):
     validity: Validity | None
 
 
-class DoubtedJson(msgspec.Struct, frozen=True):
-    """One camera that needs a look."""
+class FleetCameraJson(msgspec.Struct, frozen=True):
+    """One camera to look at."""
 
     cell: str
     camera: str
@@ -184,4 +184,4 @@ class FleetJson(msgspec.Struct, frozen=True):
 
     cameras: int
     states: dict[str, int]
-    doubted: list[DoubtedJson]
+    to_look_at: list[FleetCameraJson]

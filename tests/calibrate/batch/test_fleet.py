@@ -63,7 +63,7 @@ def cells(make_file: Callable[..., Path], tmp_path: Path) -> list[Path]:
 
 
 def facts(records: list[CameraRecord]) -> list[tuple[str, str, str, bool]]:
-    return [(Path(r.cell).name, r.camera, r.state, r.in_doubt) for r in records]
+    return [(Path(r.cell).name, r.camera, r.state, r.to_look_at) for r in records]
 
 
 def test_every_camera_is_a_record_and_what_is_in_doubt_says_so(cells: list[Path]) -> None:
@@ -184,7 +184,7 @@ def test_the_command_writes_both_and_ends_with_loss_where_a_cell_is_lost(
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)
     assert told["states"] == {"valid": 1, "in-doubt": 1}
-    assert [(Path(each["cell"]).name, each["reason"]) for each in told["doubted"]] == [
+    assert [(Path(each["cell"]).name, each["reason"]) for each in told["to_look_at"]] == [
         ("moved", "drift-check")
     ]
     assert all((tmp_path / "fleet" / name).stat().st_size for name in ("fleet.sqlite", "fleet.html"))

@@ -63,11 +63,17 @@ def _evolve_rotations(objective: QuadraticObjective, rng: np.random.Generator) -
 
     def evaluate(q: Array) -> Array:
         z = np.ones((len(q), 10))
-        z[:, :9] = Rotation.from_quat(q).as_matrix().reshape(-1, 9) - centre
+        z[:, :9] = _rotations(q).reshape(-1, 9) - centre
         return np.asarray(((z @ S) * z).sum(axis=1))
 
     evolved = evolve(evaluate, -np.ones(4), np.ones(4), rng, SETTINGS)
-    return np.asarray(Rotation.from_quat(evolved.population).as_matrix())
+    return _rotations(evolved.population)
+
+
+def _rotations(quaternions: Array) -> Array:
+    """(m, 3, 3) of quaternions (m, 4) of any length; a mutant of none at all is no turn."""
+    nothing = np.linalg.norm(quaternions, axis=1, keepdims=True) < 1e-150
+    return np.asarray(Rotation.from_quat(np.where(nothing, [0.0, 0.0, 0.0, 1.0], quaternions)).as_matrix())
 
 
 def _best_of(objective: QuadraticObjective, starts: Array) -> tuple[Array, float]:

@@ -13,6 +13,7 @@ from calibrate.handeye.axxb.evolution import (
 )
 from calibrate.handeye.axxb.pairs import consecutive_pairs
 from calibrate.handeye.axxb.paper import BOX, SETTINGS, solve_paper
+from calibrate.handeye.axxb.robust import _rotations
 from tests.calibrate.cells import LOW, make_cell
 
 ROOT = Path(__file__).parents[4]
@@ -59,6 +60,12 @@ def test_partners_are_three_different_others():
     counts = np.bincount(chosen[:, :, 0].ravel(), minlength=7)
     assert counts[0] == 0
     assert (abs(counts[1:] - 100) < 45).all()  # uniform over the other six
+
+
+def test_a_mutant_quaternion_of_no_length_is_no_turn():
+    """The box's centre: it happens with real views, and SciPy refuses it."""
+    q = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0]])
+    np.testing.assert_allclose(_rotations(q), [np.eye(3), np.diag([-1.0, -1.0, 1.0])], atol=1e-15)
 
 
 def test_mutants_are_rounded_to_the_box_and_ties_are_accepted():

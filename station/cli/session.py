@@ -111,22 +111,21 @@ def drift_check_command(
     Exit codes: 0 PASS, 4 FAIL, 1 no recording or nothing installed, 2 usage.
     """
 
-    async def captured() -> SessionOutcome:
+    async def captured() -> tuple[SessionOutcome, str]:
         async with attended(socket, headless, approve) as shell:
             standing = await shell.status()
             shell.progress.skip(standing)
-            return await shell.watch(
-                await start_drift_check(
-                    shell.client, standing, shell.approves, poses, headless=not shell.interactive
-                )
+            started = await start_drift_check(
+                shell.client, standing, shell.approves, poses, headless=not shell.interactive
             )
+            return await shell.watch(started), shell.client.camera
 
-    outcome = asyncio.run(captured())
+    outcome, camera = asyncio.run(captured())
     if not outcome.recording:
         _finish(outcome, False)
     what = check_arguments(outcome.recording, outcome.status.session.folder)
     done = subprocess.run([sys.executable, "-m", "calibrate.cli", *what])
-    if (end := judged(outcome.status.session.folder)) is not None:
+    if (end := judged(outcome.status.session.folder, camera)) is not None:
         out.print(str(end))
     raise typer.Exit(done.returncode)
 

@@ -63,10 +63,10 @@ async def recorded(link: Link, plan_sha256: str) -> SessionStatus | None:
     return None
 
 
-def judged(folder: str) -> Ending | None:
+def judged(folder: str, camera: str) -> Ending | None:
     """What to do after the drift check of this session; None: it was not judged."""
     path = Path(folder).resolve()
-    history = read_checks(path.parents[1])
+    history = read_checks(path.parents[1], camera)
     entry = next((entry for entry in reversed(history) if entry.recording == path.name), None)
     if entry is None:
         return None

@@ -18,6 +18,7 @@ from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
 from calibrate.files.verification import agrees
 from calibrate.files.versions import LogEntry, read_log, same_solve
+from calibrate.quality.checks import CheckEntry, read_checks
 from recordings.files import MAIN_CAMERA
 
 LOOK_S = 2.0
@@ -82,6 +83,17 @@ def read_installed(root: Path, camera: str = MAIN_CAMERA) -> Installed:
         ended = [end for end in ended if not same_solve(end.calibration, was)]
         ended.append(Ended(was, how, _by(entry)))
     return Installed(now, tuple(end for end in ended if not same_solve(end.calibration, now)), validity)
+
+
+def drift_history(root: Path, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
+    """Drift checks of what is installed now, oldest first; its touch tests do not begin another history."""
+    held: set[int] = set()
+    try:
+        for entry in read_log(root, camera):
+            held = {entry.generation} | (held if entry.action == "verify" else set())
+    except OSError:
+        return []
+    return [check for check in read_checks(root, camera) if check.generation in held]
 
 
 def _generation(root: Path, camera: str, number: int) -> Calibration | None:

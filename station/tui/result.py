@@ -18,10 +18,10 @@ from calibrate.files.validity import ValidityState, validity_text
 from calibrate.files.verification import agrees, touch_sigmas
 from calibrate.files.versions import LogEntry, read_log
 from calibrate.geometry import difference
-from calibrate.quality.checks import CheckEntry, find_trend, read_checks
+from calibrate.quality.checks import CheckEntry, find_trend
 from recordings.files import MAIN_CAMERA
 from station.operate.ending import Way, after_drift_check, after_solve
-from station.tui.installed import Result, local, state_root
+from station.tui.installed import Result, drift_history, local, state_root
 from station.tui.live import Panel
 from station.tui.screen import Rows, StationScreen
 from station.tui.task import Known
@@ -359,7 +359,7 @@ class VerifyScreen(ResultScreen):
             yield _panel("Held-out views", lambda r, w, h: held_out_lines(r.calibration, w), id="held-out")
         yield _panel(
             "Drift checks of the installed calibration",
-            lambda r, w, h: drift_lines(drift_history(r), w, h),
+            lambda r, w, h: drift_lines(drift_history(state_root(r.path), _camera(r)), w, h),
             id="drift",
             below="d on 7 captures one",
         )
@@ -410,13 +410,6 @@ def held_out_lines(calibration: Calibration, width: int) -> Content:
             )
         )
     return Content("\n").join(rows)
-
-
-def drift_history(result: Result) -> Sequence[CheckEntry]:
-    """Drift checks of what is installed now, oldest first."""
-    root = state_root(result.path)
-    entries = read_checks(root)
-    return [entry for entry in entries if entry.generation == entries[-1].generation] if entries else []
 
 
 def drift_lines(entries: Sequence[CheckEntry], width: int, height: int) -> Content:
@@ -497,10 +490,13 @@ def install_lines(result: Result) -> Content:
     return Content("\n").join(rows)
 
 
+def _camera(result: Result) -> str:
+    return MAIN_CAMERA if result.calibration is None else result.calibration.camera_name
+
+
 def _log(result: Result) -> Sequence[LogEntry]:
     try:
-        camera = MAIN_CAMERA if result.calibration is None else result.calibration.camera_name
-        return read_log(state_root(result.path), camera)
+        return read_log(state_root(result.path), _camera(result))
     except OSError:
         return ()
 

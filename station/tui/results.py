@@ -131,7 +131,7 @@ class ResultsDesk(Desk):
             self.notify(NO_VERDICT, timeout=10)
         else:
             await self._check(session.recording, session.folder)
-            if (end := judged(session.folder)) is not None:
+            if (end := judged(session.folder, self.camera)) is not None:
                 self.notify(str(end), title="Drift check", timeout=60, markup=False)
 
     @work(exclusive=True, group="job", exit_on_error=False)

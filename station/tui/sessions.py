@@ -17,7 +17,7 @@ from calibrate.quality.checks import CheckEntry, read_checks
 from station.cell.session_folder import SessionSummary
 from station.operate.drift_check import POSES
 from station.protocol.verbs import Sessions
-from station.tui.installed import Installed, read_installed, readable
+from station.tui.installed import Installed, drift_history, read_installed, readable
 from station.tui.live import Panel
 from station.tui.replay import ReplayLink
 from station.tui.replay_screen import WATCHABLE, ReplayScreen
@@ -114,8 +114,7 @@ class SessionsScreen(StationScreen):
         self._tell()
 
     def _drift(self, known: Known, width: int, height: int) -> Content:
-        newest = [check for check in self._checks if check.generation == self._checks[-1].generation]
-        return drift_lines(newest, width, height)
+        return drift_lines(self._checks, width, height)
 
     def _highlighted(self, known: Known, width: int, height: int) -> Content:
         if not self.table.row_count or self.table.cursor_row >= len(self._sessions):
@@ -193,11 +192,12 @@ class SessionsScreen(StationScreen):
 def _beside(
     root: Path | None, camera: str, sessions: list[SessionSummary]
 ) -> tuple[list[tuple[Content, ...]], list[CheckEntry]]:
-    """A row for each session, and the drift checks; reads files, for a thread."""
-    installed = Installed() if root is None else read_installed(root, camera)
-    checks = [] if root is None else read_checks(root)
-    judged = {check.recording: check for check in checks}
-    return [_row(session, installed, judged) for session in sessions], checks
+    """A row for each session, and drift checks of what is installed; reads files, for a thread."""
+    if root is None:
+        return [_row(session, Installed(), {}) for session in sessions], []
+    installed = read_installed(root, camera)
+    judged = {check.recording: check for check in read_checks(root, camera)}
+    return [_row(session, installed, judged) for session in sessions], drift_history(root, camera)
 
 
 def _row(session: SessionSummary, installed: Installed, judged: dict[str, CheckEntry]) -> tuple[Content, ...]:

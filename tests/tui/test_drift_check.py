@@ -11,6 +11,7 @@ from textual.pilot import Pilot
 
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
+from calibrate.quality.checks import CheckEntry, append_check
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
@@ -20,6 +21,7 @@ from station.tui import results
 from station.tui.app import StationApp
 from station.tui.desk import REMEDIES, busy_words
 from station.tui.dialogs import ConfirmMotion, JobScreen
+from station.tui.installed import drift_history
 from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 from tests.tui.test_install import GOOD
 from tests.tui.test_plan_screen import SlowPlanner
@@ -172,3 +174,17 @@ async def test_planning_it_is_said_on_every_screen(tmp_path: Path) -> None:
         assert PLANNING in text_of(app, "#next")
         link.made.set()
         await until(pilot, lambda: not app.busy)
+
+
+def test_the_history_is_of_this_camera_and_of_what_is_installed(tmp_path: Path) -> None:
+    path, root = tmp_path / "c.yaml", tmp_path / "root"
+    for camera in ("left", "right"):
+        write_calibration(GOOD, path)
+        number = install(path, root, cell="simulated", camera=camera).number
+        entry = CheckEntry(0.0, number, camera, True, (0.0,) * 6, ((0.0,) * 6,) * 6, 1.0, 12.6)
+        append_check(entry, root, camera)
+    assert [check.recording for check in drift_history(root, "right")] == ["right"]
+    assert not drift_history(root)
+    write_calibration(msgspec.structs.replace(GOOD, created="2026-02-01T00:00:00+00:00"), path)
+    install(path, root, cell="simulated", camera="right")
+    assert not drift_history(root, "right") and drift_history(root, "left")

@@ -37,7 +37,8 @@ RUNNING = (StationState.MOVING, StationState.SETTLING, StationState.CAPTURING, S
 
 def run() -> str:
     rows = [*_rows("half blocks", sixels=False), *_rows("sixels", sixels=True)]
-    load = f"Load average at the end: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
+    load = f"Load average at the end: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+    load += f", run at nice {os.nice(0)}."
     return table(("what", "n", "p50", "p90", "p99", "max", "goal"), rows) + "\n\n" + load
 
 

@@ -44,6 +44,11 @@ class CellKind(StrEnum):
     simulated = "simulated"
 
 
+SameCell = Annotated[
+    CellKind | None, typer.Option("--cell", hidden=True, help="As of install; the root holds one kind only")
+]
+
+
 def named_or_installed(
     file: Path | None, root: Path | None, camera: str = MAIN_CAMERA
 ) -> tuple[Calibration, Validity | None]:
@@ -204,6 +209,7 @@ def rollback(
     root: Root = None,
     camera: CameraName = MAIN_CAMERA,
     reason: Annotated[str, typer.Option(help="Reason, kept in the log")] = "",
+    cell: SameCell = None,
     as_json: AsJson = False,
 ) -> None:
     """Go back to an older installed calibration.
@@ -257,6 +263,7 @@ def _switched(version: InstalledVersion, as_json: bool) -> None:
 def list_installed(
     root: Root = None,
     camera: Annotated[str, typer.Option(help="One camera only (default: all of the cell)")] = "",
+    cell: SameCell = None,
     as_json: AsJson = False,
 ) -> None:
     """List every calibration that was installed here.

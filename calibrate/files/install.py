@@ -117,7 +117,7 @@ def install(
             raise kind(
                 f"{path} is not installed. {' '.join(overridden)}",
                 code="objection" if objections else "",
-                remedy='To override: calibrate install --override "REASON".',
+                remedy=f"To override: `{install_line(calibration.source, path, root, 'REASON')}`.",
                 gates=len(failed),
                 objections=len(objections),
             )
@@ -313,11 +313,14 @@ def _installed_before(root: Path | None, camera: str) -> Calibration | None:
     return (current or known)[-1].calibration if known else None
 
 
-def install_line(source: Source, path: Path) -> str:
+def install_line(source: Source, path: Path, root: Path | None = None, override: str = "") -> str:
     """The command that installs a file of this source: only what a real cell captured goes there unasked."""
     kind = _CELL_OF[source]
-    place = "" if kind == "real" else f"--cell {kind} --root FOLDER "
-    return f"calibrate install {place}{shlex.quote(str(path))}"
+    words = ["calibrate", "install"]
+    words += [] if kind == "real" else ["--cell", kind]
+    words += [] if kind == "real" and root is None else ["--root", str(root or "FOLDER")]
+    words += ["--override", override] if override else []
+    return shlex.join([*words, str(path)])
 
 
 def _refuse_foreign_source(

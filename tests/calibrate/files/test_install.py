@@ -27,6 +27,8 @@ from tests.command_line import call
 def test_the_next_step_of_a_solve_is_one_that_works() -> None:
     assert install_line("real", Path("c.yaml")) == "calibrate install c.yaml"
     assert install_line("real", Path("my c.yaml")) == "calibrate install 'my c.yaml'"
+    again = install_line("simulated", Path("c.yaml"), Path("/r"), "REASON")
+    assert again == "calibrate install --cell simulated --root /r --override REASON c.yaml"
     assert install_line("playback", Path("c.yaml")) == (
         "calibrate install --cell simulated --root FOLDER c.yaml"
     )

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from calibrate.errors import CalibrationError as CalibrationError
     from calibrate.files.calibration import Calibration as Calibration
-    from calibrate.files.calibration import Gate as Gate
     from calibrate.files.calibration import read_calibration as read_calibration
     from calibrate.files.calibration import write_calibration as write_calibration
     from calibrate.files.exports import export as export
+    from calibrate.files.gate import Gate as Gate
     from calibrate.files.install import install as install
     from calibrate.files.install import rollback as rollback
     from calibrate.files.install import set_validity as set_validity

@@ -21,7 +21,6 @@ from calibrate.files.calibration import (
     DhTable,
     Folds,
     FramePose,
-    Gate,
     HeldOutViews,
     Lens,
     Proof,
@@ -34,6 +33,7 @@ from calibrate.files.calibration import (
     Views,
     ViewWeight,
 )
+from calibrate.files.gate import Gate
 from calibrate.geometry import Transform
 from calibrate.handeye.arm import HELD, PARAMETERS
 from calibrate.handeye.solution import Remark, Solution, TableResult

@@ -15,7 +15,8 @@ import numpy as np
 from calibrate.boards.model import check_board
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
-from calibrate.files.calibration import Calibration, Gate
+from calibrate.files.calibration import Calibration
+from calibrate.files.gate import Gate
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Profile, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views

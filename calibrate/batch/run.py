@@ -20,7 +20,7 @@ from calibrate.batch.workers import BatchError, Lost, Workers, pool
 from calibrate.bounds import Limits, bounded
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import encode_calibration
-from calibrate.files.loader import content_sha256
+from calibrate.files.proof import content_sha256
 from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
 from recordings.errors import RecordingError
 

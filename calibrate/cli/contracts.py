@@ -12,13 +12,13 @@ from calibrate.files.calibration import (
     CorrectedArm,
     Folds,
     FramePose,
-    Gate,
     Lens,
     Proof,
     SessionReading,
     Sigma,
     ViewWeight,
 )
+from calibrate.files.gate import Gate
 from calibrate.files.hooks import HookRun
 from calibrate.files.validity import Validity
 from calibrate.results import BoardShape

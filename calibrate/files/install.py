@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 
 from calibrate.errors import GateFailedError, InstallError
-from calibrate.files.calibration import Calibration, Gate, Override, read_calibration
+from calibrate.files.calibration import Calibration, Override, read_calibration
+from calibrate.files.gate import Gate
 from calibrate.files.hooks import HookEvent, announce
 from calibrate.files.lines import append_line
 from calibrate.files.loader import (

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Gate, Sense
+from calibrate.files.gate import Gate, Sense
 from calibrate.handeye.readings import Reading
 from calibrate.handeye.solution import Solution
 from recordings import strict_yaml

@@ -12,8 +12,9 @@ from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.widgets import DataTable, Static
 
-from calibrate.files.calibration import Calibration, Gate
+from calibrate.files.calibration import Calibration
 from calibrate.files.formatting import arm_sentences
+from calibrate.files.gate import Gate
 from calibrate.files.validity import ValidityState, validity_text
 from calibrate.files.verification import agrees, touch_sigmas
 from calibrate.files.versions import LogEntry, read_log

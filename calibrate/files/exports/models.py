@@ -19,7 +19,7 @@ from calibrate.files.exports.frames import (
     comment,
     roll_pitch_yaw,
 )
-from calibrate.files.loader import content_sha256
+from calibrate.files.proof import content_sha256
 from calibrate.geometry import Array, Transform, inverse, pose, rotation_exp
 from calibrate.kinematics import MODELS, RobotModel, link_frames
 from calibrate.projection import camera_matrix

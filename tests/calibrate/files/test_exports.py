@@ -32,7 +32,8 @@ from calibrate.files.calibration import (
     write_calibration,
 )
 from calibrate.files.exports import FORMATS, ExportError, FrameNames
-from calibrate.files.loader import InstalledCalibration, check_result, proven_plain
+from calibrate.files.loader import InstalledCalibration
+from calibrate.files.proof import check_result, proven_plain
 from calibrate.files.validity import unrecorded
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_from_rotvec, rotation_exp
 from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model

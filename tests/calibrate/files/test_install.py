@@ -15,7 +15,8 @@ import pytest
 
 from calibrate.cli import main
 from calibrate.errors import CalibrationFileError, InstallError
-from calibrate.files.calibration import Gate, Touch, read_calibration
+from calibrate.files.calibration import Touch, read_calibration
+from calibrate.files.gate import Gate
 from calibrate.files.install import InstallGateError, install, install_line, installed_calibration, rollback
 from calibrate.files.loader import load_installed
 from calibrate.files.versions import installed_versions, read_log

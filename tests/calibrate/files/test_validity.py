@@ -25,7 +25,8 @@ from calibrate.files.calibration import Touch
 from calibrate.files.hooks import HookRun
 from calibrate.files.install import install, installed_calibration, note_check, rollback, set_validity
 from calibrate.files.lines import read_lines
-from calibrate.files.loader import cameras, canonical_json
+from calibrate.files.loader import cameras
+from calibrate.files.proof import canonical_json
 from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState
 from calibrate.files.verification import note_installed
 from calibrate.files.versions import installed_versions

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.files.calibration import Gate
+from calibrate.files.gate import Gate
 from calibrate.handeye.readings import Explanation, Reading
 from calibrate.handeye.solution import CrossValidation, Finding, NoiseScales, Remark, Solution
 from calibrate.pipeline import SolvedRecording

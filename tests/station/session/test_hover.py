@@ -9,7 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.files.calibration import FramePose, Gate, write_calibration
+from calibrate.files.calibration import FramePose, write_calibration
+from calibrate.files.gate import Gate
 from calibrate.geometry import Array, Transform
 from calibrate.kinematics import MODELS, forward
 from station.analysis.worker import BoardDetection

@@ -150,12 +150,14 @@ def read_acceptance(root: Path) -> Acceptance | None:
         return None
 
 
-def not_accepted(found: Acceptance | None, subject: ArmSubject) -> str:
-    """Why the stops of this arm are not accepted; empty: they are."""
+def not_accepted(found: Acceptance | None, subject: ArmSubject, speed_m_s: float = 0.0) -> str:
+    """Why the stops of this arm are not accepted at this speed; empty: they are."""
     if found is None:
         return "not accepted: its stops were never tested"
     if changed := found.subject.difference(subject):
         return f"not accepted: {changed} changed since its stops were tested"
     if not found.accepted:
         return "not accepted: the last test of its stops failed or was ended"
+    if found.speed_m_s < speed_m_s:
+        return f"not accepted beyond {found.speed_m_s:g} m/s: the cell's limit is {speed_m_s:g} m/s"
     return ""

@@ -61,6 +61,8 @@ async def _accept(socket: Path | None, joint: int, fastest_m_s: float, quiet: bo
 
     async with attended(socket or default_socket(), quiet=quiet) as shell:
         status = await shell.status()
+        if status.playback:
+            raise RefusedError("A played-back arm has no ways to stop.", code="playback")
         if quiet and not status.simulated:
             text = "Nothing moved: --json prompts nobody, and is for simulated cells only."
             raise RefusedError(text, code="no-person")

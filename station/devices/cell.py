@@ -12,6 +12,7 @@ import msgspec
 from recordings.schema.messages import CameraModel, Source
 from station.cell.acceptance import ArmSubject, not_accepted, read_acceptance
 from station.cell.config import StationConfig
+from station.cell.limits import SPEED_CAP_M_S
 from station.cell.plan import Plan
 from station.devices.base import Camera, Robot, Trigger
 
@@ -52,7 +53,8 @@ class Cell:
         """Why the stops of this real arm are not accepted; empty: they are, or nothing real moves."""
         if self.source != "real" or not self.robot.identity.serial or not self.robot.control_path:
             return ""
-        return not_accepted(read_acceptance(root), self.subject)
+        speed_m_s = min(self.config.limits.speed_m_s, SPEED_CAP_M_S)
+        return not_accepted(read_acceptance(root), self.subject, speed_m_s)
 
     @property
     def config_sha256(self) -> str:

@@ -52,7 +52,10 @@ def acceptance_page(acceptance: Acceptance, stops: Sequence[JudgedStop]) -> str:
                 (f"{when:%Y-%m-%d %H:%M} UTC", f"tested by {acceptance.who}"),
             ]
         ),
-        paragraph("It holds until firmware, payload or control path change. It is no safety assessment."),
+        paragraph(
+            "It holds until arm, firmware, payload or control path change, up to the stage that passed. "
+            "It is no safety assessment."
+        ),
     ]
     for stop in stops:
         sections.append(heading(f"{stop.result.way.value}, {stop.result.speed_m_s:.2f} m/s"))
@@ -76,7 +79,7 @@ def _curves(stop: JudgedStop) -> str:
                 (axes[1], curve.speed_rad_s[shown], "speed, rad/s"),
             ):
                 axis.plot(time_s, values, color=_BLUE, linewidth=1.2)
-                axis.set_xlabel("time after the stop, s")
+                axis.set_xlabel("time after the stop, s" if stop.move.moment_ns else "time, s")
                 axis.set_ylabel(unit)
                 if stop.move.moment_ns is not None:
                     axis.axvline(0.0, color=_GREY, linewidth=1)

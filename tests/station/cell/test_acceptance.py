@@ -47,6 +47,12 @@ def test_rounding_of_the_payload_does_not() -> None:
     assert not_accepted(PASSED, rounded) == ""
 
 
+def test_it_holds_up_to_the_speed_that_passed() -> None:
+    slow = msgspec.structs.replace(PASSED, speed_m_s=0.05)
+    assert not_accepted(slow, SUBJECT, 0.25) and not not_accepted(slow, SUBJECT, 0.05)
+    assert not not_accepted(PASSED, SUBJECT, 0.25)
+
+
 def test_never_tested_failed_and_unreadable_are_not_accepted(tmp_path: Path) -> None:
     assert not_accepted(read_acceptance(tmp_path), SUBJECT)
     assert not_accepted(msgspec.structs.replace(PASSED, accepted=False), SUBJECT)

@@ -327,3 +327,16 @@ async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
         await bert.request("lease", action="take")
         with raises("approval-used"):
             await bert.request("go", token=summary["token"])
+
+
+@pytest.mark.parametrize("approval", [ApprovalConfig(), ApprovalConfig(services=(ME,))])
+async def test_no_program_and_no_service_gets_a_stop_test_of_a_real_arm(
+    new_rig: NewRig, tmp_path: Path, approval: ApprovalConfig
+) -> None:
+    served = await real_cell(new_rig, tmp_path, with_none, approval)
+    async with await served.client() as program:
+        await program.request("lease", action="take")
+        with pytest.raises(RefusedError) as refused:
+            await program.request("stop_test", way="both")
+        assert refused.value.code == "no-terminal"
+    await served.control.close()

@@ -1,0 +1,94 @@
+"""Stop tests in a session: slow, by a person, ended by STOP; and what is said until the arm is accepted."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from station.cell.acceptance import Acceptance, StopWay, write_acceptance
+from station.cell.errors import RefusedError
+from station.cell.status import StationState as S
+from station.protocol.verbs import Purpose, StopTest
+from station.session.checklist import checklist
+from tests.station.session_rig import NewRig, Rig, sealed
+
+
+@pytest.mark.parametrize("speed_m_s", [0.02, 0.05, 0.25])
+@pytest.mark.parametrize("joint", [0, 2, 5])
+async def test_no_modelled_point_is_faster_than_asked_for(rig: Rig, joint: int, speed_m_s: float) -> None:
+    offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.BOTH, joint, speed_m_s))
+    assert 0 < offer.go.top_speed_m_s <= speed_m_s
+    assert offer.go.largest_step_rad <= 0.4 and offer.speed_rad_s <= 1.05
+    assert rig.arm.log == [], "nothing moved"
+
+
+async def test_a_move_needs_its_own_approval_and_records_nothing(rig: Rig) -> None:
+    for _ in range(2):
+        offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.ARRIVE))
+        rig.session.go(1, offer.go.token)
+        await rig.until(S.IDLE)
+        with pytest.raises(RefusedError) as refused:
+            rig.session.go(1, offer.go.token)
+        assert refused.value.code == "approval-used"
+    assert rig.arm.log.count("move") == 2 and rig.camera.taken == 0
+    assert rig.session.context.recording is None and rig.cause == "stop-tested"
+
+
+async def test_stop_of_a_person_stays_latched(rig: Rig) -> None:
+    offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.NETWORK))
+    rig.arm.slow = True
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.MOVING)
+    await rig.session.stop("ben")
+    assert rig.state is S.STOPPED
+    with pytest.raises(RefusedError):
+        await rig.session.prepare_stop_test(1, StopTest(StopWay.BOTH))
+
+
+async def test_whoever_has_no_control_gets_no_offer(rig: Rig) -> None:
+    with pytest.raises(RefusedError):
+        await rig.session.prepare_stop_test(2, StopTest(StopWay.BOTH))
+
+
+async def said(rig: Rig) -> list[bool]:
+    """Whether doctor, status and the preview of an approval say that the arm is not accepted."""
+    context = rig.session.context
+    rig.session.supervisor._look()
+    control = next(check for check in await checklist(context, {}) if check.name == "control")
+    preview = await rig.session.prepare(1, Purpose.RUN)
+    return [
+        control.state == "warning",
+        bool(rig.session.store.status.robot.not_accepted),
+        any("not accepted" in warning for warning in preview.warnings),
+    ]
+
+
+async def test_until_accepted_and_after_a_change_everything_says_so(new_rig: NewRig) -> None:
+    rig = await new_rig(source="real")
+    cell, root = rig.session.context.cell, rig.session.context.root
+    rig.arm.payload = (1.0, 0.0, 0.0, 0.05)
+    assert all(await said(rig))
+    write_acceptance(root, Acceptance(cell.subject, True, 0.25, 1, "anna", ()))
+    assert not any(await said(rig))
+    for change in ("payload", "firmware", "control path"):
+        before = rig.arm.payload, rig.arm.identity, rig.arm.control_path
+        if change == "payload":
+            rig.arm.payload = (2.0, 0.0, 0.0, 0.05)
+        elif change == "firmware":
+            rig.arm.identity = msgspec.structs.replace(rig.arm.identity, controller_version="9.9")
+        else:
+            rig.arm.control_path = "script"
+        assert all(await said(rig)), change
+        rig.arm.payload, rig.arm.identity, rig.arm.control_path = before
+    assert not any(await said(rig))
+
+
+async def test_the_recording_says_it_too(new_rig: NewRig) -> None:
+    rig = await new_rig(source="real")
+    await rig.give_go()
+    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    assert "not accepted" in sealed(rig).info.software["robot stops"]
+
+
+async def test_a_simulated_cell_says_nothing(rig: Rig) -> None:
+    assert not any(await said(rig))

@@ -35,8 +35,8 @@ from recordings.schema.messages import (
 
 _STAMPS = {
     "simulated": "SIMULATED: made without a robot or a camera",
-    "playback": "PLAYBACK: the pictures were played back",
-    "imported": "IMPORTED: pictures and poses of unknown origin",
+    "playback": "PLAYBACK: the images were played back",
+    "imported": "IMPORTED: images and poses of unknown origin",
 }
 
 FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"

@@ -126,10 +126,10 @@ _SAID = 3.0
 _COSTLY = 0.2
 """Share of X's variance from which its source is named with its remedy."""
 _REMEDIES = {
-    "intrinsics": "calibrate the lens from more pictures",
+    "intrinsics": "calibrate the intrinsics from more images",
     "board": "measure the board and state its tolerance (square_tolerance, flatness_m)",
     "kinematics": "have the arm calibrated",
-    "corners": "take better or more pictures",
+    "corners": "take better or more images",
     "robot_translation": "take more poses",
     "robot_rotation": "take more poses",
 }

@@ -136,7 +136,7 @@ def _first_validity(calibration: Calibration, max_age_days: float | None) -> Val
     """Validity of what is being installed: proven by its own views, unless something speaks against it."""
     state, reason = ValidityState.VALID, ValidityReason("installed")
     if calibration.source == "imported":
-        text = "Pictures and poses are of unknown origin. Check it in the cell."
+        text = "Images and poses are of unknown origin. Check it in the cell."
         state, reason = ValidityState.UNVERIFIED, ValidityReason("imported", text)
     elif calibration.override is not None:
         text = f"Installed by override: {calibration.override.reason}"

@@ -246,7 +246,7 @@ _TEXTS = {
 _WHAT_MOVED = {
     (Reading.BOARD_MOVED, "eye-in-hand"): "The board was moved",
     (Reading.BOARD_MOVED, "eye-to-hand"): "The board moved on the flange, or the TCP was changed,",
-    (Reading.CAMERA_MOVED, "eye-in-hand"): "The camera moved on its mount, or the TCP was changed,",
+    (Reading.CAMERA_MOVED, "eye-in-hand"): "The camera moved on its mounting, or the TCP was changed,",
     (Reading.CAMERA_MOVED, "eye-to-hand"): "The camera or the robot's base was moved",
 }
 

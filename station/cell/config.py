@@ -164,7 +164,7 @@ class LimitsConfig(Section, frozen=True):
 
 
 class PointerConfig(Section, frozen=True):
-    """A rod or tool on the flange whose tip a person brings onto a corner (`station verify`); in `flange`."""
+    """A tool whose tip a person brings onto a corner (`station touch-test`); in `flange`."""
 
     tip_m: Vector3
     along: Vector3 = (0.0, 0.0, 1.0)

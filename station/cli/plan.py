@@ -317,7 +317,7 @@ def _goal_text(plan: Plan, goal_m: float) -> str:
     if number is not None:
         return f"enough for the {goal} after pose {number}, if corners and arm are as good as assumed"
     if sigmas[-1] >= _NOTHING_KNOWN_M:
-        return f"not enough for the {goal}: so few poses, or so much alike, say next to nothing of the mount"
+        return f"not enough for the {goal}: poses so few or so much alike tell next to nothing"
     more = int(np.ceil(len(sigmas) * (sigmas[-1] / goal_m) ** 2))
     return f"not enough for the {goal}: about {more} poses would be (--poses), or a better camera or arm"
 

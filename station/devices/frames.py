@@ -82,7 +82,7 @@ class FrameCounter:
         if frames is None:
             self.unexpected += 1
             raise CameraError(
-                f"the camera numbers frames anew: {frame_id} came after {last_id}",
+                f"the camera restarted its frame numbers: {frame_id} came after {last_id}",
                 code="frame-ids-restarted",
                 remedy=RETAKE,
             )

@@ -133,7 +133,7 @@ class UrLink:
             raise RobotError(
                 f"another robot (serial {found.serial}) answers at {host} now",
                 code="robot-exchanged",
-                remedy="Finish this session, then start the station's daemon anew.",
+                remedy="Finish this session, then restart the daemon.",
             )
         self.remote, self.program = found.remote, found.program
 

@@ -33,7 +33,7 @@ PAYLOAD_TOLERANCE_KG = 0.005
 CENTRE_TOLERANCE_M = 0.001
 _MODEL_REMEDY = "Check robot.model and robot.kinematics in the configuration."
 _CHANGED = "the TCP offset on the pendant was changed during the session"
-_CHANGED_REMEDY = "Set it back, or finish this session and start the station's daemon anew."
+_CHANGED_REMEDY = "Set it back, or finish this session and restart the daemon."
 
 
 class TcpCheck:

@@ -162,7 +162,7 @@ class WebcamCamera:
             video.set(cv2.CAP_PROP_EXPOSURE, config.exposure_us / _EXPOSURE_UNIT_US)
         if video.get(cv2.CAP_PROP_AUTOFOCUS) > 0:
             raise CameraError(
-                "the webcam's autofocus cannot be switched off: each picture would have another lens",
+                "the webcam's autofocus cannot be switched off: each image would have other intrinsics",
                 code="autofocus",
                 remedy="Switch it off with the maker's program, or use another camera.",
             )
@@ -235,7 +235,7 @@ class WebcamCamera:
         good, pixels = video.retrieve()
         if not good:
             raise CameraError(
-                "a picture of the webcam cannot be decoded", code="frame-incomplete", remedy=RETAKE
+                "an image of the webcam cannot be decoded", code="frame-incomplete", remedy=RETAKE
             )
         self._seen += 1
         if grey := self._config.pixel_format.startswith("Mono"):

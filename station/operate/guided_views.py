@@ -90,8 +90,8 @@ class Missing:
 
 
 _WANTED = (
-    "Show the whole board in the middle of the picture",
-    "Tilt by 20° or more to one side, the whole board in the picture",
+    "Show the whole board in the middle of the image",
+    "Tilt by 20° or more to one side, the whole board in the image",
     "Tilt by 20° or more to another side than before, a hand's width nearer",
     "Tilt by 20° or more the opposite way, a hand's width further away",
     "Tilt once more, to a side not seen yet",

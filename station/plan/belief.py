@@ -67,7 +67,7 @@ def believe(config: StationConfig, glimpses: Sequence[BootstrapView]) -> CameraP
     """The mount that guess and images make most likely. ConfigError without `camera_guess`."""
     if (known := config.camera_guess) is None:
         raise ConfigError(
-            "bootstrap needs camera_guess: a rough mount, good to about 30° and 100 mm",
+            "bootstrap needs camera_guess: a rough camera pose, good to about 30° and 100 mm",
             code="no-guess",
             remedy="Add it to the configuration.",
             missing="camera_guess",

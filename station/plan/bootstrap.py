@@ -107,7 +107,7 @@ def _free_in_all(cells: list[CellGeometry], here: Array, joints: Array) -> bool:
 def _not_here(belief: CameraPoseEstimate, possible: int) -> LimitError:
     """The guess does not go with the arm's posture."""
     return LimitError(
-        f"Of {_DRAWS} camera mounts within the guess ({1000 * belief.sigma_m:.0f} mm, "
+        f"Of {_DRAWS} camera poses about the initial one ({1000 * belief.sigma_m:.0f} mm, "
         f"{belief.sigma_deg:.0f}°) "
         f"only {possible} fit with where the arm stands (limit {_FEWEST}): with the others camera or board "
         "would "
@@ -137,7 +137,7 @@ def _in_the_way(cells: Sequence[CellGeometry], here: Array, targets: Sequence[Ar
 
 def _no_move(belief: CameraPoseEstimate, in_view: int, in_the_way: str) -> LimitError:
     """`in_view` targets keep the board in the image, none of them is free to reach."""
-    mount = f"camera mount within the guess ({1000 * belief.sigma_m:.0f} mm, {belief.sigma_deg:.0f}°)"
+    mount = f"camera pose about the initial one ({1000 * belief.sigma_m:.0f} mm, {belief.sigma_deg:.0f}°)"
     if in_view == 0:
         return LimitError(
             f"No small move keeps the board in the image, and the camera no nearer, for every {mount}",
@@ -295,4 +295,6 @@ def _described(
         config.mount, camera, config.board, belief.X, place, geometry_of(config, belief.X, place, 0.0)
     )
     made = planned_pose(scene, moves, joints, forward(arm_model(config.robot), joints), None)
-    return msgspec.structs.replace(made, name=f"bootstrap {moves + 1}", why=f"find the mount: {made.why}")
+    return msgspec.structs.replace(
+        made, name=f"bootstrap {moves + 1}", why=f"find the camera pose: {made.why}"
+    )

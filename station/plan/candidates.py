@@ -19,7 +19,7 @@ from station.cell.scene import Scene
 from station.plan.order import move_times
 from station.plan.visibility import ViewRange, seen_for_certain, sees_past_the_arm
 
-NOT_IN_PICTURE = "the board is not wholly in the picture"
+NOT_IN_PICTURE = "the whole board is not in the image"
 OUT_OF_REACH = "the arm's reach"
 ARM_IN_SIGHT = "the arm itself, between camera and board"
 _PATH_RESERVE_M = 0.01

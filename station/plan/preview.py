@@ -107,13 +107,13 @@ def printed_outline(scene: Scene, base_from_board: Array) -> Array:
 def _draw_coverage(axes: Axes, scene: Scene, plan: Plan) -> None:
     for view in expected_pixels(scene, plan):
         axes.plot(view[:, 0], view[:, 1], ".", ms=1.5)
-    axes.set(xlim=(0, scene.camera.width), ylim=(scene.camera.height, 0), title="board points in the picture")
+    axes.set(xlim=(0, scene.camera.width), ylim=(scene.camera.height, 0), title="board points in the image")
     axes.set_aspect("equal")
 
 
 def _draw_error(axes: Axes, plan: Plan) -> None:
     sigmas = [1000 * pose.predicted_sigma_m for pose in plan.poses if pose.predicted_sigma_m is not None]
-    axes.set(xlabel="poses taken", title="expected error of the camera's place, mm (1σ)")
+    axes.set(xlabel="poses taken", title="expected error of the camera's position, mm (1σ)")
     if sigmas:
         axes.semilogy(range(1, len(sigmas) + 1), sigmas, "o-", ms=3)
         # The first two views say nothing about X; their bars would hide the rest.

@@ -163,7 +163,7 @@ def changes(found: Improvement) -> tuple[str, ...]:
     cut = (f"poses that would cut the board: {before.cut} → {after.cut}",) if before.cut or after.cut else ()
     known = f"{1000 * found.sigma_m:.1f} mm and {math.degrees(found.sigma_rad):.2f}°"
     return (
-        f"planned anew: {len(found.plan.poses)} poses, from a mount known to {known}",
+        f"replanned: {len(found.plan.poses)} poses, from a camera pose known to {known}",
         f"expected error at the end: {1000 * before.sigma_m:.2f} → {1000 * after.sigma_m:.2f} mm",
         f"empty strip along the image's edges: {before.margin_px:.0f} → {after.margin_px:.0f} px",
         *cut,
@@ -252,6 +252,6 @@ async def look_back(context: SessionContext) -> None:
             seen_before, recording.whole, context.cell.config.board, timeout_s=_LOOK_BACK_S
         )
     except (RecordingError, WorkerError) as error:
-        context.store.problem(error, said="the estimate begins anew, without the images so far: {}")
+        context.store.problem(error, said="the estimate restarts, without the images so far: {}")
         return
     context.seen.update({view.index: view for view in found})

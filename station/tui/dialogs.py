@@ -114,7 +114,7 @@ class ConfirmMotion(Confirm):
         line += limit_bar(left_s, APPROVAL_LIFETIME_S, 24, "$warn", 1.0)
         self.query_one("#motion-holds", Static).update(line)
         if not left_s:
-            self.notify("The question was too old: nothing moved. F5 asks anew.", severity="warning")
+            self.notify("The question was too old: nothing moved. F5 asks again.", severity="warning")
             self.dismiss(False)
 
 

@@ -411,7 +411,7 @@ class LiveScreen(StationScreen):
                     yield Panel("", progress_lines, id="poses")
                 yield Panel("Expected error of the camera's position (1σ)", error_lines, id="error")
                 yield Panel(
-                    "Where in the picture the board was seen",
+                    "Where in the image the board was seen",
                     self._coverage,
                     id="coverage",
                     below="images per part",

@@ -157,7 +157,7 @@ class BoardPage(Page):
         if seen is None:
             return [f"{describe_board(draft.board)}: looking …"]
         if not seen[1].found:
-            return [_marked("failed", self.setup.trouble or "not in the picture")]
+            return [_marked("failed", self.setup.trouble or "not in the image")]
         shown = f"{len(seen[1].pixels)} corners; O is the origin, x and y the axes"
         return [
             _marked("done", shown),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from enum import StrEnum
 from itertools import groupby
 from pathlib import Path
@@ -19,7 +18,7 @@ from calibrate.cli.output import AsJson, OutputError, check_target, err, out, pr
 from calibrate.files import exports
 from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, Lens, read_calibration, write_output
-from calibrate.files.exports import FORMATS, FrameNames
+from calibrate.files.exports import FORMATS, FrameNames, follow_command
 from calibrate.files.formatting import override_text, pose_difference, pose_text, summary, verdict_text
 from calibrate.files.lines import read_lines
 from calibrate.files.loader import cameras, current_validity, readable_folder
@@ -140,7 +139,7 @@ def export(
     """
     calibration, validity = named_or_installed(file, root, camera)
     names = FrameNames.of_camera(camera if file is None else calibration.camera_name)
-    follow = () if file is not None else _follow_command(root, camera)
+    follow = () if file is not None else follow_command(root, camera)
     frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity, follow)
     content = exports.export(calibration, str(to.value), frames)
     if validity is not None and validity.state is not ValidityState.VALID:
@@ -152,12 +151,6 @@ def export(
         return
     check_target(output, "export")
     write_output(output, content)
-
-
-def _follow_command(root: Path | None, camera: str) -> tuple[str, ...]:
-    """The command that tells another program of every change here, wherever that is started."""
-    place = ("--root", str(state_root(root).resolve()), "--camera", camera)
-    return (sys.executable, "-m", "calibrate.cli", "follow", *place)
 
 
 def install(

@@ -14,7 +14,7 @@ from textual.reactive import reactive
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration
-from calibrate.files.exports import FORMATS, FrameNames, export
+from calibrate.files.exports import FORMATS, FrameNames, export, follow_command
 from calibrate.files.install import Cell, install, rollback
 from calibrate.files.versions import InstalledVersion, before_current, installed_versions, same_solve
 from recordings.files import ASKED_FOR, write_atomically
@@ -220,7 +220,8 @@ class ResultsDesk(Desk):
             names = FrameNames.of_camera(calibration.camera_name)
             installed = read_installed(root, calibration.camera_name)
             if same_solve(calibration, installed.now):
-                names = replace(names, validity=installed.validity)
+                follow = follow_command(root, calibration.camera_name)
+                names = replace(names, validity=installed.validity, follow=follow)
             write_atomically(output, export(calibration, chosen, names), ASKED_FOR)
             return output
 

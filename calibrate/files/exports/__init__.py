@@ -9,6 +9,7 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.exports import models, ros, vision
 from calibrate.files.exports.frames import ExportError as ExportError
 from calibrate.files.exports.frames import FrameNames as FrameNames
+from calibrate.files.exports.frames import follow_command as follow_command
 
 
 class Format(NamedTuple):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, source_stamp
 from calibrate.files.validity import Validity, validity_text
 from calibrate.geometry import Array, pose
-from recordings.files import MAIN_CAMERA
+from recordings.files import MAIN_CAMERA, state_root
 
 BODY_FROM_OPTICAL: Array = pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """REP-103: a body frame looks along x with z up, an optical frame along z with y down."""
@@ -58,6 +60,12 @@ class FrameNames:
         """The camera's name as ROS and xacro allow it: letters, digits and underscores."""
         name = re.sub(r"\W", "_", self.body.removesuffix("_link"), flags=re.ASCII)
         return name if name[:1].isalpha() else f"camera{name}"
+
+
+def follow_command(root: Path | None, camera: str) -> tuple[str, ...]:
+    """The command that tells another program of every change here, wherever that is started."""
+    place = ("--root", str(state_root(root).resolve()), "--camera", camera)
+    return (sys.executable, "-m", "calibrate.cli", "follow", *place)
 
 
 def comment(calibration: Calibration, frames: FrameNames, with_table: bool = False) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import re
 import shlex
 import sys
 import types
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+import scipy.io
 import yaml
 from scipy.spatial.transform import Rotation
 
@@ -34,7 +37,7 @@ from calibrate.files.calibration import (
 from calibrate.files.exports import FORMATS, ExportError, FrameNames
 from calibrate.files.loader import InstalledCalibration
 from calibrate.files.proof import check_result, proven_plain
-from calibrate.files.validity import unrecorded
+from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_from_rotvec, rotation_exp
 from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
 from calibrate.kinematics import MODELS, base_from_flange, forward, with_near_axes
@@ -338,6 +341,54 @@ def test_camera_info_of_other_lenses(
     found = plain["distortion_coefficients"]
     assert (plain["distortion_model"], found["cols"]) == (named, count)
     assert found["data"] == [*lens.distortion, *[0.0] * (count - given)]
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "refused"),
+    [
+        ("plumb_bob", (-0.09, 0.07, 4e-4, -3e-4, 0.1), set()),
+        ("plumb_bob", (-0.3, 2.0, 0.0, 0.0, -40.0), {"kalibr"}),  # k3 bends too much for k1 and k2
+        ("rational_polynomial", (-0.09, 0.07, 4e-4, -3e-4, 0.1, 0.01, 0.0, 0.0), {"nerfstudio"}),
+        ("equidistant", (0.01, -0.02, 0.003, -0.001), set()),
+    ],
+)
+def test_a_lens_that_a_format_cannot_say_is_refused_there(
+    calibration: Calibration, model: str, given: tuple[float, ...], refused: set[str]
+) -> None:
+    lens = msgspec.structs.replace(calibration.intrinsics, distortion_model=model, distortion=given)
+    bent = msgspec.structs.replace(calibration, intrinsics=lens)
+    for name in ("kalibr", "nerfstudio", "matlab"):
+        if name in refused:
+            with pytest.raises(ExportError) as caught:
+                export(bent, name)
+            assert caught.value.code == "lens-model"
+        else:
+            export(bent, name)
+    if model == "equidistant":
+        read = yaml.safe_load(export(bent, "kalibr"))["cam0"]
+        assert (read["distortion_model"], read["distortion_coeffs"]) == ("equidistant", list(given))
+        told = json.loads(export(bent, "nerfstudio"))
+        assert [told[key] for key in ("camera_model", "k1", "k2", "k3", "k4")] == ["OPENCV_FISHEYE", *given]
+    held = scipy.io.loadmat(io.BytesIO(exports.export(bent, "matlab")))["calibration"].dtype.names
+    assert ("RadialDistortion" in held) == (model == "plumb_bob")
+
+
+def test_only_what_is_installed_can_be_followed(calibration: Calibration) -> None:
+    with pytest.raises(ExportError) as caught:
+        exports.export(calibration, "ros-launch-follow")
+    assert caught.value.code == "not-installed"
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_equal_calibrations_give_equal_bytes(calibration: Calibration, name: str) -> None:
+    assert exports.export(calibration, name, FOLLOWED) == exports.export(calibration, name, FOLLOWED)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_says_whether_the_installed_one_holds(calibration: Calibration, name: str) -> None:
+    doubted = Validity(3, ValidityState.WITHDRAWN, "2026-01-01T00:00:00+00:00", ValidityReason("withdrawn"))
+    names = replace(FOLLOWED, validity=doubted)
+    assert "withdrawn" in export(calibration, name, names)
 
 
 def test_camera_info_is_named_by_the_body_frame(calibration: Calibration) -> None:

@@ -1,0 +1,49 @@
+"""The figures in docs/contributor/solver.md, written out: whoever changes a constant changes the page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrate.handeye import arm, estimate, fit, linear, priors, readings
+from calibrate.handeye.axxb import certificate, paper
+from calibrate.handeye.axxb.pairs import MAX_PAIRS
+from calibrate.quality import drift
+
+PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("figure", "value", "said"),
+    [
+        (paper.LAMBDA, 1.0, "λ = 1 rad²/m²"),
+        (paper.SETTINGS.factor, 0.5, "F = 0.5, CR = 0.9, M = 30, 100 generations"),
+        (paper.SETTINGS.crossover, 0.9, "CR = 0.9"),
+        (paper.SETTINGS.population, 30, "M = 30"),
+        (paper.SETTINGS.generations, 100, "100 generations"),
+        (paper.BOX, [np.pi / 2] * 3 + [1.0] * 3, "|γ| ≤ π/2,  |b| ≤ 1 m per component"),
+        (certificate.FLOOR, 1e-8, "max(f, 1e-8 tr S)"),
+        (certificate.TOLERANCE, 1e-6, "certified at ≤ 1e-6"),
+        (len(certificate._constraints()), 20, "With the 20 independent equations"),
+        (MAX_PAIRS, 20_000, "thinned above 20 000"),
+        (linear.STUDENT, 8.0, "corner weight = (8 + 2) / (8 + r²/σ²)"),
+        (linear.GAIN, [1, 3, 10], "g = 1, 3, 10"),
+        ([linear.GARBAGE_M, linear.GARBAGE_RAD], [0.3, 1.0], "garbage: 0.3 m, 1 rad"),
+        (linear.ROBOT_PRIOR_COUNT, 1.0, "ν = 3 Σ p_i1 − 6 + 1"),
+        (priors.BoardTolerance().square, 0.003, "`square_tolerance` (0.3 %)"),
+        (priors.BoardTolerance().flatness_m, 0.001, "`flatness_m` (1 mm)"),
+        (priors._KNOWN_SHARE, 0.002, "0.2 % of focal length and width"),
+        (priors.ASPECT_SIGMA, 0.001, "pixels square to 0.1 %"),
+        (estimate.MAX_STEPS, 15, "At most 15 linearisations"),
+        ([len(arm.PARAMETERS), len(arm.FLEX)], [18, 9], "18 errors of the Denavit-Hartenberg table and 9 of"),
+        ([fit._BEFOREHAND[0], fit._SIZES[-1]], [0.5, 1.5], "0 to 1.5 mm and mrad, s = 0 counting one half"),
+        (readings._CLEAR, 10.0, "10 + ln n more"),
+        (drift.FALSE_ALARM, 0.05, "F⁻¹(0.95; 6, ν)"),
+        ([drift.SHIFT_M, np.degrees(drift.TURN_RAD)], [0.5e-3, 0.1], "d = 0.5 mm or 0.1°"),
+    ],
+)
+def test_a_figure_is_the_one_on_the_page(figure: object, value: object, said: str) -> None:
+    assert figure == pytest.approx(value)
+    assert said in PAGE

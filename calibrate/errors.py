@@ -53,13 +53,6 @@ class PosesDisagreeError(BadViewsError):
         self.hypothesis = hypothesis
 
 
-class GateFailedError(CalibrationError):
-    """A quality gate failed."""
-
-    code = "gate-failed"
-    exit_code = 4
-
-
 class CalibrationFileError(CalibrationError):
     """A calibration file is missing, damaged, or of another format."""
 
@@ -70,3 +63,10 @@ class InstallError(CalibrationError):
     """Refused or failed: what was installed before still is, or the message says what is now."""
 
     code = "install"
+
+
+class GateFailedError(InstallError):
+    """A gate failed and nobody gave a reason to override it."""
+
+    code = "gate-failed"
+    exit_code = 4

@@ -22,19 +22,13 @@ from recordings.errors import CodedError
 _SMALL = (VALIDITY_FILE, CHECKS_FILE, LOG, "current")
 
 
-class StorageError(BatchError):
-    """What a URL names cannot be read or written."""
-
-    code = "storage"
-
-
 def is_url(place: str) -> bool:
     return "://" in place
 
 
 @contextmanager
 def _storage(url: str) -> Iterator[tuple[Any, str]]:
-    """(file system, path on it). Whatever its driver raises becomes a StorageError."""
+    """(file system, path on it). Whatever its driver raises becomes a BatchError."""
     import fsspec
 
     try:
@@ -45,24 +39,24 @@ def _storage(url: str) -> Iterator[tuple[Any, str]]:
         raise
     except ImportError as missing:
         scheme = url.partition("://")[0]
-        raise StorageError(
+        raise BatchError(
             f"{url}: {missing}.",
             code="package-missing",
             remedy="pip install 'calibration-station[s3]'" if scheme in ("s3", "s3a") else "",
         ) from None
     except Exception as problem:  # every driver has its own
         reason = f"{type(problem).__name__}: {problem}"
-        raise StorageError(f"{url} cannot be read or written ({reason}).") from None
+        raise BatchError(f"{url} cannot be read or written ({reason}).", code="storage") from None
 
 
 def expand(place: str) -> list[str]:
-    """What a URL with `*` matches, sorted; other places as they are. StorageError: nothing."""
+    """What a URL with `*` matches, sorted; other places as they are. BatchError: nothing."""
     if not is_url(place) or "*" not in place:
         return [place]
     with _storage(place) as (fs, path):
         found = sorted(fs.unstrip_protocol(name) for name in fs.glob(path))
     if not found:
-        raise StorageError(f"{place} matches nothing.", code="storage-empty")
+        raise BatchError(f"{place} matches nothing.", code="storage-empty")
     return found
 
 
@@ -126,12 +120,12 @@ class Results:
     place: str
 
     def prepare(self) -> None:
-        """Make the folder. Raises OSError, StorageError."""
+        """Make the folder. Raises OSError, BatchError."""
         if not is_url(self.place):
             Path(self.place).mkdir(parents=True, exist_ok=True)
 
     def write(self, name: str, content: bytes) -> None:
-        """Replace a file at once. Raises CalibrationFileError, StorageError."""
+        """Replace a file at once. Raises CalibrationFileError, BatchError."""
         if not is_url(self.place):
             write_output(Path(self.place, name), content)
             return

@@ -22,43 +22,56 @@ from calibrate.batch.trends import CellHistory, cells, trends_text
 from calibrate.batch.workers import Workers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.contracts import FleetCameraJson, FleetJson
-from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
+from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit, takes
 from calibrate.cli.output import AsJson, OutputError, err, out, print_json, progress_bar
 from calibrate.load import Progress as LoadProgress
 from calibrate.pipeline import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
 
 DONE_WITH_LOSS = 3
-Processes = Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core")]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        help="Work on this Dask cluster, tcp://HOST:PORT or tls://HOST:PORT, not in processes here. Its "
-        "workers see the files under the same paths. Whoever reaches a tcp:// scheduler can run code on it: "
-        "use tls:// outside a closed network"
-    ),
-]
-SchedulerFile = Annotated[
-    Path | None, typer.Option(help="The same, by the file of `dask scheduler --scheduler-file`")
-]
-TlsCa = Annotated[Path | None, typer.Option(help="The cluster's certificate authority, PEM")]
-TlsCert = Annotated[Path | None, typer.Option(help="Your certificate, PEM")]
-TlsKey = Annotated[Path | None, typer.Option(help="Your private key, PEM")]
 OutputFolder = Annotated[str, typer.Option("-o", "--output", help="Folder of the results, or a URL")]
 
 
+def chosen_workers(
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core")] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Work on this Dask cluster, tcp://HOST:PORT or tls://HOST:PORT, not in processes here. Its "
+            "workers see the files under the same paths. Whoever reaches a tcp:// scheduler can run code on "
+            "it: use tls:// outside a closed network"
+        ),
+    ] = None,
+    scheduler_file: Annotated[
+        Path | None, typer.Option(help="The same, by the file of `dask scheduler --scheduler-file`")
+    ] = None,
+    tls_ca: Annotated[Path | None, typer.Option(help="The cluster's certificate authority, PEM")] = None,
+    tls_cert: Annotated[Path | None, typer.Option(help="Your certificate, PEM")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="Your private key, PEM")] = None,
+) -> Workers:
+    """Processes here, or a cluster."""
+    tls = (tls_ca, tls_cert, tls_key)
+    if scheduler is None and scheduler_file is None:
+        if any(tls):
+            raise OutputError("--tls-ca, --tls-cert and --tls-key need --scheduler.", code="options")
+        return pool(workers)
+    if workers is not None:
+        raise OutputError("--workers counts processes here, not on a cluster.", code="options")
+    if scheduler_file is None:
+        return cluster_workers(Cluster(scheduler or "", *tls))
+    if scheduler is not None:
+        raise OutputError("Give --scheduler or --scheduler-file, not both.", code="options")
+    return cluster_workers(Cluster.from_file(scheduler_file, *tls))
+
+
+@takes(chosen_workers, "workers")
 def batch(
     recordings: Annotated[list[str], typer.Argument(help="Recordings or session folders; URLs may have *")],
+    workers: Workers,
     output: OutputFolder = "batch",
-    workers: Processes = None,
     profile: Profile = ProfileName.robust,
     seed: Seed = 0,
     gates: GatesFile = None,
-    scheduler: Scheduler = None,
-    scheduler_file: SchedulerFile = None,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
     as_json: AsJson = False,
@@ -74,12 +87,11 @@ def batch(
     store = _results(output)
     gate_limits = GateLimits() if gates is None else read_limits(gates)
     options = JobOptions(profile=profile.value, seed=seed, limits=gate_limits)
-    chosen = _workers(workers, scheduler, scheduler_file, tls_ca, tls_cert, tls_key)
     limits = Limits(time_limit_s, memory_limit_mib)
     places = [place for word in recordings for place in expand(word)]
     with _stoppable("solving") as bar:
         told = None if bar is None else lambda done, total, result: bar(done, total, result.session)
-        results = run_batch(places, output, options, chosen, told, limits)
+        results = run_batch(places, output, options, workers, told, limits)
     found = cells(results)
     store.write("trends.txt", trends_text(found).encode())
     store.write("trends.html", trends_page(results, found).encode())
@@ -92,15 +104,11 @@ def batch(
         raise typer.Exit(DONE_WITH_LOSS)
 
 
+@takes(chosen_workers, "workers")
 def fleet(
     roots: Annotated[list[str], typer.Argument(help="State folders of the cells; URLs may have *")],
+    workers: Workers,
     output: OutputFolder = "fleet",
-    workers: Processes = None,
-    scheduler: Scheduler = None,
-    scheduler_file: SchedulerFile = None,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     as_json: AsJson = False,
 ) -> None:
     """Collect validity and drift of many cells into one table and one page.
@@ -112,10 +120,9 @@ def fleet(
     from calibrate.batch.page import fleet_page  # matplotlib is slow to load
 
     store, now = _results(output), datetime.now(UTC)
-    chosen = _workers(workers, scheduler, scheduler_file, tls_ca, tls_cert, tls_key)
     places = [place for word in roots for place in expand(word)]
     with _stoppable("reading") as bar:
-        records = collect_fleet(places, now, chosen, bar)
+        records = collect_fleet(places, now, workers, bar)
     store.prepare()
     store.write("fleet.sqlite", fleet_table(records))
     store.write("fleet.html", fleet_page(records, now).encode())
@@ -164,24 +171,3 @@ def _stoppable(label: str) -> Iterator[LoadProgress | None]:
             yield bar
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _workers(
-    count: int | None,
-    scheduler: str | None,
-    scheduler_file: Path | None,
-    ca: Path | None,
-    cert: Path | None,
-    key: Path | None,
-) -> Workers:
-    if scheduler is None and scheduler_file is None:
-        if ca or cert or key:
-            raise OutputError("--tls-ca, --tls-cert and --tls-key need --scheduler.", code="options")
-        return pool(count)
-    if count is not None:
-        raise OutputError("--workers counts processes here, not on a cluster.", code="options")
-    if scheduler_file is None:
-        return cluster_workers(Cluster(scheduler or "", ca, cert, key))
-    if scheduler is not None:
-        raise OutputError("Give --scheduler or --scheduler-file, not both.", code="options")
-    return cluster_workers(Cluster.from_file(scheduler_file, ca, cert, key))

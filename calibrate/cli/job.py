@@ -68,20 +68,22 @@ TimeLimit = Annotated[float, typer.Option(min=0.0, max=1e6, help="Time limit, s 
 MemoryLimit = Annotated[int, typer.Option(min=0, max=2**30, help="Memory limit, MiB (0: none)")]
 
 
-def takes(build: Callable[..., JobOptions]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The command offers `build`'s options instead of its parameter `options`, and gets what they make."""
+def takes(
+    build: Callable[..., object], parameter: str = "options"
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The command offers `build`'s options instead of its `parameter`, and gets what they make."""
     offered = inspect.signature(build, eval_str=True).parameters
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         own = inspect.signature(command, eval_str=True)
-        rest = [p for name, p in own.parameters.items() if name != "options"]
+        rest = [p for name, p in own.parameters.items() if name != parameter]
         needed = [p for p in rest if p.default is p.empty]
         optional = [p for p in rest if p.default is not p.empty]
 
         @wraps(command)
         def run(**given: Any) -> Any:
             chosen = {name: given.pop(name) for name in offered if name in given}
-            return command(options=build(**chosen), **given)
+            return command(**given, **{parameter: build(**chosen)})
 
         run.__signature__ = own.replace(  # type: ignore[attr-defined]
             parameters=[*needed, *offered.values(), *optional]

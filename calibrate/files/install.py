@@ -65,12 +65,6 @@ REASON_LETTERS = 5
 """Different ones; fewer are a pressed key, not words, in any script."""
 
 
-class InstallGateError(GateFailedError, InstallError):
-    """A gate failed and nobody gave a reason to override it."""
-
-    code = "gate-failed"
-
-
 def installed_calibration(root: Path | None = None, camera: str = MAIN_CAMERA) -> Calibration:
     """Everything in the installed calibration file, whatever its source and validity.
 
@@ -114,7 +108,7 @@ def install(
         failed = [f"{gate.name}: {gate.text}" for gate in _failed_gates(calibration, before)]
         overridden = [*objections, *failed]
         if overridden and not override.strip():
-            kind = InstallError if objections else InstallGateError
+            kind = InstallError if objections else GateFailedError
             raise kind(
                 f"{path} is not installed. {' '.join(overridden)}",
                 code="objection" if objections else "",

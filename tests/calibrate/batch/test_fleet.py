@@ -18,8 +18,8 @@ import pytest
 from calibrate.batch.fleet import CameraRecord, collect_fleet, fleet_table
 from calibrate.batch.page import fleet_page
 from calibrate.batch.run import run_batch
-from calibrate.batch.storage import StorageError, expand, local_copy
-from calibrate.batch.workers import pool
+from calibrate.batch.storage import expand, local_copy
+from calibrate.batch.workers import BatchError, pool
 from calibrate.files.calibration import read_calibration
 from calibrate.files.install import install, note_check, rollback
 from calibrate.files.validity import ValidityReason
@@ -163,9 +163,9 @@ def upload_file(path: Path, url: str, more: bytes = b"") -> None:
 
 
 def test_what_no_driver_can_reach_is_said(tmp_path: Path) -> None:
-    with raises_code(StorageError, "storage-empty"):
+    with raises_code(BatchError, "storage-empty"):
         expand("memory://nobody/*")
-    with raises_code(StorageError, "storage"):
+    with raises_code(BatchError, "storage"):
         run_batch(["nosuch://bucket/a.mcap"], tmp_path, workers=in_this_process)
     (record,) = collect_fleet(["nosuch://bucket"], NOW, in_this_process)
     assert (record.state, record.reason) == ("unreadable", "storage")
@@ -173,7 +173,7 @@ def test_what_no_driver_can_reach_is_said(tmp_path: Path) -> None:
 
 def test_a_missing_driver_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "s3fs", None)
-    with raises_code(StorageError, "package-missing"):
+    with raises_code(BatchError, "package-missing"):
         expand("s3://robots/*")
 
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
-from calibrate.errors import CalibrationFileError, InstallError
+from calibrate.errors import CalibrationFileError, GateFailedError, InstallError
 from calibrate.files.calibration import Touch, read_calibration
 from calibrate.files.gate import Gate
-from calibrate.files.install import InstallGateError, install, install_line, installed_calibration, rollback
+from calibrate.files.install import install, install_line, installed_calibration, rollback
 from calibrate.files.loader import load_installed
 from calibrate.files.versions import installed_versions, read_log
 from calibrate.pipeline import SolvedRecording
@@ -88,10 +88,10 @@ def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type:
 ) -> None:
     bad = Gate("holdout_share", False, 0.1, 0.005, "predicted to 100 mm")
     path = make_file(quality=msgspec.structs.replace(solved_real.calibration.quality, gates=[bad]))
-    with raises_code(InstallGateError, "gate-failed", gates=1) as refused:
+    with raises_code(GateFailedError, "gate-failed", gates=1) as refused:
         install(path, tmp_path / "s")
     assert refused.value.exit_code == 4
-    with pytest.raises(InstallGateError):
+    with pytest.raises(GateFailedError):
         install(path, tmp_path / "s", override="   ")
     install(path, tmp_path / "s", override="line is down, checked with a pointer")
     override = installed_calibration(tmp_path / "s").override
@@ -288,7 +288,7 @@ def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(  # typ
     install(make_file(quality=worse), root)  # nothing to compare with
     install(make_file(), root)
     install(make_file(quality=hardly), root)
-    with raises_code(InstallGateError, "gate-failed", gates=1, objections=0):
+    with raises_code(GateFailedError, "gate-failed", gates=1, objections=0):
         install(make_file(quality=worse), root)
     assert len(installed_versions(root)) == 3
     made = install(make_file(quality=worse), root, override="the old lens is broken")
@@ -304,5 +304,5 @@ def test_without_a_predicted_error_the_sigmas_are_compared(make_file, tmp_path: 
     sigma = installed_calibration(root).sigma
     quality = msgspec.structs.replace(installed_calibration(root).quality, predicted_error_mm=None)
     vague = msgspec.structs.replace(sigma, translation_mm=3 * sigma.translation_mm)
-    with raises_code(InstallGateError, "gate-failed", gates=1, objections=0):
+    with raises_code(GateFailedError, "gate-failed", gates=1, objections=0):
         install(make_file(quality=quality, sigma=vague), root)

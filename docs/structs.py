@@ -17,6 +17,7 @@ import msgspec
 from msgspec import inspect as kinds
 
 TYPES: dict[str, tuple[str, Any]] = runpy.run_path(str(Path(__file__).with_name("schemas.py")))["TYPES"]
+Keyed = kinds.StructType | kinds.DataclassType | kinds.TypedDictType
 PAGES = {"configuration": ("Configuration", ["station-config"]), "json": ("JSON and files", list(TYPES)[1:])}
 
 
@@ -43,7 +44,7 @@ def _structs(
     kind: kinds.Type, seen: tuple[type, ...] = ()
 ) -> Iterator[kinds.StructType | kinds.DataclassType]:
     """Each struct in it, the outer one first."""
-    if isinstance(kind, kinds.StructType | kinds.DataclassType) and kind.cls not in seen:
+    if isinstance(kind, Keyed) and kind.cls not in seen:
         yield kind
         for field in kind.fields:
             yield from _structs(field.type, (*seen, kind.cls))
@@ -53,7 +54,7 @@ def _structs(
             yield from _structs(part, seen)
 
 
-def _table(struct: kinds.StructType | kinds.DataclassType) -> list[str]:
+def _table(struct: Keyed) -> list[str]:
     said = _said(struct.cls)
     lines = ["", f"### {struct.cls.__name__}", ""]
     own = inspect.getdoc(struct.cls) if struct.cls.__doc__ else ""
@@ -75,7 +76,7 @@ def _default(field: kinds.Field) -> str:
 
 def _named(kind: kinds.Type) -> str:
     match kind:
-        case kinds.StructType() | kinds.DataclassType():
+        case kinds.StructType() | kinds.DataclassType() | kinds.TypedDictType():
             return f"[{kind.cls.__name__}](#{kind.cls.__name__.lower()})"
         case kinds.UnionType():
             return " or ".join(_named(part) for part in kind.types)

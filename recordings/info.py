@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TypedDict
 
 from recordings.mcap.contents import MessageIndex
 from recordings.reader import Recording
 from recordings.schema.frame_ids import frames_between, guess_ids
-from recordings.schema.messages import SINGLE_TAGS, BoardSpec
+from recordings.schema.messages import SINGLE_TAGS, BoardSpec, Mount, Source
 from recordings.schema.topics import Topic
 from recordings.streams import Arrivals, Steps, stamps_tables
 
@@ -18,7 +18,78 @@ _SETTINGS_LIMIT = 1000
 """Different exposures or gains that are listed."""
 
 
-def recording_info(recording: Recording) -> dict[str, Any]:
+class CameraInfoJson(TypedDict):
+    identity: str
+    serial: str
+    width: int
+    height: int
+    intrinsics: bool
+
+
+class RobotInfoJson(TypedDict):
+    model: str
+    serial: str
+
+
+class ViewsInfoJson(TypedDict):
+    poses: int
+    attempts: int
+    names: list[str]
+
+
+class TopicInfoJson(TypedDict):
+    topic: str
+    messages: int
+    bytes: int
+    span_s: float
+    rate_hz: float | None
+    foreign: bool
+
+
+class RobotStatesInfoJson(TypedDict):
+    count: int
+    rate_hz: float | None
+    gaps: int
+    largest_gap_s: float
+    backward: int
+
+
+class PicturesInfoJson(TypedDict):
+    count: int
+    frame_id_jumps: int
+    exposure_us: list[float]
+    gain_db: list[float]
+    pixel_formats: list[str]
+    time_bounds_s: dict[str, float]
+
+
+class RecordingInfoJson(TypedDict):
+    """`recordings info --json`"""
+
+    path: str
+    name: str
+    source: Source
+    mount: Mount
+    parts: int
+    missing: list[str]
+    losses: list[str]
+    size_bytes: int
+    sha256: str
+    created_wall_ns: int
+    board: str
+    camera: CameraInfoJson
+    robot: RobotInfoJson
+    views: ViewsInfoJson
+    topics: list[TopicInfoJson]
+    robot_states: RobotStatesInfoJson | None
+    pictures: PicturesInfoJson | None
+    clocks: dict[str, dict[str, float | None] | None]
+    attachments: dict[str, int]
+    software: dict[str, str]
+    note: str
+
+
+def recording_info(recording: Recording) -> RecordingInfoJson:
     """Everything `recordings info` says, one JSON-ready object. Times in seconds, sizes in bytes."""
     info = recording.info
     arrivals = {segment: Arrivals() for segment in recording.segments}
@@ -71,7 +142,7 @@ def _board_text(board: BoardSpec) -> str:
     return f"{board.kind} {board.columns}×{board.rows}, {board.square_m * 1e3:g} mm"
 
 
-def _topics(recording: Recording) -> list[dict[str, Any]]:
+def _topics(recording: Recording) -> list[TopicInfoJson]:
     """Known topics first; `foreign` ones are of other programs, and ignored."""
     known = {topic.value: [segment.messages(topic) for segment in recording.segments] for topic in Topic}
     foreign: dict[str, list[MessageIndex]] = {}
@@ -84,7 +155,7 @@ def _topics(recording: Recording) -> list[dict[str, Any]]:
     ]
 
 
-def _topic(name: str, indexes: list[MessageIndex], foreign: bool) -> dict[str, Any]:
+def _topic(name: str, indexes: list[MessageIndex], foreign: bool) -> TopicInfoJson:
     filled = [index for index in indexes if len(index)]
     span_s = sum((index.end_ns - index.start_ns) / 1e9 for index in filled)
     return {
@@ -97,7 +168,7 @@ def _topic(name: str, indexes: list[MessageIndex], foreign: bool) -> dict[str, A
     }
 
 
-def _robot_stream(steps: Steps) -> dict[str, Any] | None:
+def _robot_stream(steps: Steps) -> RobotStatesInfoJson | None:
     """Rate and gaps by the controller's own clock, so that the network's delay does not count.
 
     The time between two parts is no gap.
@@ -115,7 +186,7 @@ def _robot_stream(steps: Steps) -> dict[str, Any] | None:
     }
 
 
-def _image_stream(recording: Recording) -> dict[str, Any] | None:
+def _image_stream(recording: Recording) -> PicturesInfoJson | None:
     count = jumps = 0
     exposures: set[float] = set()
     gains: set[float] = set()

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
@@ -15,6 +15,9 @@ from recordings.exporters import Target
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.recover import Recovery, recover_recording
+
+if TYPE_CHECKING:
+    from recordings.info import PicturesInfoJson, RecordingInfoJson
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's folder", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
@@ -89,7 +92,7 @@ def _print_written(path: Path, json_: bool) -> None:
     print(json.dumps({"output": str(path)}) if json_ else f"{path} written")
 
 
-def _print_info(facts: dict[str, Any]) -> None:
+def _print_info(facts: RecordingInfoJson) -> None:
     """Prints what `recording_info` found as two small tables."""
     from rich.table import Column, Table
     from rich.text import Text
@@ -109,7 +112,7 @@ def _print_info(facts: dict[str, Any]) -> None:
     console.print(topics)
 
 
-def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def _info_rows(facts: RecordingInfoJson) -> Iterator[tuple[str, str]]:
     created = datetime.fromtimestamp(facts["created_wall_ns"] / 1e9, UTC)
     camera, robot, views = facts["camera"], facts["robot"], facts["views"]
     whole = "INCOMPLETE, what is here is finished" if facts["missing"] else "finished"
@@ -153,7 +156,7 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "note", facts["note"]
 
 
-def _images_text(images: dict[str, Any]) -> str:
+def _images_text(images: PicturesInfoJson) -> str:
     settings = [f"{value:g} µs" for value in images["exposure_us"]]
     settings += [f"{value:g} dB" for value in images["gain_db"]]
     jumps = images["frame_id_jumps"]

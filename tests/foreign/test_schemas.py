@@ -79,6 +79,7 @@ def test_what_the_commands_of_recordings_and_plans_print(findings: Findings, tmp
         assert done.returncode in (0, 3), done.stderr
         return json.loads(done.stdout)
 
+    assert findings("info", printed("recordings", "info", SAMPLE)) == []
     sample = tmp_path / "sample.mcap"
     sample.write_bytes(SAMPLE.read_bytes()[:-2000])
     recovered = printed("recordings", "recover", sample)

@@ -44,7 +44,7 @@ from station.tui.results import ResultsDesk
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.task import DIGITS
-from station.tui.themes import THEMES, TOKENS, NoColour, chosen_theme
+from station.tui.themes import TOKENS, dress
 from station.tui.widgets.graphics import detect
 from station.tui.widgets.preview import PreviewPane
 
@@ -169,11 +169,7 @@ class StationApp(ResultsDesk):
         super().__init__()
         self._connect = connect
         self._greeted = False
-        for theme in THEMES:
-            self.register_theme(theme)
-        self.theme = chosen_theme(self.no_color)
-        if self.no_color:
-            self._filters.append(NoColour())
+        dress(self)
 
     def get_theme_variable_defaults(self) -> dict[str, str]:
         """For the themes that Textual brings."""

@@ -37,7 +37,7 @@ from station.protocol.verbs import PreviewImage
 from station.tui.frame import BREAKPOINTS, StopBlock, next_line, rail_line
 from station.tui.new_cell_steps import DRAWINGS, Page, SavePage, pages
 from station.tui.task import Step as RailStep
-from station.tui.themes import THEMES, TOKENS, NoColour, chosen_theme
+from station.tui.themes import TOKENS, dress
 from station.tui.widgets.graphics import Graphics
 from station.tui.widgets.preview import PreviewPane
 
@@ -112,11 +112,7 @@ class NewCell(App[Ending]):
         self.setup = CellSetup(hardware, root, output)
         self._pages = pages(self.setup)
         self._pictures = 0
-        for theme in THEMES:
-            self.register_theme(theme)
-        self.theme = chosen_theme(self.no_color)
-        if self.no_color:
-            self._filters.append(NoColour())
+        dress(self)
 
     def get_theme_variable_defaults(self) -> dict[str, str]:
         """For the themes that Textual brings."""

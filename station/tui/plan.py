@@ -23,7 +23,7 @@ from station.tui.live import Panel
 from station.tui.screen import Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.scene import LEGEND, cell_scene, draw, view_of
-from station.tui.words import UNKNOWN, Mark, degrees, facts, limit_bar, many, mark, mm, rich_text
+from station.tui.words import MARKS, UNKNOWN, Mark, degrees, facts, limit_bar, many, mark, mm, rich_text
 
 COLUMNS = ("#", "error then", "", "distance", "tilt", "why it is there", "state")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
@@ -33,9 +33,9 @@ POSE_VERBS = {"retake": Retake, "skip": Skip, "drop": Drop}
 MOVE = Binding.Group("order", compact=True)
 SIGMA_SHOWN_MM = 100.0
 """The first poses alone determine nothing: a number in metres would only puzzle."""
-BAR_CELLS = 12
+BAR_CELLS = 7
 TURN_DEG, ZOOM = 15.0, 1.25
-_SEEN = re.compile(r"^\d+ mm, tilt \d+°, ")
+_SEEN = re.compile(r"^\d+ mm, tilt \d+°, |board (?!centred)")
 """What the columns beside it say of the planned pose."""
 _STATES: dict[str, tuple[Mark, str]] = {
     "planned": ("todo", "planned"),
@@ -52,9 +52,10 @@ def row_of(pose: PoseStatus, goal_mm: float, scene: Scene | None) -> tuple[Conte
     view = None if scene is None else view_of(scene, pose)
     kind, word = _STATES.get(pose.state, ("now", pose.state))
     state = f"{word}: {pose.reason}" if pose.state == "failed" and pose.reason else word
+    kind = "look" if pose.kept else kind
     good = sigma_mm is not None and sigma_mm <= goal_mm
     return (
-        Content.styled(f"{pose.index + 1:>3}", "$foreground"),
+        Content.styled(f"{pose.index + 1:>3} ", "$foreground") + mark(kind),
         facts(("", f"{sigma_mm:7.2f}" if shown else f"{UNKNOWN:>7}", "mm")),
         limit_bar(
             _log(sigma_mm, goal_mm) if sigma_mm else 9.0, 1.0, BAR_CELLS, "$ok" if good else "$warn", 0.5
@@ -62,7 +63,7 @@ def row_of(pose: PoseStatus, goal_mm: float, scene: Scene | None) -> tuple[Conte
         Content.styled(mm(view[0], 0) if view else UNKNOWN, "$foreground"),
         Content.styled(f"{degrees(view[1], 0):>4}" if view else UNKNOWN, "$foreground"),
         Content.styled(_SEEN.sub("", pose.why) if view else pose.why or pose.name, "$foreground"),
-        mark("look" if pose.kept else kind, "to be captured again" if pose.kept else state),
+        Content.styled("to be captured again" if pose.kept else state, MARKS[kind][1]),
     )
 
 

@@ -27,7 +27,7 @@ from station.tui.live import Panel
 from station.tui.screen import Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
-from station.tui.words import UNKNOWN, Mark, facts, limit_bar, many, mark, rich_text, signed
+from station.tui.words import UNKNOWN, Mark, facts, limit_bar, many, mark, rich_text, shortened, signed
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter shows older ones."
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
@@ -100,8 +100,7 @@ def gate_row(gate: Gate) -> tuple[Content, ...]:
     kind: Mark = "failed" if not gate.passed else "look" if gate.narrow else "done"
     colour = {"failed": "$bad", "look": "$warn", "done": "$ok"}[kind]
     style = "bold $strong" if kind != "done" else "$foreground"
-    short = gate.title.partition(" (")[0]
-    short = short if len(short) <= NAME_CELLS else f"{short[: NAME_CELLS - 1]}…"
+    short = shortened(gate.title.partition(" (")[0], NAME_CELLS)
     name = mark(kind) + Content(" ") + Content.styled(short, style)
     word = Content.styled({"failed": "FAIL", "look": "narrow", "done": "pass"}[kind], colour)
     if gate.sense is None or gate.value is None or gate.limit is None:
@@ -120,24 +119,19 @@ def accuracy_card(calibration: Calibration) -> Content:
     if quality.predicted_error_mm is None:
         return facts(("", f"± {calibration.sigma.translation_mm:.2f}", "mm, camera position (1σ)"))
     far = f"of a point {quality.working_distance_m or 0:.2f} m away (1σ)"
-    return Content("\n").join(
-        [
-            facts(("", f"± {quality.predicted_error_mm:.2f}", "mm")),
-            Content.styled(f"predicted error {far}", "$dim"),
-        ]
-    )
+    return _card(far, ("", f"± {quality.predicted_error_mm:.2f}", "mm"))
+
+
+def _card(below: str, *values: tuple[str, str, str]) -> Content:
+    return facts(*values) + Content("\n") + Content.styled(below, "$dim")
 
 
 def proof_card(calibration: Calibration) -> Content:
     held = calibration.quality.holdout
     if held is None:
         return Content.styled(f"{UNKNOWN} no views were held out", "$dim")
-    return Content("\n").join(
-        [
-            facts(("", f"{1000 * held.e_t_m:.2f}", "mm"), ("", f"{held.e_R:.4f}", "rotation")),
-            Content.styled(f"held-out error over {many(len(held.pairs), 'sample')}", "$dim"),
-        ]
-    )
+    below = f"held-out error over {many(len(held.pairs), 'sample')}"
+    return _card(below, ("", f"{1000 * held.e_t_m:.2f}", "mm"), ("", f"{held.e_R:.4f}", "rotation"))
 
 
 def change_card(result: Result) -> Content:
@@ -153,12 +147,8 @@ def change_card(result: Result) -> Content:
         return mark("look", f"installed: {installed.mount}, this one: {calibration.mount}")
     delta = difference(calibration.transform.matrix, installed.transform.matrix)
     moved_mm, turned_deg = 1000 * np.linalg.norm(delta[:3]), np.degrees(np.linalg.norm(delta[3:]))
-    return Content("\n").join(
-        [
-            facts(("", f"{moved_mm:.2f}", "mm"), ("", f"{turned_deg:.3f}", "°")),
-            Content.styled(f"from the installed one of {local(installed.created)}", "$dim"),
-        ]
-    )
+    below = f"from the installed one of {local(installed.created)}"
+    return _card(below, ("", f"{moved_mm:.2f}", "mm"), ("", f"{turned_deg:.3f}", "°"))
 
 
 def pose_table(result: Result) -> Content:

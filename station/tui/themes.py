@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from typing import TypeVar
 
 from rich.segment import Segment
 from rich.style import Style
+from textual.app import App
 from textual.color import Color
 from textual.filter import LineFilter
 from textual.theme import BUILTIN_THEMES, Theme
 
+R = TypeVar("R")
 _NAMES = [
     "line",
     "faint",
@@ -204,3 +207,12 @@ class NoColour(LineFilter):
 def _colourless(style: Style) -> Style:
     chip = style.bgcolor is not None and not style.bgcolor.is_default
     return Style(bold=style.bold, dim=style.dim, reverse=chip or style.reverse, underline=style.underline)
+
+
+def dress(app: App[R]) -> None:
+    """Give an app its themes, and the one that its terminal or a person's environment asks for."""
+    for theme in THEMES:
+        app.register_theme(theme)
+    app.theme = chosen_theme(app.no_color)
+    if app.no_color:
+        app._filters.append(NoColour())

@@ -81,7 +81,9 @@ def solve(
         out.print(summary(job.calibration))
         out.print(f"Written: {target}" + ("" if report is None else f"  Report: {report}"), soft_wrap=True)
         if job.passed:
-            out.print(f"Next: {install_line(job.calibration.source, target)}", soft_wrap=True)
+            out.print(
+                f"Next: {install_line(job.calibration.source, target, _root_of(target))}", soft_wrap=True
+            )
     if not job.passed:
         raise typer.Exit(GATE_FAILED)
 
@@ -139,6 +141,12 @@ def report(
         job = solve_recording(recording, options, progress)
     _write_report(job, target, options, root)
     out.print(f"Written: {target}", soft_wrap=True)
+
+
+def _root_of(target: Path) -> Path | None:
+    """The state folder of a session's calibration; None: it lies elsewhere."""
+    sessions = target.resolve().parent.parent
+    return sessions.parent if sessions.name == "sessions" else None
 
 
 def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root: Path | None = None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shlex
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable
@@ -54,9 +55,7 @@ def capture_command(
         raise ConfigError("Missing --plan or --sweep.", code="usage", remedy="Give one of them.")
     before = load_sweep if plan is None else partial(load_into, plan=load_plan(plan))
     outcome = asyncio.run(session(socket, Purpose.RUN, headless, approve, as_json, before))
-    if sweep and outcome.recording and not as_json:
-        out.print(f"Next: calibrate sweep {outcome.recording}")
-    _finish(outcome, as_json)
+    _finish(outcome, as_json, "sweep" if sweep else "solve")
 
 
 def resume_command(
@@ -172,13 +171,15 @@ class SessionJson(msgspec.Struct, frozen=True):
     recording: str
 
 
-def _finish(outcome: SessionOutcome, as_json: bool) -> None:
+def _finish(outcome: SessionOutcome, as_json: bool, judge: str = "solve") -> None:
     if as_json:
         poses = PosesJson(outcome.planned, outcome.captured)
         print(msgspec.json.encode(SessionJson(outcome.status.state, poses, outcome.recording)).decode())
     elif outcome.recording:
         out.print(f"{outcome.captured} of {outcome.planned} poses, finished: {outcome.recording}")
         out.print(str(after_capture(outcome.status.session)))
+        if not outcome.status.session.check:
+            out.print(f"Next: calibrate {judge} {shlex.quote(outcome.recording)}", soft_wrap=True)
     else:
         _say_state(outcome.status, outcome.status.reason)
     raise typer.Exit(outcome.exit_code)

@@ -14,8 +14,7 @@ from benchmarks.trials import in_processes, rms, table, trials
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.handeye.observations import Places
-from calibrate.handeye.readings import Reading
-from calibrate.handeye.solution import Solution, SolveOptions
+from calibrate.handeye.solution import Reading, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import single_threaded_opencv

@@ -108,14 +108,13 @@ def _copy_beside_views(recording: Recording, writer: RecordingWriter) -> None:
 def _camera_from_board(calibration: Calibration) -> Callable[[View], Array]:
     """View → camera_from_board as robot, X and the board's place say it."""
     X, B = calibration.transform.matrix, calibration.board_place.transform.matrix
+    in_hand = calibration.mount == "eye-in-hand"
 
-    def in_hand(view: View) -> Array:
-        return np.asarray(inverse(X) @ inverse(np.array(view.base_from_flange)) @ B)
+    def chain(view: View) -> Array:
+        F = np.array(view.base_from_flange)
+        return np.asarray(inverse(X) @ (inverse(F) if in_hand else F) @ B)
 
-    def to_hand(view: View) -> Array:
-        return np.asarray(inverse(X) @ np.array(view.base_from_flange) @ B)
-
-    return in_hand if calibration.mount == "eye-in-hand" else to_hand
+    return chain
 
 
 def _marks(

@@ -33,10 +33,12 @@ from calibrate.handeye.metrics import (
 from calibrate.handeye.observations import Layout, Moved
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.priors import LensPrior, Priors
-from calibrate.handeye.readings import Explanation, Reading, explain_recording, explain_text
+from calibrate.handeye.readings import explain_recording, explain_text
 from calibrate.handeye.solution import (
     ArmTable,
+    Explanation,
     NoiseScales,
+    Reading,
     Remark,
     Solution,
     SolveOptions,

@@ -8,8 +8,7 @@ something moved half-way: each is a reading of the same views, fitted like the r
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +24,7 @@ from calibrate.geometry import (
 )
 from calibrate.handeye.observations import Moved
 from calibrate.handeye.poses import BoardPoses, PoseFit, PoseViews, fit_poses
+from calibrate.handeye.solution import Explanation, Reading
 from calibrate.views import ViewSet
 
 _CLEAR = 10.0
@@ -43,40 +43,6 @@ _LEAST = 0.01
 """A factor nearer to 1 than this (relative) is a tolerance, no other reading."""
 _FREE = 1.0
 """1σ of a factor that a reading lets free."""
-
-
-class Reading(Enum):
-    """Ways in which a recording may have to be read; the value is the code in files."""
-
-    AS_RECORDED = "as-recorded"
-    INVERSE_POSES = "inverse-poses"
-    QUATERNION_ORDER = "quaternion-order"
-    ROTATION_VECTOR_AS_ANGLES = "rotation-vector-as-angles"
-    ANGLES_AS_ROTATION_VECTOR = "angles-as-rotation-vector"
-    INVERSE_ROTATIONS = "inverse-rotations"
-    SHIFTED = "shifted-pictures"
-    MIRRORED = "mirrored-pictures"
-    SQUARE_SIZE = "square-size"
-    MILLIMETRES = "millimetres"
-    FOCAL_LENGTH = "focal-length"
-    BOARD_MOVED = "board-moved"
-    CAMERA_MOVED = "camera-moved"
-    REFOCUSED = "refocused"
-
-
-@dataclass(frozen=True, eq=False)
-class Explanation:
-    """The reading that explains a recording best, and by how much."""
-
-    reading: Reading
-    log_evidence_gain: float
-    """Over the recording as it stands."""
-    at: int = 0
-    """Place of the first view after a change; images by which they are shifted."""
-    factor: float = 1.0
-    """True over configured size of the squares, or focal length, of the later part where it changed."""
-    share: float = 1.0
-    """Share of the views that carry full weight under this reading."""
 
 
 _FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL, Reading.REFOCUSED: -1}

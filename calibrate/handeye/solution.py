@@ -7,6 +7,7 @@ Lengths in metres, angles in radians; every sigma and covariance is of `geometry
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,6 @@ from calibrate.geometry import Array, Transform
 from calibrate.handeye.axxb.certificate import Certificate
 from calibrate.handeye.metrics import Observability
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.handeye.readings import Explanation, Reading
 from calibrate.kinematics import RobotModel
 from calibrate.results import BoardShape, HoldoutScore, RejectedView
 from calibrate.views import BoardView
@@ -165,6 +165,40 @@ class ArmTable:
     @property
     def detected(self) -> bool:
         return self.log_bayes > 3.0
+
+
+class Reading(Enum):
+    """Ways in which a recording may have to be read; the value is the code in files."""
+
+    AS_RECORDED = "as-recorded"
+    INVERSE_POSES = "inverse-poses"
+    QUATERNION_ORDER = "quaternion-order"
+    ROTATION_VECTOR_AS_ANGLES = "rotation-vector-as-angles"
+    ANGLES_AS_ROTATION_VECTOR = "angles-as-rotation-vector"
+    INVERSE_ROTATIONS = "inverse-rotations"
+    SHIFTED = "shifted-pictures"
+    MIRRORED = "mirrored-pictures"
+    SQUARE_SIZE = "square-size"
+    MILLIMETRES = "millimetres"
+    FOCAL_LENGTH = "focal-length"
+    BOARD_MOVED = "board-moved"
+    CAMERA_MOVED = "camera-moved"
+    REFOCUSED = "refocused"
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The reading that explains a recording best, and by how much."""
+
+    reading: Reading
+    log_evidence_gain: float
+    """Over the recording as it stands."""
+    at: int = 0
+    """Place of the first view after a change; images by which they are shifted."""
+    factor: float = 1.0
+    """True over configured size of the squares, or focal length, of the later part where it changed."""
+    share: float = 1.0
+    """Share of the views that carry full weight under this reading."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,7 @@ import numpy as np
 
 from calibrate.errors import CalibrationError
 from calibrate.files.gate import Gate, Sense
-from calibrate.handeye.readings import Reading
-from calibrate.handeye.solution import Solution
+from calibrate.handeye.solution import Reading, Solution
 from recordings import strict_yaml
 
 

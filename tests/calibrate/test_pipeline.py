@@ -15,7 +15,8 @@ from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsEr
 from calibrate.files.calibration import encode_calibration
 from calibrate.geometry import Array, difference
 from calibrate.handeye.poses import pose_views
-from calibrate.handeye.readings import Reading, explain_recording
+from calibrate.handeye.readings import explain_recording
+from calibrate.handeye.solution import Reading
 from calibrate.load import load_views
 from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording
 from recordings.importers.folder import import_folder

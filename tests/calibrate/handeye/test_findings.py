@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.handeye.readings import Reading
-from calibrate.handeye.solution import Finding
+from calibrate.handeye.solution import Finding, Reading
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import (

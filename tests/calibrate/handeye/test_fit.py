@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import inverse, perturb, pose, rotation_exp, transform_points
-from calibrate.handeye.readings import Reading
+from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import MID, changed, error_mm_deg, inside, make_cell, with_flange

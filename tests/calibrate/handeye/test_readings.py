@@ -16,7 +16,8 @@ from calibrate.geometry import (
     rotation_log,
 )
 from calibrate.handeye.poses import pose_views
-from calibrate.handeye.readings import Reading, explain_recording
+from calibrate.handeye.readings import explain_recording
+from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.projection import project_pixels
 from calibrate.quality.gates import GateInputs, judge

@@ -11,8 +11,15 @@ import numpy as np
 import pytest
 
 from calibrate.files.gate import Gate
-from calibrate.handeye.readings import Explanation, Reading
-from calibrate.handeye.solution import CrossValidation, Finding, NoiseScales, Remark, Solution
+from calibrate.handeye.solution import (
+    CrossValidation,
+    Explanation,
+    Finding,
+    NoiseScales,
+    Reading,
+    Remark,
+    Solution,
+)
 from calibrate.pipeline import SolvedRecording
 from calibrate.quality.gates import GateInputs, GateLimits, GatesError, judge, read_limits
 from calibrate.results import HoldoutScore

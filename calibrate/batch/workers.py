@@ -7,9 +7,11 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing.connection import Connection
 from typing import Protocol, TypeVar
 
@@ -48,26 +50,24 @@ def pool(count: int | None = None) -> Workers:
     """Make workers of `count` processes here (default: one per core). A killed one costs no task."""
 
     def run(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
-        attempts = dict.fromkeys(tasks, 0)
-        while attempts:
+        deaths = dict.fromkeys(tasks, 0)
+        while deaths:
             # Alone, a task that kills its worker takes no others with it.
-            suspect = next((task for task, deaths in attempts.items() if deaths), None)
-            tried = list(attempts) if suspect is None else [suspect]
+            suspect = next((task for task, died in deaths.items() if died), None)
+            tried = list(deaths) if suspect is None else [suspect]
             for task, answer in _one_pool(work, tried, count or usable_cores()):
-                del attempts[task]
+                if isinstance(answer, Lost):
+                    deaths[task] += 1
+                    if deaths[task] < _ATTEMPTS:
+                        continue
+                del deaths[task]
                 yield task, answer
-            for task in tried:
-                if task in attempts:
-                    attempts[task] += 1
-                    if attempts[task] >= _ATTEMPTS:
-                        del attempts[task]
-                        yield task, Lost(f"worker process killed {_ATTEMPTS} times")
 
     return run
 
 
-def _one_pool(work: Callable[[T], R], tasks: Sequence[T], count: int) -> Iterator[tuple[T, R]]:
-    """Until all is done or a worker dies: what was not yielded then is lost."""
+def _one_pool(work: Callable[[T], R], tasks: Sequence[T], count: int) -> Iterator[tuple[T, R | Lost]]:
+    """Until all is done or a worker dies: those are lost that were being worked on, and no others begin."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["calibrate.batch.run"])
@@ -75,13 +75,21 @@ def _one_pool(work: Callable[[T], R], tasks: Sequence[T], count: int) -> Iterato
     with ours, theirs:
         executor = ProcessPoolExecutor(min(count, len(tasks)), context, _end_with, (theirs,))
         try:
-            futures: dict[Future[R], T] = {executor.submit(work, task): task for task in tasks}
-            for future in as_completed(futures):
-                try:
-                    answer = future.result()
-                except BrokenProcessPool:
-                    continue
-                yield futures.pop(future), answer
+            waiting, whole = iter(tasks), True
+            futures: dict[Future[R], T] = {}
+            while True:
+                with suppress(BrokenProcessPool):
+                    for task in islice(waiting, count - len(futures) if whole else 0):
+                        futures[executor.submit(work, task)] = task
+                if not futures:
+                    return
+                for future in wait(futures, return_when=FIRST_COMPLETED).done:
+                    task = futures.pop(future)
+                    try:
+                        yield task, future.result()
+                    except BrokenProcessPool:
+                        whole = False
+                        yield task, Lost(f"worker process killed {_ATTEMPTS} times")
         finally:
             ours.close()
             executor.shutdown(cancel_futures=True)

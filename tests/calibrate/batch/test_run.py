@@ -161,3 +161,16 @@ def wait_until(condition: Callable[[], bool], timeout_s: float) -> None:
     while not condition():
         assert time.monotonic() < end_s
         time.sleep(0.02)
+
+
+def dies_at_three(task: int) -> int:
+    if task == 3:
+        os._exit(1)
+    return task * task
+
+
+@pytest.mark.process
+def test_a_task_that_kills_its_workers_costs_itself_only() -> None:
+    answers = dict(pool(2)(dies_at_three, range(20)))
+    assert {task for task, answer in answers.items() if isinstance(answer, Lost)} == {3}
+    assert all(answers[k] == k * k for k in range(20) if k != 3)

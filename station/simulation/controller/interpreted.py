@@ -204,6 +204,7 @@ class InterpretedProgram:
     def _set_watchdog(self, variable_name: str, min_frequency: float = 10.0, action: str = "pause") -> None:
         if variable_name not in self._robot.inputs.types or not 0 < min_frequency < inf:
             raise ScriptRuntimeError(f"no watchdog on {variable_name} at {min_frequency} Hz")
+        action = action.lower()  # Universal Robots' own example writes it in capitals
         if action not in ("ignore", "pause", "stop"):
             raise ScriptRuntimeError(f"a watchdog's action is no {action}")
         self._robot.watchdog_s = 0.0 if action == "ignore" else 1.0 / min_frequency

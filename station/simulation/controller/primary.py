@@ -112,9 +112,9 @@ def _sub_packages(robot: SimulatedRobot) -> dict[int, bytes]:
     outputs = [get(f"standard_analog_output{i}") for i in (0, 1)]
     return {
         0: struct.pack(
-            ">Q7?BBdddB", int(robot.time_s * 1e6), *map(bool, flags), *modes,
-            robot.slider, get("speed_scaling") * robot.slider, 1.0, 0,
-        ),
+            ">Q7?BBddd", int(robot.time_s * 1e6), *map(bool, flags), *modes,
+            robot.slider, get("speed_scaling") * robot.slider, 1.0,
+        ) + bytes(robot.settings.version >= (3, 5)),
         1: b"".join(
             struct.pack(">dddffffB", q, target, qd, current, voltage, celsius, celsius, int(mode))
             for q, target, qd, current, voltage, celsius, mode in joints

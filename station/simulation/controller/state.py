@@ -148,9 +148,8 @@ class ControllerState(ABC):
         self.history = History(self.dt_s)
         self._seen: dict[str, tuple[Six, Six, Rigid]] = {}
         """Per tool pose: joints, TCP and pose it was last computed for."""
-        e, version = self.settings.is_e_series, self.settings.version
         self.inputs, self.outputs = (
-            VariableStore({n: v for n, v in VARIABLES[side].items() if v.known_to(e, version)})
+            VariableStore(VARIABLES[side], self.settings.is_e_series, self.settings.version)
             for side in ("input", "output")
         )
 

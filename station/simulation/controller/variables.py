@@ -50,8 +50,9 @@ both halves are writable."""
 class VariableStore:
     """Values of named variables in one flat list, so that a recipe is packed by one index lookup."""
 
-    def __init__(self, variables: dict[str, Variable]) -> None:
-        self.types = {name: variable.type for name, variable in variables.items()}
+    def __init__(self, variables: dict[str, Variable], e_series: bool, version: tuple[int, ...]) -> None:
+        self.types = {n: v.type for n, v in variables.items() if v.known_to(e_series, version)}
+        """What clients of this controller may ask for; the others have values too."""
         self._slots: dict[str, slice] = {}
         self.elements: list[float] = []
         for name, variable in variables.items():

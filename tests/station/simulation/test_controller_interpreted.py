@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import socket
+import struct
+
 import pytest
 
 from station.devices.rtde import RuntimeState
@@ -131,3 +134,162 @@ def test_cycles_that_run_at_once_are_one_to_the_program(context) -> None:
     assert made.robot.runtime_state == RuntimeState.PLAYING
     made.run(0.5)
     assert made.robot.runtime_state == RuntimeState.STOPPED
+
+
+def pose(made) -> tuple[float, ...]:
+    return made.robot.outputs.vector("target_TCP_pose")
+
+
+def test_a_tool_speed_is_straight_and_is_stopped(context) -> None:
+    made = started(context, "  speedl([0, 0, -0.1, 0, 0, 0], a=0.5, t=1.0)\n  stopl(0.5)")
+    before = pose(made)
+    ended(made)
+    way = [b - a for a, b in zip(before[:3], pose(made)[:3], strict=True)]
+    assert way[:2] == pytest.approx([0, 0], abs=1e-4)
+    assert way[2] == pytest.approx(
+        -(0.1 * 1.0 - 0.01 + 0.01), abs=0.003
+    )  # ramps up, then brakes: 0.1²/2a each
+    assert pose(made)[3:] == pytest.approx(before[3:], abs=1e-4)
+
+
+def test_joint_speeds_and_goals_are_followed(context) -> None:
+    made = started(
+        context,
+        "  n = 0\n  q = get_target_joint_positions()\n  while n < 125:\n    q[0] = q[0] + 0.002\n"
+        "    servoj(q, t=get_steptime(), lookahead_time=0.05)\n    n = n + 1\n  end\n  stopj(2.0)\n"
+        "  speedj([0, 0, 0, 0, 0, 0.4], 2.0, 1.0)\n  stopj(2.0)",
+    )
+    ended(made)
+    assert made.robot.arm.command[0] == pytest.approx(0.25, abs=0.02)
+    assert made.robot.arm.command[5] == pytest.approx(0.4 * 1.0, abs=0.01)
+    assert not made.robot.arm.moving
+
+
+def test_a_stream_that_nobody_goes_on_with_stops_suddenly(context) -> None:
+    made = started(context, "  speedj([0.5, 0, 0, 0, 0, 0], 5.0, 0.5)\n  sleep(1.0)")
+    made.run_until(lambda: speed(made) > 0.45)
+    made.run_until(lambda: speed(made) == 0.0, limit_s=0.6)
+    assert made.robot.runtime_state == RuntimeState.PLAYING
+
+
+def test_servoc_and_movec_end_where_they_should(context) -> None:
+    text = """
+  h = get_target_tcp_pose()
+  servoc(p[h[0], h[1] + 0.05, h[2] - 0.05, h[3], h[4], h[5]], a=0.5, v=0.1)
+  stopl(1.0)
+  g = get_target_tcp_pose()
+  movec(p[g[0], g[1] + 0.05, g[2] + 0.05, g[3], g[4], g[5]], p[g[0], g[1] + 0.1, g[2], g[3], g[4], g[5]])
+"""
+    made = started(context, text)
+    start, highest = pose(made), 0.0
+    while made.robot.runtime_state == RuntimeState.PLAYING:
+        made.run(made.robot.dt_s)
+        highest = max(highest, pose(made)[2])
+    end = [b - a for a, b in zip(start[:3], pose(made)[:3], strict=True)]
+    assert end == pytest.approx([0, 0.15, -0.05], abs=1e-3)
+    assert highest == pytest.approx(start[2], abs=1e-3)  # half a circle of 50 mm above the chord
+
+
+def test_a_move_takes_the_time_it_is_given(context) -> None:
+    made = started(context, f"  movej({GOAL}, t=2.0)")
+    assert made.run_until(lambda: made.robot.runtime_state == RuntimeState.STOPPED) == pytest.approx(
+        2.0, abs=0.03
+    )
+
+
+def test_a_script_talks_over_a_socket(context) -> None:
+    text = """
+  if socket_open("127.0.0.1", {port}, "s"):
+    socket_send_line("hello", "s")
+    a = socket_read_binary_integer(2, "s")
+    b = socket_read_ascii_float(2, "s")
+    c = socket_read_line("s", timeout=0.1)
+    write_output_integer_register(30, a[0] + a[1] + a[2])
+    write_output_float_register(30, b[1] + b[2])
+    write_output_boolean_register(70, c == "")
+  end
+"""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        made = started(context, text.replace("{port}", str(server.getsockname()[1])))
+        link, _ = server.accept()
+        with link:
+            made.run(0.05)
+            assert link.recv(100) == b"hello\n"
+            link.sendall(struct.pack(">ii", 40, -7) + b"(1.5, 2.25)")
+            ended(made)
+    assert made.output("output_int_register_30") == 2 + 40 - 7
+    assert made.output("output_double_register_30") == 3.75
+    assert made.output("output_bit_register_70") == 1
+
+
+def told(made) -> list[tuple[str, dict[str, object]]]:
+    """What the primary interface is told, from now on."""
+    found: list[tuple[str, dict[str, object]]] = []
+    made.robot.tell = lambda kind, **details: found.append((kind, details))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        ("def a():\n  some_gripper_call(3)\nend\n", 2, "compile_error_name_not_found:some_gripper_call:"),
+        ("def a():\n\n  switch x:\nend\n", 3, "switch"),
+    ],
+)
+def test_what_cannot_run_is_said_and_starts_nothing(context, text: str, line: int, words: str) -> None:
+    made = context()
+    said = told(made)
+    made.robot.upload(Upload("a", text))
+    made.run(0.2)
+    assert made.robot.program is None and made.robot.runtime_state == RuntimeState.STOPPED
+    ((kind, details),) = said
+    assert kind == "exception" and details["line"] == line
+    assert words == details["text"] or line == 3
+
+
+def test_clients_are_told_of_start_text_error_and_end(context) -> None:
+    made = context()
+    said = told(made)
+    made.robot.upload(Upload("prog", 'def prog():\n  textmsg("n=", 1)\n  x = [1][3]\nend\n'))
+    made.run(0.2)
+    assert [kind for kind, _ in said] == ["key", "text", "exception", "key"]
+    assert [d["title"] for kind, d in said if kind == "key"] == ["PROGRAM_XXX_STARTED", "PROGRAM_XXX_STOPPED"]
+    assert said[1][1]["text"] == "n=1"
+
+
+def test_a_secondary_program_leaves_the_other_alone(context) -> None:
+    made = started(context, "  while True:\n    sync()\n  end")
+    made.robot.upload(Upload("s", "sec s():\n  set_standard_digital_out(3, True)\nend\n", secondary=True))
+    made.run(0.05)
+    assert int(made.output("actual_digital_output_bits")) == 8
+    assert made.robot.runtime_state == RuntimeState.PLAYING
+
+
+def test_a_popup_that_blocks_waits_for_a_person(context) -> None:
+    made = started(context, '  popup("look", blocking=True)')
+    made.run(1.0)
+    assert made.robot.runtime_state == RuntimeState.PLAYING and made.robot.popup == "look"
+    made.robot.popup = None
+    ended(made)
+
+
+def test_a_hand_may_lead_the_arm_in_freedrive_only(context) -> None:
+    made = started(context, "  freedrive_mode()\n  sleep(0.2)\n  end_freedrive_mode()\n  sleep(0.2)")
+    made.run(0.05)
+    assert made.robot.free_for_hands
+    made.run(0.3)
+    assert not made.robot.free_for_hands
+
+
+def test_payload_tool_and_force_are_states(context) -> None:
+    made = started(
+        context,
+        "  set_tcp(p[0, 0, 0.1, 0, 0, 0])\n  set_target_payload(1.5, [0, 0, 0.02], [1, 1, 1, 0, 0, 0])\n"
+        "  force_mode(p[0, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [0, 0, -5, 0, 0, 0], 2, [1, 1, 1, 1, 1, 1])\n"
+        "  sleep(0.1)",
+    )
+    made.run(0.05)
+    assert made.robot.force_mode and made.robot.outputs.vector("tcp_offset")[2] == 0.1
+    assert made.output("payload") == 1.5 and made.robot.outputs.vector("payload_inertia")[0] == 1
+    ended(made)
+    assert not made.robot.force_mode, "a mode ends with the program that began it"

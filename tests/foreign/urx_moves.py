@@ -33,7 +33,7 @@ try:
     via[1], via[2], to[1] = via[1] + 0.03, via[2] + 0.03, to[1] + 0.06
     robot.movec(via, to, acc=1.0, vel=0.2)
     seen["arc"] = [b - a for a, b in zip(before, robot.getl(), strict=True)]
-    robot.speedl((0, 0, 0.05, 0, 0, 0), 0.5, 5)
+    robot.send_program("speedl([0, 0, 0.05, 0, 0, 0], 0.5, 5)")
     for _ in range(20):
         robot.secmon.wait()
         if robot.is_program_running():

@@ -139,10 +139,13 @@ class SimulatedArm:
         self._misses = (self.miss, self._draw_miss())
 
     @property
+    def streams(self) -> bool:
+        return isinstance(self.motion, Stream) and not self.motion.braking
+
+    @property
     def stream_speeds(self) -> Six:
         """Joint speeds a stream goes on from: those of the running one, before the slider scales them."""
-        flows = isinstance(self.motion, Stream) and not self.motion.braking
-        return self.motion.speeds if flows else self.command_speed  # type: ignore[union-attr]
+        return self.motion.speeds if self.streams else self.command_speed  # type: ignore[union-attr]
 
     def stream(self, wanted: Speeds, acceleration: float) -> JointMotion:
         """Goes on from where and how fast the arm is now; a running motion ends here."""

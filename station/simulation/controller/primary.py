@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import struct
 import zlib
-from collections.abc import Iterable
 
 from station.simulation.controller.kinematics import JOINT_LIMIT_RAD
 from station.simulation.controller.network import Connection, Service
@@ -171,7 +170,7 @@ def real_time(robot: SimulatedRobot) -> bytes:
 
 
 class ScriptConnection(Connection):
-    """Takes programs. Sends a message every so often; the first one is `greeting`."""
+    """Takes programs; states version and state, the real-time port only what is said to all of it."""
 
     def __init__(self, robot: SimulatedRobot, port: int) -> None:
         self._robot, self._port = robot, port
@@ -188,7 +187,7 @@ class ScriptConnection(Connection):
     def opened(self) -> None:
         if self._port != REAL_TIME_PORT:
             self.say(version_message(self._robot))
-        self._send(first=True)
+            self._send(first=True)
 
     def say(self, data: bytes) -> None:
         """Skipped for a client that does not read."""
@@ -197,12 +196,9 @@ class ScriptConnection(Connection):
             self.transport.write(data)
 
     def _send(self, first: bool = False) -> None:
-        if self.transport.is_closing():
-            return
-        real_time_port = self._port == REAL_TIME_PORT
-        self.say(real_time(self._robot) if real_time_port else state(self._robot, first))
-        period_s = self._robot.dt_s if real_time_port else STATE_PERIOD_S
-        asyncio.get_running_loop().call_later(period_s, self._send)
+        if not self.transport.is_closing():
+            self.say(state(self._robot, first))
+            asyncio.get_running_loop().call_later(STATE_PERIOD_S, self._send)
 
 
 def script_services(host: str, robot: SimulatedRobot) -> list[Service]:
@@ -214,11 +210,13 @@ def script_services(host: str, robot: SimulatedRobot) -> list[Service]:
     services = [service(port) for port in (PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT)]
 
     def tell(kind: str, **details: object) -> None:
-        said = messages(robot, kind, details)
-        listeners: Iterable[Connection] = services[0].connections
-        for connection in listeners:
-            assert isinstance(connection, ScriptConnection)
-            connection.say(said)
+        say_to_all(services[0], messages(robot, kind, details))
 
     robot.tell = tell
     return services
+
+
+def say_to_all(service: Service, data: bytes) -> None:
+    for connection in service.connections:
+        assert isinstance(connection, ScriptConnection)
+        connection.say(data)

@@ -36,8 +36,11 @@ class ScriptError(Exception):
     """What the controller does not start, or stops, a program for."""
 
     def __init__(self, text: str, line: int = 0) -> None:
-        super().__init__(f"line {line}: {text}" if line else text)
+        super().__init__(text)
         self.text, self.line = text, line
+
+    def __str__(self) -> str:
+        return f"line {self.line}: {self.text}" if self.line else self.text
 
 
 class ScriptSyntaxError(ScriptError):
@@ -135,7 +138,7 @@ class Frame:
             frame = frame.outer
         if name in self.run.variables:
             return self.run.variables[name]
-        raise ScriptRuntimeError(f"{name} has no value")
+        raise ScriptRuntimeError(f"compile_error_name_not_found:{name}:")
 
     def write(self, name: str, value: Value, scope: str = "") -> None:
         variables = self.run.variables if scope == "global" else self.variables
@@ -225,8 +228,6 @@ class Call:
             return (yield from found) if isinstance(found, GeneratorType) else found
         except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
             raise ScriptRuntimeError(f"{self.name}: {error}", self.line) from None
-        except ScriptRuntimeError as error:
-            raise ScriptRuntimeError(error.text, error.line or self.line) from None
 
     def enter(self, frame: Frame) -> Generator[None, None, Frame]:
         """The frame of the function that is called, its arguments in place."""
@@ -255,7 +256,11 @@ def execute(body: Sequence[Node], frame: Frame) -> Steps:
     """Statement by statement, until one leaves the block; how it does."""
     for statement in body:
         frame.run.spend()
-        left = yield from statement(frame)
+        try:
+            left = yield from statement(frame)
+        except ScriptRuntimeError as error:
+            error.line = error.line or vars(statement)["line"]
+            raise
         if left is not None:
             return left
     return None

@@ -164,7 +164,9 @@ class _Parser:
                 function = self._function(self._inside)
                 self._inside.functions[function.name] = function
             elif not self._take("pass", "enter_critical", "exit_critical"):  # no thread is interrupted here
+                line = self._tokens[self._place].line
                 found.append(self._statement())
+                vars(found[-1])["line"] = line
             if not self._is(*ends, *_STATEMENTS):  # a keyword begins a statement without a new line
                 self._need(kind="line")
             self._skip_lines()

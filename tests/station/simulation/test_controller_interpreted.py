@@ -254,7 +254,7 @@ def test_clients_are_told_of_start_text_error_and_end(context) -> None:
     made.run(0.2)
     assert [kind for kind, _ in said] == ["key", "text", "exception", "key"]
     assert [d["title"] for kind, d in said if kind == "key"] == ["PROGRAM_XXX_STARTED", "PROGRAM_XXX_STOPPED"]
-    assert said[1][1]["text"] == "n=1"
+    assert said[1][1]["text"] == "n=1" and said[2][1]["line"] == 3
 
 
 def test_a_secondary_program_leaves_the_other_alone(context) -> None:
@@ -293,3 +293,14 @@ def test_payload_tool_and_force_are_states(context) -> None:
     assert made.output("payload") == 1.5 and made.robot.outputs.vector("payload_inertia")[0] == 1
     ended(made)
     assert not made.robot.force_mode, "a mode ends with the program that began it"
+
+
+def test_a_stream_waits_with_its_program_while_the_process_is_held_up(context) -> None:
+    made = started(context, "  speedj([0.5, 0, 0, 0, 0, 0], 5.0, 1.0)\n  stopj(5.0)")
+    made.run_until(lambda: speed(made) > 0.45)
+    before = made.robot.arm.command
+    for i in range(500):
+        made.robot.tick(10**12 + i, late=True)
+    assert made.robot.arm.command == before
+    ended(made)
+    assert made.robot.arm.command[0] == pytest.approx(0.5 * 1.0, abs=0.02)

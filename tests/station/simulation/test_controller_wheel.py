@@ -197,3 +197,43 @@ def test_the_log_has_every_command(controller: Start, wheel: Wheel) -> None:
     assert result["counts"]["script: movej"] == 1 and result["counts"]["script: stopj"] == 1
     assert result["counts"]["upload: rtde_control"] == 1
     assert result["move"]["goal"] == pytest.approx([0.2, -1.5, 1.5, -1.5, -1.5, 0.1])
+
+
+def test_streams_modes_and_custom_scripts_do_what_they_say(controller: Start, wheel: Wheel) -> None:
+    result = wheel(
+        controller("UR10e"),
+        """
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        control = rtde_control.RTDEControlInterface(host)
+        control.speedL([0, 0, -0.05, 0, 0, 0], 0.5)
+        time.sleep(0.4)
+        result["speed"] = receive.getActualTCPSpeed()
+        control.speedStop()
+        q = receive.getTargetQ()
+        for i in range(200):
+            start = control.initPeriod()
+            q[5] += 0.001
+            control.servoJ(q, 0, 0, 0.002, 0.1, 300)
+            control.waitPeriod(start)
+        control.servoStop()
+        result["servo"] = q[5] - receive.getTargetQ()[5]
+        result["custom"] = control.sendCustomScriptFunction("turn", "movej([0.1,-1.5,1.5,-1.5,-1.5,0])\\n")
+        result["at"] = receive.getTargetQ()
+        control.reuploadScript()
+        until(control.isProgramRunning)
+        control.startContactDetection()
+        below = receive.getTargetTCPPose()
+        below[2] -= 0.2
+        control.moveL(below, 0.05, 0.5, True)
+        time.sleep(0.5)
+        admin.ask("contact", cycles=10)
+        until(lambda: fastest(receive.getTargetQd()) < 1e-3 and finished(control))
+        result["left"] = receive.getTargetTCPPose()[2] - below[2]
+        control.stopContactDetection()
+        control.stopScript()
+        """,
+    )
+    assert result["speed"][:3] == pytest.approx([0, 0, -0.05], abs=2e-3)
+    assert abs(result["servo"]) < 0.1, "it follows with its lookahead"
+    assert result["custom"] and result["at"][0] == pytest.approx(0.1, abs=1e-3)
+    assert 0.1 < result["left"] < 0.2, "the contact ended the move"

@@ -139,7 +139,7 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
 @pytest.mark.soak
 @pytest.mark.gige
 @pytest.mark.timeout(1800)
-def test_from_an_empty_home_to_a_planned_cell(tmp_path: Path) -> None:
+def test_from_an_empty_home_to_an_installed_calibration(tmp_path: Path) -> None:
     """By keys alone, with the real drivers; needs Aravis."""
     pytest.importorskip("gi")
     command = isolated_command([sys.executable, "-m", "tests.tui.whole_cell", str(tmp_path / "cell")])
@@ -147,5 +147,6 @@ def test_from_an_empty_home_to_a_planned_cell(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     told = json.loads(done.stdout.splitlines()[-1])
     print(told)
-    assert told["keys"] <= 40
+    assert told["keys"] <= 40 and told["minutes"] <= 10
     assert told["off_m"] < 3 * told["sigma_m"]
+    assert told["chi2"] < 22.5  # the 99.9 % quantile with 6 degrees of freedom

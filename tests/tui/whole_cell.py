@@ -1,4 +1,4 @@
-"""From an empty home to a planned cell by keys alone: python -m tests.tui.whole_cell FOLDER
+"""From an empty home to an installed calibration by keys alone: python -m tests.tui.whole_cell FOLDER
 
 Runs where there is no network but `lo`: a simulated controller at an address of its own, a GigE camera, and
 `station new` in a terminal. Prints what a person did and what came of it.
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibrate.files.install import installed_calibration
 from calibrate.geometry import difference
 from station.cell.config_file import load_config
 from station.cell.scene import guess_matrix
@@ -100,11 +101,15 @@ def main(folder: Path) -> None:
     config, _ = load_config(home / ".config/calibration-station/station.yaml")
     assert config.camera_guess is not None
     off = difference(guess_matrix(config.camera_guess), np.array(truth.camera_mount))
+    installed = installed_calibration(home / ".local/state/calibration-station")
+    left = difference(installed.transform.matrix, np.array(truth.camera_mount))
     told = {
         "keys": person.keys,
         "minutes": spent_s / 60,
         "off_m": float(np.linalg.norm(off[:3])),
         "sigma_m": config.camera_guess.sigma_m,
+        "installed_off_m": float(np.linalg.norm(left[:3])),
+        "chi2": float(left @ np.linalg.solve(np.array(installed.covariance), left)),
     }
     print(json.dumps(told))
 

@@ -93,7 +93,7 @@ def main(folder: Path) -> None:
             person.press("6", "i")
             person.sees("Install this calibration")
             person.press("tab", "enter")
-            person.sees("installed")
+            person.sees("INSTALLED")
         finally:
             screen.end()
             end_daemon(home)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import ClassVar
 
 from textual import work
@@ -28,8 +29,12 @@ READY = "Nothing is missing."
 NOT_READY = "This list looks again every few seconds."
 
 
-def checklist_text(checks: list[Check]) -> Content:
+def checklist_text(checks: list[Check], width: int) -> Content:
     """What is missing first; the remedy stands below it."""
+
+    def hanging(text: str, indent: int) -> str:
+        return f"\n{' ' * indent}".join(textwrap.wrap(text, max(20, width - indent)))
+
     rows = []
     for check in sorted(checks, key=lambda check: ("failed", "warning", "ok", "skipped").index(check.state)):
         kind, word = STATES[check.state]
@@ -37,10 +42,10 @@ def checklist_text(checks: list[Check]) -> Content:
         rows.append(
             mark(kind, f"{word:<9}")
             + Content.styled(f"{check.name:<15}", style)
-            + Content.styled(check.text, "$dim")
+            + Content.styled(hanging(check.text, 26), "$dim")
         )
         if check.remedy and check.state != "ok":
-            rows.append(Content.styled(f"{'':11}→ {check.remedy}", "$foreground"))
+            rows.append(Content.styled(f"{'':11}→ {hanging(check.remedy, 13)}", "$foreground"))
     missing = any(check.state == "failed" for check in checks)
     end = mark("look", NOT_READY) if missing else mark("done", READY)
     return Content("\n").join([*rows, Content(""), end])
@@ -82,7 +87,8 @@ class ConnectScreen(StationScreen):
         if answer is None:
             return
         self.desk.checks = tuple(answer)
-        self.query_one("#checklist", Static).update(checklist_text(answer))
+        checklist = self.query_one("#checklist", Static)
+        checklist.update(checklist_text(answer, checklist.size.width))
         self.show(self.desk.known())
 
     def look_again(self) -> None:

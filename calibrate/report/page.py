@@ -62,6 +62,7 @@ def report_page(
     calibration = job.calibration
     passed = len(job.gates) - len(calibration.quality.failed)
     result = calibration.result
+    modelled = _modelled_pixels(job)
     views = f"{len(job.solution.used)} used, {len(calibration.views.rejected)} rejected"
     return html.page(
         f"Calibration of {name}",
@@ -75,13 +76,15 @@ def report_page(
                 printed=True,
             ),
             html.folded("Touch tests", _touches(touches), aside=f"{len(touches)} corners", printed=True),
-            html.folded("Residuals", _residuals(job), aside="reprojection error per view", printed=True),
+            html.folded(
+                "Residuals", _residuals(job, modelled), aside="reprojection error per view", printed=True
+            ),
             html.folded("Error sources", _error(job)),
             html.folded("Held-out error", _holdout(job, peers)),
             html.folded("Arm", _arm(job)),
             html.folded("All methods on the same views", _methods(peers)),
             html.folded("Intrinsics", _lens(job)),
-            html.folded("Views", _views(job), aside=views),
+            html.folded("Views", _views(job, modelled), aside=views),
             html.folded("Installed versions", _history(history)),
             html.folded("Provenance", _provenance(job), printed=True),
         ],
@@ -207,8 +210,12 @@ def _error(job: SolvedRecording) -> Iterator[str]:
         yield html.paragraph(sentence)
 
 
-def _modelled_pixels(job: SolvedRecording) -> dict[int, tuple[Array, Array]]:
-    """Pose number → (found, modelled) pixels by the board's own pose, through the final lens."""
+ModelledPixels = dict[int, tuple[Array, Array]]
+"""Pose number → (found, modelled) pixels."""
+
+
+def _modelled_pixels(job: SolvedRecording) -> ModelledPixels:
+    """By the board's own pose, through the final lens."""
     camera, board = job.solution.camera, job.solution.board
     # Solving began with poses through the first lens: they would shift every corner alike.
     refitted = solve_pnp(replace(job.views, camera=camera))
@@ -225,7 +232,7 @@ def _modelled_pixels(job: SolvedRecording) -> dict[int, tuple[Array, Array]]:
     }
 
 
-def _residuals(job: SolvedRecording) -> Iterator[str]:
+def _residuals(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
     solution = job.solution
     if solution.residual_px:
         robot_mm = {index: metres * 1000 for index, (metres, _) in solution.residual_robot.items()}
@@ -234,10 +241,10 @@ def _residuals(job: SolvedRecording) -> Iterator[str]:
             plots.residuals_by_view(solution.residual_px, robot_mm, limit),
             "Per pose: reprojection error of the corners, and modelled against recorded flange.",
         )
-    pairs = [both for index, both in _modelled_pixels(job).items() if index in set(solution.used)]
+    pairs = [both for index, both in modelled.items() if index in set(solution.used)]
     if pairs:
         pixels = np.concatenate([found for found, _ in pairs])
-        misses = np.concatenate([found - modelled for found, modelled in pairs])
+        misses = np.concatenate([found - shown for found, shown in pairs])
         yield html.figure(
             plots.residual_scatter(misses, pixels, job.solution.camera),
             "Found corners against the lens and each picture's own board pose. Left: circles at 1, 2, 3 σ. "
@@ -337,7 +344,7 @@ def _distortion_names(model: str) -> tuple[str, ...]:
     )
 
 
-def _views(job: SolvedRecording) -> Iterator[str]:
+def _views(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
     rejected = {view.index: view.reason for view in job.calibration.views.rejected}
     if rejected:
         names = {view.index: view.name for view in job.recording.views()}
@@ -345,7 +352,6 @@ def _views(job: SolvedRecording) -> Iterator[str]:
             ("pose", "name", "reason"),
             [(str(index + 1), names.get(index, ""), reason) for index, reason in rejected.items()],
         )
-    modelled = _modelled_pixels(job)
     cells = []
     shown = job.recording.views()[:_PICTURES_LIMIT]
     width_px = next(width for most, width in _WIDTHS_PX if len(shown) <= most)

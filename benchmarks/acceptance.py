@@ -33,7 +33,11 @@ def run() -> str:
     clean = [("", PATHS[number % 2]) for number in range(trials(CLEAN))]
     weak = [(weakness, "ur_rtde") for weakness in WEAKNESSES]
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        answers = list(pool.map(lambda job: accept(*job), [*weak, *clean]))
+        answers = []
+        for answer in pool.map(lambda job: accept(*job), [*weak, *clean]):
+            answers.append(answer)
+            said = "accepted" if answer.get("accepted") else failures(answer) or answer
+            print(f"{len(answers)} of {len(weak) + len(clean)}: {said}", file=sys.stderr, flush=True)
     rows = []
     for (weakness, _), answer in zip(weak, answers, strict=False):
         rows.append([weakness, "found" if failures(answer) else "MISSED", ", ".join(failures(answer)[:2])])

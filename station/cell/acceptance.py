@@ -114,6 +114,8 @@ class StopResult(msgspec.Struct, frozen=True):
     speed_m_s: float
     """Of the fastest modelled point, as approved."""
     figures: tuple[Figure, ...]
+    repeated: int = 0
+    """Moves before it that ended before their stop was given: the computer was too busy. Not judged."""
 
     @property
     def failed(self) -> tuple[Figure, ...]:

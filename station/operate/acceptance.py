@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import BY_PERSON, Acceptance, ArmSubject, StopResult, StopTestOffer, StopWay
+from station.cell.acceptance import BY_PERSON, Acceptance, ArmSubject, StopResult, StopWay
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview, StationState
 from station.operate.motion import Link, approved_motion
@@ -35,6 +35,9 @@ END_S = 40.0
 BACK_S = 120.0
 """A person has this long to plug the cable in again, or to raise the slider."""
 STOP_TESTED, STOP_GIVEN = "stop-tested", "stop-given"
+TRIES = 3
+BUSY = frozenset({"watchdog-computer", "no-heartbeat", "move-refused"})
+"""What ends a move when this computer is too busy."""
 _LOOK_S = 0.1
 
 
@@ -82,6 +85,22 @@ class JudgedStop:
     states: Sequence[RobotState]
 
 
+@dataclass(frozen=True)
+class _MoveEnd:
+    rests: bool
+    """The station is idle again: nothing holds the arm."""
+    ended_by: str | None
+    """Code of what ended the move; empty: it arrived; None: it never began."""
+    moment_ns: int | None
+    """When the stop was given, host monotonic."""
+
+    def measured(self, way: StopWay) -> bool:
+        """What holds the arm is always judged, and so is every stop that was given."""
+        if not self.rests or self.moment_ns is not None:
+            return True
+        return way in (StopWay.ARRIVE, *BY_PERSON) and self.ended_by not in (None, *BUSY)
+
+
 @dataclass
 class AcceptanceTest:
     """The test under way, and all that it found. Part of the `ways` accepts nothing."""
@@ -124,7 +143,23 @@ class AcceptanceTest:
         return Acceptance(self.subject, accepted, self._passed_m_s, time.time_ns(), who, results)
 
     async def _tested(self, way: StopWay, speed_m_s: float) -> bool:
-        """False: it failed, or was not approved."""
+        """False: it failed, or was not approved.
+
+        A move that ended before its stop was given says nothing of that stop: it is asked for once more.
+        """
+        for tries in range(TRIES):
+            passed = await self._move(way, speed_m_s, tries)
+            if passed is not None:
+                return passed
+        raise StationError(
+            f"{way.value}: {TRIES} moves ended before the stop was given.",
+            code="not-measured",
+            remedy="Reduce the load of this computer, then begin again.",
+            tries=TRIES,
+        )
+
+    async def _move(self, way: StopWay, speed_m_s: float, tries: int) -> bool | None:
+        """None: it was not measured."""
         await self.person.before(way)
         by_person = way in BY_PERSON
         slow_m_s, long_s = (PERSON_SPEED_M_S, PERSON_MOVE_S) if by_person else (speed_m_s, MOVE_S)
@@ -148,28 +183,32 @@ class AcceptanceTest:
         if not await approved_motion(self.link, offer.go, approves):
             return False
         try:
-            tested = await self._watched(way, offer)
+            end = await self._watched(way)
         finally:
             states = await self.recorder.end()
-        move = StopMove(way, offer.joint, offer.target_rad, offer.speed_rad_s, tested)
-        stop = JudgedStop(StopResult(way, offer.go.top_speed_m_s, judge(states, move)), move, states)
+        if not end.measured(way):
+            self._forward = not self._forward
+            return None
+        move = StopMove(way, offer.joint, offer.target_rad, offer.speed_rad_s, end.moment_ns)
+        result = StopResult(way, offer.go.top_speed_m_s, judge(states, move), tries)
+        stop = JudgedStop(result, move, states)
         self.stops.append(stop)
         self.person.judged(stop)
         return not stop.result.failed
 
-    async def _watched(self, way: StopWay, offer: StopTestOffer) -> int | None:
-        """The moment of the stop, host monotonic ns, once the arm was watched at rest."""
+    async def _watched(self, way: StopWay) -> _MoveEnd:
+        """What the station says of the move's end, once the arm was watched at rest."""
         begun_ns = time.time_ns()
         if way is StopWay.NETWORK:
             await self.person.meanwhile(way)
-        moment_ns = await self._ended(begun_ns)
+        end = await self._ended(begun_ns)
         if way in BY_PERSON:
             await self.person.afterwards(way)
             await self._back(way)
         await asyncio.sleep(AFTER_S)
-        return moment_ns
+        return end
 
-    async def _ended(self, begun_ns: int) -> int | None:
+    async def _ended(self, begun_ns: int) -> _MoveEnd:
         moment_ns: int | None = None
         try:
             async with asyncio.timeout(END_S):
@@ -178,7 +217,9 @@ class AcceptanceTest:
                         if event.code == STOP_GIVEN and event.wall_ns >= begun_ns:
                             moment_ns = int(event.values["moment_ns"])  # type: ignore[arg-type]
                     if status.state not in RUNNING:
-                        return moment_ns  # judged by what the arm did, whatever the station says of it
+                        mine = [e for e in status.events if e.code == STOP_TESTED and e.wall_ns >= begun_ns]
+                        ended_by = str(mine[-1].values["ended_by"]) if mine else None
+                        return _MoveEnd(status.state is StationState.IDLE, ended_by, moment_ns)
         except TimeoutError:
             raise StationError("The move did not end.", code="no-end", limit_s=END_S) from None
         raise DaemonGoneError("The daemon ended during the test.")

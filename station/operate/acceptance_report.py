@@ -61,6 +61,8 @@ def acceptance_page(acceptance: Acceptance, stops: Sequence[JudgedStop]) -> str:
         sections.append(heading(f"{stop.result.way.value}, {stop.result.speed_m_s:.2f} m/s"))
         rows = [["✓" if f.passed else "✗", f.name, figure_text(f), f.source] for f in stop.result.figures]
         sections.append(figure(_curves(stop), "Angle from its start, and speed, of the joint that moved."))
+        if again := stop.result.repeated:
+            sections.append(paragraph(f"{again} moves before it ended too early: the computer was busy."))
         sections.append(table(["", "figure", "measured (limit)", "where the limit comes from"], rows))
     return page(f"Stops of {subject.model} {subject.serial}", sections)
 

@@ -6,7 +6,7 @@
                       └── acknowledge ── stopped, fault          paused <─────────────┘
 
 `moving` is entered from rest by an approval only, through `checking`. `stopped` and `fault` are left by a
-person's acknowledgement and, `fault`, by STOP. A touch test leads from `moving` to `idle`.
+person's acknowledgement and, `fault`, by STOP. A touch test and a stop test lead from `moving` to `idle`.
 """
 
 from __future__ import annotations

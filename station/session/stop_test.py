@@ -175,18 +175,18 @@ class StopTestRun(Run):
         try:
             await self._give_stop(driving)
             await driving
-            said = "The arm arrived."
+            said, ended_by = "The arm arrived.", ""
         except SafetyStopError:
             raise
         except (RobotError, LimitError) as error:
             await robot.stop("stop test")
-            said = str(error)
+            said, ended_by = str(error), error.code
         finally:
             driving.cancel()
             with contextlib.suppress(asyncio.CancelledError, RobotError, LimitError):
                 await driving
         if not context.requests.halt:
-            context.store.event(STOP_TESTED, said)
+            context.store.event(STOP_TESTED, said, ended_by=ended_by)
             context.store.enter(StationState.IDLE, said, STOP_TESTED)
 
     async def _give_stop(self, driving: asyncio.Task[None]) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from station.cell.acceptance import Acceptance, StopWay
+from station.cell.acceptance import Acceptance, StopWay, read_acceptance
 from station.cell.errors import RefusedError
 from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
@@ -116,3 +120,16 @@ async def test_nothing_moves_without_emergency_stop_full_slider_and_acknowledged
         await test.run()
     assert refused.value.code == "wrong-state" and not hands.approved
     await client.close()
+
+
+@pytest.mark.soak
+@both_paths
+async def test_the_command_accepts_a_sound_arm_and_keeps_it(rig: SystemRig) -> None:
+    daemon = await rig.daemon()
+    command = [sys.executable, "-m", "station.cli", "accept", "--socket", str(daemon.socket), "--json"]
+    done = await asyncio.to_thread(subprocess.run, [*command, "--speed", "0.05"], capture_output=True)
+    assert done.returncode == 0, done.stderr
+    told, kept = msgspec.json.decode(done.stdout, type=Acceptance), read_acceptance(rig.root)
+    assert kept == told and told.accepted and told.speed_m_s == SLOW[0]
+    assert [result.way for result in told.results] == list(StopWay)
+    assert Path(told.report).read_text().count("<svg") == len(StopWay)

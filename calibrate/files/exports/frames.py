@@ -65,7 +65,7 @@ class FrameNames:
 def follow_command(root: Path | None, camera: str) -> tuple[str, ...]:
     """The command that tells another program of every change here, wherever that is started."""
     place = ("--root", str(state_root(root).resolve()), "--camera", camera)
-    return (sys.executable, "-m", "calibrate.cli", "follow", *place)
+    return (sys.executable, "-I", "-m", "calibrate.cli", "follow", *place)  # without the caller's PYTHONPATH
 
 
 def comment(calibration: Calibration, frames: FrameNames, with_table: bool = False) -> str:

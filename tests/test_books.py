@@ -63,6 +63,7 @@ def run(line: str) -> None:
         Path(written).write_text(here)
 
 
+@pytest.mark.timeout(300)
 def test_the_commands_in_the_books_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))

@@ -102,7 +102,11 @@ class Frame(Horizontal):
 
 def bar_line(known: Known, title: str, width: int) -> Content:
     """Where one is, state, robot, speed and safety; what is less important gives way first."""
-    parts = list(_bar_parts(known, title))
+    return fitting(list(_bar_parts(known, title)), width)
+
+
+def fitting(parts: list[Content], width: int) -> Content:
+    """As many parts as fit, most important first; two always."""
     for count in range(len(parts), 1, -1):
         line = Content("").join(parts[:count])
         if line.cell_length <= width:

@@ -34,7 +34,7 @@ from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, FoundCamera, Hardware, Step
 from station.operate.guided_views import enough
 from station.protocol.verbs import PreviewImage
-from station.tui.frame import BREAKPOINTS, StopBlock, next_line, rail_line
+from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
 from station.tui.new_cell_steps import DRAWINGS, Page, SavePage, pages
 from station.tui.task import Step as RailStep
 from station.tui.themes import TOKENS, dress
@@ -368,7 +368,7 @@ class NewCell(App[Ending]):
             bar.append(Content.styled(f"  {who.model} {who.serial}", "bold $strong"))
             bar.append(Content.styled(f"  {setup.arm.trouble() or 'ready'}", "$dim"))
         bar.append(Content.styled("  Your hand moves the arm, never this wizard.", "$dim"))
-        self.query_one("#bar", Static).update(Content("").join(bar))
+        self.query_one("#bar", Static).update(fitting(bar, width))
         self.query_one("#rail", Static).update(rail_line(self._rail(), self.step, width))
         self.query_one("#next", Static).update(next_line(self.page.next, width))
         self._say_live("\n".join(self.page.live()))

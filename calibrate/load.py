@@ -69,7 +69,7 @@ def load_views(
     views: list[BoardView] = []
     missing: list[RejectedView] = []
     seen: dict[int, Detection] = {}
-    for view, detection in _detect_all(recording, spec, model, progress, threads):
+    for view, detection in detect_all(recording, recording.views(), spec, model, progress, threads):
         if isinstance(detection, BadImageError):
             missing.append(RejectedView(view.index, view.name, str(detection), "unreadable-picture"))
             continue
@@ -152,16 +152,17 @@ def without_views(loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = F
     return replace(loaded, views=kept, without_board=(*loaded.without_board, *left))
 
 
-def _detect_all(
+def detect_all(
     recording: Recording,
+    views: list[View],
     spec: BoardSpec,
     camera: CameraModel,
-    progress: Progress | None,
-    threads: int | None,
+    progress: Progress | None = None,
+    threads: int | None = None,
 ) -> Iterator[tuple[View, Detection | BadImageError]]:
-    """In the order of the views, with at most a few pictures in memory."""
+    """Look for the board in these views, in their order, with at most a few pictures in memory."""
     workers = threads or usable_cores()
-    total = len(recording.views())
+    total = len(views)
     waiting: deque[tuple[View, Future[Detection]]] = deque()
     done = 0
 
@@ -181,7 +182,7 @@ def _detect_all(
 
     pool = ThreadPoolExecutor(workers, thread_name_prefix="detect")
     try:
-        for view in recording.views():
+        for view in views:
             waiting.append((view, pool.submit(_decode_and_detect, recording, view, spec, camera)))
             while len(waiting) > 2 * workers:
                 yield finished()

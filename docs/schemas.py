@@ -18,6 +18,7 @@ from calibrate.cli.contracts import (
     ListedJson,
     SolveJson,
     SweepJson,
+    WatchEventJson,
 )
 from calibrate.cli.follow import Followed
 from calibrate.files.calibration import Calibration
@@ -49,6 +50,7 @@ TYPES: dict[str, tuple[str, Any]] = {
     "follow": ("A line of calibrate follow", Followed),
     "diff": ("calibrate diff --json", DiffJson),
     "drift-check": ("calibrate drift-check --json", DriftCheckJson),
+    "watch": ("A line of `calibrate watch --json`", WatchEventJson),
     "fleet": ("calibrate fleet --json", FleetJson),
     "status": ("station status --json", StationStatus),
     "doctor": ("station doctor --json", DoctorJson),

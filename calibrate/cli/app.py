@@ -80,6 +80,14 @@ COMMANDS = {
         "Test the installed calibration on new views.",
         ("calibrate drift-check later.mcap", "calibrate drift-check later.mcap --calibration cell.yaml"),
     ),
+    "watch": LazyCommand(
+        "calibrate.cli.watch:watch",
+        "Notice in production pictures that camera, tag or arm moved.",
+        (
+            "calibrate watch monday.mcap --board tag.yaml",
+            "calibrate watch pictures --follow  # until Ctrl-C; dataset.yaml states the tag",
+        ),
+    ),
     "annotate": LazyCommand(
         "calibrate.cli.annotate:annotate",
         "Draw a calibration into a recording, for Foxglove, Lichtblick or rerun.",

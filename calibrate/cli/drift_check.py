@@ -75,7 +75,7 @@ def drift_check(
         prepared = prepare_views(recording, options, progress, fewest=FEWEST_VIEWS)
     info = prepared.recording.info
     try:
-        _require_same_cell(recording, info, calibration)
+        require_same_cell(recording, info, calibration)
     except OtherCellError as other:
         if calibration_file is None:
             _doubt_devices(recording, info, root, camera, other)
@@ -166,7 +166,8 @@ def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
     return known or sha256 == provenance.recording_sha256
 
 
-def _require_same_cell(recording: Path, info: SessionInfo, calibration: Calibration) -> None:
+def require_same_cell(recording: Path, info: SessionInfo, calibration: Calibration) -> None:
+    """Raise OtherCellError for a recording of another mounting, source, robot or camera."""
     simulated = calibration.source == "simulated"
     for name, new, known, same in (
         ("mounting", info.mount, calibration.mount, info.mount == calibration.mount),

@@ -1,0 +1,353 @@
+"""`calibrate watch`: notice in production pictures of one tag that camera, tag or arm moved."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import time
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import typer
+
+from calibrate.boards.detect import Detection, detect
+from calibrate.boards.model import check_board, describe_board
+from calibrate.cli.contracts import WatchEventJson
+from calibrate.cli.drift_check import require_same_cell
+from calibrate.cli.files import read_board
+from calibrate.cli.installed import CameraName, Root, named_or_installed
+from calibrate.cli.job import BoardFile, Threads
+from calibrate.cli.output import OutputError, err, out, print_json, progress_bar
+from calibrate.errors import InstallError
+from calibrate.files.calibration import Calibration
+from calibrate.files.formatting import VALIDITY_STYLES
+from calibrate.files.install import note_check
+from calibrate.files.loader import current_version, readable_folder
+from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
+from calibrate.kinematics import MODELS
+from calibrate.load import detect_all
+from calibrate.pipeline import single_threaded_opencv
+from calibrate.quality.movement.evidence import Moved
+from calibrate.quality.movement.log import FILE, MonitorLog, WatchedTag, WatchEntry
+from calibrate.quality.movement.monitor import LARGEST_MISFIT_PX, NAMED_AFTER, Event, EventKind
+from calibrate.quality.movement.pictures import CellModel
+from recordings.errors import BadImageError
+from recordings.files import MAIN_CAMERA
+from recordings.images import IMAGE_LIMIT_BYTES, ImageError, decode_image, read_header
+from recordings.importers.dataset import DATASET_FILE, PoseRow, read_dataset, read_poses
+from recordings.reader import open_recording
+from recordings.schema.messages import BoardSpec, Mount
+
+MOVED = 4
+_POLL_S = 2.0
+AsLines = Annotated[bool, typer.Option("--json", help="Print a JSON object for each event, one a line")]
+
+
+class WatchSourceError(OutputError):
+    """A source of `calibrate watch` cannot be used with this calibration."""
+
+    code = "watch-source"
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Where pictures come from; `entries` can be asked again for what is new."""
+
+    path: Path
+    mount: Mount
+    board: BoardSpec
+    entries: Callable[[BoardSpec, Callable[[str], bool], int | None], Iterator[tuple[int, int, WatchEntry]]]
+    """(done, of, picture) of those that are not known."""
+
+
+def watch(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE",
+            help="Recordings, session folders, or folders of pictures with dataset.yaml and poses.csv",
+        ),
+    ],
+    board: BoardFile = None,
+    follow: Annotated[
+        bool,
+        typer.Option("--follow", help="Wait for new lines in poses.csv of the last SOURCE, until Ctrl-C"),
+    ] = False,
+    calibration_file: Annotated[
+        Path | None,
+        typer.Option("--calibration", help="Instead of the installed one; nothing is kept or noted"),
+    ] = None,
+    root: Root = None,
+    camera: CameraName = MAIN_CAMERA,
+    as_json: AsLines = False,
+    threads: Threads = None,
+) -> None:
+    """Notice in production pictures that camera, tag or arm moved.
+
+    One tag or small board is fixed in the cell (eye-to-hand: on the gripper) and shows up in pictures that
+    are taken anyway, while the arm stands. No motion and no session is added. The first 60 pictures with it
+    are learned from. A posture that comes again is compared with its own earlier pictures: that notices most.
+
+    When something moved, the installed calibration is put in doubt and its hooks run. 30 pictures later it is
+    said what moved, or that the pictures cannot tell, and the shortest way back. All pictures are kept in
+    watch.jsonl beside the calibrations: start it again, with the same SOURCE or the next, and it goes on.
+
+    It sees changes since it began, not whether the calibration was right: that is `calibrate drift-check`.
+
+    Exit codes: 0 nothing moved so far, 4 something moved, 1 sources unusable, 2 wrong options.
+    """
+    calibration, validity = named_or_installed(calibration_file, root, camera)
+    opened = [_open(path, calibration) for path in sources]
+    tag = opened[0].board if board is None else read_board(board)
+    check_board(tag)
+    if follow and not (sources[-1] / DATASET_FILE).is_file():
+        raise OutputError(
+            f"--follow: {sources[-1]} does not grow.",
+            code="options",
+            remedy=f"Give a folder with {DATASET_FILE} and poses.csv last.",
+        )
+    folder = None if calibration_file is not None else readable_folder(root, camera)
+    version = 0 if folder is None else current_version(folder)[0]
+    cell = CellModel(
+        calibration.mount,
+        calibration.intrinsics.model,
+        calibration.transform.matrix,
+        np.array(calibration.covariance),
+        MODELS.get(calibration.robot.model),
+    )
+    try:
+        log = MonitorLog(None if folder is None else folder / FILE, WatchedTag(version, tag), cell)
+        if log.monitor.alarmed and validity is not None and validity.state is ValidityState.VALID:
+            log.begin_anew()  # a check has passed since
+        installed = calibration_file if folder is None else folder / "current"
+        teller = _Teller(installed or Path(), root, camera, None if folder is None else version, as_json)
+        with single_threaded_opencv():
+            for source in opened:
+                _read(source, tag, log, teller, threads)
+            while follow and not log.monitor.finished:
+                time.sleep(_POLL_S)
+                _read(opened[-1], tag, log, teller, threads)
+    except KeyboardInterrupt:
+        pass
+    except OSError as problem:
+        raise InstallError(
+            f"{problem.filename or folder}: {problem.strerror}. What was seen cannot be kept.",
+            code="state-folder",
+            remedy="Name another state folder with --root.",
+        ) from None
+    teller.summary(log, tag)
+    if log.monitor.alarmed:
+        raise typer.Exit(MOVED)
+    if log.monitor.finished:
+        raise typer.Exit(1)
+
+
+def _read(source: _Source, tag: BoardSpec, log: MonitorLog, teller: _Teller, threads: int | None) -> None:
+    with progress_bar("watching") if err.is_terminal else nullcontext() as bar:
+        for done, total, entry in source.entries(tag, log.knows, threads):
+            if bar is not None:
+                bar(done, total, entry.name)
+            for event in log.add(entry):
+                teller.tell(event)
+            if log.monitor.finished:
+                return
+
+
+# --- sources ---
+def _open(path: Path, calibration: Calibration) -> _Source:
+    if (path / DATASET_FILE).is_file():
+        return _open_folder(path, calibration)
+    recording = open_recording(path)
+    info, lens = recording.info, calibration.intrinsics.model
+    require_same_cell(path, info, calibration)
+
+    def entries(
+        tag: BoardSpec, known: Callable[[str], bool], threads: int | None
+    ) -> Iterator[tuple[int, int, WatchEntry]]:
+        views = [
+            view
+            for view in recording.views()
+            if not known(f"{info.name}/{info.created_wall_ns}/{view.index}")
+        ]
+        for done, (view, detection) in enumerate(detect_all(recording, views, tag, lens, threads=threads), 1):
+            wall_s = (view.stamps.host_wall_ns or info.created_wall_ns) / 1e9
+            key = f"{info.name}/{info.created_wall_ns}/{view.index}"
+            entry = WatchEntry(None, key, view.name, wall_s, view.base_from_flange, view.joints_rad)
+            found = None if isinstance(detection, BadImageError) else detection
+            yield done, len(views), _with_corners(entry, found)
+
+    return _Source(path, info.mount, info.board, entries)
+
+
+def _open_folder(folder: Path, calibration: Calibration) -> _Source:
+    dataset, _ = read_dataset(folder / DATASET_FILE)
+    lens = calibration.intrinsics
+    if dataset.mount != calibration.mount:
+        raise WatchSourceError(
+            f"{folder} is {dataset.mount}, the calibration {calibration.mount}.",
+            found=dataset.mount,
+            calibrated=calibration.mount,
+        )
+
+    def entries(
+        tag: BoardSpec, known: Callable[[str], bool], threads: int | None
+    ) -> Iterator[tuple[int, int, WatchEntry]]:
+        rows = [row for row in read_poses(folder)[0] if not known(f"{folder.resolve()}/{row.image}")]
+        for done, row in enumerate(rows, 1):
+            entry = WatchEntry(
+                None, f"{folder.resolve()}/{row.image}", row.image, 0.0, row.base_from_flange, row.joints_rad
+            )
+            yield done, len(rows), _with_corners(entry, _detect(folder, row, tag, (lens.width, lens.height)))
+
+    return _Source(folder, dataset.mount, dataset.board, entries)
+
+
+def _detect(folder: Path, row: PoseRow, tag: BoardSpec, size: tuple[int, int]) -> Detection:
+    """Raises WatchSourceError with file and line."""
+    path, reason = folder / row.image, ""
+    try:
+        if not Path(os.path.realpath(path)).is_relative_to(folder.resolve()):
+            reason = "lies outside the folder"
+        else:
+            with path.open("rb") as file:
+                data = file.read(IMAGE_LIMIT_BYTES)
+            header = read_header(data)
+            if (header.width, header.height) == size:
+                return detect(decode_image(data, *size), tag, thorough=False, with_quality=False)
+            reason = f"is {header.width}×{header.height}, the calibration is of {size[0]}×{size[1]}"
+    except ImageError as problem:
+        reason = f"is no usable image: {problem}"
+    except OSError as problem:
+        reason = f"cannot be read ({problem.strerror})"
+    raise WatchSourceError(
+        f"{folder}/poses.csv line {row.line}: image {row.image} {reason}.",
+        remedy="Write an image before its line in poses.csv; delete lines of images that are not to be used.",
+        line=row.line,
+    )
+
+
+def _with_corners(entry: WatchEntry, detection: Detection | None) -> WatchEntry:
+    if detection is None or not detection.found:
+        return entry
+    pixels = tuple((float(u), float(v)) for u, v in detection.pixels)
+    return msgspec.structs.replace(entry, corners=tuple(detection.indices.tolist()), pixels=pixels)
+
+
+# --- what is said ---
+class _Teller:
+    """Says what the monitor found, and puts the installed calibration in doubt."""
+
+    def __init__(
+        self, installed: Path, root: Path | None, camera: str, version: int | None, as_json: bool
+    ) -> None:
+        self._installed, self._root, self._camera = str(installed), root, camera
+        self._version, self._as_json = version, as_json
+
+    def tell(self, event: Event) -> None:
+        text = event_text(event)
+        moved = event.kind in (EventKind.ALARM, EventKind.NAMED)
+        validity = self._doubt(event, text) if moved and self._version is not None else None
+        steps = next_steps(event.moved, self._installed) if event.moved is not None else []
+        if self._as_json:
+            line = WatchEventJson(
+                event.kind, event.picture, event.pictures, event.moved, event.values, text, steps, validity
+            )
+            print_json(line)
+            return
+        bad = (EventKind.NOT_FIXED, EventKind.PICTURES_WORSE, EventKind.TAG_UNSEEN)
+        style = "bold red" if moved else "yellow" if event.kind in bad else None
+        out.print(f"{event.picture}: {text}", style=style)
+        for step in steps:
+            out.print(f"  {step}", soft_wrap=True)
+        if validity is not None:
+            shown = VALIDITY_STYLES[validity.state]
+            out.print(f"The installed calibration is {validity_text(validity)}", style=shown)
+
+    def _doubt(self, event: Event, text: str) -> Validity:
+        reason = ValidityReason(
+            "watch",
+            text,
+            {"picture": event.picture, "moved": event.moved and event.moved.value, **event.values},
+        )
+        return note_check(
+            self._root,
+            "watch",
+            reason,
+            passed=False,
+            sensitive=True,
+            when=datetime.now(UTC),
+            camera=self._camera,
+            version=self._version,
+        )
+
+    def summary(self, log: MonitorLog, tag: BoardSpec) -> None:
+        """Say where it stands at the end of the sources."""
+        monitor = log.monitor
+        state = "moved" if monitor.alarmed else "stopped" if monitor.finished else "watching"
+        if not monitor.finished and not monitor.alarmed and monitor.needed:
+            state = "learning"
+        texts = {
+            "moved": "Something moved."
+            if monitor.finished
+            else f"Something moved; up to {NAMED_AFTER} more pictures may tell what.",
+            "stopped": "Nothing can be watched.",
+            "watching": "Nothing moved.",
+            "learning": f"Learning: at least {monitor.needed} more pictures are needed.",
+        }
+        text = f"{monitor.pictures} pictures with the {describe_board(tag)}. {texts[state]}"
+        if not self._as_json:
+            out.print(text)
+            return
+        values: dict[str, str | float | int | bool | None] = {
+            "state": state,
+            "needed": monitor.needed,
+            "missed_in_a_row": monitor.missed,
+        }
+        print_json(WatchEventJson("summary", "", monitor.pictures, None, values, text, [], None))
+
+
+_MOVED_TEXT = {
+    Moved.CAMERA: "The camera moved, or the zero of joint 6",
+    Moved.CAMERA_BASE: "The camera moved, or the robot's base, or the zero of joint 1",
+    Moved.TAG: "The tag moved, or the robot's base, or the zero of joint 1",
+    Moved.TAG_GRIPPER: "The tag moved, or the gripper, or the zero of joint 6",
+    Moved.CANNOT_TELL: "Something moved; these pictures cannot tell what",
+    **{joint: f"The zero of joint {joint[-1]} changed" for joint in Moved if joint.startswith("joint-")},
+}
+
+
+def event_text(event: Event) -> str:
+    """What happened, for people."""
+    values = event.values
+    if event.kind is EventKind.NAMED and event.moved is not None:
+        size = f" by {values['moved_mm']} mm, {values['moved_deg']}°" if "moved_mm" in values else ""
+        return f"{_MOVED_TEXT[event.moved]}{size}."
+    return {
+        EventKind.LEARNED: f"The tag's place is learned (misfit {values.get('median_misfit_px')} px).",
+        EventKind.NOT_FIXED: f"These fit no fixed tag: misfit {values.get('median_misfit_px')} px (limit "
+        f"{LARGEST_MISFIT_PX:g} px). Check that it is fixed, its size, and run `calibrate drift-check`.",
+        EventKind.TESTING: f"Learned; from now on pictures of {values.get('postures')} postures are tested.",
+        EventKind.ALARM: f"Something moved {values.get('since_pictures')} pictures ago or less.",
+        EventKind.PICTURES_WORSE: "The last 20 pictures are worse, none moved: check focus and light.",
+        EventKind.TAG_UNSEEN: f"No tag in the last {values.get('in_a_row')} pictures: nothing is watched.",
+    }[event.kind]
+
+
+def next_steps(moved: Moved, installed: str) -> list[str]:
+    """The shortest way back, commands in their order; installed: file whose lens still holds."""
+    plan, capture = "station plan --config station.yaml", "station capture --plan plan.yaml"
+    install = "calibrate install new.yaml --cell-config station.yaml"
+    if moved in (Moved.CAMERA, Moved.CAMERA_BASE):  # the lens holds: fewer poses are enough
+        solve = f"calibrate solve SESSION --camera {shlex.quote(installed)} -o new.yaml"
+        return [f"{plan} --poses 10 -o plan.yaml", capture, solve, install]
+    if moved in (Moved.TAG, Moved.TAG_GRIPPER, Moved.CANNOT_TELL):
+        return ["station drift-check  # is the camera where it was?"]
+    solve = "calibrate solve SESSION -o new.yaml"
+    return [f"{plan} --for arm -o plan.yaml  # once the joint is mended", capture, solve, install]

@@ -1,0 +1,125 @@
+"""What a monitor has seen, on the disk: pictures' corners and poses, so that a restart goes on where it was.
+
+    ROOT/calibrations/…/watch.jsonl     one line a picture, behind a line for the tag that is watched
+
+Lines are added and durable; beyond `_MOST` the file is replaced, in one step, by its latest part.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from calibrate.boards.model import board_points
+from calibrate.files.lines import append_line, read_lines
+from calibrate.quality.movement.monitor import Event, Monitor
+from calibrate.quality.movement.pictures import CellModel, Picture
+from recordings.files import write_atomically
+from recordings.schema.messages import BoardSpec, Matrix4, Vector6
+
+FILE = "watch.jsonl"
+_MOST, _LATEST = 12_000, 3_000
+
+
+class WatchedTag(msgspec.Struct, frozen=True):
+    """What is watched, and by which installed version."""
+
+    version: int
+    tag: BoardSpec
+    pose: Matrix4 | None = None
+    """base_from_tag (eye-in-hand) or flange_from_tag, where the first pictures are gone."""
+
+
+class WatchEntry(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A line of the file: a beginning (`begun`), or a picture; one without the tag has no pixels."""
+
+    begun: WatchedTag | None = None
+    key: str = ""
+    """Source and number of the picture: no picture counts twice."""
+    name: str = ""
+    wall_s: float = 0.0
+    base_from_flange: Matrix4 | None = None
+    joints_rad: Vector6 | None = None
+    corners: tuple[int, ...] = ()
+    pixels: tuple[tuple[float, float], ...] = ()
+
+    def picture(self, tag: BoardSpec) -> Picture:
+        """The picture that the monitor takes."""
+        return Picture(
+            self.name,
+            self.wall_s,
+            np.array(self.base_from_flange),
+            None if self.joints_rad is None else np.array(self.joints_rad),
+            self.corners,
+            board_points(tag)[list(self.corners)],
+            np.array(self.pixels),
+        )
+
+
+class MonitorLog:
+    """A monitor and the file that it goes on from; without a file nothing is kept."""
+
+    def __init__(self, path: Path | None, watched: WatchedTag, cell: CellModel) -> None:
+        """Raises OSError."""
+        self._path, self._watched, self._cell = path, watched, cell
+        self.monitor = Monitor(cell)
+        self._keys: deque[str] = deque(maxlen=_MOST)
+        self._known: set[str] = set()
+        entries = [] if path is None else read_lines(path, WatchEntry)
+        begun = [place for place, entry in enumerate(entries) if entry.begun is not None]
+        last = entries[begun[-1]].begun if begun else None
+        if last is None or (last.version, last.tag) != (watched.version, watched.tag):
+            self.begin_anew()
+            return
+        self._replay(last, entries[begun[-1] + 1 :])
+
+    def _replay(self, watched: WatchedTag, entries: list[WatchEntry]) -> None:
+        self.monitor = Monitor(self._cell, None if watched.pose is None else np.array(watched.pose))
+        seen: list[Picture] = []
+        for entry in entries:
+            self._remember(entry.key)
+            if entry.pixels:
+                seen.append(entry.picture(watched.tag))
+        list(self.monitor.add(seen))
+        self._lines = len(entries)
+
+    def begin_anew(self) -> None:
+        """Learn from the next picture on: after a proof that the calibration holds, say. Raises OSError."""
+        self.monitor, self._lines = Monitor(self._cell), 0
+        if self._path is not None:
+            append_line(self._path, WatchEntry(begun=self._watched))
+
+    def knows(self, key: str) -> bool:
+        """Whether this picture was taken in before."""
+        return key in self._known
+
+    def add(self, entry: WatchEntry) -> list[Event]:
+        """Keep a picture, then judge it. Raises OSError."""
+        self._remember(entry.key)
+        if self._path is not None:
+            append_line(self._path, entry)
+            self._lines += 1
+            if self._lines > _MOST:
+                self._shorten(self._path)
+        if not entry.pixels:
+            return list(self.monitor.miss(entry.name))
+        return list(self.monitor.add([entry.picture(self._watched.tag)]))
+
+    def _remember(self, key: str) -> None:
+        if len(self._keys) == self._keys.maxlen:
+            self._known.discard(self._keys[0])
+        self._keys.append(key)
+        self._known.add(key)
+
+    def _shorten(self, path: Path) -> None:
+        """Keep the latest pictures, and the tag's pose, which was learned from the first."""
+        if self.monitor.P is None:
+            return
+        rows = tuple(tuple(row) for row in self.monitor.P.tolist())
+        begun = WatchEntry(begun=msgspec.structs.replace(self._watched, pose=rows))
+        kept = [entry for entry in read_lines(path, WatchEntry) if entry.begun is None][-_LATEST:]
+        write_atomically(path, b"".join(msgspec.json.encode(entry) + b"\n" for entry in (begun, *kept)))
+        self._lines = len(kept)

@@ -1,0 +1,307 @@
+"""Pictures in, events out: learning, the two tests, an alarm, and what moved."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+import numpy as np
+from scipy import special
+
+from calibrate.errors import BadViewsError
+from calibrate.geometry import Array, inverse, project_to_rotation, rotation_log
+from calibrate.lens.pnp import candidate_poses
+from calibrate.quality.movement.evidence import Moved, move_size, what_moved
+from calibrate.quality.movement.free import FreePostures, Row
+from calibrate.quality.movement.pictures import (
+    ArmErrors,
+    CellModel,
+    Deviations,
+    Picture,
+    all_deviations,
+    deviations,
+    fitted_tag,
+    same_corners,
+)
+from calibrate.quality.movement.postures import PostureIndex
+from calibrate.quality.movement.repeated import FIRST_VISITS, RepeatedPostures
+from calibrate.quality.movement.window import KEPT, LEARNING, Finding
+from calibrate.views import BoardView
+
+NAMED_AFTER = 30
+"""Pictures after an alarm at which it is said what moved."""
+MISSED_AFTER = 50
+"""Pictures in a row without the tag at which that is said."""
+LARGEST_MISFIT_PX = 20.0
+"""Median misfit of the learning pictures beyond which they show no fixed tag, or not this X."""
+_JUDGED_FOR = 20
+"""Pictures over which the fast lane's finding is judged: a move, or worse pictures."""
+_CHANCE = 0.999
+"""Quantile of the share of mere noise that a move must exceed."""
+_FEWEST_POSTURES, _LEAST_TURN_RAD = 3, float(np.radians(5.0))
+"""What moved is not named from fewer postures, or turned by less (1σ) about the second axis."""
+_STARTS = 8
+_FACTORS = (0.25, 0.5, 1.0, 2.0)
+"""Sizes of an arm's errors that are tried."""
+Test = RepeatedPostures | FreePostures
+
+
+class EventKind(StrEnum):
+    """What there is to say."""
+
+    LEARNED = "learned"
+    NOT_FIXED = "not-fixed"
+    """The learning pictures do not agree with one place of the tag: nothing can be watched."""
+    TESTING = "testing"
+    """From now on pictures of this kind are tested."""
+    ALARM = "alarm"
+    NAMED = "named"
+    PICTURES_WORSE = "pictures-worse"
+    TAG_UNSEEN = "tag-unseen"
+
+
+@dataclass(frozen=True)
+class Event:
+    kind: EventKind
+    picture: str
+    """Name of the picture after which it is said."""
+    pictures: int
+    """Pictures with the tag so far."""
+    moved: Moved | None = None
+    values: dict[str, str | float | int | bool | None] = field(default_factory=dict)
+    """Figures; each name ends in its unit."""
+
+
+@dataclass
+class _Suspicion:
+    """An alarm whose cause is still to be named."""
+
+    test: Test
+    since: int
+    """Pictures of that test since it moved."""
+    after: int = 0
+
+
+class Monitor:
+    """Watches one tag in one cell; `add` pictures as they come.
+
+    The first `LEARNING` pictures place the tag and tell the noise. Memory is bounded. Once it is `finished`
+    (after NAMED or NOT_FIXED) nothing more is tested.
+    """
+
+    def __init__(self, cell: CellModel, P: Array | None = None) -> None:
+        """P: (4, 4) where the tag's place is known; else the first pictures tell it."""
+        self.cell = cell
+        self.pictures = 0
+        self.missed = 0
+        self.P = P
+        """(4, 4) base_from_tag (eye-in-hand) or flange_from_tag, once it is learned."""
+        self.repeated: RepeatedPostures | None = None
+        self.free: FreePostures | None = None
+        self.alarmed = self.finished = False
+        self._learning: list[Picture] = []
+        self._index = PostureIndex()
+        self._first: dict[int, list[Picture]] = {}
+        """First visits of each posture that may come again."""
+        self._visits: list[tuple[int, Picture]] = []
+        """Visits of postures that came again, until their test begins; and pictures of the others."""
+        self._others: list[Picture] = []
+        self._arm = ArmErrors()
+        self._turns: dict[bool, deque[tuple[int, Array]]] = {
+            kind: deque(maxlen=KEPT) for kind in (False, True)
+        }
+        self._suspicion: _Suspicion | None = None
+
+    @property
+    def needed(self) -> int:
+        """Pictures that are still needed before anything is tested; 0 when something is."""
+        if self.repeated is not None or self.free is not None:
+            return 0
+        return LEARNING - max(len(self._learning), len(self._visits), len(self._others))
+
+    def miss(self, name: str) -> Iterator[Event]:
+        """Take note of a picture without the tag."""
+        self.missed += 1
+        if self.missed % MISSED_AFTER == 0:
+            yield Event(EventKind.TAG_UNSEEN, name, self.pictures, None, {"in_a_row": self.missed})
+
+    def add(self, pictures: Iterable[Picture]) -> Iterator[Event]:
+        """Judge pictures with the tag, oldest first. Many at once are faster, the events are the same."""
+        waiting = list(pictures)
+        if self.P is None and not self.finished:
+            taken = LEARNING - len(self._learning)
+            self._learning += waiting[:taken]
+            self.pictures += len(waiting[:taken])
+            if len(self._learning) < LEARNING:
+                return
+            yield self._place_tag()
+            self.pictures -= LEARNING
+            waiting, self._learning = [*self._learning, *waiting[taken:]], []
+        if self.P is None:
+            return
+        for group in same_corners(waiting):
+            while group and not self.finished:
+                group = yield from self._add_alike(group)
+
+    def _add_alike(self, group: list[Picture]) -> Generator[Event, None, list[Picture]]:
+        """Judge pictures of equally many corners; those that are left when a test begins."""
+        assert self.P is not None
+        arm = self._arm
+        again, anywhere = deviations(self.cell, self.P, group, arm)
+        for place, picture in enumerate(group):
+            if self.finished or self._arm != arm:
+                return group[place:]
+            self.pictures, self.missed = self.pictures + 1, 0
+            yield from self._step(picture, again.y[place], (anywhere.effects[place], anywhere.y[place]))
+        return []
+
+    def _place_tag(self) -> Event:
+        P, misfit_px = fitted_tag(self.cell, self._learning, self._tag_starts())
+        kind = EventKind.LEARNED if misfit_px <= LARGEST_MISFIT_PX else EventKind.NOT_FIXED
+        self.finished = kind is EventKind.NOT_FIXED
+        self.P = None if self.finished else P
+        values = {"median_misfit_px": round(misfit_px, 3)}
+        return Event(kind, self._learning[-1].name, self.pictures, None, dict(values))
+
+    def _tag_starts(self) -> list[Array]:
+        """Places (4, 4) of the tag by single pictures, every tilt that one leaves open."""
+        starts = []
+        for picture in self._learning[:: max(1, len(self._learning) // _STARTS)]:
+            F, X = picture.base_from_flange, self.cell.X
+            view = BoardView(0, picture.name, F, picture.points, picture.pixels)
+            camera = F @ X if self.cell.mount == "eye-in-hand" else inverse(F) @ X
+            try:
+                starts += [
+                    camera @ c.camera_from_board for c in candidate_poses(view, self.cell.camera, None)
+                ]
+            except BadViewsError:
+                continue
+        return starts or [np.eye(4)]
+
+    def _step(self, picture: Picture, again: Array, anywhere: Row) -> Iterator[Event]:
+        slot, known = self._index.find(picture)
+        turn = (slot, picture.base_from_flange[:3, :3])
+        if slot in self._first or not known:
+            yield from self._step_free(picture, turn, anywhere)
+            yield from self._first_visit(picture, slot, known)
+            return
+        self._turns[True].append(turn)
+        if self.repeated is None:
+            self._visits.append((slot, picture))
+            yield from self._begin_repeated(picture)
+        else:
+            yield from self._judge(picture, self.repeated, self.repeated.add((slot, again)))
+
+    def _first_visit(self, picture: Picture, slot: int, known: bool) -> Iterator[Event]:
+        """Collect the first visits of a posture, until it counts as a repeated one."""
+        visits = self._first[slot] = [*(self._first[slot] if known else ()), picture]
+        if len(visits) < FIRST_VISITS or (number := self._index.keep(slot)) is None:
+            del visits[: -FIRST_VISITS + 1]
+            return
+        del self._first[slot]
+        if self.repeated is not None:
+            self.repeated.establish(self._whitened(visits, self._arm)[0])
+            return
+        self._visits += [(number, visit) for visit in visits]
+        yield from self._begin_repeated(picture)
+
+    def _whitened(self, pictures: list[Picture], arm: ArmErrors) -> tuple[Deviations, Deviations]:
+        assert self.P is not None
+        return all_deviations(self.cell, self.P, pictures, arm)
+
+    def _begin_repeated(self, picture: Picture) -> Iterator[Event]:
+        """Begin with the repeatability of the arm that the visits make likeliest."""
+        if len(self._visits) < LEARNING:
+            return
+        postures, visits = [number for number, _ in self._visits], [visit for _, visit in self._visits]
+        tests = {
+            factor: RepeatedPostures(postures, self._whitened(visits, ArmErrors(repeating=factor))[0])
+            for factor in _FACTORS
+        }
+        best = max(tests, key=lambda factor: tests[factor].log_likelihood)
+        self._arm, self.repeated, self._visits = replace(self._arm, repeating=best), tests[best], []
+        yield self._testing(picture, self.repeated)
+
+    def _step_free(self, picture: Picture, turn: tuple[int, Array], row: Row) -> Iterator[Event]:
+        self._turns[False].append(turn)
+        if self.free is not None:
+            yield from self._judge(picture, self.free, self.free.add(row))
+            return
+        self._others.append(picture)
+        if len(self._others) < LEARNING:
+            return
+        covariance, others = self.cell.X_covariance, self._others
+        tests = {
+            factor: FreePostures(covariance, self._whitened(others, replace(self._arm, table=factor))[1])
+            for factor in _FACTORS
+        }
+        best = max(tests, key=lambda factor: tests[factor].log_likelihood)
+        self._arm, self.free, self._others = replace(self._arm, table=best), tests[best], []
+        yield self._testing(picture, self.free)
+
+    def _testing(self, picture: Picture, test: Test) -> Event:
+        kind = "repeated" if test is self.repeated else "any"
+        values: dict[str, str | float | int | bool | None] = {"postures": kind, "noise": round(test.noise, 3)}
+        return Event(EventKind.TESTING, picture.name, self.pictures, None, values)
+
+    def _judge(self, picture: Picture, test: Test, finding: Finding) -> Iterator[Event]:
+        if self._suspicion is not None:
+            yield from self._name(picture, test, self._suspicion)
+        elif finding.alarm:
+            yield self._alarm(picture, test, finding.window, finding)
+        elif 0 < finding.far <= _JUDGED_FOR:
+            share, count = test.explained_share(finding.far)
+            if share > self._share_of_noise(count):
+                yield self._alarm(picture, test, finding.far, finding)
+            elif finding.far == _JUDGED_FOR:
+                yield Event(EventKind.PICTURES_WORSE, picture.name, self.pictures)
+
+    def _share_of_noise(self, count: int) -> float:
+        """Share of the noise of n pictures that p unknowns seldom explain: Beta(p/2, (6 n - p)/2)."""
+        moves = 12 if self.cell.arm is None else 16
+        return float(special.betaincinv(moves / 2, (6 * count - moves) / 2, _CHANCE))
+
+    def _alarm(self, picture: Picture, test: Test, since: int, finding: Finding) -> Event:
+        self.alarmed, self._suspicion = True, _Suspicion(test, since)
+        values: dict[str, str | float | int | bool | None] = {
+            "log_ratio": round(finding.score, 2),
+            "limit": test.limit,
+            "since_pictures": since,
+            "fast_lane": not finding.alarm,
+        }
+        return Event(EventKind.ALARM, picture.name, self.pictures, None, values)
+
+    def _name(self, picture: Picture, test: Test, suspicion: _Suspicion) -> Iterator[Event]:
+        """Say what moved, `NAMED_AFTER` pictures of the test that noticed it."""
+        if test is not suspicion.test:
+            return
+        suspicion.after += 1
+        if suspicion.after < NAMED_AFTER:
+            return
+        self.finished = True
+        count = suspicion.since + suspicion.after
+        M, u = test.move_since(count)
+        moved, log_odds = what_moved(M, u, self.cell.mount)
+        postures, turn_rad = self._variety(test, count)
+        if postures < _FEWEST_POSTURES or turn_rad < _LEAST_TURN_RAD:
+            moved = Moved.CANNOT_TELL
+        values: dict[str, str | float | int | bool | None] = {
+            "log_odds": round(log_odds, 2),
+            "postures": postures,
+            "turn_deg": round(float(np.degrees(turn_rad)), 2),
+        }
+        if moved in (Moved.CAMERA, Moved.CAMERA_BASE, Moved.TAG, Moved.TAG_GRIPPER):
+            size = move_size(M, u, moved)
+            values["moved_mm"] = round(float(np.linalg.norm(size[:3]) * 1e3), 3)
+            values["moved_deg"] = round(float(np.degrees(np.linalg.norm(size[3:]))), 4)
+        yield Event(EventKind.NAMED, picture.name, self.pictures, moved, values)
+
+    def _variety(self, test: Test, count: int) -> tuple[int, float]:
+        """Postures of the test's latest pictures, and 1σ of their turns about the second axis, radians."""
+        turns = list(self._turns[test is self.repeated])[-count:]
+        R = np.array([turn for _, turn in turns])
+        apart = rotation_log(R @ project_to_rotation(R.mean(axis=0)).T)
+        spread = np.linalg.eigvalsh(np.cov(apart.T))
+        return len({slot for slot, _ in turns}), float(np.sqrt(max(spread[1], 0.0)))

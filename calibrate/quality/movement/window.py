@@ -1,0 +1,182 @@
+"""What both tests share: shortened outliers, windows of many lengths, and a fast lane for large moves.
+
+A deviation from what the latest pictures showed is shortened to a limit before it counts, so one blurred
+picture cannot raise an alarm. A large move is then shortened too, over and over: the fast lane counts that.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.geometry import Array
+from calibrate.quality.movement.evidence import move_score
+from calibrate.quality.movement.pictures import Deviations
+
+LEARNING = 60
+"""Pictures that a test needs before it judges."""
+REFERENCE = 1000
+"""Pictures before a window that it is compared with."""
+WINDOWS = 3 * 2 ** np.arange(8)
+"""3, 6 … 384 pictures."""
+KEPT = REFERENCE + int(WINDOWS[-1])
+CHI2_6_MEDIAN, _CHI2_6_99 = 5.348, 16.81
+LIMIT = float(np.sqrt(_CHI2_6_99))
+"""Whitened length to which a deviation is shortened; 1 % of good pictures are longer."""
+_STEP, _FAST_LIMIT = float(np.log(9)), 13.8
+"""Log-odds of a shortened picture, and the sum (CUSUM) that is an alarm: seven in a row."""
+_ROBUST_STEPS = 6
+_FAINT = 0.01
+"""Information beforehand on moves, per `UNITS` squared: only so that what nothing shows stays finite."""
+Entry = TypeVar("Entry")
+Counts = NDArray[np.intp]
+
+
+class RunningSums:
+    """Sums of the latest `KEPT` entries and of any latest part of them, in bounded memory."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._rows = np.zeros((2 * KEPT + 1, *shape))
+        self._at = 0
+
+    def __len__(self) -> int:
+        return min(self._at, KEPT)
+
+    def append(self, value: Array, place: int | None = None) -> None:
+        """Add an entry: a whole row, or what is at `place` of it."""
+        if self._at == len(self._rows) - 1:
+            kept = self._rows[-KEPT - 1 :] - self._rows[-KEPT - 1]
+            self._rows[: KEPT + 1] = kept
+            self._at = KEPT
+        row = self._rows[self._at + 1]
+        row[...] = self._rows[self._at]
+        row[... if place is None else place] += value
+        self._at += 1
+
+    def widen(self, places: int) -> None:
+        """Make room for more places in every row."""
+        wider = np.zeros((len(self._rows), places, *self._rows.shape[2:]))
+        wider[:, : self._rows.shape[1]] = self._rows
+        self._rows = wider
+
+    @property
+    def places(self) -> int:
+        return self._rows.shape[1]
+
+    def latest(self, counts: Counts | int) -> Array:
+        """Sum the latest `counts` entries."""
+        return np.asarray(self._rows[self._at] - self._rows[self._at - np.asarray(counts)])
+
+    def before(self, counts: Counts | int, most: int = REFERENCE) -> Array:
+        """Sum at most `most` entries before the latest `counts`."""
+        end = self._at - np.asarray(counts)
+        return np.asarray(self._rows[end] - self._rows[np.maximum(end - most, max(self._at - KEPT, 0))])
+
+
+@dataclass(frozen=True)
+class Finding:
+    """State of a test after a picture."""
+
+    score: float
+    """ln of the likelihood ratio of a move, the highest of all windows; 0 before there is one."""
+    window: int
+    """Pictures of that window."""
+    far: int
+    """Pictures since the fast lane began to count; 0 below its limit."""
+    alarm: bool
+
+
+class WindowTest(ABC, Generic[Entry]):
+    """A sequential test of one kind of pictures."""
+
+    log_likelihood: float
+    """Of the pictures learned from."""
+    limit: float
+    """Score that is an alarm."""
+
+    def __init__(self, noise: float) -> None:
+        self.noise = noise
+        """Standard deviation of whitened deviations, by the learning pictures."""
+        self.latest: deque[Entry] = deque(maxlen=KEPT)
+        self._cusum, self._since = 0.0, 0
+
+    @abstractmethod
+    def add(self, entry: Entry) -> Finding:
+        """Judge the next picture."""
+
+    @abstractmethod
+    def contrasts(self, windows: Counts) -> tuple[Array, Array]:
+        """M (w, 12, 12) and u (w, 12) of these latest windows against what was before, unit noise."""
+
+    @abstractmethod
+    def contrast(self, count: int, weights: Array) -> tuple[Array, Array]:
+        """M (16, 16) and u (16,) of the latest `count` pictures, not shortened, against what was before."""
+
+    @abstractmethod
+    def rest(self, count: int, weights: Array, move: Array) -> Array:
+        """Deviations (m, 6) of the latest `count` pictures that a move (16,) leaves, whitened, not shortened.
+
+        `count` pictures, or fewer where some have nothing to be compared with.
+        """
+
+    def _judge(self, length: float) -> Finding:
+        """Finding after the picture whose deviation has this whitened length."""
+        step = _STEP if length > LIMIT else -_STEP
+        self._cusum = min(max(0.0, self._cusum + step), 1.5 * _FAST_LIMIT)
+        self._since = self._since + 1 if self._cusum > 0 else 0
+        far = self._since if self._cusum > _FAST_LIMIT else 0
+        windows = WINDOWS[: int(np.searchsorted(WINDOWS, len(self.latest) // 2, side="right"))]
+        if not len(windows):
+            return Finding(0.0, 0, far, False)
+        M, u = self.contrasts(windows)
+        scores = move_score(M / self.noise**2, u / self.noise**2) + np.log(windows) / 2
+        best = int(scores.argmax())
+        return Finding(float(scores[best]), int(windows[best]), far, bool(scores[best] > self.limit))
+
+    def move_since(self, count: int) -> tuple[Array, Array]:
+        """M (16, 16) and u (16,) of the latest `count` pictures over the noise, far ones weighed down."""
+        weights: Array = np.ones(count)
+        for _ in range(_ROBUST_STEPS):
+            M, u = self.contrast(count, weights)
+            move = np.asarray(np.linalg.solve(M + _FAINT * self.noise**2 * np.eye(16), u), dtype=float)
+            lengths = np.linalg.norm(self.rest(count, weights, move), axis=1) / self.noise
+            weights = np.asarray(np.minimum(1.0, LIMIT / np.maximum(lengths, 1e-12)))
+        return M / self.noise**2, u / self.noise**2
+
+    def explained_share(self, count: int) -> tuple[float, int]:
+        """Share of the latest pictures' squared deviations that a move of camera, tag and joints explains.
+
+        The longest tenth is left out: one blurred picture would hide any move. The second value is the number
+        of pictures that are left.
+        """
+        lengths: Array = np.linalg.norm(self.rest(count, np.ones(count), np.zeros(16)), axis=1)
+        kept = lengths <= np.sort(lengths)[count - 1 - -(-count // 10)]
+        weights = np.asarray(kept, dtype=float)
+        M, u = self.contrast(count, weights)
+        move = np.asarray(np.linalg.solve(M + _FAINT * self.noise**2 * np.eye(16), u), dtype=float)
+        total, left = (float((self.rest(count, weights, by)[kept] ** 2).sum()) for by in (np.zeros(16), move))
+        return 1.0 - left / max(total, 1e-300), int(kept.sum())
+
+
+def shortened(deviation: Array, limit: float) -> tuple[Array, float]:
+    """A deviation (6,) no longer than `limit`, and the length that it had."""
+    length = float(np.sqrt(deviation @ deviation))
+    return deviation * min(1.0, limit / max(length, 1e-300)), length
+
+
+def log_likelihood(learned: Deviations, lengths: Array, noise: float) -> float:
+    """ln of the likelihood of pictures with deviations of these lengths, far ones shortened."""
+    squares = np.minimum(lengths / noise, LIMIT) ** 2
+    return float((learned.log_density - squares / 2).sum() - learned.y.size * np.log(noise))
+
+
+def noise_of(lengths: Array, freedom: float = 1.0) -> float:
+    """Standard deviation of six whitened numbers from their lengths (n,), by the median; `freedom`: the share
+    that a fit left.
+    """
+    return float(np.sqrt(np.median(lengths**2) / (CHI2_6_MEDIAN * freedom)))

@@ -107,6 +107,8 @@ def _settings(options: argparse.Namespace) -> Settings:
     given["input_delay_cycles"] = max(0, options.input_delay)
     given["paused_by_protective_stop"] = not options.protective_stop_ends_program
     if options.software is not None:
+        if not all(part.isdecimal() for part in options.software.split(".")):
+            raise ValueError(f"--software is numbers with dots, such as 5.25.1, not {options.software}")
         given["software"] = tuple(map(int, options.software.split(".")))
     named = (text.partition("=") for text in options.program)
     given["programs"] = {name: Path(file).read_text() if file else None for name, _, file in named}

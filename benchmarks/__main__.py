@@ -40,7 +40,7 @@ SHOWN: dict[str, str] = {
     "speed": r"^\| (18|4950) \|",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
     "batch": "speed-up|bits",
-    "fleet": "Dask",
+    "fleet": "process|Dask",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves, plan|predicted)",
     "improving": "improved",
     "drift": r"planned \| [38] \|",

@@ -12,6 +12,7 @@ from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.widgets import Static
 
+from station.protocol.states import RUNNING
 from station.protocol.verbs import Check, Doctor
 from station.tui.screen import StationScreen
 from station.tui.task import Known
@@ -92,6 +93,9 @@ class ConnectScreen(StationScreen):
         self.show(self.desk.known())
 
     def look_again(self) -> None:
-        """Check again while something is missing; what is there is left in peace."""
-        if self.is_current and self.desk.known().missing is not None:
+        """Check again while something is missing, whatever is shown; an arm at work is left in peace."""
+        known = self.desk.known()
+        if known.missing is None or known.status is None or known.silent_s is not None:
+            return
+        if known.status.state not in RUNNING:
             self.action_refresh_checks()

@@ -35,7 +35,7 @@ SIGMA_SHOWN_MM = 100.0
 """The first poses alone determine nothing: a number in metres would only puzzle."""
 BAR_CELLS = 7
 TURN_DEG, ZOOM = 15.0, 1.25
-_SEEN = re.compile(r"^\d+ mm, tilt \d+°, |board (?!centred)")
+_SEEN = re.compile(r"^\d+ mm, tilt \d+°, |board ")
 """What the columns beside it say of the planned pose."""
 _STATES: dict[str, tuple[Mark, str]] = {
     "planned": ("todo", "planned"),

@@ -8,6 +8,7 @@ from textual.widgets import DataTable
 
 from station.cell.status import StationState
 from station.protocol.verbs import Check
+from station.tui import connect
 from station.tui.app import StationApp
 from station.tui.connect import ConnectScreen
 from station.tui.dialogs import Help
@@ -39,6 +40,20 @@ async def test_a_long_checklist_is_read_to_its_end_with_keys(link: FakeLink) -> 
         assert "This&#160;list&#160;looks" not in pilot.app.export_screenshot()
         await pilot.press("end")
         await until(pilot, lambda: "This&#160;list&#160;looks" in pilot.app.export_screenshot())
+
+
+async def test_what_was_missing_is_looked_for_on_every_screen(
+    link: FakeLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connect, "AGAIN_S", 0.1)
+    link.answers["doctor"] = MISSING
+    async with opened(link) as pilot:
+        await pilot.press("1")
+        await until(pilot, lambda: pilot.app.known().missing is not None)
+        await pilot.press("3")
+        link.answers["doctor"] = THERE
+        await until(pilot, lambda: pilot.app.known().missing is None)
+        assert isinstance(pilot.app.screen, LiveScreen)
 
 
 async def test_before_the_first_session_too(link: FakeLink) -> None:

@@ -5,20 +5,19 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from recordings.errors import Value
 from recordings.schema.messages import Vector6
+from station.cell.acceptance import StopWay
+from station.cell.collision import CellGeometry
 from station.cell.errors import RefusedError
+from station.cell.limits import MoveCheck
 from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus, MotionPreview
 from station.plan.hover import HoverPath
 from station.protocol.verbs import Purpose
 from station.session.queue import PlanRevision
-
-if TYPE_CHECKING:
-    from station.session.stop_test import StopTestMove
 
 START_TOLERANCE_RAD = 0.005
 """The arm must stand where it stood when the person was asked."""
@@ -55,6 +54,16 @@ class LeaseManager:
                 remedy="Ask them to release it (F4 on their screen); you may watch and STOP.",
                 holder=self.lease.holder,
             )
+
+
+@dataclass(frozen=True, eq=False)
+class StopTestMove:
+    """The checked move of an acceptance test, and what ends it."""
+
+    way: StopWay
+    target_rad: Vector6
+    check: MoveCheck
+    geometry: CellGeometry
 
 
 @dataclass(frozen=True)

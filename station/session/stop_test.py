@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -20,14 +20,14 @@ from station.cell.acceptance import StopTestOffer, StopWay
 from station.cell.collision import CellGeometry
 from station.cell.config import matrix4, vector6
 from station.cell.errors import LimitError, RefusedError, RobotError, SafetyStopError, StaleStateError
-from station.cell.limits import MoveCheck, PlanCheck, check_path, check_plan
+from station.cell.limits import PlanCheck, check_path, check_plan
 from station.cell.plan import Plan, PlannedPose, plan_sha256
 from station.cell.scene import geometry_from
 from station.cell.status import StationState
 from station.cell.stillness import RestingCheck
 from station.protocol import verbs
 from station.session.context import SessionContext, displacement
-from station.session.lease import MotionApproval
+from station.session.lease import MotionApproval, StopTestMove
 from station.session.run import Run
 from station.session.summary import motion_preview, motion_warnings
 
@@ -53,16 +53,6 @@ _WORDS = {
     StopWay.NETWORK: "ends as you pull the robot's network cable",
     StopWay.SLIDER: "waits at slider 0 and is given up after 10 s",
 }
-
-
-@dataclass(frozen=True, eq=False)
-class StopTestMove:
-    """The checked move, and what ends it."""
-
-    way: StopWay
-    target_rad: Vector6
-    check: MoveCheck
-    geometry: CellGeometry
 
 
 async def prepare_stop_test(

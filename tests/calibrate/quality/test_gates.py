@@ -170,8 +170,8 @@ def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) ->
 
 
 def test_the_documented_defaults_are_those_in_force() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "calibration-file.md").read_text()
-    table = text[text.index("## Gates") : text.index("Installing asks one gate more")]
+    text = (Path(__file__).parents[3] / "docs" / "integrator" / "calibration-file.md").read_text()
+    table = text[text.index("## Gates") : text.index("Installing asks one more")]
     documented: dict[str, str] = {}
     for row in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", table, re.MULTILINE):
         documented |= zip(re.findall(r"`(\w+)`", row[0]), row[1].strip().split(", "), strict=True)

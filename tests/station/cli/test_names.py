@@ -38,7 +38,7 @@ def test_a_configuration(folder: Path) -> None:
     file = folder / "].yaml"
     cell = cell_config(make_cell("paper", 0, "low", "eye-in-hand"), "127.0.0.1")
     file.write_bytes(msgspec.yaml.encode(cell))
-    assert call(main, "doctor", "--config", file).stdout.startswith(f"{file}: good; ")
+    assert call(main, "doctor", "--config", file).stdout.startswith(f"{file}: incomplete; ")
 
 
 def test_a_plan_and_its_poses(folder: Path) -> None:

@@ -8,7 +8,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import ClassVar, cast
 
 from rich.console import Group
 from rich.table import Table
@@ -25,7 +25,7 @@ from calibrate.files.exports import FORMATS
 from calibrate.files.install import reason_problem
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
-from station.tui.frame import Question
+from station.tui.frame import Frame, Knowing, Question
 from station.tui.task import Action, Known
 from station.tui.words import duration, limit_bar
 
@@ -206,6 +206,9 @@ class Help(Question[None]):
         self.titled(self._title)
 
 
+READ = Action("", "Read what it says", "It is done; Enter closes this window.", look=True)
+
+
 class JobScreen(Question[int]):
     """Runs `python -m MODULE ARGS…` and returns its exit code; Escape or Cancel ends it (-1).
 
@@ -268,6 +271,8 @@ class JobScreen(Question[int]):
             close = self.query_one("#job-cancel", Button)
             close.label = "Close"
             close.focus()
+            self.query_one(Frame).question = READ
+            self.show(cast(Knowing, self.app).known())
 
     async def action_cancel(self) -> None:
         if self._process is None or self._exit_code is not None:

@@ -81,7 +81,7 @@ class Frame(Horizontal):
 
     def __init__(self, title: str, mode: str, question: Action | None = None) -> None:
         super().__init__(classes="frame")
-        self._title, self._mode, self._question = title, mode, question
+        self._title, self._mode, self.question = title, mode, question
 
     def compose(self) -> ComposeResult:
         with Vertical(classes="head"):
@@ -91,7 +91,7 @@ class Frame(Horizontal):
         yield StopBlock(id="stop")
 
     def _next(self, known: Known, width: int) -> Content:
-        action = self._question or next_action(known).on(self._mode)
+        action = self.question or next_action(known).on(self._mode)
         return next_line(action, width - self.query_one(StopBlock).size.width)
 
     def show(self, known: Known) -> None:

@@ -12,8 +12,9 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Button, Label, RichLog
 
+from station.tui.dialogs import READ
 from station.tui.results import JobScreen
-from tests.tui.conftest import FakeLink, app_on, until
+from tests.tui.conftest import FakeLink, app_on, text_of, until
 
 
 @pytest.fixture
@@ -67,6 +68,7 @@ async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, jo
         button = screen.query_one("#job-cancel", Button)
         await until(pilot, lambda: str(button.label) == "Close")
         assert any("no board in any view" in line.text for line in screen.query_one(RichLog).lines)
+        await until(pilot, lambda: READ.label in text_of(pilot.app, "#next"))
         assert codes == []
         await pilot.press("escape")
         await until(pilot, lambda: codes)

@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.offline import make_recording
 from benchmarks.trials import trials
 from calibrate.batch.run import BatchResult, Progress, run_batch
-from calibrate.batch.workers import Lost, R, T, Workers, pool
+from calibrate.batch.workers import BatchWorkers, Lost, R, T, pool
 
 _PARTS = 4
 """Both ways take turns, a quarter of the recordings each, so that both see the same load of the machine."""
@@ -71,7 +71,7 @@ def in_this_process(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tup
 
 
 def _timed(
-    recordings: Sequence[Path], output: Path, workers: Workers, progress: Progress | None = None
+    recordings: Sequence[Path], output: Path, workers: BatchWorkers, progress: Progress | None = None
 ) -> tuple[float, list[BatchResult]]:
     start = time.perf_counter()
     results = run_batch(recordings, output, workers=workers, progress=progress)

@@ -26,7 +26,7 @@ from benchmarks.trials import table, trials
 from calibrate.batch import CameraRecord, collect_fleet, dask_workers, fleet_table, pool, run_batch
 from calibrate.batch.fleet import UNREADABLE
 from calibrate.batch.page import fleet_page
-from calibrate.batch.workers import R, Workers
+from calibrate.batch.workers import BatchWorkers, R
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
 from calibrate.pipeline import solve_recording
@@ -121,7 +121,7 @@ class _Measured:
 
 
 def _measure(
-    workers: Workers,
+    workers: BatchWorkers,
     cells: Sequence[Path],
     recordings: Sequence[Path],
     output: Path,

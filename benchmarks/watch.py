@@ -19,7 +19,7 @@ from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, tran
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many
 from calibrate.projection import project_pixels
 from calibrate.quality.movement.evidence import Moved
-from calibrate.quality.movement.monitor import EventKind, Monitor
+from calibrate.quality.movement.monitor import EventKind, MovementMonitor
 from calibrate.quality.movement.pictures import CellModel, Picture
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 
@@ -200,11 +200,11 @@ def _run_cell(task: tuple[Cell, tuple[Happening, ...]]) -> list[Outcome]:
     """Each happening in the same cell, whose pictures before it are the same."""
     cell, happenings = task
     found = []
-    watched: Monitor | None = None
+    watched: MovementMonitor | None = None
     for what in happenings:
         model, pictures = simulate(cell, _BEFORE + _AFTER, what)
         if watched is None:
-            watched = Monitor(model)
+            watched = MovementMonitor(model)
             list(watched.add(pictures[:_BEFORE]))
         monitor = copy.deepcopy(watched)
         events = list(monitor.add(pictures[_BEFORE:]))
@@ -217,7 +217,7 @@ def _run_cell(task: tuple[Cell, tuple[Happening, ...]]) -> list[Outcome]:
 
 def _run_null(cell: Cell) -> tuple[int, bool]:
     model, pictures = simulate(cell, _NULL, None)
-    monitor = Monitor(model)
+    monitor = MovementMonitor(model)
     events = list(monitor.add(pictures))
     begun = next(e.pictures for e in events if e.kind is EventKind.TESTING)
     ended = next((e.pictures for e in events if e.kind is EventKind.ALARM), _NULL)

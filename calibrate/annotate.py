@@ -21,7 +21,7 @@ from calibrate.geometry import Array, inverse
 from calibrate.load import Progress, load_views
 from calibrate.projection import project_pixels
 from recordings.reader import Recording
-from recordings.scene import Entity, Line
+from recordings.scene import Entity, Polyline
 from recordings.schema.messages import CameraModel, Matrix4, View
 from recordings.schema.viewing import DETECTED, Marks, drawn
 from recordings.writer import RecordingWriter, derived_recording
@@ -150,7 +150,7 @@ def _board_entity(calibration: Calibration) -> Entity:
     points = board_points(calibration.board)
     low, high = points.min(axis=0), points.max(axis=0)
     outline = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]], low[:2]])
-    line = Line(np.column_stack([outline, np.zeros(5)]), (1.0, 1.0, 1.0, 1.0))
+    line = Polyline(np.column_stack([outline, np.zeros(5)]), (1.0, 1.0, 1.0, 1.0))
     return Entity("board", calibration.board_place.child_frame, (line,), "board")
 
 
@@ -167,6 +167,6 @@ def _camera_entity(
     if calibration.mount == "eye-in-hand":
         T = T @ calibration.transform.matrix
     colour = (*(REJECTED if residual.rejected else USED), 1.0)
-    lines = tuple(Line(points @ T[:3, :3].T + T[:3, 3], colour, 0.0015) for points in (rays, spokes))
+    lines = tuple(Polyline(points @ T[:3, :3].T + T[:3, 3], colour, 0.0015) for points in (rays, spokes))
     at = T[:3, 3]
     return Entity(f"pose {view.index + 1}", "base", lines, str(view.index + 1), (at[0], at[1], at[2]))

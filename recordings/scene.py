@@ -24,8 +24,8 @@ Colour = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
-    """A polyline (n, 3) in the entity's frame, metres."""
+class Polyline:
+    """Points (n, 3) joined by a line, in the entity's frame, metres."""
 
     points: NDArray[np.float64]
     colour: Colour
@@ -38,7 +38,7 @@ class Entity:
 
     name: str
     frame: str
-    lines: tuple[Line, ...] = ()
+    lines: tuple[Polyline, ...] = ()
     text: str = ""
     text_at_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from calibrate.batch.workers import BatchError, Lost, R, T, Workers
+from calibrate.batch.workers import BatchError, BatchWorkers, Lost, R, T
 from calibrate.document import software_versions
 
 _CONNECT_S = 30
@@ -82,7 +82,7 @@ class _SchedulerFile(msgspec.Struct):
     address: str
 
 
-def cluster_workers(cluster: Cluster) -> Workers:
+def cluster_workers(cluster: Cluster) -> BatchWorkers:
     """Check at once that `distributed` is installed and the address makes sense; connect when there is work.
 
     Raises ClusterError.
@@ -105,7 +105,7 @@ def cluster_workers(cluster: Cluster) -> Workers:
     return run
 
 
-def dask_workers(client: Any) -> Workers:
+def dask_workers(client: Any) -> BatchWorkers:
     """Make workers of a `distributed.Client` that is connected; it stays open.
 
     When the batch ends early, or its process is killed, the scheduler forgets what has not begun.

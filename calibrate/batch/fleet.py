@@ -13,7 +13,7 @@ import msgspec
 
 from calibrate.batch.run import whole
 from calibrate.batch.storage import cell_folder
-from calibrate.batch.workers import Lost, Workers, pool
+from calibrate.batch.workers import BatchWorkers, Lost, pool
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration
 from calibrate.files.loader import cameras, current_validity, current_version, readable_folder
@@ -72,7 +72,7 @@ Progress = Callable[[int, int, str], None]
 def collect_fleet(
     cells: Sequence[Path | str],
     now: datetime | None = None,
-    workers: Workers | None = None,
+    workers: BatchWorkers | None = None,
     progress: Progress | None = None,
 ) -> list[CameraRecord]:
     """Read the state of every camera of every cell, in the order of `cells` and by camera.

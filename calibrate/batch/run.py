@@ -16,7 +16,7 @@ import cv2
 import msgspec
 
 from calibrate.batch.storage import Results, facts, is_url, local_copy
-from calibrate.batch.workers import BatchError, Lost, Workers, pool
+from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.bounds import Limits, bounded
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import encode_calibration
@@ -73,7 +73,7 @@ def run_batch(
     recordings: Sequence[Path | str],
     output: Path | str,
     options: JobOptions | None = None,
-    workers: Workers | None = None,
+    workers: BatchWorkers | None = None,
     progress: Progress | None = None,
     limits: Limits | None = None,
 ) -> list[BatchResult]:

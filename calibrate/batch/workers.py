@@ -37,7 +37,7 @@ class Lost:
     reason: str
 
 
-class Workers(Protocol):
+class BatchWorkers(Protocol):
     """Calls `work`, a module's own function, with each task; tasks can be hashed and pickled.
 
     Yields every task once with its answer, as they come, in any order. Closed early, nothing goes on.
@@ -46,7 +46,7 @@ class Workers(Protocol):
     def __call__(self, work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]: ...
 
 
-def pool(count: int | None = None) -> Workers:
+def pool(count: int | None = None) -> BatchWorkers:
     """Make workers of `count` processes here (default: one per core). A killed one costs no task."""
 
     def run(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:

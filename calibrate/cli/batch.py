@@ -19,7 +19,7 @@ from calibrate.batch.fleet import UNREADABLE, collect_fleet, fleet_table
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.storage import Results, expand
 from calibrate.batch.trends import CellHistory, cells, trends_text
-from calibrate.batch.workers import Workers, pool
+from calibrate.batch.workers import BatchWorkers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.contracts import FleetCameraJson, FleetJson
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit, takes
@@ -48,7 +48,7 @@ def chosen_workers(
     tls_ca: Annotated[Path | None, typer.Option(help="The cluster's certificate authority, PEM")] = None,
     tls_cert: Annotated[Path | None, typer.Option(help="Your certificate, PEM")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="Your private key, PEM")] = None,
-) -> Workers:
+) -> BatchWorkers:
     """Processes here, or a cluster."""
     tls = (tls_ca, tls_cert, tls_key)
     if scheduler is None and scheduler_file is None:
@@ -67,7 +67,7 @@ def chosen_workers(
 @takes(chosen_workers, "workers")
 def batch(
     recordings: Annotated[list[str], typer.Argument(help="Recordings or session folders; URLs may have *")],
-    workers: Workers,
+    workers: BatchWorkers,
     output: OutputFolder = "batch",
     profile: Profile = ProfileName.robust,
     seed: Seed = 0,
@@ -107,7 +107,7 @@ def batch(
 @takes(chosen_workers, "workers")
 def fleet(
     roots: Annotated[list[str], typer.Argument(help="State folders of the cells; URLs may have *")],
-    workers: Workers,
+    workers: BatchWorkers,
     output: OutputFolder = "fleet",
     as_json: AsJson = False,
 ) -> None:

@@ -35,7 +35,7 @@ from calibrate.load import detect_all
 from calibrate.pipeline import single_threaded_opencv
 from calibrate.quality.movement.evidence import Moved
 from calibrate.quality.movement.log import FILE, MonitorLog, WatchedTag, WatchEntry
-from calibrate.quality.movement.monitor import LARGEST_MISFIT_PX, NAMED_AFTER, Event, EventKind
+from calibrate.quality.movement.monitor import LARGEST_MISFIT_PX, NAMED_AFTER, EventKind, MovementEvent
 from calibrate.quality.movement.pictures import CellModel
 from recordings.errors import BadImageError
 from recordings.files import MAIN_CAMERA
@@ -250,7 +250,7 @@ class _Teller:
         self._installed, self._root, self._camera = str(installed), root, camera
         self._version, self._as_json = version, as_json
 
-    def tell(self, event: Event) -> None:
+    def tell(self, event: MovementEvent) -> None:
         text = event_text(event)
         moved = event.kind in (EventKind.ALARM, EventKind.NAMED)
         validity = self._doubt(event, text) if moved and self._version is not None else None
@@ -270,7 +270,7 @@ class _Teller:
             shown = VALIDITY_STYLES[validity.state]
             out.print(f"The installed calibration is {validity_text(validity)}", style=shown)
 
-    def _doubt(self, event: Event, text: str) -> Validity:
+    def _doubt(self, event: MovementEvent, text: str) -> Validity:
         reason = ValidityReason(
             "watch",
             text,
@@ -323,7 +323,7 @@ _MOVED_TEXT = {
 }
 
 
-def event_text(event: Event) -> str:
+def event_text(event: MovementEvent) -> str:
     """What happened, for people."""
     values = event.values
     if event.kind is EventKind.NAMED and event.moved is not None:

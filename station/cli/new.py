@@ -26,7 +26,7 @@ from station.devices.ur_condition import what_holds
 from station.devices.ur_dashboard import STOP, DashboardError
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import probe
-from station.operate.draft import ArmReader, CameraReader, FoundCamera
+from station.operate.draft import ArmReader, CameraChoice, CameraReader
 from station.operate.new_cell import default_place
 
 SERVICES = (
@@ -135,13 +135,13 @@ class RealHardware:
         await link.connect()
         return LinkedArm(link)
 
-    async def cameras(self) -> tuple[FoundCamera, ...]:
+    async def cameras(self) -> tuple[CameraChoice, ...]:
         return tuple(
-            FoundCamera("aravis", serial or address, f"{model} {serial}")
+            CameraChoice("aravis", serial or address, f"{model} {serial}")
             for model, serial, address in await asyncio.to_thread(found_cameras)
         )
 
-    async def camera(self, found: FoundCamera) -> CameraReader:
+    async def camera(self, found: CameraChoice) -> CameraReader:
         reader = GenicamReader(found.device)
         await reader.open()
         return reader

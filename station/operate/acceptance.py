@@ -41,7 +41,7 @@ BUSY = frozenset({"watchdog-computer", "no-heartbeat", "move-refused"})
 _LOOK_S = 0.1
 
 
-class Recorder(Protocol):
+class StateRecorder(Protocol):
     """Every sample of the arm, by a connection that is not the daemon's."""
 
     async def begin(self) -> None: ...
@@ -107,7 +107,7 @@ class AcceptanceTest:
 
     link: Link
     person: PersonAtArm
-    recorder: Recorder
+    recorder: StateRecorder
     joint: int = 0
     speeds_m_s: Sequence[float] = SPEEDS_M_S
     ways: Sequence[StopWay] = tuple(StopWay)

@@ -16,7 +16,7 @@ from recordings.files import ASKED_FOR, write_atomically
 from recordings.schema.messages import BoardSpec, Image, Mount, RobotState
 from station.cell.errors import RobotError, StationError
 from station.operate import draft as drafts
-from station.operate.draft import ArmReader, CameraReader, Draft, FoundCamera, Hardware, Step
+from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep, Draft, Hardware
 from station.operate.guided_views import (
     STILL_RAD_S,
     STILL_S,
@@ -31,7 +31,7 @@ from station.operate.guided_views import (
 GREY_WANTED = 110.0
 """Mean grey of a well exposed image of paper and table, of 255."""
 EXPOSURE_US = (50.0, 200_000.0)
-_LOOKED_FOR = (Step.BOARD, Step.VIEWS, Step.LIMITS)
+_LOOKED_FOR = (CellStep.BOARD, CellStep.VIEWS, CellStep.LIMITS)
 
 
 class CellSetup:
@@ -43,7 +43,7 @@ class CellSetup:
         self.draft: Draft = drafts.load_draft(root)
         self.arm: ArmReader | None = None
         self.camera: CameraReader | None = None
-        self.cameras: tuple[FoundCamera, ...] = ()
+        self.cameras: tuple[CameraChoice, ...] = ()
         self.mount: Mount = self.draft.mount or "eye-in-hand"
         """The drawing that is marked."""
         self.state: RobotState | None = None
@@ -106,7 +106,7 @@ class CellSetup:
             await self.open(found[0])
         return changed
 
-    async def open(self, chosen: FoundCamera) -> None:
+    async def open(self, chosen: CameraChoice) -> None:
         """Show what this camera sees from now on, exposed well. Raises CameraError."""
         if self.draft.camera == chosen and self.camera is not None:
             return
@@ -138,12 +138,12 @@ class CellSetup:
         if self.state is None or max(map(abs, self.state.joint_speeds_rad_s)) > STILL_RAD_S:
             self._moved_s = time.monotonic()
 
-    def look(self, begun_s: float, image: Image, step: Step) -> Detection | None:
+    def look(self, begun_s: float, image: Image, step: CellStep) -> Detection | None:
         """Look for the board; None in steps that do not ask for it. A tenth of a second, in any thread."""
         board = self.draft.board
         if board is None or step not in _LOOKED_FOR:
             return None
-        found = detect(image.pixels, board, step is Step.BOARD and self.seen is None)
+        found = detect(image.pixels, board, step is CellStep.BOARD and self.seen is None)
         self.seen, self.trouble = (begun_s, found), image_trouble(image, found)[1]
         return found
 

@@ -15,7 +15,7 @@ from recordings.schema.messages import BoardSpec, Image, Matrix4, Mount, RobotId
 DRAFT_FILE = "new-cell.json"
 
 
-class Step(StrEnum):
+class CellStep(StrEnum):
     """The steps of the wizard, in order."""
 
     ROBOT = "robot"
@@ -27,10 +27,10 @@ class Step(StrEnum):
     SAVE = "save"
 
 
-STEPS = tuple(Step)
+STEPS = tuple(CellStep)
 
 
-class FoundCamera(msgspec.Struct, frozen=True):
+class CameraChoice(msgspec.Struct, frozen=True):
     """A camera that answered."""
 
     driver: str
@@ -82,10 +82,10 @@ class Hardware(Protocol):
     async def arm(self, host: str) -> ArmReader:
         """Connect for reading only. Raises RobotError with the pendant's own menu words."""
 
-    async def cameras(self) -> tuple[FoundCamera, ...]:
+    async def cameras(self) -> tuple[CameraChoice, ...]:
         """Cameras that answer now. Raises CameraError."""
 
-    async def camera(self, found: FoundCamera) -> CameraReader:
+    async def camera(self, found: CameraChoice) -> CameraReader:
         """Open it. Raises CameraError."""
 
 
@@ -104,7 +104,7 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
 
     host: str = ""
     robot: RobotIdentity | None = None
-    camera: FoundCamera | None = None
+    camera: CameraChoice | None = None
     width: int = 0
     height: int = 0
     exposure_us: float = 10_000.0

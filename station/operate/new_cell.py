@@ -30,7 +30,7 @@ from station.cell.config import (
 from station.cell.config_file import config_error, examine_config
 from station.cell.errors import ConfigError, RefusedError
 from station.cell.scene import guess_from, scene_of
-from station.operate.draft import STEPS, Draft, Step
+from station.operate.draft import STEPS, CellStep, Draft
 from station.operate.guided_views import FEWEST_GUIDED, FoundCell, enough, find_cell
 
 _ROOM_M = 0.35
@@ -46,37 +46,37 @@ _COUNTED = {
 """Boards that the wizard offers; a single tag shows too little of the lens."""
 
 
-def next_step(draft: Draft) -> Step:
+def next_step(draft: Draft) -> CellStep:
     """The first step that is not done."""
     if draft.robot is None:
-        return Step.ROBOT
+        return CellStep.ROBOT
     if draft.camera is None:
-        return Step.CAMERA
+        return CellStep.CAMERA
     if draft.mount is None:
-        return Step.MOUNTING
+        return CellStep.MOUNTING
     if draft.board is None:
-        return Step.BOARD
+        return CellStep.BOARD
     if not enough(draft):
-        return Step.VIEWS
-    return Step.SAVE if draft.limits_seen else Step.LIMITS
+        return CellStep.VIEWS
+    return CellStep.SAVE if draft.limits_seen else CellStep.LIMITS
 
 
-def summary(draft: Draft, step: Step) -> str:
+def summary(draft: Draft, step: CellStep) -> str:
     """What a step holds, in a few words; empty: nothing yet."""
     match step:
-        case Step.ROBOT if draft.robot is not None:
+        case CellStep.ROBOT if draft.robot is not None:
             return f"{draft.robot.model}, {draft.host}"
-        case Step.CAMERA if draft.camera is not None:
+        case CellStep.CAMERA if draft.camera is not None:
             return draft.camera.name
-        case Step.MOUNTING if draft.mount is not None:
+        case CellStep.MOUNTING if draft.mount is not None:
             return "on flange" if draft.mount == "eye-in-hand" else "beside the arm"
-        case Step.BOARD if draft.board is not None:
+        case CellStep.BOARD if draft.board is not None:
             return board_words(draft.board)
-        case Step.VIEWS if draft.views:
+        case CellStep.VIEWS if draft.views:
             return f"{len(draft.views)} of {max(FEWEST_GUIDED, len(draft.views))}"
-        case Step.LIMITS if draft.limits_seen:
+        case CellStep.LIMITS if draft.limits_seen:
             return "set"
-        case Step.SAVE if draft.written:
+        case CellStep.SAVE if draft.written:
             return Path(draft.written).name
     return ""
 

@@ -10,7 +10,7 @@ import numpy as np
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
 from calibrate.projection import camera_matrix, project
-from recordings.scene import Colour, Entity, Line, write_scene
+from recordings.scene import Colour, Entity, Polyline, write_scene
 from station.cell.collision import body_segments
 from station.cell.errors import ConfigError
 from station.cell.limits import check_plan
@@ -215,15 +215,18 @@ def save_scene(scene: Scene, plan: Plan, path: Path) -> None:
 
 def _fixed(scene: Scene, plan: Plan) -> list[Entity]:
     cameras, boards, path = _placed(scene, plan)
-    frusta = tuple(Line(edge, _CAMERA, 0.001) for camera in cameras for edge in camera_frustum(scene, camera))
-    outlines = tuple(Line(printed_outline(scene, board), _BOARD, 0.002) for board in boards)
-    return [Entity("plan", "base", (*frusta, *outlines, Line(path, _PATH, 0.002)))]
+    frusta = tuple(
+        Polyline(edge, _CAMERA, 0.001) for camera in cameras for edge in camera_frustum(scene, camera)
+    )
+    outlines = tuple(Polyline(printed_outline(scene, board), _BOARD, 0.002) for board in boards)
+    return [Entity("plan", "base", (*frusta, *outlines, Polyline(path, _PATH, 0.002)))]
 
 
 def _moving(scene: Scene, joints: Array, text: str) -> list[Entity]:
     starts, ends, radii = body_segments(scene.geometry, joints[None])
     arm = tuple(
-        Line(np.stack([a, b]), _ARM, float(2 * r)) for a, b, r in zip(starts[0], ends[0], radii, strict=True)
+        Polyline(np.stack([a, b]), _ARM, float(2 * r))
+        for a, b, r in zip(starts[0], ends[0], radii, strict=True)
     )
     x, y, z = (float(v) for v in ends[0, 6] + [0.0, 0.0, 0.15])
     return [Entity("arm", "base", arm, text, (x, y, z))]

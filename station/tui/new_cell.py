@@ -31,12 +31,12 @@ from recordings.schema.messages import BoardSpec
 from station.cell.errors import StationError
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
-from station.operate.draft import STEPS, FoundCamera, Hardware, Step
+from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
 from station.operate.guided_views import enough
 from station.protocol.verbs import PreviewImage
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
-from station.tui.new_cell_steps import DRAWINGS, Page, SavePage, pages
-from station.tui.task import Step as RailStep
+from station.tui.new_cell_steps import DRAWINGS, SavePage, StepPage, pages
+from station.tui.task import Step
 from station.tui.themes import TOKENS, dress
 from station.tui.widgets.graphics import Graphics
 from station.tui.widgets.preview import PreviewPane
@@ -94,18 +94,18 @@ class NewCell(App[Ending]):
         Binding("f9", "rehearse", "Rehearse", tooltip="Run the whole job with this cell in simulation"),
         Binding("escape", "leave", "Leave", tooltip="Leave; what was found is kept"),
     ]
-    ONLY: ClassVar[dict[str, tuple[Step, ...]]] = {
-        "other_mount": (Step.MOUNTING,),
-        "take": (Step.VIEWS,),
-        "drop": (Step.VIEWS,),
-        "print_board": (Step.BOARD,),
-        "expose": (Step.CAMERA, Step.BOARD, Step.VIEWS),
-        "table_here": (Step.LIMITS,),
-        "rehearse": (Step.SAVE,),
+    ONLY: ClassVar[dict[str, tuple[CellStep, ...]]] = {
+        "other_mount": (CellStep.MOUNTING,),
+        "take": (CellStep.VIEWS,),
+        "drop": (CellStep.VIEWS,),
+        "print_board": (CellStep.BOARD,),
+        "expose": (CellStep.CAMERA, CellStep.BOARD, CellStep.VIEWS),
+        "table_here": (CellStep.LIMITS,),
+        "rehearse": (CellStep.SAVE,),
     }
     """Steps in which an action means something."""
     graphics: Graphics | None = None
-    step: reactive[Step] = reactive(Step.ROBOT, init=False)
+    step: reactive[CellStep] = reactive(CellStep.ROBOT, init=False)
 
     def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
         super().__init__()
@@ -146,7 +146,7 @@ class NewCell(App[Ending]):
         self.resume()
 
     @property
-    def page(self) -> Page:
+    def page(self) -> StepPage:
         return self._pages[self.step]
 
     @work(group="accept", exit_on_error=False)
@@ -181,7 +181,7 @@ class NewCell(App[Ending]):
             try:
                 if self.setup.camera is not None:
                     await self._look()
-                elif self.step is Step.CAMERA:
+                elif self.step is CellStep.CAMERA:
                     await self._look_for_cameras()
             except StationError as problem:
                 self._say_problem(str(problem))
@@ -195,7 +195,7 @@ class NewCell(App[Ending]):
             choice.clear_options()
             choice.add_options([Option(camera.name) for camera in self.setup.cameras])
             choice.highlighted = 0 if self.setup.cameras else None
-            if self.step is Step.CAMERA:
+            if self.step is CellStep.CAMERA:
                 choice.focus()
         await asyncio.sleep(LOOK_S)
 
@@ -207,7 +207,7 @@ class NewCell(App[Ending]):
             return
         found = await asyncio.to_thread(self.setup.look, begun_s, image, step)
         await self._show_picture(image.pixels, found)
-        if step is self.step is Step.VIEWS and self.setup.new_view():
+        if step is self.step is CellStep.VIEWS and self.setup.new_view():
             self._add_view()
         self._show()
 
@@ -270,7 +270,7 @@ class NewCell(App[Ending]):
         self.action_accept(self.setup.cameras[event.option_index])
 
     @work(group="accept", exclusive=True, exit_on_error=False)
-    async def action_accept(self, chosen: FoundCamera | None = None) -> None:
+    async def action_accept(self, chosen: CameraChoice | None = None) -> None:
         page = self.page
         if page.working:
             self._say_live(page.working)
@@ -283,7 +283,7 @@ class NewCell(App[Ending]):
             return
         if not done:
             self.watch_step()
-        elif page.step is Step.SAVE:
+        elif page.step is CellStep.SAVE:
             self.exit("serve")
         else:
             self.step = STEPS[STEPS.index(page.step) + 1]
@@ -345,7 +345,7 @@ class NewCell(App[Ending]):
         typed.value, typed.placeholder = page.typed, page.placeholder
         if typed.display:
             typed.focus()
-        elif self.step is Step.CAMERA and self.setup.cameras:
+        elif self.step is CellStep.CAMERA and self.setup.cameras:
             self.query_one("#choice").focus()
         else:
             self.set_focus(None)
@@ -373,17 +373,15 @@ class NewCell(App[Ending]):
         self.query_one("#next", Static).update(next_line(self.page.next, width))
         self._say_live("\n".join(self.page.live()))
 
-    def _rail(self) -> tuple[RailStep, ...]:
+    def _rail(self) -> tuple[Step, ...]:
         draft = self.setup.draft
         reached = STEPS.index(flow.next_step(draft))
         done = [
-            number < reached or (step is Step.SAVE and bool(draft.written))
+            number < reached or (step is CellStep.SAVE and bool(draft.written))
             for number, step in enumerate(STEPS)
         ]
         return tuple(
-            RailStep(
-                step, "now" if step is self.step else "done" if was else "todo", flow.summary(draft, step)
-            )
+            Step(step, "now" if step is self.step else "done" if was else "todo", flow.summary(draft, step))
             for step, was in zip(STEPS, done, strict=True)
         )
 

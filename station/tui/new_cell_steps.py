@@ -13,7 +13,7 @@ from recordings.schema.messages import Mount
 from station.cell.errors import StationError
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
-from station.operate.draft import Step
+from station.operate.draft import CellStep
 from station.operate.guided_views import FEWEST_GUIDED, TURN_RAD, enough, what_is_missing
 from station.tui.task import Action
 from station.tui.words import Mark, mark
@@ -24,10 +24,10 @@ REMOTE = (
 )
 
 
-class Page:
+class StepPage:
     """One step of the wizard."""
 
-    step: ClassVar[Step]
+    step: ClassVar[CellStep]
     title: ClassVar[str]
     parts: ClassVar[Sequence[str]] = ()
     """Widgets it shows below its words."""
@@ -60,8 +60,8 @@ class Page:
         raise NotImplementedError
 
 
-class RobotPage(Page):
-    step, title = Step.ROBOT, "Which robot?"
+class RobotPage(StepPage):
+    step, title = CellStep.ROBOT, "Which robot?"
     parts = ("#typed",)
     placeholder, working = "address of the controller, e.g. 192.168.1.10", "Asking the controller …"
 
@@ -91,8 +91,8 @@ class RobotPage(Page):
         return self.setup.arm is not None
 
 
-class CameraPage(Page):
-    step, title = Step.CAMERA, "Which camera?"
+class CameraPage(StepPage):
+    step, title = CellStep.CAMERA, "Which camera?"
     parts = ("#choice", "#picture")
 
     @property
@@ -109,8 +109,8 @@ class CameraPage(Page):
         return self.setup.camera is not None
 
 
-class MountingPage(Page):
-    step, title = Step.MOUNTING, "Where is the camera?"
+class MountingPage(StepPage):
+    step, title = CellStep.MOUNTING, "Where is the camera?"
     parts = ("#drawings",)
 
     @property
@@ -126,8 +126,8 @@ class MountingPage(Page):
         return True
 
 
-class BoardPage(Page):
-    step, title = Step.BOARD, "Which board?"
+class BoardPage(StepPage):
+    step, title = CellStep.BOARD, "Which board?"
     parts: ClassVar[Sequence[str]] = ("#typed", "#picture")
     placeholder = "7x6 25"
 
@@ -173,7 +173,7 @@ class BoardPage(Page):
 
 
 class ViewsPage(BoardPage):
-    step, title = Step.VIEWS, "Guide the arm to four views of the board"
+    step, title = CellStep.VIEWS, "Guide the arm to four views of the board"
     parts: ClassVar[Sequence[str]] = ("#picture",)
     placeholder = ""
 
@@ -213,8 +213,8 @@ class ViewsPage(BoardPage):
         return enough(self.setup.draft)
 
 
-class LimitsPage(Page):
-    step, title = Step.LIMITS, "Where may the arm move?"
+class LimitsPage(StepPage):
+    step, title = CellStep.LIMITS, "Where may the arm move?"
     parts = ("#typed",)
     placeholder = "table's height over the arm's base, mm; empty: as shown"
 
@@ -256,8 +256,8 @@ class LimitsPage(Page):
         return False
 
 
-class SavePage(Page):
-    step, title = Step.SAVE, "Write the configuration"
+class SavePage(StepPage):
+    step, title = CellStep.SAVE, "Write the configuration"
     parts = ("#text",)
 
     @property
@@ -288,7 +288,7 @@ class SavePage(Page):
         return False
 
 
-def pages(setup: CellSetup) -> dict[Step, Page]:
+def pages(setup: CellSetup) -> dict[CellStep, StepPage]:
     """All of them, in order."""
     kinds = (RobotPage, CameraPage, MountingPage, BoardPage, ViewsPage, LimitsPage, SavePage)
     return {kind.step: kind(setup) for kind in kinds}

@@ -5,11 +5,11 @@ from __future__ import annotations
 from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.cli.new import RealHardware
-from station.operate.draft import CameraReader, FoundCamera
+from station.operate.draft import CameraChoice, CameraReader
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import CellTruth
 
-CAMERA = FoundCamera("aravis", "SIM00001", "MER-131-75GM SIM00001")
+CAMERA = CameraChoice("aravis", "SIM00001", "MER-131-75GM SIM00001")
 
 
 class RenderedReader:
@@ -41,10 +41,10 @@ class SimulatedHardware(RealHardware):
         self.truth, self.host = truth, host
         self.readers: list[RenderedReader] = []
 
-    async def cameras(self) -> tuple[FoundCamera, ...]:
+    async def cameras(self) -> tuple[CameraChoice, ...]:
         return (CAMERA,)
 
-    async def camera(self, found: FoundCamera) -> CameraReader:
+    async def camera(self, found: CameraChoice) -> CameraReader:
         reader = RenderedReader(self.truth, self.host)
         await reader.camera.open()
         self.readers.append(reader)

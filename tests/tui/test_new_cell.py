@@ -20,7 +20,7 @@ from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.cell.config_file import load_config
 from station.cell.scene import guess_matrix
-from station.operate.draft import STEPS, Step, load_draft
+from station.operate.draft import STEPS, CellStep, load_draft
 from station.simulation.cell import CellTruth, write_truth
 from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.netns import isolated_command
@@ -65,7 +65,7 @@ class Operator:
     async def type(self, text: str) -> None:
         await self.press(*("space" if c == " " else "full_stop" if c == "." else c for c in text))
 
-    async def until_step(self, step: Step) -> None:
+    async def until_step(self, step: CellStep) -> None:
         await until(self.pilot, lambda: self.app.step is step, f"{step} did not come, it is {self.app.step}")
 
     async def guide(self, joints: np.ndarray) -> None:
@@ -91,32 +91,34 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
             person = Operator(pilot, app, controller)
             await person.type(controller.host)
             await person.press("enter")
-            await person.until_step(Step.CAMERA)
+            await person.until_step(CellStep.CAMERA)
             await until(pilot, lambda: app.setup.camera is not None, "no camera was opened")
             await person.press("enter")
-            await person.until_step(Step.MOUNTING)
+            await person.until_step(CellStep.MOUNTING)
             await person.press("enter")
-            await person.until_step(Step.BOARD)
+            await person.until_step(CellStep.BOARD)
             await person.type("8x5 23")
             await person.press("enter")
             await until(
                 pilot, lambda: app.setup.seen is not None and app.setup.seen[1].found, "the board is not seen"
             )
             await person.press("enter")
-            await person.until_step(Step.VIEWS)
+            await person.until_step(CellStep.VIEWS)
             for joints in guided_joints(truth)[1:]:  # it stands at the first one
-                if app.step is not Step.VIEWS:
+                if app.step is not CellStep.VIEWS:
                     break
                 before = len(app.setup.draft.views)
                 await person.guide(joints)
                 await until(
                     pilot,
-                    lambda before=before: len(app.setup.draft.views) > before or app.step is not Step.VIEWS,
+                    lambda before=before: (
+                        len(app.setup.draft.views) > before or app.step is not CellStep.VIEWS
+                    ),
                     "no view was taken",
                 )
-            await person.until_step(Step.LIMITS)
+            await person.until_step(CellStep.LIMITS)
             await person.press("enter")
-            await person.until_step(Step.SAVE)
+            await person.until_step(CellStep.SAVE)
             await person.press("enter")
             await until(pilot, lambda: app.setup.draft.written, "nothing was written")
             await person.press("enter")

@@ -1,6 +1,6 @@
 """Notice in production pictures of one fixed tag or small board that camera, tag or arm moved.
 
-    monitor.Monitor     takes pictures one after the other, yields `Event`s: the way in
+    monitor.MovementMonitor     takes pictures one after the other, yields `MovementEvent`s: the way in
     pictures            a picture as a deviation of the tag's pose, and what each unknown would do to it
     repeated, free      the two tests: a posture against its own history; any postures against a common fit
     evidence            likelihood ratios: did something move, and what

@@ -13,8 +13,8 @@ from calibrate.quality.movement.pictures import CAMERA, MOVES, SHARED, TAG, UNIT
 from calibrate.quality.movement.window import (
     LIMIT,
     Counts,
-    Finding,
     RunningSums,
+    WindowFinding,
     WindowTest,
     log_likelihood,
     noise_of,
@@ -66,7 +66,7 @@ class FreePostures(WindowTest[Row]):
         self.latest.append(row)
         return length / self.noise
 
-    def add(self, entry: Row) -> Finding:
+    def add(self, entry: Row) -> WindowFinding:
         sums = self._sums.latest(min(_LATEST, len(self._sums)))
         theta = np.linalg.solve(sums[:, :16] + self._prior, sums[:, 16])
         return self._judge(self._count(entry, np.asarray(theta, dtype=float)))

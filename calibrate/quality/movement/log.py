@@ -15,7 +15,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.files.lines import append_line, read_lines
-from calibrate.quality.movement.monitor import Event, Monitor
+from calibrate.quality.movement.monitor import MovementEvent, MovementMonitor
 from calibrate.quality.movement.pictures import CellModel, Picture
 from recordings.files import write_atomically
 from recordings.schema.messages import BoardSpec, Matrix4, Vector6
@@ -65,7 +65,7 @@ class MonitorLog:
     def __init__(self, path: Path | None, watched: WatchedTag, cell: CellModel) -> None:
         """Raises OSError."""
         self._path, self._watched, self._cell = path, watched, cell
-        self.monitor = Monitor(cell)
+        self.monitor = MovementMonitor(cell)
         self._keys: deque[str] = deque(maxlen=_MOST)
         self._known: set[str] = set()
         entries = [] if path is None else read_lines(path, WatchEntry)
@@ -77,7 +77,7 @@ class MonitorLog:
         self._replay(last, entries[begun[-1] + 1 :])
 
     def _replay(self, watched: WatchedTag, entries: list[WatchEntry]) -> None:
-        self.monitor = Monitor(self._cell, None if watched.pose is None else np.array(watched.pose))
+        self.monitor = MovementMonitor(self._cell, None if watched.pose is None else np.array(watched.pose))
         seen: list[Picture] = []
         for entry in entries:
             self._remember(entry.key)
@@ -88,7 +88,7 @@ class MonitorLog:
 
     def begin_anew(self) -> None:
         """Learn from the next picture on: after a proof that the calibration holds, say. Raises OSError."""
-        self.monitor, self._lines = Monitor(self._cell), 0
+        self.monitor, self._lines = MovementMonitor(self._cell), 0
         if self._path is not None:
             append_line(self._path, WatchEntry(begun=self._watched))
 
@@ -96,7 +96,7 @@ class MonitorLog:
         """Whether this picture was taken in before."""
         return key in self._known
 
-    def add(self, entry: WatchEntry) -> list[Event]:
+    def add(self, entry: WatchEntry) -> list[MovementEvent]:
         """Keep a picture, then judge it. Raises OSError."""
         self._remember(entry.key)
         if self._path is not None:

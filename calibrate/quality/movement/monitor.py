@@ -27,7 +27,7 @@ from calibrate.quality.movement.pictures import (
 )
 from calibrate.quality.movement.postures import PostureIndex
 from calibrate.quality.movement.repeated import FIRST_VISITS, RepeatedPostures
-from calibrate.quality.movement.window import KEPT, LEARNING, Finding
+from calibrate.quality.movement.window import KEPT, LEARNING, WindowFinding
 from calibrate.views import BoardView
 
 NAMED_AFTER = 30
@@ -63,7 +63,7 @@ class EventKind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Event:
+class MovementEvent:
     kind: EventKind
     picture: str
     """Name of the picture after which it is said."""
@@ -84,7 +84,7 @@ class _Suspicion:
     after: int = 0
 
 
-class Monitor:
+class MovementMonitor:
     """Watches one tag in one cell; `add` pictures as they come.
 
     The first `LEARNING` pictures place the tag and tell the noise. Memory is bounded. Once it is `finished`
@@ -121,13 +121,13 @@ class Monitor:
             return 0
         return LEARNING - max(len(self._learning), len(self._visits), len(self._others))
 
-    def miss(self, name: str) -> Iterator[Event]:
+    def miss(self, name: str) -> Iterator[MovementEvent]:
         """Take note of a picture without the tag."""
         self.missed += 1
         if self.missed % MISSED_AFTER == 0:
-            yield Event(EventKind.TAG_UNSEEN, name, self.pictures, None, {"in_a_row": self.missed})
+            yield MovementEvent(EventKind.TAG_UNSEEN, name, self.pictures, None, {"in_a_row": self.missed})
 
-    def add(self, pictures: Iterable[Picture]) -> Iterator[Event]:
+    def add(self, pictures: Iterable[Picture]) -> Iterator[MovementEvent]:
         """Judge pictures with the tag, oldest first. Many at once are faster, the events are the same."""
         waiting = list(pictures)
         if self.P is None and not self.finished:
@@ -145,7 +145,7 @@ class Monitor:
             while group and not self.finished:
                 group = yield from self._add_alike(group)
 
-    def _add_alike(self, group: list[Picture]) -> Generator[Event, None, list[Picture]]:
+    def _add_alike(self, group: list[Picture]) -> Generator[MovementEvent, None, list[Picture]]:
         """Judge pictures of equally many corners; those that are left when a test begins."""
         assert self.P is not None
         arm = self._arm
@@ -157,13 +157,13 @@ class Monitor:
             yield from self._step(picture, again.y[place], (anywhere.effects[place], anywhere.y[place]))
         return []
 
-    def _place_tag(self) -> Event:
+    def _place_tag(self) -> MovementEvent:
         P, misfit_px = fitted_tag(self.cell, self._learning, self._tag_starts())
         kind = EventKind.LEARNED if misfit_px <= LARGEST_MISFIT_PX else EventKind.NOT_FIXED
         self.finished = kind is EventKind.NOT_FIXED
         self.P = None if self.finished else P
         values = {"median_misfit_px": round(misfit_px, 3)}
-        return Event(kind, self._learning[-1].name, self.pictures, None, dict(values))
+        return MovementEvent(kind, self._learning[-1].name, self.pictures, None, dict(values))
 
     def _tag_starts(self) -> list[Array]:
         """Places (4, 4) of the tag by single pictures, every tilt that one leaves open."""
@@ -180,7 +180,7 @@ class Monitor:
                 continue
         return starts or [np.eye(4)]
 
-    def _step(self, picture: Picture, again: Array, anywhere: Row) -> Iterator[Event]:
+    def _step(self, picture: Picture, again: Array, anywhere: Row) -> Iterator[MovementEvent]:
         slot, known = self._index.find(picture)
         turn = (slot, picture.base_from_flange[:3, :3])
         if slot in self._first or not known:
@@ -194,7 +194,7 @@ class Monitor:
         else:
             yield from self._judge(picture, self.repeated, self.repeated.add((slot, again)))
 
-    def _first_visit(self, picture: Picture, slot: int, known: bool) -> Iterator[Event]:
+    def _first_visit(self, picture: Picture, slot: int, known: bool) -> Iterator[MovementEvent]:
         """Collect the first visits of a posture, until it counts as a repeated one."""
         visits = self._first[slot] = [*(self._first[slot] if known else ()), picture]
         if len(visits) < FIRST_VISITS or (number := self._index.keep(slot)) is None:
@@ -211,7 +211,7 @@ class Monitor:
         assert self.P is not None
         return all_deviations(self.cell, self.P, pictures, arm)
 
-    def _begin_repeated(self, picture: Picture) -> Iterator[Event]:
+    def _begin_repeated(self, picture: Picture) -> Iterator[MovementEvent]:
         """Begin with the repeatability of the arm that the visits make likeliest."""
         if len(self._visits) < LEARNING:
             return
@@ -224,7 +224,7 @@ class Monitor:
         self._arm, self.repeated, self._visits = replace(self._arm, repeating=best), tests[best], []
         yield self._testing(picture, self.repeated)
 
-    def _step_free(self, picture: Picture, turn: tuple[int, Array], row: Row) -> Iterator[Event]:
+    def _step_free(self, picture: Picture, turn: tuple[int, Array], row: Row) -> Iterator[MovementEvent]:
         self._turns[False].append(turn)
         if self.free is not None:
             yield from self._judge(picture, self.free, self.free.add(row))
@@ -241,12 +241,12 @@ class Monitor:
         self._arm, self.free, self._others = replace(self._arm, table=best), tests[best], []
         yield self._testing(picture, self.free)
 
-    def _testing(self, picture: Picture, test: Test) -> Event:
+    def _testing(self, picture: Picture, test: Test) -> MovementEvent:
         kind = "repeated" if test is self.repeated else "any"
         values: dict[str, str | float | int | bool | None] = {"postures": kind, "noise": round(test.noise, 3)}
-        return Event(EventKind.TESTING, picture.name, self.pictures, None, values)
+        return MovementEvent(EventKind.TESTING, picture.name, self.pictures, None, values)
 
-    def _judge(self, picture: Picture, test: Test, finding: Finding) -> Iterator[Event]:
+    def _judge(self, picture: Picture, test: Test, finding: WindowFinding) -> Iterator[MovementEvent]:
         if self._suspicion is not None:
             yield from self._name(picture, test, self._suspicion)
         elif finding.alarm:
@@ -256,14 +256,14 @@ class Monitor:
             if share > self._share_of_noise(count):
                 yield self._alarm(picture, test, finding.far, finding)
             elif finding.far == _JUDGED_FOR:
-                yield Event(EventKind.PICTURES_WORSE, picture.name, self.pictures)
+                yield MovementEvent(EventKind.PICTURES_WORSE, picture.name, self.pictures)
 
     def _share_of_noise(self, count: int) -> float:
         """Share of the noise of n pictures that p unknowns seldom explain: Beta(p/2, (6 n - p)/2)."""
         moves = 12 if self.cell.arm is None else 16
         return float(special.betaincinv(moves / 2, (6 * count - moves) / 2, _CHANCE))
 
-    def _alarm(self, picture: Picture, test: Test, since: int, finding: Finding) -> Event:
+    def _alarm(self, picture: Picture, test: Test, since: int, finding: WindowFinding) -> MovementEvent:
         self.alarmed, self._suspicion = True, _Suspicion(test, since)
         values: dict[str, str | float | int | bool | None] = {
             "log_ratio": round(finding.score, 2),
@@ -271,9 +271,9 @@ class Monitor:
             "since_pictures": since,
             "fast_lane": not finding.alarm,
         }
-        return Event(EventKind.ALARM, picture.name, self.pictures, None, values)
+        return MovementEvent(EventKind.ALARM, picture.name, self.pictures, None, values)
 
-    def _name(self, picture: Picture, test: Test, suspicion: _Suspicion) -> Iterator[Event]:
+    def _name(self, picture: Picture, test: Test, suspicion: _Suspicion) -> Iterator[MovementEvent]:
         """Say what moved, `NAMED_AFTER` pictures of the test that noticed it."""
         if test is not suspicion.test:
             return
@@ -296,7 +296,7 @@ class Monitor:
             size = move_size(M, u, moved)
             values["moved_mm"] = round(float(np.linalg.norm(size[:3]) * 1e3), 3)
             values["moved_deg"] = round(float(np.degrees(np.linalg.norm(size[3:]))), 4)
-        yield Event(EventKind.NAMED, picture.name, self.pictures, moved, values)
+        yield MovementEvent(EventKind.NAMED, picture.name, self.pictures, moved, values)
 
     def _variety(self, test: Test, count: int) -> tuple[int, float]:
         """Postures of the test's latest pictures, and 1σ of their turns about the second axis, radians."""

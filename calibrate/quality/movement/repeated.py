@@ -15,8 +15,8 @@ from calibrate.quality.movement.pictures import Deviations
 from calibrate.quality.movement.window import (
     LIMIT,
     Counts,
-    Finding,
     RunningSums,
+    WindowFinding,
     WindowTest,
     log_likelihood,
     noise_of,
@@ -82,7 +82,7 @@ class RepeatedPostures(WindowTest[Visit]):
         self.latest.append((posture, y))
         return length / self.noise
 
-    def add(self, entry: Visit) -> Finding:
+    def add(self, entry: Visit) -> WindowFinding:
         posture, y = entry
         return self._judge(self._count(posture, y, np.median(np.array(self._visits[posture]), axis=0)))
 

@@ -79,7 +79,7 @@ class RunningSums:
 
 
 @dataclass(frozen=True)
-class Finding:
+class WindowFinding:
     """State of a test after a picture."""
 
     score: float
@@ -106,7 +106,7 @@ class WindowTest(ABC, Generic[Entry]):
         self._cusum, self._since = 0.0, 0
 
     @abstractmethod
-    def add(self, entry: Entry) -> Finding:
+    def add(self, entry: Entry) -> WindowFinding:
         """Judge the next picture."""
 
     @abstractmethod
@@ -124,7 +124,7 @@ class WindowTest(ABC, Generic[Entry]):
         `count` pictures, or fewer where some have nothing to be compared with.
         """
 
-    def _judge(self, length: float) -> Finding:
+    def _judge(self, length: float) -> WindowFinding:
         """Finding after the picture whose deviation has this whitened length."""
         step = _STEP if length > LIMIT else -_STEP
         self._cusum = min(max(0.0, self._cusum + step), 1.5 * _FAST_LIMIT)
@@ -132,11 +132,11 @@ class WindowTest(ABC, Generic[Entry]):
         far = self._since if self._cusum > _FAST_LIMIT else 0
         windows = WINDOWS[: int(np.searchsorted(WINDOWS, len(self.latest) // 2, side="right"))]
         if not len(windows):
-            return Finding(0.0, 0, far, False)
+            return WindowFinding(0.0, 0, far, False)
         M, u = self.contrasts(windows)
         scores = move_score(M / self.noise**2, u / self.noise**2) + np.log(windows) / 2
         best = int(scores.argmax())
-        return Finding(float(scores[best]), int(windows[best]), far, bool(scores[best] > self.limit))
+        return WindowFinding(float(scores[best]), int(windows[best]), far, bool(scores[best] > self.limit))
 
     def move_since(self, count: int) -> tuple[Array, Array]:
         """M (16, 16) and u (16,) of the latest `count` pictures over the noise, far ones weighed down."""

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from math import inf, isfinite
 
 from station.simulation.controller.arm import Vibration
-from station.simulation.controller.kinematics import DhTable, Six
+from station.simulation.controller.kinematics import ArmGeometry, Six
 from station.simulation.controller.machine import Machine
 from station.simulation.controller.network import Cut
 from station.simulation.controller.paths import Path, PolylinePath
@@ -159,7 +159,7 @@ def dh(
     theta_rad: list[float] | None = None,
 ) -> None:
     """The true arm differs from the nominal table by these; what the controller reports does not."""
-    nominal: DhTable = machine.robot.table
+    nominal: ArmGeometry = machine.robot.table
     machine.robot.true_table = nominal.plus(
         numbers("a_m", a_m, 6),
         numbers("d_m", d_m, 6),

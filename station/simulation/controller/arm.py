@@ -8,7 +8,7 @@ from math import exp, inf, pi, sin
 
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
-    DhTable,
+    ArmGeometry,
     Rigid,
     Six,
     compose,
@@ -96,7 +96,7 @@ class Vibration:
 class SimulatedArm:
     """Joints that move in time. Speeds in rad/s of simulated time; `scale` is slider × pause."""
 
-    def __init__(self, table: DhTable, joints_rad: Six, draw_miss: Callable[[], Six]) -> None:
+    def __init__(self, table: ArmGeometry, joints_rad: Six, draw_miss: Callable[[], Six]) -> None:
         self.table = table
         self.flange_from_tcp: Rigid = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
         self.command = joints_rad

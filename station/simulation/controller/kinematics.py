@@ -20,19 +20,19 @@ JOINT_LIMIT_RAD = 2 * pi
 
 
 @dataclass(frozen=True)
-class DhTable:
+class ArmGeometry:
     a_m: Six
     d_m: Six
     alpha_rad: Six = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
     theta_rad: Six = (0.0,) * 6
-    published: DhTable | None = field(default=None, compare=False)
+    published: ArmGeometry | None = field(default=None, compare=False)
     """The table it was made from; None: it is one itself."""
 
-    def plus(self, a_m: Six, d_m: Six, alpha_rad: Six, theta_rad: Six) -> DhTable:
+    def plus(self, a_m: Six, d_m: Six, alpha_rad: Six, theta_rad: Six) -> ArmGeometry:
         def add(x: Six, y: Six) -> Six:
             return tuple(i + j for i, j in zip(x, y, strict=True))
 
-        return DhTable(
+        return ArmGeometry(
             add(self.a_m, a_m),
             add(self.d_m, d_m),
             add(self.alpha_rad, alpha_rad),
@@ -41,8 +41,8 @@ class DhTable:
         )
 
 
-def _table(a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> DhTable:
-    return DhTable((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6))
+def _table(a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> ArmGeometry:
+    return ArmGeometry((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6))
 
 
 TABLES = {
@@ -132,7 +132,7 @@ def to_pose(A: Rigid) -> Six:
     return (A[3], A[7], A[11], *to_rotvec(A))
 
 
-def forward(table: DhTable, joints_rad: Six) -> Rigid:
+def forward(table: ArmGeometry, joints_rad: Six) -> Rigid:
     """base_from_flange."""
     T = IDENTITY
     for q, theta, a, d, alpha in zip(
@@ -143,7 +143,7 @@ def forward(table: DhTable, joints_rad: Six) -> Rigid:
     return T
 
 
-def inverse_all(table: DhTable, base_from_flange: Rigid) -> list[Six]:
+def inverse_all(table: ArmGeometry, base_from_flange: Rigid) -> list[Six]:
     """Every solution of the nominal geometry, at most 8. At a wrist singularity: those with wrist 3 = 0.
 
     Derived from the geometry: the wrist's centre lies d4 beside the plane of the arm (2 × q1); the angle
@@ -187,7 +187,7 @@ def _wrap(angle: float) -> float:
     return (angle + pi) % (2 * pi) - pi
 
 
-def inverse_nearest(table: DhTable, base_from_flange: Rigid, near_rad: Six) -> Six | None:
+def inverse_nearest(table: ArmGeometry, base_from_flange: Rigid, near_rad: Six) -> Six | None:
     """The solution nearest to `near_rad` (largest joint difference), turns chosen within ±2π; or None."""
     published = table.published
     if published is None:
@@ -203,7 +203,7 @@ def inverse_nearest(table: DhTable, base_from_flange: Rigid, near_rad: Six) -> S
     return joints
 
 
-def _nearest(table: DhTable, base_from_flange: Rigid, near_rad: Six) -> Six | None:
+def _nearest(table: ArmGeometry, base_from_flange: Rigid, near_rad: Six) -> Six | None:
     best, best_distance = None, float("inf")
     for solution in inverse_all(table, base_from_flange):
         turned = tuple(_nearest_turn(q, near) for q, near in zip(solution, near_rad, strict=True))

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
-    DhTable,
+    ArmGeometry,
     Rigid,
     Six,
     compose,
@@ -57,7 +57,7 @@ class JointPath:
 class LinePath:
     """The tool's point on a straight line, the tool turning about one fixed axis; the nearest inverse."""
 
-    def __init__(self, table: DhTable, flange_from_tcp: Rigid, start: Six, base_from_goal: Rigid) -> None:
+    def __init__(self, table: ArmGeometry, flange_from_tcp: Rigid, start: Six, base_from_goal: Rigid) -> None:
         self._table = table
         self._tcp_from_flange = invert(flange_from_tcp)
         self._first = compose(forward(table, start), flange_from_tcp)
@@ -92,7 +92,12 @@ class ArcPath(LinePath):
     """The tool's point on a circle through a second point, the tool turning as on a line."""
 
     def __init__(
-        self, table: DhTable, flange_from_tcp: Rigid, start: Six, base_from_via: Rigid, base_from_goal: Rigid
+        self,
+        table: ArmGeometry,
+        flange_from_tcp: Rigid,
+        start: Six,
+        base_from_via: Rigid,
+        base_from_goal: Rigid,
     ) -> None:
         super().__init__(table, flange_from_tcp, start, base_from_goal)
         begin, via, end = (

@@ -16,7 +16,7 @@ from station.devices.rtde import RobotMode, RobotStatusBits, RuntimeState, Safet
 from station.simulation.controller.arm import History, SimulatedArm
 from station.simulation.controller.kinematics import (
     TABLES,
-    DhTable,
+    ArmGeometry,
     Rigid,
     Six,
     compose,
@@ -116,7 +116,7 @@ class ControllerState(ABC):
         published = TABLES[settings.model]
         self.table = published.plus(*settings.factory) if any(map(any, settings.factory)) else published
         self.stated_table = self.table if settings.states_factory else published
-        self.true_table: DhTable = self.table.plus(*settings.dh_delta)
+        self.true_table: ArmGeometry = self.table.plus(*settings.dh_delta)
         self._random = random.Random(settings.seed)
         self.arm = SimulatedArm(self.table, settings.start_joints_rad, self._draw_miss)
         self.tcp: Six = (0.0,) * 6

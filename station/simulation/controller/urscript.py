@@ -24,7 +24,7 @@ Value = Any
 """bool, int, float, str, list, Pose, Thread; None is what a function without `return` gives."""
 Steps = Generator[None, None, Value]
 """Yields once for every cycle it takes, then returns a value."""
-Node = Callable[["Frame"], Steps]
+Node = Callable[["CallFrame"], Steps]
 """A piece of program. A statement's value is None, or how it leaves its block: (word, value)."""
 Builtin = Callable[..., Any]
 
@@ -86,7 +86,7 @@ class ScriptRun:
         self.halted = False
         self._threads: list[Thread] = []
         self._spent = 0
-        self.start(Frame(program, None, self, 0))
+        self.start(CallFrame(program, None, self, 0))
 
     def step(self) -> bool:
         """False when the program has ended. Raises ScriptRuntimeError."""
@@ -110,7 +110,7 @@ class ScriptRun:
             if not thread.done and thread is not self.thread:
                 thread.kill()
 
-    def start(self, frame: Frame) -> Thread:
+    def start(self, frame: CallFrame) -> Thread:
         self._threads.append(Thread(frame.function.steps(frame)))
         return self._threads[-1]
 
@@ -121,17 +121,17 @@ class ScriptRun:
             raise ScriptRuntimeError("an infinite loop: it never waits")
 
 
-class Frame:
+class CallFrame:
     """The variables of one call."""
 
     __slots__ = ("depth", "function", "outer", "run", "variables")
 
-    def __init__(self, function: Function, outer: Frame | None, run: ScriptRun, depth: int) -> None:
+    def __init__(self, function: Function, outer: CallFrame | None, run: ScriptRun, depth: int) -> None:
         self.function, self.outer, self.run, self.depth = function, outer, run, depth
         self.variables: dict[str, Value] = {}
 
     def read(self, name: str) -> Value:
-        frame: Frame | None = self
+        frame: CallFrame | None = self
         while frame is not None:
             if name in frame.variables:
                 return frame.variables[name]
@@ -142,7 +142,7 @@ class Frame:
 
     def write(self, name: str, value: Value, scope: str = "") -> None:
         variables = self.run.variables if scope == "global" else self.variables
-        frame: Frame | None = None if scope else self
+        frame: CallFrame | None = None if scope else self
         while frame is not None and name not in frame.variables:
             frame = frame.outer
         if frame is not None:
@@ -151,14 +151,14 @@ class Frame:
             variables = self.run.variables
         variables[name] = type(value)(value) if isinstance(value, list) else value
 
-    def inner(self, function: Function) -> Frame:
+    def inner(self, function: Function) -> CallFrame:
         """Of a function that is called from here."""
         if self.depth >= CALL_DEPTH:
             raise ScriptRuntimeError(f"{function.name} is called too deeply")
-        around: Frame | None = self
+        around: CallFrame | None = self
         while around is not None and around.function is not function.outer:
             around = around.outer
-        return Frame(function, around, self.run, self.depth + 1)
+        return CallFrame(function, around, self.run, self.depth + 1)
 
 
 @dataclass
@@ -174,7 +174,7 @@ class Function:
     calls: list[Call] = field(default_factory=list)
     """All that are written in it."""
 
-    def steps(self, frame: Frame) -> Steps:
+    def steps(self, frame: CallFrame) -> Steps:
         left = yield from execute(self.body, frame)
         return left[1] if left is not None else None
 
@@ -217,7 +217,7 @@ class Call:
         if not fits:
             raise ScriptSyntaxError(f"{self.name} does not take these arguments", self.line)
 
-    def value(self, frame: Frame) -> Steps:
+    def value(self, frame: CallFrame) -> Steps:
         if self.function is not None:
             inner = yield from self.enter(frame)
             return (yield from self.function.steps(inner))
@@ -229,7 +229,7 @@ class Call:
         except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
             raise ScriptRuntimeError(f"{self.name}: {error}", self.line) from None
 
-    def enter(self, frame: Frame) -> Generator[None, None, Frame]:
+    def enter(self, frame: CallFrame) -> Generator[None, None, CallFrame]:
         """The frame of the function that is called, its arguments in place."""
         if self.function is None:
             raise ScriptRuntimeError(f"{self.name} is no thread", self.line)
@@ -246,13 +246,13 @@ class Call:
                 raise ScriptRuntimeError(f"{self.name} needs {name}", self.line)
         return inner
 
-    def _evaluated(self, frame: Frame) -> Generator[None, None, tuple[list[Value], dict[str, Value]]]:
+    def _evaluated(self, frame: CallFrame) -> Generator[None, None, tuple[list[Value], dict[str, Value]]]:
         arguments = yield from evaluate_all(self.arguments, frame)
         named = yield from evaluate_all(tuple(self.named.values()), frame)
         return arguments, dict(zip(self.named, named, strict=True))
 
 
-def execute(body: Sequence[Node], frame: Frame) -> Steps:
+def execute(body: Sequence[Node], frame: CallFrame) -> Steps:
     """Statement by statement, until one leaves the block; how it does."""
     for statement in body:
         frame.run.spend()
@@ -266,7 +266,7 @@ def execute(body: Sequence[Node], frame: Frame) -> Steps:
     return None
 
 
-def evaluate_all(nodes: Sequence[Node], frame: Frame) -> Generator[None, None, list[Value]]:
+def evaluate_all(nodes: Sequence[Node], frame: CallFrame) -> Generator[None, None, list[Value]]:
     found = []
     for node in nodes:
         value = yield from node(frame)

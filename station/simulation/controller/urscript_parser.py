@@ -9,7 +9,7 @@ from typing import NamedTuple
 from station.simulation.controller.urscript import (
     Builtin,
     Call,
-    Frame,
+    CallFrame,
     Function,
     Node,
     Pose,
@@ -188,7 +188,7 @@ class _Parser:
         if word.text == "return" and not self._next_is("line"):
             value = self._expression()
 
-        def leave(frame: Frame) -> Steps:
+        def leave(frame: CallFrame) -> Steps:
             frame.run.halted |= word.text == "halt"
             if frame.run.halted:
                 yield
@@ -209,7 +209,7 @@ class _Parser:
             self._place = before
         value = self._expression()
 
-        def evaluate(frame: Frame) -> Steps:
+        def evaluate(frame: CallFrame) -> Steps:
             yield from value(frame)
 
         return evaluate
@@ -219,13 +219,13 @@ class _Parser:
         self._need("=")
         value = self._expression()
 
-        def assign(frame: Frame) -> Steps:
+        def assign(frame: CallFrame) -> Steps:
             frame.write(name, (yield from value(frame)), scope)
 
         return assign
 
     def _assign_item(self, name: str, index: Node, value: Node) -> Node:
-        def assign(frame: Frame) -> Steps:
+        def assign(frame: CallFrame) -> Steps:
             place = yield from index(frame)
             found = yield from value(frame)
             items = frame.read(name)
@@ -239,7 +239,7 @@ class _Parser:
             branches.append((self._expression(), self._block("elif", "else")))
         otherwise = self._block() if self._take("else") else []
 
-        def choose(frame: Frame) -> Steps:
+        def choose(frame: CallFrame) -> Steps:
             for condition, body in branches:
                 if truth((yield from condition(frame))):
                     return (yield from execute(body, frame))
@@ -250,7 +250,7 @@ class _Parser:
     def _while(self) -> Node:
         condition, body = self._expression(), self._block()
 
-        def repeat(frame: Frame) -> Steps:
+        def repeat(frame: CallFrame) -> Steps:
             while truth((yield from condition(frame))):
                 frame.run.spend()
                 left = yield from execute(body, frame)
@@ -265,7 +265,7 @@ class _Parser:
     def _wait_or_kill(self, kill: bool) -> Node:
         thread = self._expression()
 
-        def end(frame: Frame) -> Steps:
+        def end(frame: CallFrame) -> Steps:
             found = yield from thread(frame)
             while isinstance(found, Thread) and not found.done:  # scripts keep a 0 where none started yet
                 if kill:
@@ -343,7 +343,7 @@ class _Parser:
 
 
 def _constant(value: Value) -> Node:
-    def constant(frame: Frame) -> Steps:
+    def constant(frame: CallFrame) -> Steps:
         yield from ()
         return value
 
@@ -351,7 +351,7 @@ def _constant(value: Value) -> Node:
 
 
 def _name(name: str) -> Node:
-    def read(frame: Frame) -> Steps:
+    def read(frame: CallFrame) -> Steps:
         yield from ()
         return frame.read(name)
 
@@ -359,14 +359,14 @@ def _name(name: str) -> Node:
 
 
 def _items(items: Sequence[Node], make: Callable[[list[Value]], list[Value]]) -> Node:
-    def build(frame: Frame) -> Steps:
+    def build(frame: CallFrame) -> Steps:
         return make((yield from evaluate_all(items, frame)))
 
     return build
 
 
 def _item(of: Node, index: Node) -> Node:
-    def item(frame: Frame) -> Steps:
+    def item(frame: CallFrame) -> Steps:
         items = yield from of(frame)
         place = yield from index(frame)
         return items[place_of(items, place)]
@@ -375,14 +375,14 @@ def _item(of: Node, index: Node) -> Node:
 
 
 def _not(of: Node) -> Node:
-    def negate(frame: Frame) -> Steps:
+    def negate(frame: CallFrame) -> Steps:
         return not truth((yield from of(frame)))
 
     return negate
 
 
 def _logic(word: str, left: Node, right: Node) -> Node:
-    def decide(frame: Frame) -> Steps:
+    def decide(frame: CallFrame) -> Steps:
         first = truth((yield from left(frame)))
         if word != "xor" and first == (word == "or"):
             return first
@@ -393,7 +393,7 @@ def _logic(word: str, left: Node, right: Node) -> Node:
 
 
 def _binary(sign: str, left: Node, right: Node) -> Node:
-    def result(frame: Frame) -> Steps:
+    def result(frame: CallFrame) -> Steps:
         first = yield from left(frame)
         return operate(sign, first, (yield from right(frame)))
 
@@ -401,7 +401,7 @@ def _binary(sign: str, left: Node, right: Node) -> Node:
 
 
 def _started(call: Call) -> Node:
-    def start(frame: Frame) -> Steps:
+    def start(frame: CallFrame) -> Steps:
         inner = yield from call.enter(frame)
         return frame.run.start(inner)
 

@@ -26,7 +26,7 @@ from calibrate.quality.movement import log as movement_log
 from calibrate.quality.movement import monitor
 from calibrate.quality.movement.evidence import Moved
 from calibrate.quality.movement.log import FILE, MonitorLog, WatchedTag, WatchEntry
-from calibrate.quality.movement.monitor import Monitor
+from calibrate.quality.movement.monitor import MovementMonitor
 from calibrate.quality.movement.pictures import Picture
 from recordings.schema.messages import BoardKind, BoardSpec
 from tests.calibrate.sessions import looking
@@ -186,7 +186,7 @@ def test_a_restart_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Monk
             told += log.add(entry(picture))
         with path.open("ab") as file:
             file.write(b'{"key": "cut')
-    assert told == list(Monitor(model).add(pictures)) and told[-1].moved is not None
+    assert told == list(MovementMonitor(model).add(pictures)) and told[-1].moved is not None
 
 
 def test_a_long_log_is_shortened_and_still_notices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,9 +15,9 @@ from calibrate.quality.movement.monitor import (
     LARGEST_MISFIT_PX,
     MISSED_AFTER,
     NAMED_AFTER,
-    Event,
     EventKind,
-    Monitor,
+    MovementEvent,
+    MovementMonitor,
 )
 from calibrate.quality.movement.pictures import (
     UNITS,
@@ -35,17 +35,17 @@ BEFORE = 600
 """Pictures before anything happens in the benchmark's cells."""
 
 
-def watched(cell: Cell, count: int, what: Happening | None) -> tuple[Monitor, list[Event]]:
+def watched(cell: Cell, count: int, what: Happening | None) -> tuple[MovementMonitor, list[MovementEvent]]:
     model, pictures = simulate(cell, count, what)
-    monitor = Monitor(model)
+    monitor = MovementMonitor(model)
     return monitor, list(monitor.add(pictures))
 
 
-def kinds(events: list[Event]) -> list[EventKind]:
+def kinds(events: list[MovementEvent]) -> list[EventKind]:
     return [event.kind for event in events]
 
 
-def after(events: list[Event], kind: EventKind) -> int:
+def after(events: list[MovementEvent], kind: EventKind) -> int:
     return next(event.pictures for event in events if event.kind is kind) - BEFORE
 
 
@@ -82,7 +82,7 @@ def test_a_sound_cell_that_warms_and_creeps_is_quiet(mount: Mount, repeated: boo
 def test_nothing_is_named_from_two_postures() -> None:
     model, pictures = simulate(Cell(4, "eye-in-hand", True), BEFORE + 120, Happening("camera", 1.0, 0.1))
     postures = sorted({tuple(p.joints_rad) for p in pictures if p.joints_rad is not None})[:2]
-    monitor = Monitor(model)
+    monitor = MovementMonitor(model)
     events = list(
         monitor.add(p for p in pictures if p.joints_rad is not None and tuple(p.joints_rad) in postures)
     )
@@ -98,7 +98,7 @@ def test_noisy_pictures_are_no_move() -> None:
 
 def test_nothing_is_said_while_it_learns() -> None:
     model, pictures = simulate(Cell(6, "eye-in-hand", False), 80, None)
-    monitor = Monitor(model)
+    monitor = MovementMonitor(model)
     assert list(monitor.add(pictures[: LEARNING - 1])) == [] and monitor.needed == 1
     assert kinds(list(monitor.add(pictures[LEARNING - 1 :]))) == [EventKind.LEARNED, EventKind.TESTING]
 
@@ -106,7 +106,7 @@ def test_nothing_is_said_while_it_learns() -> None:
 def test_postures_that_came_too_seldom_are_not_tested() -> None:
     """Twenty postures, four times each: too seldom for a history, too few for the others' test."""
     model, pictures = simulate(Cell(7, "eye-in-hand", False), 20, None)
-    monitor = Monitor(model)
+    monitor = MovementMonitor(model)
     events = list(monitor.add([p for _ in range(3) for p in pictures][:59]))
     assert events == [] and monitor.needed == 1
 
@@ -115,7 +115,7 @@ def test_a_tag_that_is_not_fixed_is_refused() -> None:
     model, pictures = simulate(Cell(8, "eye-in-hand", False), LEARNING, None)
     rng = np.random.default_rng(1)
     moved = [replace(p, pixels=p.pixels + rng.normal(size=2) * 60) for p in pictures]
-    monitor = Monitor(model)
+    monitor = MovementMonitor(model)
     (event,) = monitor.add(moved)
     assert event.kind is EventKind.NOT_FIXED and monitor.finished
     assert float(str(event.values["median_misfit_px"])) > LARGEST_MISFIT_PX
@@ -123,7 +123,7 @@ def test_a_tag_that_is_not_fixed_is_refused() -> None:
 
 def test_pictures_without_the_tag_are_told() -> None:
     model, _ = simulate(Cell(8, "eye-in-hand", True), 10, None)
-    monitor = Monitor(model)
+    monitor = MovementMonitor(model)
     told = [event for k in range(2 * MISSED_AFTER) for event in monitor.miss(str(k))]
     assert [event.values["in_a_row"] for event in told] == [MISSED_AFTER, 2 * MISSED_AFTER]
 
@@ -131,7 +131,7 @@ def test_pictures_without_the_tag_are_told() -> None:
 def test_one_at_a_time_or_all_at_once_is_the_same() -> None:
     model, pictures = simulate(Cell(9, "eye-to-hand", True), BEFORE + 60, Happening("camera", 1.0))
     pictures = pictures[430:]
-    together, single = Monitor(model), Monitor(model)
+    together, single = MovementMonitor(model), MovementMonitor(model)
     assert list(together.add(pictures)) == [event for p in pictures for event in single.add([p])]
 
 

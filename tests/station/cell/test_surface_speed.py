@@ -12,7 +12,7 @@ from station.cell.collision import ARM_BODIES, CellGeometry, body_segments
 from station.cell.config import Capsule, LimitsConfig
 from station.cell.limits import SPEED_CAP_M_S, check_plan, point_speed_m_s
 from station.cell.plan import Plan, PlannedPose
-from station.simulation.controller.kinematics import TABLES, DhTable
+from station.simulation.controller.kinematics import TABLES, ArmGeometry
 
 PLANS, MOVES = 80, 2
 STEP_S = 0.02
@@ -25,7 +25,7 @@ def around(count: int) -> np.ndarray:
     return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
 
 
-def links(table: DhTable, joints_rad: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def links(table: ArmGeometry, joints_rad: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Rotation (n, 3, 3) and origin (n, 3) of links 0…6 in `base`, (n, 6) joints: Rz(q) Tz(d) Tx(a) Rx(α)."""
     R, o = np.tile(np.eye(3), (len(joints_rad), 1, 1)), np.zeros((len(joints_rad), 3))
     found = [(R, o)]

@@ -10,7 +10,7 @@ from calibrate.kinematics import MODELS, forward, inverse_nearest
 from calibrate.projection import project
 from recordings.schema.messages import RobotIdentity
 from station.cell.config import matrix4, vector6
-from station.operate.draft import Draft, FoundCamera, GuidedView
+from station.operate.draft import CameraChoice, Draft, GuidedView
 from station.simulation.cell import CellTruth
 
 NEARER_M = (0.0, 0.02, -0.05, 0.06, 0.0)
@@ -61,7 +61,7 @@ def draft_of(truth: CellTruth, views: int = 4) -> Draft:
     return Draft(
         host="127.0.0.9",
         robot=RobotIdentity(model=truth.robot_model, serial="2026"),
-        camera=FoundCamera("aravis", "SIM", "camera SIM"),
+        camera=CameraChoice("aravis", "SIM", "camera SIM"),
         width=truth.camera.width,
         height=truth.camera.height,
         mount=truth.mount,

@@ -17,7 +17,7 @@ from station.cell.scene import scene_of
 from station.operate import draft as drafts
 from station.operate import guided_views
 from station.operate import new_cell as flow
-from station.operate.draft import Draft, Step
+from station.operate.draft import CellStep, Draft
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.scenes import make_cell
 from tests.codes import raises
@@ -90,11 +90,11 @@ def test_what_was_written_is_read_back_and_can_be_planned(done: tuple[Draft, obj
 
 def test_it_is_taken_up_where_it_was_left(done: tuple[Draft, object], tmp_path: Path) -> None:
     draft, _ = done
-    assert flow.next_step(drafts.load_draft(tmp_path)) is Step.ROBOT
+    assert flow.next_step(drafts.load_draft(tmp_path)) is CellStep.ROBOT
     drafts.save_draft(tmp_path, draft)
     again = drafts.load_draft(tmp_path)
-    assert again == draft and flow.next_step(again) is Step.LIMITS
-    assert flow.next_step(draft.without_views(board=draft.board)) is Step.VIEWS
+    assert again == draft and flow.next_step(again) is CellStep.LIMITS
+    assert flow.next_step(draft.without_views(board=draft.board)) is CellStep.VIEWS
     (tmp_path / drafts.DRAFT_FILE).write_text("{")
     assert drafts.load_draft(tmp_path) == Draft()
 

@@ -1,7 +1,8 @@
-"""Sharp pictures: only on a terminal that says it draws sixels, never over a question or a notice."""
+"""Sharp pictures: only on a terminal that says it draws them, never over a question or a notice."""
 
 from __future__ import annotations
 
+import base64
 import fcntl
 import os
 import pty
@@ -15,9 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
+from rich.style import Style
 from textual._compositor import Compositor
 from textual._xterm_parser import XTermParser
 from textual.geometry import Region, Size
@@ -34,6 +37,12 @@ from tests.tui.conftest import FakeLink, app_on, idle, opened, until
 CELL = (8, 17)
 VT340 = b"\x1b[?63;1;2;4;6;9;15;22c"
 PLAIN = b"\x1b[?62;22c"
+KITTY, OLD_KITTY, GHOSTTY = (
+    b"\x1bP>|kitty(0.41.1)\x1b\\",
+    b"\x1bP>|kitty(0.26.5)\x1b\\",
+    b"\x1bP>|ghostty 1.1.3\x1b\\",
+)
+"""Of the first the answer of a real one, 0.41.1, was seen."""
 
 
 @pytest.fixture
@@ -126,6 +135,24 @@ async def test_a_dear_picture_makes_the_next_one_wait(
         assert len(drawn) == 1
 
 
+def test_kitty_shows_the_image_in_letters(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graphics_module, "cell_pixels", lambda: CELL)
+    grey = np.full((100, 80), 128, dtype=np.uint8)
+    picture = Graphics(None).draw(grey, np.array([[0.5, 0.5]]), Size(30, 12))
+    *above, last = picture.strips(4, 2, Style())
+    for row, strip in enumerate([*above, last][: picture.rows]):
+        letters = list(strip)[1]
+        assert letters.text.count("\U0010eeee") == picture.columns == letters.cell_length
+        assert letters.text[1] == graphics_module._ROWS[row]
+    assert all(strip.cell_length == 30 for strip in (*above, last)) and len(above) == 11
+    messages = re.findall(r"\x1b_G([^;\x1b]*);?([^\x1b]*)\x1b\\", list(last)[-1].text)
+    png = base64.b64decode("".join(payload for _, payload in messages))
+    shown = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert shown is not None and shown.shape[:2] == (picture.rows * CELL[1], picture.columns * CELL[0])
+    assert (shown == (0, 230, 0)).all(axis=2).any(), "the corner's cross"
+    assert f"U=1,i={graphics_module._KITTY_ID},c={picture.columns},r={picture.rows}" in messages[-1][0]
+
+
 def test_corners_are_crosses_and_not_only_a_colour(sixels: Graphics) -> None:
     grey = np.full((50, 40), 128, dtype=np.uint8)
     without = sixels._indexed(grey, np.zeros((0, 2)), Size(10, 6))
@@ -166,7 +193,15 @@ def answer(terminal: int, *parts: bytes) -> threading.Thread:
 
 @pytest.mark.parametrize(
     ("parts", "sharp"),
-    [((VT340,), True), ((VT340[:7], VT340[7:]), True), ((b"x", VT340), True), ((PLAIN,), False)],
+    [
+        ((VT340,), True),
+        ((VT340[:7], VT340[7:]), True),
+        ((b"x", VT340), True),
+        ((PLAIN,), False),
+        ((KITTY, PLAIN), True),
+        ((GHOSTTY, PLAIN), True),
+        ((OLD_KITTY, PLAIN), False),
+    ],
 )
 def test_the_terminal_is_asked(terminal: int, parts: tuple[bytes, ...], sharp: bool) -> None:
     asked = answer(terminal, *parts)

@@ -84,7 +84,6 @@ class RenderedCamera:
         )
         self._frames, self._answers = asyncio.Queue(), asyncio.Queue()
         self.counter.restart()
-        self._clock.restart()
         self._reader = asyncio.create_task(self._read(self._process))
         setup = {
             "truth": msgspec.to_builtins(self._truth),
@@ -94,6 +93,7 @@ class RenderedCamera:
         }
         try:
             await self._ask(setup, START_TIMEOUT_S)
+            self._clock.restart()  # not before: until its first reading it would count as one without a clock
             async with self._asking:
                 for _ in range(_CLOCK_READINGS):
                     await self._read_clock()

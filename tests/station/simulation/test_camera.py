@@ -131,3 +131,21 @@ async def test_a_closed_camera_is_refused_and_can_be_opened_again(camera: Render
 async def test_an_unknown_fault_is_refused(camera: RenderedCamera) -> None:
     with raises("camera-refused"):
         await camera.inject("gremlins")
+
+
+async def test_while_it_starts_nothing_is_said_of_its_clock(
+    arm: SimulatedController, cell: CellTruth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Doctor would call a clock missing that is only not read yet."""
+    rendered, ask = RenderedCamera(cell, arm.host), RenderedCamera._ask
+    while_starting = []
+
+    async def asked(camera: RenderedCamera, request: dict[str, object], timeout_s: float) -> object:
+        while_starting.append(camera.timing)
+        return await ask(camera, request, timeout_s)
+
+    monkeypatch.setattr(RenderedCamera, "_ask", asked)
+    await rendered.open()
+    assert while_starting == [None]
+    assert rendered.timing is not None and rendered.timing.source == "latched"
+    await rendered.close()

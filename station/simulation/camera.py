@@ -92,9 +92,9 @@ class RenderedCamera:
             "gain_db": self._gain_db,
         }
         try:
-            await self._ask(setup, START_TIMEOUT_S)
-            self._clock.restart()  # not before: until its first reading it would count as one without a clock
-            async with self._asking:
+            async with self._asking:  # whoever asks for an image meanwhile finds the clock read
+                await self._ask_locked(setup, START_TIMEOUT_S)
+                self._clock.restart()  # not before: without a reading it counts as one that cannot be read
                 for _ in range(_CLOCK_READINGS):
                     await self._read_clock()
         except BaseException:

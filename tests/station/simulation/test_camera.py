@@ -137,15 +137,19 @@ async def test_while_it_starts_nothing_is_said_of_its_clock(
     arm: SimulatedController, cell: CellTruth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Doctor would call a clock missing that is only not read yet."""
-    rendered, ask = RenderedCamera(cell, arm.host), RenderedCamera._ask
+    rendered, ask = RenderedCamera(cell, arm.host), RenderedCamera._ask_locked
     while_starting = []
 
     async def asked(camera: RenderedCamera, request: dict[str, object], timeout_s: float) -> object:
         while_starting.append(camera.timing)
         return await ask(camera, request, timeout_s)
 
-    monkeypatch.setattr(RenderedCamera, "_ask", asked)
-    await rendered.open()
-    assert while_starting == [None]
+    monkeypatch.setattr(RenderedCamera, "_ask_locked", asked)
+    opening = asyncio.create_task(rendered.open())
+    while not while_starting:
+        await asyncio.sleep(0.001)
+    await rendered.preview()
+    assert while_starting[0] is None
     assert rendered.timing is not None and rendered.timing.source == "latched"
+    await opening
     await rendered.close()

@@ -339,7 +339,7 @@ class BackgroundSync:
     """fdatasync of one open file beside its writer; a failed one is raised by the next call.
 
     What is on the disk leaves the computer's memory again, but for the newest part: gigabytes of pages that
-    nobody reads made the daemon fall silent for tenths of a second (docs/decisions/0088).
+    nobody reads made the daemon fall silent for tenths of a second.
     """
 
     def __init__(self, descriptor: int) -> None:

@@ -100,7 +100,7 @@ def _compare_choices(cell: RandomCell, result: CellResult, rng: np.random.Genera
     for name, view in (("moderate", MODERATE), ("wide", WIDE)):
         options = PlanOptions(seed=seed, noise=NOISE, view=view)
         pool, _ = candidate_pool(scene, options, cell.start, rng)
-        each = informations(scene, pool.base_from_flange, NOISE)
+        each = informations(scene, pool.base_from_flange, noise=NOISE)
         objective = objective_for(scene, "A", True)
         for label, sets in (
             (f"{name} planned 25", [choose(each, 25, objective, rng)] * VISITS),

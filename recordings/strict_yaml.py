@@ -233,7 +233,7 @@ def _problems(node: yaml.Node, kind: Any, where: str) -> Iterator[YamlProblem]:
 def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: str) -> Iterator[YamlProblem]:
     from msgspec.structs import fields as fields_of
 
-    hints = get_type_hints(kind)
+    hints = get_type_hints(kind, include_extras=True)  # with the limits of numbers
     fields = {f.encode_name: f for f in fields_of(kind)}
     seen: set[str] = set()
     for key, value in node.value:

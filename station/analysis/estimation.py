@@ -25,7 +25,7 @@ from station.cell.config import StationConfig, matrix4
 from station.cell.errors import StationError
 from station.cell.scene import scene_of
 from station.cell.status import EstimateStatus
-from station.plan.predict import Advice, AdviceOptions, advise
+from station.plan.predict import Advice, advise
 
 FEWEST_VIEWS = 4
 FEWEST_FOR_LENS = 6
@@ -82,9 +82,7 @@ def next_best(
     Free to reach from here, and from it the pose that is next (`onward_rad`). By forecast from the configured
     guesses; ConfigError where these are missing.
     """
-    return advise(
-        scene_of(config), base_from_flange, 0.0, joints_now_rad, AdviceOptions(onward_rad=onward_rad)
-    )
+    return advise(scene_of(config), base_from_flange, 0.0, joints_now_rad, onward_rad)
 
 
 def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:

@@ -15,13 +15,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
-from calibrate.geometry import (
-    Array,
-    difference,
-    inverse,
-    perturb,
-)
-from calibrate.handeye.information import MeasurementNoise
+from calibrate.geometry import Array, difference, inverse, perturb
 from calibrate.projection import project
 from station.analysis.estimation import FEWEST_FOR_LENS, quick_sigma, solve_quickly
 from station.analysis.worker import CapturedView
@@ -153,7 +147,7 @@ def _require_agreement(guess: PoseGuess, X: Array) -> None:
 def _worth(scene: Scene, seen: Sequence[CapturedView], left: Plan, free_lens: bool) -> ReplanGain:
     flange = flange_poses(scene, left)
     captured = np.array([view.base_from_flange for view in seen])
-    everything = informations(scene, np.concatenate([captured, flange]), MeasurementNoise()).sum(axis=0)
+    everything = informations(scene, np.concatenate([captured, flange])).sum(axis=0)
     sigma_m = sigma_of(everything, objective_for(scene, "A", free_lens))[0]
     whole = visible(scene.camera, scene.seen(flange, outline(scene.board)), 0.0)
     points = scene.seen(flange[whole], board_points(scene.board))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -19,6 +19,8 @@ from recordings.schema.messages import (
 )
 
 Vector3 = tuple[float, float, float]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 
 def vector3(values: Iterable[float]) -> Vector3:
@@ -47,8 +49,8 @@ class PoseGuess(Section, frozen=True):
 
     translation_m: Vector3
     rotation_xyzw: tuple[float, float, float, float]
-    sigma_m: float = 0.02
-    sigma_rad: float = 0.1
+    sigma_m: NotNegative = 0.02
+    sigma_rad: NotNegative = 0.1
 
 
 class KinematicsDeltas(Section, frozen=True):
@@ -89,7 +91,7 @@ class CameraConfig(Section, frozen=True):
     pixel_format: str = "Mono8"
     frame_rate_hz: float | None = None
     """free-running: None = the camera's own"""
-    exposure_us: float = 10_000.0
+    exposure_us: Positive = 10_000.0
     gain_db: float = 0.0
     gain: float | None = None
     """In the camera's own unit, instead of `gain_db`: for cameras that know no dB."""
@@ -123,7 +125,7 @@ class CameraConfig(Section, frozen=True):
 class TriggerConfig(Section, frozen=True):
     port: str
     mode: Literal["box", "rts", "dtr"] = "box"
-    pulse_us: int = 1000
+    pulse_us: Annotated[int, msgspec.Meta(gt=0)] = 1000
     light_level: float | None = None
 
 
@@ -133,7 +135,7 @@ class Capsule(Section, frozen=True):
     name: str
     from_m: Vector3
     to_m: Vector3
-    radius_m: float
+    radius_m: Positive
 
 
 class Plane(Section, frozen=True):
@@ -147,9 +149,9 @@ class Plane(Section, frozen=True):
 class LimitsConfig(Section, frozen=True):
     speed_m_s: float = 0.25
     """Speed of any modelled point of arm, tool or camera; code caps it at 0.25."""
-    joint_speed_rad_s: float = 0.6
-    joint_acceleration_rad_s2: float = 1.0
-    joint_step_rad: float = 3.2
+    joint_speed_rad_s: Positive = 0.6
+    joint_acceleration_rad_s2: Positive = 1.0
+    joint_step_rad: Positive = 3.2
     """Largest turn of one joint between neighbouring poses."""
     joints_min_rad: Vector6 | None = None
     joints_max_rad: Vector6 | None = None
@@ -159,8 +161,8 @@ class LimitsConfig(Section, frozen=True):
     planes: tuple[Plane, ...] = ()
     solids: tuple[Capsule, ...] = ()
     """On the flange, in `flange`."""
-    clearance_m: float = 0.03
-    board_clearance_m: float = 0.10
+    clearance_m: Positive = 0.03
+    board_clearance_m: Positive = 0.10
 
 
 class PointerConfig(Section, frozen=True):
@@ -169,33 +171,33 @@ class PointerConfig(Section, frozen=True):
     tip_m: Vector3
     along: Vector3 = (0.0, 0.0, 1.0)
     """Where it points to."""
-    radius_m: float = 0.01
+    radius_m: Positive = 0.01
 
 
 class StillnessConfig(Section, frozen=True):
-    window_s: float = 0.3
-    joint_speed_rad_s: float = 0.002
-    position_m: float = 0.00005
-    rotation_rad: float = 0.00005
-    image_motion_px: float = 0.3
-    timeout_s: float = 5.0
+    window_s: Positive = 0.3
+    joint_speed_rad_s: Positive = 0.002
+    position_m: Positive = 0.00005
+    rotation_rad: Positive = 0.00005
+    image_motion_px: Positive = 0.3
+    timeout_s: Positive = 5.0
 
 
 class CaptureConfig(Section, frozen=True):
     lossless_png: bool = False
-    time_bound_s: float = 0.02
+    time_bound_s: Positive = 0.02
     """A pose whose time bound is worse is refused. The arm is at rest: at the stillness limit of 2 mrad/s
     this is 0.04 mm at one metre."""
-    free_space_bytes: int = 2_000_000_000
-    retries: int = 2
-    goal_m: float = 0.0005
+    free_space_bytes: Annotated[int, msgspec.Meta(ge=0)] = 2_000_000_000
+    retries: Annotated[int, msgspec.Meta(ge=0)] = 2
+    goal_m: Positive = 0.0005
     """The session is good enough when the expected error of X (1 sigma of its translation) is below this."""
 
 
 class ValidityConfig(Section, frozen=True):
     """When an installed calibration is in doubt by itself."""
 
-    max_age_days: float | None = None
+    max_age_days: Positive | None = None
     """Oldest that the last proof may be: a calibration, or a drift check that passed; None: no limit."""
 
 

@@ -35,28 +35,6 @@ _FOCAL_LENGTH = (
 _FACING = 0.3
 """Cosine from which a printed side faces something."""
 
-_ABOVE_ZERO = {
-    "limits": (
-        "joint_speed_rad_s",
-        "joint_acceleration_rad_s2",
-        "joint_step_rad",
-        "clearance_m",
-        "board_clearance_m",
-    ),
-    "stillness": (
-        "window_s",
-        "joint_speed_rad_s",
-        "position_m",
-        "rotation_rad",
-        "image_motion_px",
-        "timeout_s",
-    ),
-    "camera": ("exposure_us",),
-    "capture": ("time_bound_s", "goal_m"),
-    "trigger": ("pulse_us",),
-    "pointer": ("radius_m",),
-}
-
 
 @dataclass(frozen=True)
 class ConfigReport:
@@ -124,9 +102,9 @@ def _line(lines: dict[str, int], where: str) -> int:
     return lines.get(where, 0)
 
 
-def _readable(plain: dict[str, Any]) -> tuple[StationConfig, set[str]]:
+def _readable(plain: dict[str, object]) -> tuple[StationConfig, set[str]]:
     """The configuration with stand-ins for sections that cannot be read, and the names of the others."""
-    stand_ins: dict[str, Any] = {
+    stand_ins: dict[str, object] = {
         "robot": {},
         "camera": {},
         "board": {"kind": "chessboard", "columns": 7, "rows": 6, "square_m": 0.025},
@@ -170,7 +148,6 @@ def _meaning_problems(config: StationConfig) -> Iterator[YamlProblem]:
             "the controller's address is missing",
             "Read it on the pendant: menu (top right) → About, or Settings → System → Network.",
         )
-    yield from _number_problems(config)
     yield from _solid_problems(config)
     if not 0 < limits.speed_m_s <= SPEED_CAP_M_S:
         text = f"{limits.speed_m_s} must be above 0 and at most {SPEED_CAP_M_S}"
@@ -187,8 +164,6 @@ def _meaning_problems(config: StationConfig) -> Iterator[YamlProblem]:
             yield YamlProblem(0, f"limits.planes[{place}].normal", text, "A table has [0, 0, 1].")
     if not is_session_name(camera.name):
         yield YamlProblem(0, "camera.name", f"'{camera.name}' must be 1 to 40 of a-z, 0-9 and -")
-    if (days := config.validity.max_age_days) is not None and not days > 0:
-        yield YamlProblem(0, "validity.max_age_days", f"{days} must be above 0", "Give days.")
     if camera.trigger == "hardware" and config.trigger is None:
         text = "hardware needs a section 'trigger' with the box's port"
         yield YamlProblem(
@@ -253,9 +228,6 @@ def _guess_problems(config: StationConfig) -> Iterator[YamlProblem]:
             known[name] = None
             remedy = "`station new` finds it without one."
             yield YamlProblem(0, f"{name}.rotation_xyzw", "its length must be 1 (x, y, z, w)", remedy)
-        if min(guess.sigma_m, guess.sigma_rad) < 0:
-            text = "sigma_m and sigma_rad must not be below 0; what hangs on it is thickened by them"
-            yield YamlProblem(0, name, text)
     if known["board_guess"] is not None and (problem := board_turned_away(config)):
         yield problem
     elif known["camera_guess" if config.mount == "eye-to-hand" else "board_guess"] is not None:
@@ -324,23 +296,10 @@ def _real_capture_problems(config: StationConfig) -> Iterator[YamlProblem]:
             yield YamlProblem(0, name, f"is missing: planning asks {what}", "`station new` finds it.")
 
 
-def _number_problems(config: StationConfig) -> Iterator[YamlProblem]:
-    for section, names in _ABOVE_ZERO.items():
-        part = getattr(config, section)
-        for name in names if part is not None else ():
-            if not getattr(part, name) > 0:
-                yield YamlProblem(0, f"{section}.{name}", f"{getattr(part, name)} must be above 0")
-    for name in ("retries", "free_space_bytes"):
-        if (value := getattr(config.capture, name)) < 0:
-            yield YamlProblem(0, f"capture.{name}", f"{value} must not be below 0")
-
-
 def _solid_problems(config: StationConfig) -> Iterator[YamlProblem]:
-    """Finds bodies on the flange that are too thin to be bodies to the checks."""
+    """Finds bodies on the flange of impossible size."""
     for place, solid in enumerate(config.limits.solids):
         where = f"limits.solids[{place}]"
-        if not solid.radius_m > 0:
-            yield YamlProblem(0, where, f"'{solid.name}': radius_m must be above 0, not {solid.radius_m}")
         if np.abs([*solid.from_m, *solid.to_m, solid.radius_m]).max() > LARGEST_REACH_M:
             yield YamlProblem(0, where, f"'{solid.name}' reaches further than {LARGEST_REACH_M} m", METRES)
     pointer = config.pointer

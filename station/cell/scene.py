@@ -16,12 +16,13 @@ from calibrate.geometry import (
     pose_from_quaternion,
     pose_from_rotvec,
     quaternion_from_matrix,
+    rotation_log,
     transform_points,
 )
 from calibrate.kinematics import MODELS, RobotModel, forward
 from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
 from station.cell.collision import CellGeometry, gap_to_arm, plate
-from station.cell.config import Capsule, PoseGuess, RobotConfig, StationConfig, Vector3, vector3
+from station.cell.config import Capsule, PoseGuess, RobotConfig, StationConfig, Vector3, vector3, vector6
 from station.cell.errors import ConfigError, LimitError
 from station.cell.limits import SPACING_M
 from station.cell.plan import Plan
@@ -53,9 +54,7 @@ class Scene:
 
     def camera_from_board(self, base_from_flange: Array) -> Array:
         """(..., 4, 4) → (..., 4, 4)"""
-        if self.mount == "eye-in-hand":
-            return np.asarray(inverse(base_from_flange @ self.X) @ self.Y)
-        return np.asarray(inverse(self.X) @ base_from_flange @ self.Y)
+        return camera_from_board(self.mount, base_from_flange, self.X, self.Y)
 
     def base_from_flange(self, camera_from_board: Array) -> Array:
         """The flange pose that shows the board so."""
@@ -68,6 +67,13 @@ class Scene:
         return transform_points(self.camera_from_board(base_from_flange), points)
 
 
+def camera_from_board(mount: Mount, base_from_flange: Array, X: Array, Y: Array) -> Array:
+    """How the board is seen from flange poses (..., 4, 4), if camera and board stand at X and Y (`Scene`)."""
+    if mount == "eye-in-hand":
+        return np.asarray(inverse(base_from_flange @ X) @ Y)
+    return np.asarray(inverse(X) @ base_from_flange @ Y)
+
+
 def flange_poses(scene: Scene, plan: Plan) -> Array:
     """(n, 4, 4) base_from_flange of the plan's joints."""
     joints = np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6)
@@ -78,6 +84,12 @@ def board_extent(board: BoardSpec) -> tuple[Array, Array]:
     """Corners (2,) of the printed area in the board's plane, one square beyond the outermost points."""
     points = board_points(board)[:, :2]
     return points.min(axis=0) - board.square_m, points.max(axis=0) + board.square_m
+
+
+def printed_corners(board: BoardSpec) -> Array:
+    """The same corners in order around it, (4, 3) in `board`."""
+    (x0, y0), (x1, y1) = board_extent(board)
+    return np.array([(x0, y0, 0.0), (x1, y0, 0.0), (x1, y1, 0.0), (x0, y1, 0.0)])
 
 
 def scene_of(config: StationConfig) -> Scene:
@@ -181,8 +193,7 @@ def geometry_of(
                 msgspec.structs.replace(rod, radius_m=rod.radius_m + thicker_m)
                 for rod in plate("board", Y, low, high)
             )
-            corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-            watched = tuple(vector3(p) for p in transform_points(Y, corners))
+            watched = tuple(vector3(p) for p in transform_points(Y, printed_corners(config.board)))
         if X is not None:
             obstacles = (camera_body("camera", X),)
             clearance = limits.clearance_m + 2 * camera_doubt_m
@@ -255,6 +266,11 @@ def geometry_from(config: StationConfig, standing_rad: ArrayLike) -> CellGeometr
         return cell
     Y, board_m = (None, 0.0) if board is None else (guess_matrix(board), board.sigma_m)
     return geometry_of(config, mounts[roomy[0]], Y, guess.sigma_m, board_m)
+
+
+def pose_vector(matrix: Array) -> Vector6:
+    """A pose (4, 4) as UR writes it: x, y, z [m] and a rotation vector [rad]."""
+    return vector6([*matrix[:3, 3], *rotation_log(matrix[:3, :3])])
 
 
 def flange_pose(state: RobotState, tcp_offset: Vector6) -> Array:

@@ -57,7 +57,7 @@ def accept_command(
 
 async def _accept(socket: Path | None, joint: int, fastest_m_s: float, quiet: bool) -> Acceptance:
     # Reading the arm beside the daemon is this command's alone: the flow knows it as a `StateRecorder`.
-    from station.devices.ur_trace import TraceRecorder
+    from station.devices.ur_state import TraceRecorder
 
     async with attended(socket or default_socket(), quiet=quiet) as shell:
         status = await shell.status()

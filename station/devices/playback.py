@@ -16,7 +16,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from calibrate.geometry import interpolate, pose_from_rotvec, rotation_log
+from calibrate.geometry import interpolate, pose_from_rotvec
 from recordings import strict_yaml
 from recordings.errors import RecordingError
 from recordings.images import Pixels
@@ -36,6 +36,7 @@ from station.cell.acceptance import StopWay
 from station.cell.config import CameraConfig, StationConfig, vector6
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.plan import Plan, PlannedPose
+from station.cell.scene import pose_vector
 from station.devices.cell import Cell
 from station.devices.frames import CameraCounts, FrameTiming
 
@@ -329,7 +330,7 @@ class PlaybackRobot:
             joints_rad=vector6(a + fraction * (b - a)),
             joint_speeds_rad_s=vector6(speed),
             target_joints_rad=_joints(after),
-            tcp_pose=vector6(np.concatenate([tool[:3, 3], rotation_log(tool[:3, :3])])),
+            tcp_pose=pose_vector(tool),
             robot_mode=7,
             safety_mode=1,
             safety_status_bits=1,

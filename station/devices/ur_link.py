@@ -20,10 +20,9 @@ from station.cell.process import waited_share
 from station.cell.scene import arm_model
 from station.devices.ur_condition import HICCUP_S, STALE_S, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
-from station.devices.ur_primary import Installation, PrimaryReader
 from station.devices.ur_probe import SCRIPT_PORT, ProbeResult, RobotLock, check_port, identify, lock_name
 from station.devices.ur_state import Payload, Sample, StateReader, state_at
-from station.devices.ur_tool import TcpCheck, check_payload
+from station.devices.ur_tool import Installation, PrimaryReader, TcpCheck, check_payload
 
 log = logging.getLogger(__name__)
 

@@ -1,10 +1,12 @@
 """Reads the controller's state at its full rate, in its own thread, keeping every sample. Read-only.
 
-A reader lives as long as its connection: when that ends it says why and is not used again.
+A reader lives as long as its connection: when that ends it says why and is not used again. A trace recorder
+opens the next one.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import select
@@ -19,13 +21,14 @@ from concurrent.futures import Future
 from typing import NamedTuple
 
 import msgspec
-import numpy as np
 
 from calibrate.geometry import interpolate as between_poses
-from calibrate.geometry import pose_from_rotvec, rotation_log
+from calibrate.geometry import pose_from_rotvec
 from recordings.schema.clocks import ClockEstimator, ClockFit, monotonic_from_wall_ns
 from recordings.schema.messages import RobotState, Stamps, Vector6
-from station.cell.errors import StaleStateError
+from station.cell.config import vector6
+from station.cell.errors import RobotError, StaleStateError
+from station.cell.scene import pose_vector
 from station.devices.rtde import PORT, PacketType, Recipe, RtdeError
 from station.devices.rtde_link import HANDSHAKE_S, RtdeLink
 from station.devices.ur_dashboard import connect_trouble
@@ -33,6 +36,7 @@ from station.devices.ur_dashboard import connect_trouble
 log = logging.getLogger(__name__)
 
 HISTORY_S = 10.0
+RECONNECT_S = 0.3
 SILENCE_S = 2.0
 """Without data for this long the connection is given up."""
 SO_TIMESTAMPNS = 35
@@ -277,15 +281,65 @@ def state_at(history: Sequence[RobotState], clock: ClockFit | None, host_monoton
 
 
 def _mix(first: Vector6, second: Vector6, fraction: float) -> Vector6:
-    a, b, c, d, e, f = (x + (y - x) * fraction for x, y in zip(first, second, strict=True))
-    return (a, b, c, d, e, f)
+    return vector6(x + (y - x) * fraction for x, y in zip(first, second, strict=True))
 
 
 def _mix_poses(first: Vector6, second: Vector6, fraction: float) -> Vector6:
     if first == second:
         return first
-    T = between_poses(
-        pose_from_rotvec(first[:3], first[3:]), pose_from_rotvec(second[:3], second[3:]), fraction
-    )
-    x, y, z, rx, ry, rz = np.concatenate([T[:3, 3], rotation_log(T[:3, :3])]).tolist()
-    return (x, y, z, rx, ry, rz)
+    a, b = (pose_from_rotvec(vector[:3], vector[3:]) for vector in (first, second))
+    return pose_vector(between_poses(a, b, fraction))
+
+
+class TraceRecorder:
+    """Every sample between `begin` and `end`, again and again; a connection that is cut is opened anew."""
+
+    def __init__(self, host: str) -> None:
+        self._host = host
+        self._states: list[RobotState] = []
+        self._reader: StateReader | None = None
+        self._keeper: asyncio.Task[None] | None = None
+
+    async def begin(self) -> None:
+        """Returns once samples come. RobotError when none do."""
+        self._states = []
+        await self._open()
+        self._keeper = asyncio.create_task(self._keep())
+
+    async def end(self) -> list[RobotState]:
+        """All samples since `begin`, in order."""
+        if self._keeper is not None:
+            self._keeper.cancel()
+            await asyncio.gather(self._keeper, return_exceptions=True)
+        await self._close()
+        return self._states
+
+    @property
+    def newest(self) -> RobotState | None:
+        return self._states[-1] if self._states else None
+
+    def silent_s(self) -> float:
+        """Time since the last sample came."""
+        newest = self.newest
+        return (time.monotonic_ns() - newest.stamps.host_monotonic_ns) / 1e9 if newest else 0.0
+
+    async def _open(self) -> None:
+        states = self._states
+        self._reader = reader = StateReader(self._host, states.append, lambda _: None)
+        reader.start()
+        await asyncio.wrap_future(reader.started)
+
+    async def _close(self) -> None:
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.request_end()
+            await asyncio.to_thread(reader.join, 3.0)
+
+    async def _keep(self) -> None:
+        """A lost connection is opened again until it comes."""
+        while True:
+            await asyncio.sleep(RECONNECT_S)
+            if self._reader is None or self._reader.ended is not None:
+                await self._close()
+                with contextlib.suppress(RobotError):
+                    await self._open()

@@ -4,26 +4,47 @@ flange_from_tcp = forward(joints)⁻¹ · base_from_tcp, from one and the same s
 the controller states, and it must not change. The controller knows the factory calibration of its arm and our
 nominal table does not: they differ by some millimetres, so the check is fine only when the controller states
 its kinematics too, or when the configuration does.
+
+It states both on its primary interface (port 30001, read-only), ten times a second. One message = int32 size,
+uint8 type (16 = robot state), then sub-packages of int32 size, uint8 type, payload; everything big-endian.
+Source: Universal Robots, "Remote control via TCP/IP: client interfaces".
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import logging
 import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from calibrate.geometry import Array, difference, inverse, pose_from_rotvec, rotation_log
+from calibrate.geometry import Array, difference, inverse, pose_from_rotvec
 from calibrate.kinematics import RobotModel, forward
 from recordings.schema.messages import ArmKinematics, RobotState, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError
-from station.devices.ur_primary import DhParameters, Installation
+from station.cell.scene import pose_vector
 from station.devices.ur_state import Payload
 
 log = logging.getLogger(__name__)
 
+PORT = 30001
+ROBOT_STATE = 16
+CARTESIAN_INFO = 4
+KINEMATICS_INFO = 5
+MESSAGE_LIMIT = 64 * 1024
+SILENCE_S = 3.0
+FIRST_S = 1.0
+_HEADER = struct.Struct(">iB")
+_CARTESIAN = struct.Struct(">12d")
+"""TCP pose, then TCP offset: x y z [m], rotation vector [rad] each"""
+_KINEMATICS = struct.Struct(">6I24dI")
+"""Checksum per joint; theta, a, d, alpha of all joints; calibration status"""
 NOMINAL_TOLERANCE = (0.006, math.radians(1.0))
 CALIBRATED_TOLERANCE = (0.0005, math.radians(0.1))
 STATED_TOLERANCE = (1e-6, 1e-6)
@@ -34,6 +55,104 @@ CENTRE_TOLERANCE_M = 0.001
 _MODEL_REMEDY = "Check robot.model and robot.kinematics in the configuration."
 _CHANGED = "the TCP offset on the pendant was changed during the session"
 _CHANGED_REMEDY = "Set it back, or finish this session and restart the daemon."
+
+
+@dataclass(frozen=True)
+class Installation:
+    tcp_offset: Vector6 | None = None
+    """flange_from_tcp as set on the pendant"""
+    dh: tuple[Vector6, Vector6, Vector6, Vector6] | None = None
+    """theta, a, d, alpha of this very arm (standard Denavit-Hartenberg), factory corrections included; sent
+    once, at the beginning of a connection"""
+
+
+class PrimaryError(RobotError):
+    """Port 30001 does not speak the primary interface."""
+
+    code = "primary-interface"
+
+
+def read_state(payload: bytes) -> Installation:
+    """The sub-packages of a robot state message. Raises PrimaryError on impossible sizes."""
+    offset: Vector6 | None = None
+    dh: tuple[Vector6, Vector6, Vector6, Vector6] | None = None
+    at = 0
+    while at + _HEADER.size <= len(payload):
+        size, kind = _HEADER.unpack_from(payload, at)
+        if size < _HEADER.size or at + size > len(payload):
+            raise PrimaryError(f"a sub-package of the robot state claims {size} bytes", size_bytes=size)
+        body = payload[at + _HEADER.size : at + size]
+        if kind == CARTESIAN_INFO and len(body) >= _CARTESIAN.size:
+            offset = _six(_CARTESIAN.unpack_from(body)[6:])
+        elif kind == KINEMATICS_INFO and len(body) >= _KINEMATICS.size:
+            v = _KINEMATICS.unpack_from(body)[6:30]
+            dh = _six(v[0:6]), _six(v[6:12]), _six(v[12:18]), _six(v[18:24])
+        at += size
+    return Installation(offset, dh)
+
+
+def _six(values: Sequence[float]) -> Vector6:
+    if not all(map(math.isfinite, values)):
+        raise PrimaryError("the robot state holds a number that is not finite")
+    return vector6(values)
+
+
+class PrimaryReader:
+    """Follows the installation until the connection ends; `dead` then says why. Sends nothing, ever."""
+
+    def __init__(self, host: str) -> None:
+        self.installation = Installation()
+        self.dead = ""
+        self._host = host
+        self._first = asyncio.Event()
+        self._task = asyncio.create_task(self._run(), name=f"installation of {host}")
+
+    async def first(self) -> Installation:
+        """Waits for the first statement; empty when none comes in time (a firewalled or old controller)."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(FIRST_S):
+                await self._first.wait()
+        return self.installation
+
+    async def _run(self) -> None:
+        writer = None
+        try:
+            async with asyncio.timeout(SILENCE_S):
+                reader, writer = await asyncio.open_connection(self._host, PORT, limit=MESSAGE_LIMIT)
+            while True:
+                async with asyncio.timeout(SILENCE_S):
+                    kind, payload = await _message(reader)
+                if kind == ROBOT_STATE:
+                    self._learn(read_state(payload))
+        except TimeoutError:
+            self.dead = f"nothing came from {self._host}:{PORT} for {SILENCE_S:g} s"
+        except (OSError, EOFError, PrimaryError) as error:
+            self.dead = str(error) or type(error).__name__
+        finally:
+            self._first.set()
+            if writer is not None:
+                writer.transport.abort()
+
+    def _learn(self, news: Installation) -> None:
+        known = self.installation
+        self.installation = Installation(news.tcp_offset or known.tcp_offset, news.dh or known.dh)
+        if self.installation.tcp_offset is not None:
+            self._first.set()
+
+    async def close(self) -> None:
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+
+
+async def _message(reader: asyncio.StreamReader) -> tuple[int, bytes]:
+    size, kind = _HEADER.unpack(await reader.readexactly(_HEADER.size))
+    if not _HEADER.size <= size <= MESSAGE_LIMIT:
+        raise PrimaryError(
+            f"a message on port {PORT} claims {size} bytes",
+            remedy="Check the robot's address.",
+            size_bytes=size,
+        )
+    return kind, await reader.readexactly(size - _HEADER.size)
 
 
 class TcpCheck:
@@ -48,8 +167,10 @@ class TcpCheck:
         self._source: Literal["controller", "configuration"] | None = "configuration" if calibrated else None
         self._stated = installation.tcp_offset
         if not calibrated and installation.dh is not None and self._stated is not None:
-            self._try_controllers_model(_stated_model(model, installation.dh), first)
-        self._first = self._derive(first)
+            theta, a, d, alpha = installation.dh
+            stated = replace(model, theta_offset_rad=theta, a_m=a, d_m=d, alpha_rad=alpha)
+            self._try_controllers_model(stated, first)
+        self._first = _flange_from_tcp(self._model, first)
         length_m = float(np.linalg.norm(self._first[:3, 3]))
         if length_m > LONGEST_M:
             raise RobotError(
@@ -94,9 +215,7 @@ class TcpCheck:
         """flange_from_tcp: x y z [m], rotation vector [rad]; the controller's words where it has any."""
         if self._stated is not None:
             return self._stated
-        T = self._first
-        x, y, z, rx, ry, rz = np.concatenate([T[:3, 3], rotation_log(T[:3, :3])]).tolist()
-        return (x, y, z, rx, ry, rz)
+        return pose_vector(self._first)
 
     def agree(self, stated: Vector6) -> None:
         """Raises RobotError unless the offset that the controller states explains its tool pose."""
@@ -108,10 +227,8 @@ class TcpCheck:
         if self._stated is not None and installation.tcp_offset is not None:
             now = _pose(installation.tcp_offset)
             _compare(now, _pose(self._stated), STATED_TOLERANCE, _CHANGED, "tcp-changed", _CHANGED_REMEDY)
-        _compare(self._derive(state), self._first, self._tolerance, _CHANGED, "tcp-changed", _CHANGED_REMEDY)
-
-    def _derive(self, state: RobotState) -> Array:
-        return _flange_from_tcp(self._model, state)
+        now = _flange_from_tcp(self._model, state)
+        _compare(now, self._first, self._tolerance, _CHANGED, "tcp-changed", _CHANGED_REMEDY)
 
 
 def check_payload(now: Payload, first: Payload) -> None:
@@ -135,20 +252,6 @@ def _flange_from_tcp(model: RobotModel, state: RobotState) -> Array:
 
 def _pose(vector: Vector6) -> Array:
     return pose_from_rotvec(vector[:3], vector[3:])
-
-
-def _stated_model(nominal: RobotModel, dh: DhParameters) -> RobotModel:
-    """The nominal model with the deltas that make it the controller's."""
-
-    def minus(stated: Vector6, table: tuple[float, ...]) -> tuple[float, ...]:
-        return tuple(s - t for s, t in zip(stated, table, strict=True))
-
-    return nominal.calibrated(
-        a_m=minus(dh.a_m, nominal.a_m),
-        d_m=minus(dh.d_m, nominal.d_m),
-        alpha_rad=minus(dh.alpha_rad, nominal.alpha_rad),
-        theta_rad=minus(dh.theta_rad, nominal.theta_offset_rad),
-    )
 
 
 def _exceeds(delta: Array, tolerance: tuple[float, float]) -> bool:

@@ -23,6 +23,7 @@ from recordings.schema.frame_time import by_arrival
 from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
+from station.devices.discovery import kernel_text
 from station.devices.frames import RETAKE, CameraCounts, FrameTiming
 
 T = TypeVar("T")
@@ -299,16 +300,9 @@ def _readable(video: cv2.VideoCapture) -> dict[str, float]:
 def _identity(device: str) -> CameraIdentity:
     """By what the kernel knows of it; a device without a serial number is named by its path."""
     node = f"video{device}" if device.isdecimal() else Path(device).resolve().name
-
-    def told(name: str) -> str:
-        try:
-            return (_SYSTEM / node / name).read_text(encoding="utf-8", errors="replace").strip()
-        except OSError:
-            return ""
-
     return CameraIdentity(
-        vendor=told("device/../manufacturer"),
-        model=told("name") or "webcam",
-        serial=told("device/../serial") or node,
+        vendor=kernel_text(_SYSTEM / node / "device/../manufacturer"),
+        model=kernel_text(_SYSTEM / node / "name") or "webcam",
+        serial=kernel_text(_SYSTEM / node / "device/../serial") or node,
         driver="webcam",
     )

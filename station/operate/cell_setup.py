@@ -15,6 +15,7 @@ from calibrate.geometry import Array
 from recordings.files import ASKED_FOR, write_atomically
 from recordings.schema.messages import BoardSpec, Image, Mount, RobotState
 from station.cell.errors import RobotError, StationError
+from station.cell.scene import flange_pose
 from station.operate import draft as drafts
 from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep, Draft, Hardware
 from station.operate.guided_views import (
@@ -22,7 +23,6 @@ from station.operate.guided_views import (
     STILL_S,
     FoundCell,
     find_cell,
-    flange_of,
     guided_view,
     image_trouble,
     what_is_missing,
@@ -68,7 +68,7 @@ class CellSetup:
         """base_from_flange now, (4, 4); None: not known."""
         if self.state is None or self.arm is None:
             return None
-        return flange_of(self.state, self.arm.identity.tcp_offset)
+        return flange_pose(self.state, self.arm.identity.tcp_offset)
 
     def keep(self, draft: Draft) -> None:
         """Raises StationError where the disk does not take it; it holds until the end all the same."""

@@ -16,13 +16,14 @@ import numpy as np
 from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, inverse, pose_from_rotvec, rotation_log
+from calibrate.geometry import Array, inverse, rotation_log
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotState, Vector6
 from station.analysis.estimation import quick_sigma, solve_quickly
 from station.analysis.worker import CapturedView, assess
 from station.cell.config import matrix4
+from station.cell.scene import flange_pose
 from station.operate.draft import Draft, GuidedView
 
 FEWEST_GUIDED, MOST_GUIDED = 4, 6
@@ -61,17 +62,11 @@ def image_trouble(image: Image, found: Detection) -> tuple[str, str]:
     return (cause, told[cause]) if cause else (found.cause, found.reason)
 
 
-def flange_of(state: RobotState, tcp_offset: Vector6) -> Array:
-    """base_from_flange, (4, 4)."""
-    tcp = pose_from_rotvec(tcp_offset[:3], tcp_offset[3:])
-    return pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:]) @ inverse(tcp)
-
-
 def guided_view(state: RobotState, tcp_offset: Vector6, found: Detection) -> GuidedView:
     """The view of an arm at rest."""
     return GuidedView(
         state.joints_rad,
-        matrix4(flange_of(state, tcp_offset)),
+        matrix4(flange_pose(state, tcp_offset)),
         tuple(int(k) for k in found.indices),
         tuple((float(x), float(y)) for x, y in found.pixels),
     )

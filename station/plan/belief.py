@@ -9,17 +9,12 @@ import msgspec
 import numpy as np
 from scipy.optimize import least_squares
 
-from calibrate.geometry import (
-    Array,
-    difference,
-    inverse,
-    perturb,
-)
+from calibrate.geometry import Array, difference, inverse, perturb
 from calibrate.kinematics import forward
 from recordings.schema.messages import Mount
 from station.cell.config import StationConfig
 from station.cell.errors import ConfigError
-from station.cell.scene import arm_model, guess_from, guess_matrix
+from station.cell.scene import arm_model, camera_from_board, guess_from, guess_matrix
 
 GOOD_M, GOOD_RAD = 0.006, 0.02
 """A belief this sharp (1 sigma per axis) is enough to plan from."""
@@ -137,10 +132,7 @@ def board_seen(config: StationConfig, glimpse: BootstrapView, X: Array) -> Array
 
 def seen_from(config: StationConfig, taught: BootstrapView, X: Array, targets: Array) -> Array:
     """camera_from_board (n, 4, 4) at the targets, if the mount is X."""
-    Y = board_seen(config, taught, X)
-    if config.mount == "eye-in-hand":
-        return np.asarray(inverse(targets @ X) @ Y)
-    return np.asarray(inverse(X) @ targets @ Y)
+    return camera_from_board(config.mount, targets, X, board_seen(config, taught, X))
 
 
 def _misfit(place: Array, reference: Array) -> Array:

@@ -108,10 +108,8 @@ def _not_here(belief: CameraPoseEstimate, possible: int) -> LimitError:
     """The guess does not go with the arm's posture."""
     return LimitError(
         f"Of {_DRAWS} camera poses about the initial one ({1000 * belief.sigma_m:.0f} mm, "
-        f"{belief.sigma_deg:.0f}°) "
-        f"only {possible} fit with where the arm stands (limit {_FEWEST}): with the others camera or board "
-        "would "
-        "touch something",
+        f"{belief.sigma_deg:.0f}°) only {possible} fit with where the arm stands (limit {_FEWEST}): with the "
+        "others camera or board would touch something",
         code="no-mount-fits",
         remedy="Correct camera_guess, its sigmas or the board's size, or teach a view with more room.",
         possible=possible,
@@ -143,16 +141,13 @@ def _no_move(belief: CameraPoseEstimate, in_view: int, in_the_way: str) -> Limit
             f"No small move keeps the board in the image, and the camera no nearer, for every {mount}",
             code="board-leaves-image",
             remedy="Teach a view with the board in the middle of the image and filling less of it, or "
-            "measure "
-            "camera_guess better.",
+            "measure camera_guess better.",
         )
     return LimitError(
-        f"{in_view} small moves keep the board in the image, but none is free for every {mount}; mostly in "
-        "the "
-        f"way: {in_the_way}",
+        f"{in_view} small moves keep the board in the image, but none is free for every {mount}; mostly "
+        f"in the way: {in_the_way}",
         code="no-free-move",
-        remedy="Teach a view with more room around the arm, correct `limits`, or measure camera_guess "
-        "better.",
+        remedy="Teach a view with more room for the arm, correct `limits`, or measure camera_guess better.",
         in_the_way=in_the_way,
     )
 

@@ -27,6 +27,7 @@ CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm", "both": "all"}
 """What the poses are to tell best, for people → criterion."""
 _LENS_SHARE = {"A": 0.02, "D": 0.2, "arm": 0.0, "all": 0.0}
 """Weight of the lens, so that the image is covered."""
+USUAL_NOISE = MeasurementNoise()
 TABLE_MM = 0.3
 """1σ of the errors of an arm's table that a plan expects, mm and mrad."""
 _ENOUGH_TO_RANK, _SHORTLIST = 8, 60
@@ -87,7 +88,10 @@ class Objective:
 
 
 def informations(
-    scene: Scene, base_from_flange: Array, noise: MeasurementNoise, joints_rad: Array | None = None
+    scene: Scene,
+    base_from_flange: Array,
+    joints_rad: Array | None = None,
+    noise: MeasurementNoise = USUAL_NOISE,
 ) -> Array:
     """(n, p, p) information of each pose by the scene's guess; with joints (n, 6) on the arm's table too."""
     points, motion = board_points(scene.board), None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import msgspec
@@ -28,6 +28,7 @@ from station.plan.candidates import (
     find_candidates,
 )
 from station.plan.choose import (
+    USUAL_NOISE,
     WITH_TABLE,
     Criterion,
     Objective,
@@ -51,8 +52,7 @@ _REMEDIES = {
     "the joint range": "Widen limits.joints_min_rad and joints_max_rad, or turn the board.",
     "singular postures": "Move the board sideways, so that the arm need not stretch or fold.",
     ARM_IN_SIGHT: "Turn the board to face the camera, mount the camera so that it looks away from the arm, "
-    "or "
-    "correct camera_guess.",
+    "or correct camera_guess.",
     "the workspace box": "Widen limits.workspace_min_m and workspace_max_m, or move the board to its middle.",
     "the arm touching itself or its tool": "Check limits.solids, or move the board further from the base.",
     "the board": "Lower limits.board_clearance_m, measure board_guess better (its sigma counts), or turn it.",
@@ -74,11 +74,9 @@ def explain_shortage(
         angle_deg = float(np.rad2deg(np.arccos(np.clip(scene.X[2, 2], -1.0, 1.0))))
         return LimitError(
             f"The camera looks back at the arm: camera_guess's z axis is {angle_deg:.0f}° away from where "
-            "the "
-            f"flange points, and in {found.alone[ARM_IN_SIGHT]} postures the arm would hide the board",
+            f"the flange points, and in {found.alone[ARM_IN_SIGHT]} postures the arm would hide the board",
             code="camera-looks-back",
-            remedy="Turn camera_guess by 180° about its x or y axis, if its z axis does not point out of the "
-            "lens.",
+            remedy="Turn camera_guess by 180° about its x or y axis: z points out of the lens.",
             **counts,
         )
     if start is not None and len(found) >= wanted and len(group) < wanted:
@@ -132,8 +130,7 @@ def _out_of_reach(scene: Scene, few: str, counts: dict[str, int], beyond: int) -
     away_m = float(np.linalg.norm(centre - [0.0, 0.0, model.d_m[0]]))
     return LimitError(
         f"{few}: {beyond} views of the board lie beyond the arm's reach. The {thing} stands {away_m:.2f} m "
-        "from "
-        f"the {model.name}'s shoulder (limit {arm_m:.2f} m)",
+        f"from the {model.name}'s shoulder (limit {arm_m:.2f} m)",
         code="out-of-reach",
         remedy=f"Bring the {thing} nearer, turn it towards the arm, or correct {thing}_guess.",
         distance_m=away_m,
@@ -150,8 +147,7 @@ def _start_is_cut_off(scene: Scene, counts: dict[str, int], passing: int, start:
         f"{passing} poses are possible, but from where the arm stands free direct moves lead to only "
         f"{counts['possible']} of the wanted {counts['wanted']}{near}",
         code="start-cut-off",
-        remedy="Jog the arm to where the camera looks at the board from the middle of the room it may use, "
-        "and "
+        remedy="Jog the arm to where the camera looks at the board from the middle of the arm's room, and "
         "plan again.",
         **counts,
     )
@@ -162,7 +158,7 @@ class PlanOptions:
     count: int = 25
     seed: int = 0
     criterion: Criterion = "A"
-    noise: MeasurementNoise = field(default_factory=MeasurementNoise)
+    noise: MeasurementNoise = USUAL_NOISE
     free_intrinsics: bool = True
     """The lens is calibrated from the same images."""
     view: ViewRange | None = None
@@ -265,10 +261,10 @@ def _choose_and_order(
     """The checked plan. Poses that no free path leads to leave the set, and the choice is made again."""
     joints = pool.joints_rad if options.criterion in WITH_TABLE else None
     objective = objective_for(scene, options.criterion, options.free_intrinsics, joints)
-    information = informations(scene, pool.base_from_flange, options.noise, joints)
+    information = informations(scene, pool.base_from_flange, joints, options.noise)
     known: Array | None = None
     if captured is not None:
-        known = informations(scene, captured, options.noise).sum(axis=0)
+        known = informations(scene, captured, noise=options.noise).sum(axis=0)
     left = np.arange(len(pool))
     picked: list[int] = []
     while len(left) >= options.count:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -19,8 +19,8 @@ from station.cell.limits import check_path
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import Scene, flange_poses
 from station.plan.candidates import find_candidates
-from station.plan.choose import TABLE_MM, informations, objective_for, sigma_of
-from station.plan.visibility import ViewRange, planned_pose, view_range, visible
+from station.plan.choose import TABLE_MM, USUAL_NOISE, Objective, informations, objective_for, sigma_of
+from station.plan.visibility import planned_pose, view_range, visible
 
 _FURTHER_POSES = 60
 _TRIES = 12
@@ -45,18 +45,6 @@ class Advice:
     """So many more like it reach the goal; None = not with poses of this kind."""
 
 
-@dataclass(frozen=True)
-class AdviceOptions:
-    noise: MeasurementNoise = field(default_factory=MeasurementNoise)
-    free_intrinsics: bool = True
-    view: ViewRange | None = None
-    """None = by the lens and the board's size."""
-    pool: int = 150
-    seed: int = 0
-    onward_rad: Sequence[float] | None = None
-    """Joints of the pose after it: the path on to it must be free too."""
-
-
 _OPEN = 0.7
 """A parameter whose 1σ stays above this share of what it was beforehand stays open."""
 
@@ -73,14 +61,14 @@ class ArmForecast:
     """Parameters of the table of which the plan tells little."""
 
 
-def forecast_arm(scene: Scene, plan: Plan, free_intrinsics: bool = True) -> ArmForecast:
+def forecast_arm(scene: Scene, plan: Plan) -> ArmForecast:
     """Forecast by the scene's guess and the usual noise, for errors of the table of the usual size."""
     joints = np.array([pose.joints_rad for pose in plan.poses])
-    gains = informations(scene, flange_poses(scene, plan), MeasurementNoise(), joints)
+    gains = informations(scene, flange_poses(scene, plan), joints)
     total, expected = gains.sum(axis=0), []
     for tolerance in (scene.board.square_tolerance, MEASURED):
         board = msgspec.structs.replace(scene.board, square_tolerance=tolerance)
-        objective = objective_for(replace(scene, board=board), "arm", free_intrinsics, joints)
+        objective = objective_for(replace(scene, board=board), "arm", free_intrinsics=True, joints_rad=joints)
         expected.append(float(np.exp(objective(total) / 2)))
         if tolerance is scene.board.square_tolerance:
             left = np.diag(covariance_of(total, objective.prior))[-len(PARAMETERS) :]
@@ -98,7 +86,7 @@ def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
     cut = tuple(pose.name for pose, seen in zip(plan.poses, _whole(scene, flange), strict=True) if not seen)
     if all(pose.predicted_sigma_m is not None for pose in plan.poses):
         return plan, cut
-    expected = forecast_views(scene, flange, MeasurementNoise())
+    expected = forecast_views(scene, flange)
     poses = tuple(
         msgspec.structs.replace(pose, predicted_sigma_m=after.sigma_m)
         for pose, after in zip(plan.poses, expected, strict=True)
@@ -107,14 +95,17 @@ def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
 
 
 def forecast_views(
-    scene: Scene, base_from_flange: Array, noise: MeasurementNoise, free_intrinsics: bool = True
+    scene: Scene,
+    base_from_flange: Array,
+    free_intrinsics: bool = True,
+    noise: MeasurementNoise = USUAL_NOISE,
 ) -> list[Forecast]:
     """Expected sigma after each of the views taken from these flange poses (n, 4, 4).
 
     A view that by the guess does not show the whole board brings nothing.
     """
     objective = objective_for(scene, "A", free_intrinsics)
-    gains = informations(scene, base_from_flange, noise)
+    gains = informations(scene, base_from_flange, noise=noise)
     gains[~_whole(scene, base_from_flange)] = 0.0
     return [Forecast(*sigma_of(information, objective)) for information in gains.cumsum(axis=0)]
 
@@ -129,31 +120,32 @@ def advise(
     captured: ArrayLike,
     goal_m: float,
     joints_now_rad: Sequence[float],
-    options: AdviceOptions | None = None,
+    onward_rad: Sequence[float] | None = None,
+    pool_size: int = 150,
 ) -> Advice:
-    """Are the captured flange poses (n, 4, 4) enough? If not: the next best pose, and how many more."""
-    options = options or AdviceOptions()
+    """Are the captured flange poses (n, 4, 4) enough? If not: the next best pose, and how many more.
+
+    `onward_rad`: joints of the pose after it; the path on to it must be free too.
+    """
     flange = np.asarray(captured, dtype=float).reshape(-1, 4, 4)
-    objective = objective_for(scene, "A", options.free_intrinsics)
-    known = informations(scene, flange, options.noise).sum(axis=0)
+    objective = objective_for(scene, "A", free_intrinsics=True)
+    known = informations(scene, flange).sum(axis=0)
     now = Forecast(*sigma_of(known, objective))
     state = f"expected error {1000 * now.sigma_m:.2f} mm after {len(flange)} views"
     if now.sigma_m <= goal_m:
         return Advice(now, True, f"enough: {state}, the goal is {1000 * goal_m:.2f} mm")
-    rng = np.random.default_rng(options.seed)
     start = np.asarray(joints_now_rad, dtype=float)
-    view = options.view or view_range(scene)
-    pool = find_candidates(scene, view, options.pool, rng, start)
+    pool = find_candidates(scene, view_range(scene), pool_size, np.random.default_rng(0), start)
     if len(pool) == 0:
         return Advice(now, False, f"{state}; no further pose is reachable with the board in view")
-    gains = informations(scene, pool.base_from_flange, options.noise)
-    stops = [start] if options.onward_rad is None else [start, np.asarray(options.onward_rad, dtype=float)]
+    gains = informations(scene, pool.base_from_flange)
+    stops = [start] if onward_rad is None else [start, np.asarray(onward_rad, dtype=float)]
     best = _best_free(scene, stops, pool.joints_rad, objective(known + gains))
     if best is None:
         return Advice(
             now, False, f"{state}; no free path from here to a pose that helps: jog the arm and ask again"
         )
-    missing = _missing(known, gains, goal_m=goal_m, scene=scene, free_intrinsics=options.free_intrinsics)
+    missing = _missing(known, gains, goal_m, objective)
     after = sigma_of(known + gains[best], objective)[0]
     joints = pool.joints_rad[best]
     pose = planned_pose(scene, len(flange), joints, forward(scene.geometry.model, joints), after)
@@ -172,9 +164,8 @@ def _best_free(scene: Scene, stops: Sequence[Array], joints_rad: Array, scores: 
     return None
 
 
-def _missing(known: Array, gains: Array, goal_m: float, scene: Scene, free_intrinsics: bool) -> int | None:
+def _missing(known: Array, gains: Array, goal_m: float, objective: Objective) -> int | None:
     """Counts the greedily chosen further poses that reach the goal."""
-    objective = objective_for(scene, "A", free_intrinsics)
     total = known
     for count in range(1, _FURTHER_POSES + 1):
         total = total + gains[int(np.argmin(objective(total + gains)))]

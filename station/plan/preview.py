@@ -15,7 +15,7 @@ from station.cell.collision import body_segments
 from station.cell.errors import ConfigError
 from station.cell.limits import check_plan
 from station.cell.plan import Plan
-from station.cell.scene import Scene, board_extent, flange_poses
+from station.cell.scene import Scene, flange_poses, printed_corners
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,9 +99,7 @@ def camera_frustum(scene: Scene, base_from_camera: Array) -> list[Array]:
 
 def printed_outline(scene: Scene, base_from_board: Array) -> Array:
     """The printed area's outline, closed, (5, 3) in `base`."""
-    low, high = board_extent(scene.board)
-    flat = [(low[0], low[1], 0), (high[0], low[1], 0), (high[0], high[1], 0), (low[0], high[1], 0)]
-    return transform_points(base_from_board, np.array([*flat, flat[0]], dtype=float))
+    return transform_points(base_from_board, printed_corners(scene.board)[[0, 1, 2, 3, 0]])
 
 
 def _draw_coverage(axes: Axes, scene: Scene, plan: Plan) -> None:

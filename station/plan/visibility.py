@@ -16,7 +16,7 @@ from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.collision import ARM_BODIES, body_segments, segment_distance
 from station.cell.config import matrix4, vector6
 from station.cell.plan import ExpectedView, PlannedPose
-from station.cell.scene import Scene, board_extent
+from station.cell.scene import Scene, printed_corners
 
 _ON_THE_WAY = 7
 """Images looked at along a move."""
@@ -153,13 +153,9 @@ def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
     """Predicts how the board looks from a flange pose (4, 4), by the scene's guess."""
     camera_from_board = scene.camera_from_board(base_from_flange)
     points = board_points(scene.board)
-    low, high = board_extent(scene.board)
-    outline = np.array(
-        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
-    )
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     R, t = camera_from_board[:3, :3], camera_from_board[:3, 3]
-    seen = np.vstack([centre, outline]) @ R.T + t
+    seen = np.vstack([centre, printed_corners(scene.board)]) @ R.T + t
     pixels = project(scene.camera, np.maximum(seen, [-np.inf, -np.inf, 0.02])).pixels
     area = abs(float(cv2.contourArea(pixels[1:].astype(np.float32))))
     return ExpectedView(

@@ -12,11 +12,10 @@ from calibrate.files.validity import ValidityState, validity_text
 from recordings.files import bytes_text
 from station.cell.errors import CameraError, RobotError
 from station.cell.status import StationState
-from station.devices.gige_discovery import FoundCamera, discover
+from station.devices.discovery import USB3_MBIT_S, FoundCamera, UsbCamera, discover, discover_usb
 from station.devices.ur import control_trouble
 from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
 from station.devices.ur_probe import probe
-from station.devices.usb3_discovery import USB3_MBIT_S, UsbCamera, discover_usb
 from station.protocol.verbs import Check
 from station.session.context import SessionContext
 

@@ -1,8 +1,9 @@
-"""Devices in the status: opened, opened again, and what they say ten times a second."""
+"""Devices for the screen: opened, opened again, what they say ten times a second, and their images."""
 
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import logging
 import shutil
@@ -10,11 +11,15 @@ import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
+import cv2
 import msgspec
+import numpy as np
 
+from recordings.images import eight_bits
 from recordings.schema.clocks import ClockFit
-from recordings.schema.messages import RobotState
+from recordings.schema.messages import Image, RobotState
 from station.analysis.pool import WorkerError
+from station.analysis.worker import BoardDetection, sight
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, RobotError, StationError
 from station.cell.limits import SPEED_CAP_M_S, point_speed_m_s
@@ -30,6 +35,7 @@ from station.cell.status import (
 )
 from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
 from station.protocol.states import RUNNING
+from station.protocol.verbs import PreviewImage
 from station.session.context import SessionContext
 
 log = logging.getLogger(__name__)
@@ -39,6 +45,11 @@ DISK_PERIOD_S = 2.0
 FPS_PERIOD_S = 2.0
 PAUSES = "pauses after this pose"
 FINISHES = "finishes after this pose"
+PREVIEW_PERIOD_S = 0.2
+JPEG_LIMIT_BYTES = 40_000
+"""In base64 it must fit into one line of the protocol."""
+_QUALITIES = (75, 50, 30, 15)
+SIDES = (16, 1024)
 WALL_STEP_S = 0.5
 """Less is a clock that is being disciplined, or a moment between two readings on a busy computer."""
 
@@ -292,3 +303,65 @@ class DeviceConnector:
         if cell.trigger is not None:
             await cell.trigger.close()
         await asyncio.to_thread(cell.ended)
+
+
+class Previewer:
+    """Small images, never recorded, asked for once per `PREVIEW_PERIOD_S` however many screens watch."""
+
+    def __init__(self, context: SessionContext) -> None:
+        self._context = context
+        self._taking = asyncio.Lock()
+        self._picture: Image | None = None
+        self._sighting: BoardDetection | None = None
+        self._taken_s = 0.0
+        self._count = 0
+
+    async def preview(self, width: int, height: int) -> PreviewImage:
+        """A JPEG that fits into width × height, px; empty without an image."""
+        async with self._taking:
+            if time.monotonic() - self._taken_s >= PREVIEW_PERIOD_S:
+                await self._take()
+        if self._picture is None:
+            return PreviewImage()
+        low, high = SIDES
+        width, height = min(max(width, low), high), min(max(height, low), high)
+        return await asyncio.to_thread(self._encode, self._picture, self._sighting, width, height)
+
+    async def _take(self) -> None:
+        context = self._context
+        self._taken_s = time.monotonic()
+        if context.store.state is StationState.CAPTURING or context.workers.waiting:
+            return  # the capture has the camera, or the worker is needed for more than the screen
+        try:
+            image = await context.cell.camera.preview()
+        except CameraError:
+            image = None
+        if image is None:
+            return
+        config = context.cell.config
+        try:
+            exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None
+            sighting = await context.workers.call(
+                sight, image.viewable(), config.board, config.camera.model, False, exposure, timeout_s=5.0
+            )
+        except WorkerError:
+            sighting = None
+        self._picture, self._sighting = image, sighting
+        self._count += 1
+        if sighting is not None and context.store.state is not StationState.WRITING:
+            context.store.update(detection=sighting.status)
+
+    def _encode(self, taken: Image, sighting: BoardDetection | None, width: int, height: int) -> PreviewImage:
+        image = eight_bits(taken.viewable(), taken.pixel_format)
+        scale = min(width / image.shape[1], height / image.shape[0], 1.0)
+        size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        for quality in _QUALITIES:
+            ok, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
+            if ok and len(jpeg) <= JPEG_LIMIT_BYTES:
+                sides = image.shape[1::-1]
+                pixels = np.zeros((0, 2)) if sighting is None else (sighting.pixels + 0.5) / sides
+                corners = tuple((float(x), float(y)) for x, y in pixels.round(4))
+                data = base64.b64encode(jpeg.tobytes()).decode()
+                return PreviewImage(data, *size, corners, self._count)
+        return PreviewImage()

@@ -11,10 +11,8 @@ from typing import TypeVar, cast
 
 import cv2
 import msgspec
-import numpy as np
 
 from calibrate.boards.detect import detect
-from calibrate.geometry import pose_from_rotvec
 from recordings.errors import RecordingError
 from recordings.files import MAIN_CAMERA
 from recordings.images import eight_bits
@@ -23,6 +21,7 @@ from recordings.reader import open_recording
 from recordings.schema.messages import CaptureEvent, RobotState, View
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StationError
+from station.cell.scene import flange_pose
 from station.cell.status import (
     CameraStatus,
     DetectionStatus,
@@ -262,14 +261,10 @@ class Timeline:
         status = RobotStatus(connected=True, model=identity.model, serial=identity.serial, safety="RECORDED")
         if state is None:
             return status
-        base_from_tcp, flange_from_tcp = (
-            pose_from_rotvec(np.array(pose[:3]), np.array(pose[3:]))
-            for pose in (state.tcp_pose, identity.tcp_offset)
-        )
         return msgspec.structs.replace(
             status,
             joints_rad=state.joints_rad,
-            base_from_flange=matrix4(base_from_tcp @ np.linalg.inv(flange_from_tcp)),
+            base_from_flange=matrix4(flange_pose(state, identity.tcp_offset)),
         )
 
     def _pose(self, number: int, done: int, state: StationState) -> PoseStatus:

@@ -14,7 +14,7 @@ import pytest
 from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
-from station.devices.gige_discovery import discover
+from station.devices.discovery import discover
 from tests.codes import raises
 from tests.gige_vision import description
 from tests.gige_vision.camera import EmulatedCamera

@@ -15,7 +15,7 @@ from station.cell.acceptance import Acceptance, StopWay, read_acceptance
 from station.cell.errors import RefusedError
 from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
-from station.devices.ur_trace import TraceRecorder
+from station.devices.ur_state import TraceRecorder
 from station.operate.acceptance import AcceptanceTest, JudgedStop
 from station.operate.acceptance_report import acceptance_page
 from station.protocol.client import Client

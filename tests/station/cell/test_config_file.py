@@ -53,9 +53,13 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
         ("host: 192.0.2.10", "host: ''", "robot.host"),
         ("square_m: 0.025", "square_m: 25", "Write 25 mm as 0.025"),
         ("speed_m_s: 0.2", "speed_mm_s: 200", "did you mean 'speed_m_s'"),
-        ("speed_m_s: 0.2", "board_clearance_m: -0.1", "limits.board_clearance_m: -0.1 must be above 0"),
-        ("speed_m_s: 0.2", "clearance_m: 0.0", "limits.clearance_m: 0.0 must be above 0"),
-        ("speed_m_s: 0.2", f"solids: [{TOOL}, radius_m: -0.04}}]", "'tool': radius_m must be above 0"),
+        ("speed_m_s: 0.2", "board_clearance_m: -0.1", "limits.board_clearance_m: Expected `float` > 0.0"),
+        ("speed_m_s: 0.2", "clearance_m: 0.0", "limits.clearance_m: Expected `float` > 0.0"),
+        (
+            "speed_m_s: 0.2",
+            f"solids: [{TOOL}, radius_m: -0.04}}]",
+            "radius_m: Expected `float` > 0.0",
+        ),
         ("speed_m_s: 0.2", f"solids: [{TOOL}, radius_m: 40}}]", "'tool' reaches further than 5.0 m"),
         (
             "speed_m_s: 0.2",
@@ -80,8 +84,16 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
             "camera_guess: {translation_m: [0, 0, 0], rotation_xyzw: [0, 0, 1, 1]}\nlimits:",
             "must be 1",
         ),
-        ("limits:", f"camera_guess: {{{PLACE}, sigma_m: -0.02}}\nlimits:", "must not be below 0"),
-        ("limits:", f"board_guess: {{{PLACE}, sigma_rad: -0.1}}\nlimits:", "must not be below 0"),
+        (
+            "limits:",
+            f"camera_guess: {{{PLACE}, sigma_m: -0.02}}\nlimits:",
+            "sigma_m: Expected `float` >= 0.0",
+        ),
+        (
+            "limits:",
+            f"board_guess: {{{PLACE}, sigma_rad: -0.1}}\nlimits:",
+            "Expected `float` >= 0.0",
+        ),
         (
             "limits:",
             "pointer: {tip_m: [0, 0, 0.2], along: [0, 0, 0]}\nlimits:",
@@ -90,7 +102,7 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
         ("limits:", "pointer: {tip_m: [0, 0, 0.2], radius_m: -0.01}\nlimits:", "pointer.radius_m"),
         ("limits:", "pointer: {tip_m: [0, 0, 200]}\nlimits:", "pointer.tip_m: further than"),
         ("limits:", "stillness: {timeout_s: 0}\nlimits:", "stillness.timeout_s"),
-        ("limits:", "capture: {retries: -1}\nlimits:", "capture.retries: -1 must not be below 0"),
+        ("limits:", "capture: {retries: -1}\nlimits:", "capture.retries: Expected `int` >= 0"),
         ("limits:", "trigger: {port: /dev/ttyUSB0, pulse_us: -5}\nlimits:", "trigger.pulse_us"),
     ],
 )

@@ -59,7 +59,8 @@ def test_a_board_on_the_flange_and_a_camera_in_the_cell() -> None:
     assert covers(cell.solids[1:], X)
     thin = geometry_of(config_of("eye-to-hand"), Y, X)
     assert cell.solids[1].radius_m == pytest.approx(thin.solids[0].radius_m + 3 * 0.004)
-    corners = [(x, y, 0.0) for x in (LOW[0], HIGH[0]) for y in (LOW[1], HIGH[1])]
+    (x0, y0), (x1, y1) = LOW[:2], HIGH[:2]
+    corners = [(x0, y0, 0.0), (x1, y0, 0.0), (x1, y1, 0.0), (x0, y1, 0.0)]
     np.testing.assert_allclose(cell.watched_m, transform_points(X, np.array(corners)), atol=1e-12)
     [camera] = cell.obstacles
     assert camera.from_m == pytest.approx(Y[:3, 3]) and camera.radius_m == 0.035

@@ -9,12 +9,7 @@ import pytest
 from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, RobotModel, forward
 from recordings.schema.messages import RobotState, Vector6
-from station.devices.ur_primary import (
-    DhParameters,
-    Installation,
-    read_state,
-)
-from station.devices.ur_tool import TcpCheck
+from station.devices.ur_tool import Installation, TcpCheck, read_state
 from station.simulation.controller.primary import state
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
@@ -44,7 +39,7 @@ def sample(arm: RobotModel, joints_rad: Vector6, tool: Vector6) -> RobotState:
 
 
 def stated(arm: RobotModel, tool: Vector6) -> Installation:
-    return Installation(tool, DhParameters(arm.theta_offset_rad, arm.a_m, arm.d_m, arm.alpha_rad))  # type: ignore[arg-type]
+    return Installation(tool, (arm.theta_offset_rad, arm.a_m, arm.d_m, arm.alpha_rad))  # type: ignore[arg-type]
 
 
 def test_the_controllers_words_are_taken_when_they_fit() -> None:
@@ -140,7 +135,7 @@ def test_the_controllers_statements_are_understood() -> None:
     said = read_state(state_of(made))
     table = made.stated_table
     assert said.tcp_offset == TOOL
-    assert said.dh == DhParameters(table.theta_rad, table.a_m, table.d_m, table.alpha_rad)  # type: ignore[arg-type]
+    assert said.dh == (table.theta_rad, table.a_m, table.d_m, table.alpha_rad)
 
 
 @pytest.mark.parametrize("cut", [1, 4, 10, 20, 40, 60])

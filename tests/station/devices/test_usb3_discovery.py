@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from station.devices.usb3_discovery import UsbCamera, discover_usb
+from station.devices.discovery import UsbCamera, discover_usb
 
 CAMERA = {
     "busnum": "2",

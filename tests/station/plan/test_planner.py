@@ -19,7 +19,6 @@ from calibrate.geometry import (
     rotation_angle,
     rotation_exp,
 )
-from calibrate.handeye.information import MeasurementNoise
 from calibrate.kinematics import MODELS, forward
 from station.cell.limits import SPEED_CAP_M_S, check_plan
 from station.cell.scene import cell_geometry, scene_of
@@ -141,7 +140,7 @@ def test_the_choice_beats_random_poses_of_the_same_pool():
     scene = scene_of(config)
     rng = np.random.default_rng(0)
     pool = find_candidates(scene, replace(view_range(scene), doubt=0.0), 200, rng, None)
-    each = informations(scene, pool.base_from_flange, MeasurementNoise())
+    each = informations(scene, pool.base_from_flange)
     for criterion in ("A", "D"):
         objective = objective_for(scene, criterion, True)
         best = float(objective(each[choose(each, 15, objective, rng)].sum(axis=0)))
@@ -154,7 +153,7 @@ def test_kept_poses_stay_chosen():
     scene = scene_of(config)
     rng = np.random.default_rng(0)
     pool = find_candidates(scene, replace(view_range(scene), doubt=0.0), 100, rng, None)
-    each = informations(scene, pool.base_from_flange, MeasurementNoise())
+    each = informations(scene, pool.base_from_flange)
     chosen = choose(each, 8, objective_for(scene, "A", True), rng, keep=(3, 5))
     assert chosen[:2] == [3, 5]
     assert len(set(chosen)) == 8
@@ -270,5 +269,5 @@ def test_six_poses_for_a_known_lens_tell_more_of_where_the_camera_sits():
     for known in (False, True):
         plan = make_plan(config, start_joints_rad=truth.start_joints_rad, count=6, lens_known=known)
         flange = np.array([pose.base_from_flange for pose in plan.poses])
-        sigmas_m.append(forecast_views(scene, flange, MeasurementNoise(), free_intrinsics=False)[-1].sigma_m)
+        sigmas_m.append(forecast_views(scene, flange, free_intrinsics=False)[-1].sigma_m)
     assert sigmas_m[1] < 0.9 * sigmas_m[0]

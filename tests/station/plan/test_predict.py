@@ -18,7 +18,7 @@ from station.cell.plan import PlannedPose
 from station.cell.scene import scene_of
 from station.plan.choose import CRITERIA
 from station.plan.planner import make_plan
-from station.plan.predict import AdviceOptions, advise, forecast_arm, forecast_views, with_forecast
+from station.plan.predict import advise, forecast_arm, forecast_views, with_forecast
 from station.simulation.scenes import cell_config, make_cell
 
 
@@ -54,10 +54,10 @@ def test_a_pose_that_cuts_the_board_is_named_and_expected_to_bring_nothing():
 
 def test_a_known_lens_and_less_noise_make_it_better():
     scene, _, flange = world()
-    usual = forecast_views(scene, flange, MeasurementNoise())[-1].sigma_m
-    assert forecast_views(scene, flange, MeasurementNoise(), free_intrinsics=False)[-1].sigma_m < usual
+    usual = forecast_views(scene, flange)[-1].sigma_m
+    assert forecast_views(scene, flange, free_intrinsics=False)[-1].sigma_m < usual
     half = MeasurementNoise(0.075, 5e-5, 8.5e-5)
-    assert forecast_views(scene, flange, half)[-1].sigma_m == pytest.approx(usual / 2, rel=0.05)
+    assert forecast_views(scene, flange, noise=half)[-1].sigma_m == pytest.approx(usual / 2, rel=0.05)
 
 
 def test_enough_is_said_when_the_goal_is_reached():
@@ -76,7 +76,7 @@ def test_the_next_best_pose_helps_and_is_free_to_reach():
     assert advice.next_pose is not None
     assert check_path(scene.geometry, here, advice.next_pose.joints_rad).problems == ()
     more = np.concatenate([flange[:8], forward(scene.geometry.model, advice.next_pose.joints_rad)[None]])
-    found = forecast_views(scene, more, MeasurementNoise())[-1].sigma_m
+    found = forecast_views(scene, more)[-1].sigma_m
     assert found < advice.now.sigma_m
     assert found == pytest.approx(advice.next_pose.predicted_sigma_m, rel=1e-6)
     assert advice.poses_missing is not None and 1 < advice.poses_missing < 25
@@ -85,7 +85,7 @@ def test_the_next_best_pose_helps_and_is_free_to_reach():
 
 def test_a_goal_beyond_the_arm_is_not_promised():
     scene, plan, flange = world()
-    advice = advise(scene, flange, 1e-6, plan.poses[-1].joints_rad, AdviceOptions(pool=60))
+    advice = advise(scene, flange, 1e-6, plan.poses[-1].joints_rad, pool_size=60)
     assert not advice.enough
     assert advice.poses_missing is None
     assert "better camera or arm" in advice.text

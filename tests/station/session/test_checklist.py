@@ -13,10 +13,9 @@ from calibrate.files.install import install, set_validity
 from calibrate.files.validity import ValidityReason, ValidityState
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import TimeSource
+from station.devices.discovery import FoundCamera, UsbCamera
 from station.devices.frames import FrameTiming
-from station.devices.gige_discovery import FoundCamera
 from station.devices.ur_dashboard import Dashboard, DashboardError
-from station.devices.usb3_discovery import UsbCamera
 from station.protocol.verbs import Check
 from station.session.checklist import checklist
 from station.simulation.launch import SimulatedController

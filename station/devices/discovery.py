@@ -1,19 +1,21 @@
-"""GigE Vision cameras on this computer's networks: what they are, and why one cannot be used.
+"""GigE and USB3 Vision cameras on this computer's wires: what they are, and why one cannot be used.
 
-Asked by GVCP itself, and answered by broadcast: a camera of another network answers too, which no library
-that opens cameras can reach. Addresses are those of the standard's bootstrap registers, which the answer to
-DISCOVERY_CMD repeats from 0 on.
+Networks are asked by GVCP itself, and answer by broadcast: a camera of another network answers too, which no
+library that opens cameras can reach. Addresses are those of the standard's bootstrap registers, which the
+answer to DISCOVERY_CMD repeats from 0 on. USB is read as the kernel lists it: also what nobody may open.
 """
 
 from __future__ import annotations
 
 import fcntl
+import os
 import select
 import socket
 import struct
 import time
 from contextlib import suppress
 from ipaddress import IPv4Interface
+from pathlib import Path
 
 import msgspec
 
@@ -29,6 +31,10 @@ _LENGTH = 248
 _PRIVILEGE, _PRIMARY_ADDRESS = 0xA00, 0xA14
 _GET_ADDRESS, _GET_MASK = 0x8915, 0x891B
 """Linux: SIOCGIFADDR, SIOCGIFNETMASK"""
+_DEVICES, _NODES = Path("/sys/bus/usb/devices"), Path("/dev/bus/usb")
+_CONTROL = {"bInterfaceClass": "ef", "bInterfaceSubClass": "05", "bInterfaceProtocol": "00"}
+"""USB3 Vision's interface for control; by the same values udev's rules for all such cameras choose."""
+USB3_MBIT_S = 5000
 
 
 class FoundCamera(msgspec.Struct, frozen=True):
@@ -137,3 +143,47 @@ def _interfaces() -> list[tuple[str, IPv4Interface]]:
                 )
                 found.append((name, IPv4Interface(f"{ip}/{mask}")))
     return found
+
+
+class UsbCamera(msgspec.Struct, frozen=True):
+    vendor: str
+    model: str
+    serial: str
+    firmware: str
+    port: str
+    """As the kernel counts: bus, then the ports of the hubs on the way"""
+    speed_mbit_s: float
+    """Of the link as it came up"""
+    permitted: bool
+    """This program may open it."""
+
+
+def discover_usb(devices: Path = _DEVICES, nodes: Path = _NODES) -> list[UsbCamera]:
+    """List USB3 Vision cameras, sorted by model and serial; none where the kernel has no USB."""
+    found = []
+    for interface in sorted(devices.glob("*:*")):
+        if any(kernel_text(interface / name) != value for name, value in _CONTROL.items()):
+            continue
+        camera = devices / interface.name.partition(":")[0]
+        node = nodes / kernel_text(camera / "busnum").zfill(3) / kernel_text(camera / "devnum").zfill(3)
+        speed = kernel_text(camera / "speed")
+        found.append(
+            UsbCamera(
+                kernel_text(camera / "manufacturer"),
+                kernel_text(camera / "product"),
+                kernel_text(camera / "serial"),
+                kernel_text(camera / "bcdDevice"),
+                camera.name,
+                float(speed) if speed.replace(".", "", 1).isdigit() else 0.0,
+                os.access(node, os.R_OK | os.W_OK),
+            )
+        )
+    return sorted(found, key=lambda camera: (camera.model, camera.serial))
+
+
+def kernel_text(file: Path) -> str:
+    """Content of a file of the kernel's; nothing where it is not, or the camera has just gone."""
+    try:
+        return file.read_text(errors="replace").strip()
+    except OSError:
+        return ""

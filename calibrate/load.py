@@ -1,4 +1,4 @@
-"""From a recording to views: images decoded, boards detected, in bounded memory and in a fixed order."""
+"""Views of a recording: images decoded, boards detected, in bounded memory and in a fixed order."""
 
 from __future__ import annotations
 

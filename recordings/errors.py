@@ -28,7 +28,7 @@ class ErrorData:
 
 @dataclass(frozen=True)
 class ErrorReport:
-    """What a command with `--json` prints when it fails."""
+    """Object that a command with `--json` prints when it fails."""
 
     error: ErrorData
 

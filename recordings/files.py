@@ -141,12 +141,12 @@ def require_free_space(folder: Path, reserve_bytes: int) -> int:
 
 
 def bytes_text(count: int) -> str:
-    """For people: 4.0 GB, 120 MB."""
+    """Write a size for people: 4.0 GB, 120 MB."""
     return f"{count / 1e9:.1f} GB" if count >= 1_000_000_000 else f"{count / 1e6:.0f} MB"
 
 
 def usable_cores() -> int:
-    """How many cores this process may use; all of the machine's where the system does not say (macOS)."""
+    """Count the cores that this process may use; all of them where the system does not say (macOS)."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 

@@ -175,7 +175,7 @@ def raw_encoding(image: Pixels, pixel_format: str) -> str:
 
 
 def viewable(pixels: Pixels, pixel_format: str) -> Pixels:
-    """What people and detectors look at: a colour mosaic interpolated to BGR, everything else as it is."""
+    """Convert for people and detectors: a colour mosaic interpolated to BGR, everything else as it is."""
     if pixel_format in _BAYER and pixels.ndim == 2:
         return np.asarray(cv2.cvtColor(pixels, _BAYER[pixel_format][1]))
     return pixels

@@ -67,7 +67,7 @@ def _damaged(path: Path, reason: str) -> CorruptRecordingError:
 
 
 def enter_part(folder: Path, session: str, part: int, file_name: str) -> None:
-    """From now on the session is incomplete without this file. Returns when it is on the disk."""
+    """Note a segment without which the session is incomplete from now on. Returns when it is on the disk."""
     known = read_manifest(folder) or Manifest(session, {})
     if known.session != session:
         raise RecordingError(

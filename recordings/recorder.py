@@ -138,7 +138,7 @@ class Recorder:
     def frame(
         self, parent: str, child: str, parent_from_child: Matrix4, stamps: Stamps | None = None
     ) -> None:
-        """Where something stays that is known now, for viewers."""
+        """Record a frame that stays where it is, for viewers."""
         self._put(_Item(lambda: self._writer.frame(parent, child, parent_from_child, stamps), _SMALL_BYTES))
 
     def attach(self, name: str, media_type: str, content: bytes) -> None:

@@ -175,7 +175,7 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> tupl
 
 
 def _put_in_place(source: Path, temporary: Path, final: Path) -> Path:
-    """Where the damaged file is now. A kill at any moment leaves one under a name that the next run finds."""
+    """Move the damaged file aside, return its place. A kill leaves it under a name the next run finds."""
     original = _free_name(source.with_name(source.name + DAMAGED_SUFFIX))
     try:
         os.link(source, original)

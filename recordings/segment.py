@@ -82,7 +82,7 @@ class RecordingSegment:
             self._descriptor = -1
 
     def messages(self, topic: Topic) -> MessageIndex:
-        """Where a topic's messages lie, with their times; empty when there are none."""
+        """List the places of a topic's messages, with their times; empty when there are none."""
         return self._topics.get(topic, MessageIndex())
 
     def robot_states(self) -> Iterator[RobotState]:
@@ -291,7 +291,7 @@ class RecordingSegment:
 
 
 def _other_format(version: str) -> tuple[str, str, str]:
-    """Why a file with this format is not read: reason, code, remedy."""
+    """Say why a file with this format is not read: reason, code, remedy."""
     name, _, number = version.partition("/")
     own_name, _, newest = FORMATS[-1].partition("/")
     if name != own_name or not number.isdecimal():

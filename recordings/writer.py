@@ -135,7 +135,7 @@ class RecordingWriter:
         self.flush()
 
     def clock_reading(self, reading: ClockReading) -> None:
-        """Of the camera's clock; those that an image brings along come with the image."""
+        """Write a reading of the camera's clock; those that an image brings along come with the image."""
         self._add(
             Topic.CLOCK_READING, [encode(reading)], self._time_ns(Stamps(host_wall_ns=reading.host_wall_ns))
         )
@@ -322,7 +322,7 @@ class _Channel:
 def derived_recording(
     path: Path, info: SessionInfo, *, lossless_png: bool = False
 ) -> Iterator[RecordingWriter]:
-    """For what is made from something that stays: nothing is left behind when the block fails."""
+    """Write what is made from something that stays: nothing is left behind when the block fails."""
     writer = RecordingWriter(path, info, lossless_png=lossless_png)
     try:
         yield writer
@@ -360,7 +360,7 @@ class BackgroundSync:
         self._thread.start()
 
     def wait(self) -> None:
-        """Until none runs. OSError when one failed: what it should have kept may be lost."""
+        """Wait until none runs. OSError when one failed: what it should have kept may be lost."""
         if self._thread is not None:
             self._thread.join()
         if self._error is not None:

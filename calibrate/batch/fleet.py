@@ -47,7 +47,7 @@ class CameraRecord(msgspec.Struct, frozen=True):
     trend: Trend | None = None
     """Drift over the checks of this version that chance does not explain."""
     checks: tuple[CheckEntry, ...] = ()
-    """Of all versions, oldest first."""
+    """Drift checks of all versions, oldest first."""
 
     @property
     def current_checks(self) -> list[CheckEntry]:
@@ -56,12 +56,12 @@ class CameraRecord(msgspec.Struct, frozen=True):
 
     @property
     def to_look_at(self) -> bool:
-        """It does not hold, nothing can be said, or it drifts."""
+        """Tell whether it does not hold, is not known to, or drifts."""
         return self.state not in (ValidityState.VALID, ValidityState.UNVERIFIED) or self.trend is not None
 
     @property
     def why(self) -> str:
-        """What there is to look at, for people."""
+        """Say for people what there is to look at."""
         said = "" if self.state == ValidityState.VALID else self.reason_text or self.reason
         return f"{said} {'' if self.trend is None else self.trend.text}".strip()
 

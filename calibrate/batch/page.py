@@ -122,7 +122,7 @@ _FLEET_HEAD = ("cell", "camera", "state", "since (UTC)", "checks", "failed", "la
 
 
 def fleet_page(records: Sequence[CameraRecord], now: datetime) -> str:
-    """Which cameras to look at and since when, the drift of each over its checks, then all cameras."""
+    """Write the page: cameras to look at and since when, the drift of each, then all cameras."""
     found = sorted((r for r in records if r.to_look_at), key=lambda r: (r.state != "in-doubt", r.since))
     count = [(sum(record.state == state for record in records), state) for state in _STATES]
     count.append((sum(record.trend is not None for record in records), "drifting"))

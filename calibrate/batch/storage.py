@@ -50,7 +50,7 @@ def _storage(url: str) -> Iterator[tuple[Any, str]]:
 
 
 def expand(place: str) -> list[str]:
-    """What a URL with `*` matches, sorted; other places as they are. BatchError: nothing."""
+    """List what a URL with `*` matches, sorted; other places as they are. BatchError: nothing."""
     if not is_url(place) or "*" not in place:
         return [place]
     with _storage(place) as (fs, path):
@@ -61,7 +61,7 @@ def expand(place: str) -> list[str]:
 
 
 def facts(url: str) -> list[str]:
-    """What changes when any file below the URL does."""
+    """Return a value that changes when any file below the URL does."""
     with _storage(url) as (fs, path):
         return [fs.ukey(name) for name in sorted(fs.find(path))]
 
@@ -115,7 +115,7 @@ def _link_again(current: Path, names: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class Results:
-    """Where the results of a batch are kept: a folder here, or below a URL."""
+    """Place of a batch's results: a folder here, or below a URL."""
 
     place: str
 

@@ -19,7 +19,7 @@ _FALSE_ALARM = 1e-4
 
 @dataclass(frozen=True)
 class Move:
-    """From one session's X to another's; in X's parent frame (flange or base)."""
+    """Move from one session's X to another's, in X's parent frame (flange or base)."""
 
     earlier: BatchResult
     later: BatchResult
@@ -103,7 +103,7 @@ def place(result: BatchResult) -> Array:
 
 
 def quiet_text(found: Sequence[CellHistory]) -> str:
-    """When nobody's camera moved: or that nothing could be compared."""
+    """Say that nobody's camera moved, or that nothing could be compared."""
     if found and not any(cell.followed for cell in found):
         return "No camera was followed."
     return "No camera moved by more than chance explains."

@@ -1,4 +1,4 @@
-"""Who does the tasks of a batch: processes of this machine, or (`cluster`) the workers of a Dask cluster."""
+"""Workers for a batch's tasks: processes of this machine, or (`cluster`) the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def pool(count: int | None = None) -> BatchWorkers:
 
 
 def _one_pool(work: Callable[[T], R], tasks: Sequence[T], count: int) -> Iterator[tuple[T, R | Lost]]:
-    """Until all is done or a worker dies: those are lost that were being worked on, and no others begin."""
+    """Work until all is done or a worker dies: then those under way are lost, and no others begin."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["calibrate.batch.run"])
@@ -96,7 +96,7 @@ def _one_pool(work: Callable[[T], R], tasks: Sequence[T], count: int) -> Iterato
 
 
 def _end_with(parent: Connection) -> None:
-    """In a worker: end when the parent closes its side of the pipe, as the kernel does for a killed one.
+    """End a worker when the parent closes its side of the pipe, as the kernel does for a killed one.
 
     Ctrl-C is the parent's to answer.
     """

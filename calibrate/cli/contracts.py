@@ -1,4 +1,4 @@
-"""What the commands print with `--json`; docs/schemas/ is made from these types."""
+"""Objects that the commands print with `--json`; docs/schemas/ is made from these types."""
 # ruff: noqa: N815  (e_R is written as the paper writes it)
 
 from __future__ import annotations
@@ -196,11 +196,11 @@ class WatchEventJson(msgspec.Struct, frozen=True):
     pictures: int
     """Pictures with the tag so far."""
     moved: str | None
-    """Of `named`: camera-or-joint-6, tag-base-or-joint-1, joint-2 …, cannot-tell (eye-to-hand:
+    """Code of `named`: camera-or-joint-6, tag-base-or-joint-1, joint-2 …, cannot-tell (eye-to-hand:
     camera-base-or-joint-1, tag-gripper-or-joint-6)."""
     values: dict[str, str | float | int | bool | None]
     text: str
     next: list[str]
     """Commands of the shortest way back, in their order."""
     validity: Validity | None
-    """Of the installed calibration, where the event changed it."""
+    """Validity of the installed calibration, where the event changed it."""

@@ -116,7 +116,7 @@ def _log(
 
 
 def _taken(info: SessionInfo) -> datetime:
-    """When the views were taken; now where the recording does not say."""
+    """Return when the views were taken; now where the recording does not say."""
     return datetime.fromtimestamp(info.created_wall_ns / 1e9 or time.time(), UTC)
 
 
@@ -160,7 +160,7 @@ def _doubt_devices(
 
 
 def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
-    """Whether the calibration was made from this recording; an excerpt is of the same session."""
+    """Tell whether the calibration was made from this recording; an excerpt is of the same session."""
     session = (info.name, info.created_wall_ns)
     known = bool(info.created_wall_ns) and session == (provenance.session, provenance.recorded_wall_ns)
     return known or sha256 == provenance.recording_sha256

@@ -64,7 +64,7 @@ def read_lens_sigma(path: Path) -> dict[str, float]:
 
 
 class CellFacts(NamedTuple):
-    """What a station's configuration says of its calibrations; empty or None where it says nothing."""
+    """Facts of a station's configuration on its calibrations; empty or None where it says nothing."""
 
     robot_serial: str
     camera_serial: str

@@ -295,7 +295,7 @@ def _verdict_text(calibration: Calibration) -> str:
 
 
 def history_rows(root: Path | None, camera: str) -> list[tuple[str, str, str, str]]:
-    """For the report: version, when and by whom, what was done, change; at last whether it still holds."""
+    """List for the report: version, when and by whom, what was done, change; at last whether it holds."""
     rows = [
         (str(entry.generation), f"{entry.wall}, {entry.who}", entry.action, entry.change)
         for entry in read_log(root, camera)

@@ -89,7 +89,7 @@ def solve(
 
 
 def solve_json(job: SolvedRecording) -> SolveJson:
-    """What `calibrate solve --json` prints."""
+    """Build the object that `calibrate solve --json` prints."""
     found, quality = job.calibration, job.calibration.quality
     score = quality.holdout
     return SolveJson(

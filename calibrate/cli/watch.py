@@ -58,7 +58,7 @@ class WatchSourceError(OutputError):
 
 @dataclass(frozen=True)
 class _Source:
-    """Where pictures come from; `entries` can be asked again for what is new."""
+    """Source of pictures; `entries` can be asked again for what is new."""
 
     path: Path
     mount: Mount
@@ -324,7 +324,7 @@ _MOVED_TEXT = {
 
 
 def event_text(event: MovementEvent) -> str:
-    """What happened, for people."""
+    """Say for people what happened."""
     values = event.values
     if event.kind is EventKind.NAMED and event.moved is not None:
         size = f" by {values['moved_mm']} mm, {values['moved_deg']}°" if "moved_mm" in values else ""

@@ -52,7 +52,7 @@ VALIDITY_STYLES = {
 
 
 def summary(calibration: Calibration, validity: Validity | None = None) -> RenderableType:
-    """For a rich console, 80 columns and more. `validity`: of the installed one."""
+    """Write a calibration for a rich console, 80 columns and more. `validity`: of the installed one."""
     style = "bold red" if calibration.verdict == "FAIL" else "bold green"
     parts: list[RenderableType] = [Text(verdict_text(calibration), style=style)]
     if validity is not None:
@@ -157,7 +157,7 @@ _REFUSED = {
     "not-better": "it does not help on poses elsewhere",
 }
 _WORTH_SAYING = 0.85
-"""What would limit the table is named where knowing it leaves less than this share of the error."""
+"""A limiting cause of the table is named where knowing it leaves less than this share of the error."""
 
 
 def arm_sentences(calibration: Calibration) -> Iterator[str]:

@@ -88,7 +88,7 @@ def _runs(folder: Path, event: HookEvent, fields: dict[str, str]) -> list[HookRu
 
 
 def _distrusted(path: Path) -> str:
-    """Why it is not run; empty when it belongs to root or to us and nobody else may change it."""
+    """Say why it is not run; empty when it belongs to root or to us and nobody else may change it."""
     found = path.lstat()
     if stat.S_ISLNK(found.st_mode):
         return f"{path} is a symbolic link."

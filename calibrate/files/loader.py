@@ -96,7 +96,7 @@ def current_validity(folder: Path, now: datetime | None = None) -> Validity:
 
 
 def _validity_of(folder: Path, number: int, now: datetime | None = None) -> Validity:
-    """Of one version: what is current may change while it is read."""
+    """Read the validity of one version: what is current may change while it is read."""
     try:
         installed = datetime.fromtimestamp((folder / "current").lstat().st_mtime, UTC)
         found = read_validity(folder).get(number) or unrecorded(number, time_text(installed))
@@ -168,7 +168,7 @@ def refused_table(reason: str) -> CalibrationFileError:
 
 @dataclass(frozen=True, eq=False)
 class InstalledCalibration:
-    """What a program needs of an installed calibration. The whole file: `read_calibration(self.path)`."""
+    """Installed calibration as a program needs it. The whole file: `read_calibration(self.path)`."""
 
     camera_name: str
     version: int
@@ -220,7 +220,7 @@ class InstalledCalibration:
 
     @property
     def created(self) -> str:
-        """When it was solved, UTC."""
+        """Time of the solve, UTC."""
         return str(self.plain["created"])
 
     @property
@@ -321,7 +321,7 @@ def _require(found: InstalledCalibration, valid: bool | None) -> None:
 # --- and when it changes ---
 @dataclass(frozen=True, eq=False)
 class InstallationChange:
-    """What happened to the installed calibration of a camera."""
+    """Change of a camera's installed calibration."""
 
     event: str
     """installed, rolled-back, valid, unverified, in-doubt, withdrawn, or unreadable"""

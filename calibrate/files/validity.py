@@ -106,7 +106,7 @@ def validity_text(validity: Validity) -> str:
 
 
 def read_validity(folder: Path) -> dict[int, Validity]:
-    """What was recorded last of each version, as it was then (`Validity.at` tells what it is now).
+    """Read the last record of each version, as it was then (`Validity.at` tells what it is now).
 
     OSError as it comes; lines that are cut or of another shape are left out.
     """

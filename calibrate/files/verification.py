@@ -38,7 +38,7 @@ def touch_sigmas(touch: Touch) -> float:
 
 
 def agrees(touch: Touch) -> bool:
-    """Whether the offset is within what was predicted."""
+    """Tell whether the offset is within what was predicted."""
     return touch_sigmas(touch) <= LIMIT_SIGMAS
 
 

@@ -87,7 +87,7 @@ def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> l
 
 
 def same_solve(one: Calibration, other: Calibration | None) -> bool:
-    """They differ at most in what people added: a reason, or a check by hand."""
+    """Tell whether two calibrations differ at most in what people added: a reason, or a check by hand."""
     if other is None:
         return False
     return msgspec.structs.replace(one, override=other.override, verification=other.verification) == other

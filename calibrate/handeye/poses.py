@@ -268,7 +268,7 @@ def _start(views: PoseViews, seed: int) -> tuple[Array, Array, Array]:
 
 
 def _prior(boards: BoardPoses, poses: int, factors: Array) -> Quadratic:
-    """For `poses` poses, known to a metre and a radian, and the factors: open ones may be of any size."""
+    """Make the prior of poses, known to 1 m and 1 rad, and factors: open ones may be of any size."""
     precision = np.concatenate([np.full(6 * poses, 1e-6), boards.sigma**-2.0])
     precision[6 * poses + boards.open] = 1e-9
     miss = np.concatenate([np.zeros(6 * poses), factors - 1.0])

@@ -65,7 +65,7 @@ def read_checks(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[Che
 
 
 def earlier_results(history: Sequence[CheckEntry], generation: int) -> list[bool]:
-    """Which checks of this installed version passed: one alarm alone may be chance."""
+    """List which checks of this installed version passed: one alarm alone may be chance."""
     return [entry.passed for entry in history if entry.generation == generation]
 
 

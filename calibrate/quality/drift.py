@@ -195,7 +195,7 @@ def _inverse(information: Array) -> Array:
 
 
 def powers(covariance: Array, nu: float) -> tuple[float, float]:
-    """To notice `SHIFT_M` and `TURN_RAD`, each in the worst direction; covariance S: (6, 6) of a shift.
+    """Compute the powers to notice `SHIFT_M`, `TURN_RAD` in the worst direction; S: (6, 6) of a shift.
 
     After a true shift d, δᵀ S⁻¹ δ / 6 follows the non-central F(6, nu) of noncentrality dᵀ S⁻¹ d.
     """
@@ -212,7 +212,7 @@ def powers(covariance: Array, nu: float) -> tuple[float, float]:
 
 
 def _views_needed(fitted: Array, installed: Array, views: int, nu: float) -> int | None:
-    """If further views tell as much as these did on average."""
+    """Estimate the views needed, if further ones tell as much as these did on average."""
     counts = range(views, max(views, _MOST_VIEWS) + 1)
     place = bisect_left(counts, POWER, key=lambda n: min(powers(fitted * views / n + installed, nu)))
     return counts[place] if place < len(counts) else None

@@ -64,7 +64,7 @@ class TimeOffset:
     lost: tuple[str, ...] = ()
     """Pictures that could not be used, each in words"""
     source: TimeSource | None = None
-    """How most frames' times are known; None in recordings without frame times"""
+    """Source of most frames' times; None in recordings without frame times"""
     bound_s: float | None = None
     """Largest 95 % bound of those times"""
     derived_s: float | None = None

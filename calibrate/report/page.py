@@ -117,7 +117,7 @@ def _verdict(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[str]:
 
 
 def rehearsal_text(job: SolvedRecording) -> str:
-    """What a rehearsal says of the real run; empty: this was none.
+    """Say what a rehearsal tells of the real run; empty: this was none.
 
     The simulated cell's truth is known, so the error that was really made stands beside the predicted one.
     """

@@ -22,7 +22,7 @@ from recordings.schema.messages import CameraModel
 _BLUE, _RED, _GREY, _ORANGE = "#0969da", "#b42318", "#8c959f", "#bc4c00"
 _FAR_WORSE = 3.0
 _DPI = 120
-"""Of clouds of points, which would be most of the page as lines."""
+"""Resolution of clouds of points, which would be most of the page as lines."""
 STYLE: Any = {
     "svg.hashsalt": "report",
     "svg.fonttype": "none",
@@ -143,7 +143,7 @@ def holdout_samples(methods: Sequence[tuple[str, Array, Array]]) -> str:
 
 
 def _top(curves: Sequence[Array]) -> float:
-    """So high that all are seen but those several times worse than most: one would flatten all others."""
+    """Choose a top that shows all but those several times worse than most: one would flatten all others."""
     peaks = np.array([float(np.max(curve)) for curve in curves])
     return 1.05 * float(peaks[peaks <= _FAR_WORSE * np.median(peaks)].max())
 

@@ -84,7 +84,7 @@ class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
     views: int
     bytes: int
     bag: BagPlan | None = None
-    """Of a bag or an MCAP file."""
+    """Options of a bag or an MCAP file."""
 
 
 def _print_import(facts: ImportJson) -> None:

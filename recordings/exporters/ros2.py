@@ -65,7 +65,7 @@ def write_ros2(recording: Recording, folder: Path) -> None:
 
 
 def _entries(messages: _Messages, recording: Recording, segment: RecordingSegment) -> Iterator[_Entry]:
-    """In time order."""
+    """List the entries in time order."""
     counted = {view.picture_sequence: view for view in recording.views() if view.part == segment.info.part}
     stored = {message.sequence: message.time_ns for message in segment.stored(Topic.PICTURE_FACTS)}
     facts = {facts.sequence: facts for facts in segment.image_facts()}

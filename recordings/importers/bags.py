@@ -92,7 +92,7 @@ class Bag:
                 self._progress("reading the bag", self._done, self._total)
 
     def values(self, topic: str) -> Iterator[Value]:
-        """In the order of the file. Raises ImportSourceError."""
+        """Yield the values in the order of the file. Raises ImportSourceError."""
         told = self._by_name[topic]
         for time_ns, data in self._read(topic):
             yield decoded(told.encoding, told.schema, data, time_ns)

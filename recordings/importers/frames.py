@@ -102,7 +102,7 @@ class FrameTree:
         )
 
     def moves(self, pair: tuple[str, str]) -> bool:
-        """Whether a link is ever told to be anywhere else."""
+        """Tell whether a link is ever told to be anywhere else."""
         table = np.frombuffer(self.edges[pair].numbers).reshape(-1, 7)
         return len(table) > 1 and bool(np.ptp(table, axis=0).max() > 0)
 

@@ -1,4 +1,4 @@
-"""Which topics and frames of a bag are taken: named by the user, or found where only one can be meant."""
+"""Topics and frames of a bag: named by the user, or found where only one can be meant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a recorded arm stood still, by the station's own rule, and which image to take of each stop.
+"""Stops of a recorded arm, by the station's own rule, and the image to take of each.
 
 The rule (station/stillness.py): over a window before the image the flange stays within `POSITION_M` of its
 mean place and `ROTATION_RAD` of its newest orientation, and no joint is faster than `JOINT_SPEED_RAD_S`.

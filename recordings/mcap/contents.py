@@ -42,7 +42,7 @@ _BATCH = 16384
 
 @dataclass
 class MessageIndex:
-    """Where the messages of one channel lie, in file order, and what they come to."""
+    """Places of the messages of one channel, in file order, and their sum."""
 
     addresses: array[int] = field(default_factory=lambda: array("Q"))
     """Addresses of the message records, as `Source` counts."""

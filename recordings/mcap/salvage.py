@@ -243,7 +243,7 @@ class _Walk:
                 at = match.start() + 1
 
     def _plausible(self, position: int) -> bool:
-        """Whether the first bytes fit the kind: dark images are full of patterns that look like records."""
+        """Tell whether the first bytes fit the kind: dark images are full of what looks like records."""
         head = self._read(position, RECORD_HEAD.size + _PEEK_BYTES)
         if len(head) < RECORD_HEAD.size + _PEEK_BYTES:
             return False

@@ -1,4 +1,4 @@
-"""How transports number frames, and how many frames lie between two numbers."""
+"""Frame numbers of the transports, and the frames between two of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a frame was exposed: the middle of its exposure on the host's clock, with a bound and a source.
+"""Time of a frame: the middle of its exposure on the host's clock, with a bound and a source.
 
 Live cameras and offline work share this, so that times can be derived again from a recording's raw readings.
 """
@@ -158,7 +158,7 @@ def derived_again(
 def by_trigger(
     fired_ns: int, fired_bound_s: float, delay_us: float, exposure_us: float, arrival_ns: int
 ) -> FrameTime:
-    """From the pulse of a trigger box and the camera's set delay after it.
+    """Time a frame by the pulse of a trigger box and the camera's set delay after it.
 
     What the camera adds of its own is not known: the bound is all that lies between pulse and arrival.
     """
@@ -172,7 +172,7 @@ def by_trigger(
 def by_arrival(
     arrival_ns: int, exposure_us: float, asked_ns: int | None = None, readout_s: float = UNKNOWN_READOUT_S
 ) -> FrameTime:
-    """From the first packet's arrival: the exposure began after it was asked for, and ended before.
+    """Time a frame by its first packet: the exposure began after it was asked for, and ended before.
 
     `asked_ns`: just before its trigger; None = not triggered, then `readout_s` is what can lie between.
     """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # commands that only ask the daemon do not load numpy
 
 Mount = Literal["eye-in-hand", "eye-to-hand"]
 Source = Literal["real", "simulated", "playback", "imported"]
-"""Where the images and poses came from; anything but `real` never installs on a real cell."""
+"""Origin of images and poses; anything but `real` never installs on a real cell."""
 
 Vector6 = tuple[float, float, float, float, float, float]
 Matrix4 = tuple[tuple[float, ...], ...]
@@ -101,7 +101,7 @@ class CameraIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, om
     driver: str = ""
     """aravis, playback, rendered, imported"""
     name: str = ""
-    """Of the cell's cameras; empty: the cell's only or first one, `main`."""
+    """Name among the cell's cameras; empty: the cell's only or first one, `main`."""
 
 
 class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -145,7 +145,7 @@ class Stamps(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 TimeSource = Literal["ptp", "chunk", "latched", "trigger", "arrival"]
-"""How a frame's time is known, best first.
+"""Sources of a frame's time, best first.
 
 ptp: the camera's clock follows this computer's (IEEE 1588). chunk: stamp and exposure came with the frame,
 and its clock is read by round trips. latched: the same clock, with the stamp of the transport. trigger: the
@@ -163,7 +163,7 @@ class FrameTime(msgspec.Struct, frozen=True):
 
 
 class TimeCorrection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What a sweep measured of a camera's frame times, and where it comes from."""
+    """Offset of a camera's frame times that a sweep measured, and its source."""
 
     offset_s: float
     """Add it to a frame's time of that source."""
@@ -214,7 +214,7 @@ class Image(msgspec.Struct, frozen=True, eq=False):
     stamps: Stamps
     """device_ns: the camera's clock at the start of exposure; host: first packet received."""
     frame_id: int | None
-    """As the transport numbers frames; None where it does not"""
+    """Number by the transport; None where it does not"""
     sequence: int
     """Counts from 0 in this recording, never wraps."""
     exposure_us: float = 0.0
@@ -228,7 +228,7 @@ class Image(msgspec.Struct, frozen=True, eq=False):
     """Readings of the camera's clock since the frame before; empty when read from a recording."""
 
     def viewable(self) -> Pixels:
-        """What people and detectors look at: a colour mosaic interpolated to BGR, else `pixels`."""
+        """Convert for people and detectors: a colour mosaic interpolated to BGR, else `pixels`."""
         from recordings.images import viewable
 
         return viewable(self.pixels, self.pixel_format)

@@ -77,7 +77,7 @@ def next_best(
     joints_now_rad: Sequence[float],
     onward_rad: Sequence[float] | None,
 ) -> Advice:
-    """Which pose would help most after those captured (n, 4, 4), whether or not these are enough.
+    """Find the pose that would help most after those captured (n, 4, 4), whether or not these are enough.
 
     Free to reach from here, and from it the pose that is next (`onward_rad`). By forecast from the configured
     guesses; ConfigError where these are missing.
@@ -86,7 +86,7 @@ def next_best(
 
 
 def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:
-    """Which pose would help most and how many are missing for `capture.goal_m`; empty when none is, or none
+    """Say which pose would help most, how many are missing for `capture.goal_m`; empty when none is, or none
     helps, or the guesses are missing."""
     goal_m = config.capture.goal_m
     try:

@@ -268,7 +268,7 @@ def _blur(grey: NDArray[np.float32], contrast: float) -> float | None:
 
 
 def board_box(view: ExpectedView | None, width: int, height: int) -> Box | None:
-    """Where the board should stand in an image of this size (px); None where that is not known."""
+    """Predict where the board stands in an image of this size (px); None where that is not known."""
     if view is None or view.coverage <= 0 or width <= 0 or height <= 0:
         return None
     half = _BOARD_GROWTH * np.sqrt(view.coverage * width * height) / 2

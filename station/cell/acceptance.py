@@ -1,4 +1,4 @@
-"""Whether this arm's ways to stop passed `station accept`: the result that is kept with the cell.
+"""Result of `station accept`, kept with the cell: whether this arm's ways to stop passed.
 
 It holds for one arm with one firmware, payload and control path. Another one of these makes it void.
 """
@@ -20,7 +20,7 @@ PAYLOAD_TOLERANCE = 0.005
 
 
 class StopWay(StrEnum):
-    """What ends a move of the acceptance test."""
+    """Ways to end a move of the acceptance test."""
 
     ARRIVE = "arrive"
     """Nothing: it arrives."""
@@ -41,11 +41,11 @@ class StopWay(StrEnum):
 
 
 BY_PERSON = frozenset({StopWay.NETWORK, StopWay.SLIDER})
-"""What only a person at the robot can do."""
+"""Ways that only a person at the robot can use."""
 
 
 class ArmSubject(msgspec.Struct, frozen=True):
-    """What an acceptance holds for."""
+    """Arm, firmware, payload and control path that an acceptance holds for."""
 
     source: str
     """real, or simulated"""
@@ -80,11 +80,11 @@ class StopTestOffer(msgspec.Struct, frozen=True):
     go: MotionPreview
     subject: ArmSubject
     joint: int
-    """That moves, from 0."""
+    """Number of the joint that moves, from 0."""
     target_rad: float
-    """Where it would arrive."""
+    """Goal of that joint."""
     speed_rad_s: float
-    """Of that joint."""
+    """Speed of that joint."""
 
 
 class Figure(msgspec.Struct, frozen=True):
@@ -112,7 +112,7 @@ class StopResult(msgspec.Struct, frozen=True):
 
     way: StopWay
     speed_m_s: float
-    """Of the fastest modelled point, as approved."""
+    """Speed of the fastest modelled point, as approved."""
     figures: tuple[Figure, ...]
     repeated: int = 0
     """Moves before it that ended before their stop was given: the computer was too busy. Not judged."""
@@ -153,7 +153,7 @@ def read_acceptance(root: Path) -> Acceptance | None:
 
 
 def not_accepted(found: Acceptance | None, subject: ArmSubject, speed_m_s: float = 0.0) -> str:
-    """Why the stops of this arm are not accepted at this speed; empty: they are."""
+    """Say why the stops of this arm are not accepted at this speed; empty: they are."""
     if found is None:
         return "not accepted: its stops were never tested"
     if changed := found.subject.difference(subject):

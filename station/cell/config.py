@@ -63,7 +63,7 @@ class KinematicsDeltas(Section, frozen=True):
 
 
 ControlPath = Literal["ur_rtde", "script"]
-"""What drives the arm: the library, or a script of our own where the library does not exist."""
+"""Driver of the arm: the library, or a script of our own where the library does not exist."""
 
 
 class RobotConfig(Section, frozen=True):
@@ -82,7 +82,7 @@ REAL_DRIVERS = ("aravis", "webcam")
 
 class CameraConfig(Section, frozen=True):
     name: str = MAIN_CAMERA
-    """Of the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""
+    """Name among the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""
     driver: Literal["aravis", "webcam", "playback", "rendered"] = "aravis"
     device: str = ""
     """aravis: serial, IP address or name. webcam: its number or device file. playback: a folder, video or
@@ -113,7 +113,7 @@ class CameraConfig(Section, frozen=True):
     ptp: bool = False
     """The camera's clock follows the network's master (IEEE 1588)"""
     time_offset: TimeCorrection | None = None
-    """What a sweep measured (`calibrate sweep -o`): added to the frames' times of the same source."""
+    """Offset from a sweep (`calibrate sweep -o`), added to the frames' times of the same source."""
     playback_pace: float = 0.0
     """playback: 0 = as fast as asked, 1 = at its own pace."""
     model: CameraModel | None = None
@@ -195,7 +195,7 @@ class CaptureConfig(Section, frozen=True):
 
 
 class ValidityConfig(Section, frozen=True):
-    """When an installed calibration is in doubt by itself."""
+    """Age at which an installed calibration is in doubt by itself."""
 
     max_age_days: Positive | None = None
     """Oldest that the last proof may be: a calibration, or a drift check that passed; None: no limit."""

@@ -46,7 +46,7 @@ class ConfigReport:
     wrong: tuple[YamlProblem, ...]
     """With these nothing is started."""
     missing: tuple[YamlProblem, ...]
-    """What planned capture with a real arm needs besides."""
+    """Keys that planned capture with a real arm needs besides."""
 
 
 def load_config(path: Path) -> tuple[StationConfig, bytes]:
@@ -260,7 +260,7 @@ def board_turned_away(config: StationConfig) -> YamlProblem | None:
 
 
 def _behind(plane: Plane, point: Array) -> float:
-    """How far a point lies behind a keep-out plane, m."""
+    """Measure how far a point lies behind a keep-out plane, m."""
     normal = np.asarray(plane.normal) / max(float(np.linalg.norm(plane.normal)), 1e-9)
     return float(normal @ (np.asarray(plane.point_m) - point))
 
@@ -284,7 +284,7 @@ def _reach_problems(config: StationConfig) -> Iterator[YamlProblem]:
 
 
 def _real_capture_problems(config: StationConfig) -> Iterator[YamlProblem]:
-    """What planned capture with a real arm needs, and a rehearsal or capture by hand does not."""
+    """List what planned capture with a real arm lacks; a rehearsal or capture by hand does not need it."""
     if config.camera.driver not in REAL_DRIVERS:
         text = f"'{config.camera.driver}' shows no real image"
         yield YamlProblem(0, "camera.driver", text, "Choose aravis or webcam, or rehearse: `--rehearse`.")

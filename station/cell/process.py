@@ -1,4 +1,4 @@
-"""This process before other programs, as far as the system permits."""
+"""Priority of this process before other programs, as far as the system permits."""
 
 from __future__ import annotations
 

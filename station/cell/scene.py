@@ -223,7 +223,7 @@ def require_kept_clear(config: StationConfig) -> None:
 
 
 def covers_its_doubt(guess: PoseGuess) -> bool:
-    """Whether what hangs on the flange gets as much thicker as it may be off."""
+    """Tell whether what hangs on the flange gets as much thicker as it may be off."""
     return _DOUBT * guess.sigma_m <= _MOST_DOUBT_M
 
 

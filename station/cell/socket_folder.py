@@ -1,4 +1,4 @@
-"""Where the daemon's sockets lie, and whose they must be. Loads nothing large: STOP from a shell needs it.
+"""Place of the daemon's sockets, and whose it must be. Loads nothing large: STOP from a shell needs it.
 
 In a folder that somebody else may write to, anyone can put a socket that answers in the daemon's place.
 """
@@ -18,7 +18,7 @@ class UntrustedFolderError(Exception):
 
 
 def default_socket() -> Path:
-    """Where systemd puts it, when it is there; else the user's own runtime or state folder."""
+    """Choose the socket: where systemd puts it, else the user's own runtime or state folder."""
     if runtime := os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]:
         return Path(runtime) / "control.sock"
     system = Path("/run/station/control.sock")

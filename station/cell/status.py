@@ -76,7 +76,7 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     control: bool = False
     """A control child lives."""
     control_path: str = ""
-    """What drives the arm: ur_rtde, or script (the station's own)"""
+    """Driver of the arm: ur_rtde, or script (the station's own)"""
     not_accepted: str = ""
     """Why the stops of this real arm are not accepted (`station accept`); empty: they are."""
     speed_m_s: float = 0.0
@@ -143,7 +143,7 @@ class ClockStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     camera_bound_ms: float | None = None
     camera_drift_ppm: float | None = None
     camera_source: TimeSource | None = None
-    """How the time of a frame is known; `camera_bound_ms` is that time's bound."""
+    """Source of a frame's time; `camera_bound_ms` is that time's bound."""
 
 
 class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -162,9 +162,9 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     sigma_translation_mm: float | None = None
     sigma_rotation_deg: float | None = None
     camera_pose: Matrix4 | None = None
-    """Of the camera in the flange (eye-in-hand) or the base."""
+    """Pose of the camera in the flange (eye-in-hand) or the base."""
     board_pose: Matrix4 | None = None
-    """Of the board in the base (eye-in-hand) or the flange."""
+    """Pose of the board in the base (eye-in-hand) or the flange."""
     goal_mm: float | None = None
     enough: bool = False
     advice: str = ""
@@ -216,7 +216,7 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 APPROVAL_LIFETIME_S = 120.0
-"""How long a motion that was offered waits for a person."""
+"""Time that an offered motion waits for a person."""
 
 
 class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -92,7 +92,7 @@ class GenicamDevice:
 
     @property
     def frame_ids(self) -> FrameIds:
-        """How its transport numbers frames."""
+        """Numbering of frames by its transport."""
         mode = "GevGVSPExtendedIDMode"
         camera = self._camera
         if not camera.is_gv_device() or (
@@ -176,7 +176,7 @@ class GenicamDevice:
 
     @property
     def chunks(self) -> frozenset[str]:
-        """What comes with every frame, of `genicam_settings.CHUNKS`."""
+        """Chunks that come with every frame, of `genicam_settings.CHUNKS`."""
         return frozenset() if self._applied is None else self._applied.chunks
 
     def _find_ptp_status(self) -> str:

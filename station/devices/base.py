@@ -24,7 +24,7 @@ class Robot(Protocol):
 
     @property
     def control_path(self) -> str:
-        """What drives the arm: ur_rtde or script; empty where nothing real moves."""
+        """Driver of the arm: ur_rtde or script; empty where nothing real moves."""
 
     @property
     def kinematics(self) -> ArmKinematics | None:
@@ -96,7 +96,7 @@ class Camera(Protocol):
 
     @property
     def timing(self) -> FrameTiming | None:
-        """How surely its frames are placed in time now; None while not known. At once, from any thread."""
+        """Accuracy of its frames' times now; None while not known. At once, from any thread."""
 
     def counts(self) -> CameraCounts:
         """Since it was made. At once, from any thread."""

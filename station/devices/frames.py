@@ -152,7 +152,7 @@ class FrameCounter:
 
 
 class FrameTiming(msgspec.Struct, frozen=True):
-    """How surely a camera's frames are placed in time, for doctor and screen."""
+    """Accuracy of a camera's frame times, for doctor and screen."""
 
     source: TimeSource
     bound_s: float

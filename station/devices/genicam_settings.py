@@ -14,11 +14,11 @@ _GAIN_TOLERANCE = 0.2
 """dB, or the camera's unit"""
 TIME_CHUNKS = ("Timestamp", "ExposureTime")
 CHUNKS = (*TIME_CHUNKS, "Gain")
-"""What a frame can bring along of itself"""
+"""Facts that a frame can bring along"""
 
 
 class Applied(NamedTuple):
-    """What the camera was set to."""
+    """Settings that the camera was given."""
 
     region: Region
     gain: float
@@ -127,7 +127,7 @@ def _cannot(what: str, key: str) -> CameraError:
 
 
 def gain_unit(camera: Any) -> str:
-    """As the camera names it: dB, or something else; empty = it names none."""
+    """Read the camera's unit of gain: dB, or something else; empty = it names none."""
     for name in ("Gain", "GainRaw", "GainAbs"):
         if camera.is_feature_available(name):
             node = camera.get_device().get_feature(name)

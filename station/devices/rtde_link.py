@@ -32,7 +32,7 @@ class RtdeLink:
         self._link = link
         self.packets = PacketReader()
         self.pending: deque[tuple[int, bytes]] = deque()
-        """What arrived and was not yet read: after `start`, the first data."""
+        """Data that arrived and was not yet read: after `start`, the first data."""
 
     def speak(self) -> None:
         accepted = self._ask(PacketType.PROTOCOL_VERSION, struct.pack(">H", PROTOCOL_VERSION))

@@ -74,7 +74,7 @@ def longest_gap_s(moments_s: Sequence[float], since_s: float) -> float:
 
 
 def control_path(config: RobotConfig) -> ControlPath:
-    """As configured; else ur_rtde where it is installed, and our own script where it is not."""
+    """Choose the control path: as configured, else ur_rtde where it is installed, else our own script."""
     return config.control or ("ur_rtde" if library_installed() else "script")
 
 
@@ -83,7 +83,7 @@ def library_installed() -> bool:
 
 
 def control_trouble(path: str) -> tuple[str, str]:
-    """What speaks against driving an arm that way, and what to do; empty: nothing."""
+    """Say what speaks against driving an arm that way, and what to do; empty: nothing."""
     if path == "ur_rtde" and not library_installed():
         return "ur_rtde is not installed", REFUSALS["ur-rtde-missing"][1]
     return "", ""
@@ -392,7 +392,7 @@ class UrRobot(UrLink):
             raise
 
     def _program_trouble(self) -> RobotError | None:
-        """What state stream and dashboard say against the control program; StaleStateError without news."""
+        """Say what state and dashboard hold against the control program; StaleStateError without news."""
         state = self.newest().state
         if self.age_s() > STALE_S:
             return self.stale(self.age_s())

@@ -36,7 +36,7 @@ LIBRARY_WORDS = {
     "remote control": "local-control",
     "start control script": "script-not-started",
 }
-"""What ur_rtde's refusals say, in small letters; it has no codes."""
+"""Words of ur_rtde's refusals, in small letters; it has no codes."""
 
 
 class MotionServer:

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 FIRST_STATE_S = 4.0
 SUPERVISE_S = 0.2
 _BUSY_SHARE = 0.5
-"""Of the time that programs wait for a processor: from then on a gap is more likely ours than the cable's."""
+"""Share of time spent waiting for a processor from which a gap is more likely ours than the cable's."""
 RECONNECT_S = (0.2, 0.5, 1.0, 2.0)
 
 

@@ -41,7 +41,7 @@ STALE_S = 0.5
 
 
 class Command(IntEnum):
-    """What the script obeys. Any other number ends it."""
+    """Commands that the script obeys. Any other number ends it."""
 
     NONE = 0
     ARM = 1
@@ -51,7 +51,7 @@ class Command(IntEnum):
 
 
 class State(IntEnum):
-    """What the script says of itself."""
+    """State as the script reports it."""
 
     WAITING = 1
     ARMED = 2
@@ -255,7 +255,7 @@ class ScriptControl:
         return list(self._told.tcp)
 
     def setWatchdog(self, minimum_hz: float) -> bool:
-        """From now on the script lives only as long as its keepalive advances; the time is its own."""
+        """Let the script live from now on only as long as its keepalive advances; the time is its own."""
         return self._ask(Command.ARM)
 
     def kickWatchdog(self) -> bool:

@@ -277,7 +277,7 @@ class _Line:
 
 
 def _rtde_answers(host: str, question: str, rate_hz: float) -> dict[str, str]:
-    """What RTDE says to one odd request; '' where it said nothing wrong."""
+    """Send RTDE one odd request and return its answer; '' where it said nothing wrong."""
     with socket.create_connection((host, PORT), HANDSHAKE_S) as link:
         rtde = RtdeLink(link)
         rtde.speak()

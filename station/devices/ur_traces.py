@@ -1,4 +1,4 @@
-"""What a controller did in the scenarios of `ur_trace_scenarios`: its file, its figures, their comparison."""
+"""Traces of a controller in the scenarios of `ur_trace_scenarios`: file, figures, comparison."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from station.devices.rtde import RuntimeState
 
 HERE = Path(__file__).parent
 SHIPPED = {125: HERE / "traces-cb3.json.gz", 500: HERE / "traces-e-series.json.gz"}
-"""Of the simulated controller, by its rate in Hz."""
+"""Traces of the simulated controller, by its rate in Hz."""
 RESTING_RAD_S = 0.005
 MOVES_RAD = 0.001
 SLOWER = 0.9
@@ -32,12 +32,12 @@ TOLERANCES: dict[str, float] = {
 
 
 class ScenarioTrace(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What a controller did: n samples, times in s from the program's first mark."""
+    """Trace of one scenario: n samples, times in s from the program's first mark."""
 
     name: str
     time_s: list[float] = []
     angle_rad: list[float] = []
-    """Of wrist 3, from where it was, in the direction of the turn."""
+    """Angle of wrist 3 from its start, in the direction of the turn."""
     speed_rad_s: list[float] = []
     runtime: list[int] = []
     safety: list[int] = []
@@ -79,7 +79,7 @@ def read_traces(path: Path) -> TraceFile:
 
 
 def figures(trace: ScenarioTrace) -> dict[str, float | str]:
-    """What a trace comes down to; the end of each name tells its unit and tolerance."""
+    """Reduce a trace to figures; the end of each name tells its unit and tolerance."""
     found: dict[str, float | str] = dict(trace.answers)
     if not trace.time_s:
         return {k: float(v) if k.endswith("_s") and v[:1].isdigit() else v for k, v in trace.answers.items()}

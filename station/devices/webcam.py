@@ -35,7 +35,7 @@ _PATIENCE_S = 0.5
 _CHECK_S = 1.0
 """So often settings are read while frames come by themselves."""
 _EXPOSURE_UNIT_US = 100.0
-"""Of V4L2's absolute exposure"""
+"""Unit of V4L2's absolute exposure"""
 _MANUAL_EXPOSURE = 1
 _FOUND_AT_S = 1.0
 """A stamp of the driver that is older is none of the monotonic clock."""
@@ -103,7 +103,7 @@ class WebcamCamera:
         worker.shutdown(wait=False)
 
     async def _run(self, job: Callable[[], T], timeout_s: float | None = None) -> T:
-        """In the one thread that calls the driver, which may be stuck in it for ten seconds."""
+        """Call the driver in its one thread, which may be stuck in it for ten seconds."""
         if self._worker is None:
             self._worker = ThreadPoolExecutor(1, "webcam")
         running = asyncio.get_running_loop().run_in_executor(self._worker, job)

@@ -37,7 +37,7 @@ BACK_S = 120.0
 STOP_TESTED, STOP_GIVEN = "stop-tested", "stop-given"
 TRIES = 3
 BUSY = frozenset({"watchdog-computer", "no-heartbeat", "move-refused"})
-"""What ends a move when this computer is too busy."""
+"""Causes that end a move when this computer is too busy."""
 _LOOK_S = 0.1
 
 
@@ -95,7 +95,7 @@ class _MoveEnd:
     """When the stop was given, host monotonic."""
 
     def measured(self, way: StopWay) -> bool:
-        """What holds the arm is always judged, and so is every stop that was given."""
+        """Tell whether it was measured: what holds the arm always is, and so is every stop that was given."""
         if not self.rests or self.moment_ns is not None:
             return True
         return way in (StopWay.ARRIVE, *BY_PERSON) and self.ended_by not in (None, *BUSY)
@@ -117,7 +117,7 @@ class AcceptanceTest:
     _passed_m_s: float = 0.0
 
     async def run(self) -> Acceptance:
-        """Until all passed, one failed, or the person wants no more. StationError: no move was possible."""
+        """Test until all passed, one failed, or the person ends it. StationError: no move was possible."""
         if not await self.person.holds_emergency_stop():
             raise RefusedError(
                 "Nothing moved: nobody holds the emergency stop.",
@@ -197,7 +197,7 @@ class AcceptanceTest:
         return not stop.result.failed
 
     async def _watched(self, way: StopWay) -> _MoveEnd:
-        """What the station says of the move's end, once the arm was watched at rest."""
+        """Wait for the station's account of the move's end, once the arm was watched at rest."""
         begun_ns = time.time_ns()
         if way is StopWay.NETWORK:
             await self.person.meanwhile(way)

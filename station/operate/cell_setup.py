@@ -99,7 +99,7 @@ class CellSetup:
         )
 
     async def look_for_cameras(self) -> bool:
-        """Whether others answer than before; one that is alone is opened: its picture says what it is."""
+        """Tell whether others answer than before; one that is alone is opened: its picture says more."""
         found = await self._hardware.cameras()
         changed, self.cameras = found != self.cameras, found
         if len(found) == 1:

@@ -77,7 +77,7 @@ class CameraReader(Protocol):
 
 
 class Hardware(Protocol):
-    """What a shell brings for this flow: it alone knows devices."""
+    """Devices that a shell brings for this flow: it alone knows them."""
 
     async def arm(self, host: str) -> ArmReader:
         """Connect for reading only. Raises RobotError with the pendant's own menu words."""
@@ -90,7 +90,7 @@ class Hardware(Protocol):
 
 
 class GuidedView(msgspec.Struct, frozen=True):
-    """What the camera saw from where a hand brought the arm."""
+    """View from where a hand brought the arm."""
 
     joints_rad: Vector6
     base_from_flange: Matrix4
@@ -100,7 +100,7 @@ class GuidedView(msgspec.Struct, frozen=True):
 
 
 class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What is known of the cell so far."""
+    """Facts of the cell that are known so far."""
 
     host: str = ""
     robot: RobotIdentity | None = None
@@ -118,12 +118,12 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
     """The configuration's path, once it is written."""
 
     def without_views(self, **changes: object) -> Draft:
-        """With changes that make the views taken so far worthless."""
+        """Return the draft with changes that make the views taken so far worthless."""
         return msgspec.structs.replace(self, views=(), limits_seen=False, written="", **changes)
 
 
 def load_draft(root: Path) -> Draft:
-    """What was found before; an empty one where there is nothing, or nothing readable."""
+    """Load what was found before; an empty one where there is nothing, or nothing readable."""
     with contextlib.suppress(OSError, msgspec.DecodeError):
         return msgspec.json.decode((root / DRAFT_FILE).read_bytes(), type=Draft)
     return Draft()

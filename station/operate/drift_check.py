@@ -41,7 +41,7 @@ async def start_drift_check(
 
 
 def _never_run(status: StationStatus) -> bool:
-    """Whether a plan is loaded and none of its poses was ever tried: somebody may still want it."""
+    """Tell whether a plan is loaded and none of its poses was ever tried: somebody may still want it."""
     poses = status.session.poses
     return bool(poses) and not any(pose.attempt for pose in poses)
 
@@ -64,7 +64,7 @@ async def recorded(link: Link, plan_sha256: str) -> SessionStatus | None:
 
 
 def judged(folder: str, camera: str) -> Ending | None:
-    """What to do after the drift check of this session; None: it was not judged."""
+    """Judge this session's drift check and say what to do after it; None: it was not judged."""
     path = Path(folder).resolve()
     history = read_checks(path.parents[1], camera)
     entry = next((entry for entry in reversed(history) if entry.recording == path.name), None)

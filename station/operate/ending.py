@@ -13,7 +13,7 @@ from station.cell.status import SessionStatus
 
 
 class Way(StrEnum):
-    """What to do after a flow."""
+    """Next step after a flow."""
 
     SOLVE = "solve"
     INSTALL = "install"

@@ -42,7 +42,7 @@ _MOVED_M = 0.006
 _WRONG_SCALE = 0.03
 """Share by which the squares may differ from what is stated before a person is told."""
 _SCALE_SIGMA, _TRAVEL_M = 0.5, 0.001
-"""What is known of it before, and how well the arm's travel and the camera's agree."""
+"""Prior 1σ of the scale; 1σ of the arm's travel against the camera's."""
 _LIT = 0.15
 """Brightest part of an image without a board, of full scale, that could be read."""
 _OTHER_MOUNT = 3.0
@@ -50,7 +50,7 @@ _OTHER_MOUNT = 3.0
 
 
 def image_trouble(image: Image, found: Detection) -> tuple[str, str]:
-    """What is wrong with an image, for a program and for a person; both empty: the board is seen well."""
+    """Say what is wrong with an image, for a program and for a person; both empty: the board is seen well."""
     advice = assess(image.pixels, found.pixels if found.found else None, image.exposure_us, image.gain_db)
     if found.cause and found.cause != "not-found":
         return found.cause, found.reason
@@ -74,7 +74,7 @@ def guided_view(state: RobotState, tcp_offset: Vector6, found: Detection) -> Gui
 
 @dataclass(frozen=True)
 class Missing:
-    """What the next view should show."""
+    """View that is still missing."""
 
     text: str
     """For a person; empty: nothing is missing."""
@@ -122,7 +122,7 @@ def _turns(views: Sequence[GuidedView]) -> list[Array]:
 
 
 def _across(turns: list[Array]) -> float:
-    """How far the turns spread about a second axis, 0…1 of the first."""
+    """Measure the turns' spread about a second axis, 0…1 of the first."""
     if len(turns) < 2:
         return 0.0
     spread = np.linalg.svd(np.array(turns), compute_uv=False)
@@ -153,7 +153,7 @@ class FoundCell:
 
     @property
     def cause(self) -> Literal["", "other-mounting", "square-size", "moved"]:
-        """What cannot be right, for a program; empty: it can."""
+        """Code of what cannot be right; empty: it can."""
         if self.other_fits:
             return "other-mounting"
         if abs(self.scale - 1) > _WRONG_SCALE:
@@ -162,7 +162,7 @@ class FoundCell:
 
     @property
     def warning(self) -> str:
-        """Why this cannot be right, and what to do; empty: it can."""
+        """Say why this cannot be right, and what to do; empty: it can."""
         if self.cause == "other-mounting":
             return "These views fit the other drawing (step 3): the camera is mounted the other way."
         if self.cause == "square-size":
@@ -266,7 +266,7 @@ def _scale(views: ViewSet, X: Array) -> float:
 
 
 def enough(draft: Draft) -> bool:
-    """Whether the views so far are enough to plan from."""
+    """Tell whether the views so far are enough to plan from."""
     if len(draft.views) < FEWEST_GUIDED or _across(_turns(draft.views)) < _OTHER_AXIS:
         return False
     found = find_cell(draft)

@@ -62,7 +62,7 @@ def next_step(draft: Draft) -> CellStep:
 
 
 def summary(draft: Draft, step: CellStep) -> str:
-    """What a step holds, in a few words; empty: nothing yet."""
+    """Summarize what a step holds, in a few words; empty: nothing yet."""
     match step:
         case CellStep.ROBOT if draft.robot is not None:
             return f"{draft.robot.model}, {draft.host}"
@@ -108,7 +108,7 @@ def read_board(text: str) -> BoardSpec:
 
 
 def board_words(board: BoardSpec) -> str:
-    """As `read_board` reads it."""
+    """Write a board as `read_board` reads it."""
     kind = () if board.kind is BoardKind.CHESSBOARD else (board.kind.value,)
     sizes = (f"{1000 * size_m:g}" for size_m in (board.square_m, board.marker_m) if size_m)
     named = (board.dictionary,) if board.dictionary else ()
@@ -133,7 +133,7 @@ def limits_of(draft: Draft, found: FoundCell) -> LimitsConfig:
 
 
 def table_height_m(draft: Draft, found: FoundCell) -> float:
-    """As a person said; else the height of the arm's base, or just below a board that lies lower."""
+    """Choose the table's height: as typed, else the arm's base, or just below a board that lies lower."""
     if draft.table_m is not None:
         return draft.table_m
     if draft.mount == "eye-in-hand" and draft.board is not None:
@@ -243,7 +243,7 @@ def config_text(config: StationConfig) -> str:
 
 
 def default_place() -> Path:
-    """Where `station` looks for the user's configuration."""
+    """Return the place where `station` looks for the user's configuration."""
     home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     return home / "calibration-station" / "station.yaml"
 

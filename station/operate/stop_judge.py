@@ -57,18 +57,18 @@ class StopMove:
 
     way: StopWay
     joint: int
-    """That moves, from 0."""
+    """Number of the joint that moves, from 0."""
     target_rad: float
-    """Of that joint."""
+    """Goal of that joint."""
     speed_rad_s: float
-    """Of that joint, as planned."""
+    """Planned speed of that joint."""
     moment_ns: int | None = None
-    """When the stop was given (host monotonic); None: it is found in the trace."""
+    """Time of the stop (host monotonic); None: it is found in the trace."""
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """What the judge saw of the joint that moved, for the judge and for the report."""
+    """Motion of the joint that moved, for the judge and for the report."""
 
     time_s: Array
     """(n,) the controller's, 0 at the moment of the stop"""
@@ -103,7 +103,7 @@ class Trace:
 
     @property
     def moment_s(self) -> float:
-        """Of the stop, in controller time."""
+        """Time of the stop on the controller's clock."""
         if self.move.moment_ns is not None:
             return self.move.moment_ns / 1e9 - self.ahead_s
         if self.move.way is StopWay.NETWORK:
@@ -199,7 +199,7 @@ def _deceleration(trace: Trace, moment: int) -> float:
 
 
 def _after_rest(trace: Trace, rest: int) -> list[Figure]:
-    """It neither swings back nor drifts nor goes on, for as long as it is watched."""
+    """Judge that it neither swings back nor drifts nor goes on, for as long as it is watched."""
     if trace.move.way is StopWay.ARRIVE:
         found = rest_index(trace.time_s, trace.fastest, int(np.argmax(trace.fastest)))
         rest = len(trace.time_s) - 1 if found is None else found

@@ -1,4 +1,4 @@
-"""From one taught view of the board to a first camera mount and board place, by a few small safe moves.
+"""First camera and board pose from one taught view of the board, by a few small safe moves.
 
 The mount is known only to about 30° and 100 mm. Each move is chosen so that for every mount the views so
 far allow, the board is in the image at its end, the camera comes no nearer to the board than it was
@@ -96,7 +96,7 @@ def _passing(cell: CellGeometry, here: Array, targets: Array) -> Array:
 
 
 def _free_in_all(cells: list[CellGeometry], here: Array, joints: Array) -> bool:
-    """Whether the move is free in each of them. The cell that says no comes first next time: it is tight."""
+    """Tell whether the move is free in each. The cell that says no comes first next time: it is tight."""
     for place, cell in enumerate(cells):
         if not np.isfinite(move_times(cell, here[None], joints[None])[0]):
             cells.insert(0, cells.pop(place))
@@ -263,7 +263,7 @@ def _stays_in_view(
 def _keeps_away(
     config: StationConfig, taught: BootstrapView, samples: Array, here: Array, joints: Array
 ) -> bool:
-    """Whether for every possible mount the camera comes no nearer on the path than it was taught, or is."""
+    """Tell whether every possible camera comes no nearer on the path than it was taught, or is."""
     way = forward(arm_model(config.robot), here + np.linspace(0, 1, _ON_THE_WAY)[:, None] * (joints - here))
     taught_m = float(_away_m(config, taught.camera_from_board))
     for X in samples:

@@ -165,7 +165,7 @@ def _gather(q: Array, near: Array | None, low: Array, high: Array) -> Array:
 
 
 def branch_of(scene: Scene, joints_rad: Array) -> Array:
-    """Which of the 8 arm branches joints (n, 6) belong to: shoulder side, elbow, wrist flip, as bits (n,)."""
+    """Find the arm branch of joints (n, 6), one of 8: shoulder side, elbow, wrist flip, as bits (n,)."""
     model = scene.geometry.model
     q = np.asarray(joints_rad)
     elbow = np.sin(q[:, 2]) > 0

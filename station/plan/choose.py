@@ -1,4 +1,4 @@
-"""Which poses are worth taking: exchange on the information matrix of the solver's own model."""
+"""Choice of poses: exchange on the information matrix of the solver's own model."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ smallest ellipsoid of X, board, lens and table together."""
 WITH_TABLE = ("arm", "all")
 Aim = Literal["camera", "arm", "both"]
 CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm", "both": "all"}
-"""What the poses are to tell best, for people → criterion."""
+"""Aims of a plan, for people → criterion."""
 _LENS_SHARE = {"A": 0.02, "D": 0.2, "arm": 0.0, "all": 0.0}
 """Weight of the lens, so that the image is covered."""
 USUAL_NOISE = MeasurementNoise()
@@ -156,7 +156,7 @@ def choose(
 
 
 def _best_addition(pool: Array, total: Array, taken: list[int], objective: Objective) -> tuple[int, float]:
-    """Which further member makes the sum best, and how good it is then."""
+    """Find the further member that makes the sum best, and how good it is then."""
     open_places = np.setdiff1d(np.arange(len(pool)), taken)
     if len(open_places) == 0:
         return taken[0], np.inf

@@ -1,4 +1,4 @@
-"""Where the flange must go so that the pointer stands over a corner of the board, and the path there.
+"""Flange pose that puts the pointer over a corner of the board, and the path there.
 
 A check of a calibration that needs no mathematics to believe: the tip stands where the calibration says the
 corner is, a safe way above it; a person guides it down by hand and sees how far off it is. The station itself

@@ -1,4 +1,4 @@
-"""From a rough idea of the cell to a plan: candidates, one arm branch, the best 25, a short safe order."""
+"""Plan from a rough idea of the cell: candidates, one arm branch, the best 25, a short safe order."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ _KEYHOLE = 10
 def explain_shortage(
     scene: Scene, wanted: int, group: CandidateSet, found: CandidateSet, start: Array | None
 ) -> LimitError:
-    """Why there is no plan: `group` is what is usable, `found` all that passes pose by pose."""
+    """Say why there is no plan: `group` is what is usable, `found` all that passes pose by pose."""
     counts = {"possible": len(group), "wanted": wanted}
     if looks_back(scene, found):
         angle_deg = float(np.rad2deg(np.arccos(np.clip(scene.X[2, 2], -1.0, 1.0))))
@@ -116,7 +116,7 @@ def _remedy(limit: str) -> str:
 
 
 def looks_back(scene: Scene, found: CandidateSet) -> bool:
-    """Whether the guessed camera looks back at the arm, which hides the board from nearly everywhere."""
+    """Tell whether the guessed camera looks back at the arm, which hides the board from nearly everywhere."""
     backwards = scene.mount == "eye-in-hand" and scene.X[2, 2] < _BACKWARDS
     return bool(backwards and found.alone[ARM_IN_SIGHT] > _KEYHOLE * len(found))
 

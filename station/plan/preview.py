@@ -121,7 +121,7 @@ def _draw_error(axes: Axes, plan: Plan) -> None:
 
 
 def expected_pixels(scene: Scene, plan: Plan) -> Array:
-    """Where every board point is expected in every image, (n, k, 2) pixels; NaN behind the camera."""
+    """Predict every board point in every image, (n, k, 2) pixels; NaN behind the camera."""
     points = board_points(scene.board)
     seen = scene.seen(flange_poses(scene, plan), points)
     pixels = project(scene.camera, np.maximum(seen.reshape(-1, 3), [-np.inf, -np.inf, 1e-3])).pixels

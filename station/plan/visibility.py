@@ -24,7 +24,7 @@ _ON_THE_WAY = 7
 
 @dataclass(frozen=True)
 class ViewRange:
-    """From where the board may be looked at."""
+    """Range of places from which the board may be looked at."""
 
     distance_m: tuple[float, float] = (0.38, 0.60)
     tilt_rad: tuple[float, float] = (0.0, 0.70)

@@ -239,7 +239,7 @@ class Client:
         self._fresh.set()
 
     def _gone_error(self) -> DaemonGoneError:
-        """While it was asked: it may have done what it was asked for, and then have gone."""
+        """Make the error of a daemon that was lost while asked: it may have done what it was asked for."""
         return DaemonGoneError(
             f"The station daemon at {self._path} is gone and did not answer: whether it heard this is not "
             "known.",

@@ -66,7 +66,7 @@ def create_page(path: Path, page: Page) -> int:
 
 
 def write_page(descriptor: int, page: Page) -> None:
-    """In one call; a disk that is full or stuck may refuse it or take long. Raises OSError."""
+    """Write the page in one call; a disk that is full or stuck may refuse it or take long. Raises OSError."""
     os.pwrite(descriptor, packed(page), 0)
 
 
@@ -92,7 +92,7 @@ def read_page(descriptor: int) -> Page | None:
 
 
 class Outcome(Enum):
-    """What became of a STOP."""
+    """Result of a STOP."""
 
     RESTS = "stopped, the arm rests; latched: look at the cell, then `station acknowledge`"
     MOVES = "STOP was heard, but the arm still moves. Press the emergency stop."

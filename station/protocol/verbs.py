@@ -54,7 +54,7 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def refusal(cls, state: S) -> RefusedError | None:
-        """Why it is not possible in this state; None where it is."""
+        """Say why it is not possible in this state; None where it is."""
         if state in cls.states:
             return None
         why, remedy = _NOT_NOW.get(state, (f"the session is {state.value}", "Pause or stop it first."))
@@ -82,7 +82,7 @@ _NOT_NOW: dict[S, tuple[str, str]] = {
 
 
 class Done(msgspec.Struct, frozen=True):
-    """It is done, and there is nothing to tell."""
+    """Reply of a verb that has nothing to tell."""
 
 
 class Welcome(msgspec.Struct, frozen=True):
@@ -202,7 +202,7 @@ class MakePlan(Verb[PlanFacts], frozen=True):
     seed: int = 0
     lens_known: bool = False
     aim: Literal["camera", "arm", "both"] = "camera"
-    """What the poses are to tell best: where the camera is, the arm's table too, or all there is."""
+    """Aim of the poses: where the camera is, the arm's table too, or all there is."""
 
 
 class Prepare(Verb[MotionPreview], frozen=True):
@@ -237,9 +237,9 @@ class StopTest(Verb[StopTestOffer], frozen=True):
     way: StopWay
     joint: Annotated[int, msgspec.Meta(ge=0, le=5)] = 0
     speed_m_s: Annotated[float, msgspec.Meta(gt=0, le=0.25)] = 0.05
-    """Of the fastest modelled point."""
+    """Speed of the fastest modelled point."""
     duration_s: Annotated[float, msgspec.Meta(ge=1, le=12)] = 3.0
-    """Of the whole move, as far as its path is free."""
+    """Duration of the whole move, as far as its path is free."""
     forward: bool = True
     """The direction that is tried first."""
 

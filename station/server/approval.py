@@ -1,4 +1,4 @@
-"""Who may approve motion: decided by the daemon from the kernel's word and its configuration.
+"""Permission to approve motion: decided by the daemon from the kernel's word and its configuration.
 
 What a client says of itself counts for nothing here. A person counts as present when the client is in the
 foreground of a terminal that its user owns; what that proves and what it does not: docs/operator/safety.md.

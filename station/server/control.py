@@ -48,7 +48,7 @@ NEW_PER_S = 200
 
 @dataclass(frozen=True)
 class Peer:
-    """Who is at the other end, by the kernel's word."""
+    """Process at the other end, by the kernel's word."""
 
     client_id: int
     pid: int
@@ -157,7 +157,7 @@ class ControlServer:
         loop.call_later(ACCEPT_PAUSE_S, self._listen)
 
     def _full_for(self, uid: int) -> RefusedError | None:
-        """Why this user is not let in now; None: there is room."""
+        """Say why this user is not let in now; None: there is room."""
         if len(self._serving) >= CLIENT_LIMIT:
             return _full(f"{CLIENT_LIMIT} clients are connected already", CLIENT_LIMIT)
         if list(self._serving.values()).count(uid) >= USER_CLIENT_LIMIT:

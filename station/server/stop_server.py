@@ -38,7 +38,7 @@ _ANCILLARY_BYTES = socket.CMSG_SPACE(_CREDENTIALS.size)
 
 @dataclass(frozen=True)
 class Sender:
-    """Who sent a STOP, by the kernel's word."""
+    """Sender of a STOP, by the kernel's word."""
 
     pid: int
     uid: int

@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 
 class PoseFailedError(StationError):
-    """This pose gave nothing usable; the session goes on."""
+    """Pose that gave nothing usable; the session goes on."""
 
     code = "pose-failed"
 
@@ -72,7 +72,7 @@ def _phase(context: SessionContext, index: int, state: StationState, pose_state:
 
 
 async def take_image(context: SessionContext, index: int | None = None) -> Image:
-    """For a pose, or for none. PoseFailedError once the configured retries are used up."""
+    """Take an image for a pose, or for none. PoseFailedError once the configured retries are used up."""
     tries = 1 + context.cell.config.capture.retries
     camera = context.cell.camera
     for number in range(1, tries + 1):
@@ -200,7 +200,7 @@ async def _sighting(context: SessionContext, image: Image, index: int) -> BoardD
 
 
 def _unusable(sighting: BoardDetection) -> PoseFailedError | None:
-    """Why an image does not count; None when it does."""
+    """Say why an image does not count; None when it does."""
     status = sighting.status
     if not status.found:
         return PoseFailedError(status.reason or "No board in the image.", code="no-board")

@@ -24,7 +24,7 @@ NOT_ACCEPTED_REMEDY = "run `station accept`; until then: low speed slider, a han
 
 
 async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[Check]:
-    """In the order in which a person would go through them."""
+    """List the checks in the order in which a person would go through them."""
     return [
         *await _robot_checks(context, troubles),
         await _camera_check(context, troubles),
@@ -115,7 +115,7 @@ async def _wire_checks(context: SessionContext) -> list[Check]:
 
 
 def _listed(name: str, none: str, cameras: list[tuple[str, str]]) -> Check:
-    """What each camera is, and what to do about it or ""."""
+    """List each camera that was found, and what to do about it or ""."""
     problem = "; ".join(problem for _, problem in cameras if problem)
     text = "; ".join(line for line, _ in cameras)
     return Check(name, "warning" if problem else "ok" if text else "skipped", text or none, problem)
@@ -162,7 +162,7 @@ def _board_check(context: SessionContext) -> Check:
 
 
 def _calibration_check(context: SessionContext) -> Check:
-    """Whether what is installed holds, and is of this robot and this camera."""
+    """Check whether what is installed holds, and is of this robot and this camera."""
     cell = context.cell
     try:
         found = load_installed(

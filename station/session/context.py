@@ -55,7 +55,7 @@ class SessionContext:
 
     @property
     def resting(self) -> StationState:
-        """Where the station stands between two motions: `paused` always has a session to continue."""
+        """Return the state between two motions: `paused` always has a session to continue."""
         return StationState.IDLE if self.recording is None else StationState.PAUSED
 
     def loaded(self) -> PoseQueue:

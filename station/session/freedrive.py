@@ -73,7 +73,7 @@ class FreedriveCapture:
         context.queue = queue
 
     def end(self) -> None:
-        """To paused; the recording stays open."""
+        """End freedrive: to paused; the recording stays open."""
         self._end_watch()
         if self._context.store.state is StationState.FREE_DRIVE:
             self._context.store.enter(
@@ -141,7 +141,7 @@ class FreedriveCapture:
             self._context.store.problem(error, "error", index)
 
     async def _watch(self) -> None:
-        """For as long as freedrive lasts."""
+        """Watch for as long as freedrive lasts."""
         while self._context.store.state not in (StationState.PAUSED, StationState.IDLE):
             await asyncio.sleep(WATCH_PERIOD_S)
             if self._context.store.state is not StationState.FREE_DRIVE:

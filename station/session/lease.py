@@ -1,4 +1,4 @@
-"""Who has control, and the one-use approval to move. Both end the moment anything is in doubt."""
+"""Control, and the one-use approval to move. Both end the moment anything is in doubt."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class MotionApproval:
 
     @property
     def beside_plan(self) -> bool:
-        """It drives to no pose of the plan and records nothing."""
+        """Tell whether it drives to no pose of the plan and records nothing."""
         return self.hover is not None or self.stop_test is not None
 
     @property
@@ -123,7 +123,7 @@ class ApprovalManager:
         replanned: PlanRevision | None = None,
         stop_test: StopTestMove | None = None,
     ) -> MotionApproval:
-        """From where the summary begins. An older one is void."""
+        """Offer a motion from where the summary begins. An older one is void."""
         start = summary.start_joints_rad
         assert start is not None
         expires_s = self._clock() + APPROVAL_LIFETIME_S

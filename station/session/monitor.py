@@ -67,7 +67,7 @@ class Monitor:
         context.cell.robot.subscribe(self._count)
 
     def _count(self, state: RobotState) -> None:
-        """From the reader's thread: one addition."""
+        """Count from the reader's thread: one addition."""
         self._states_seen += 1
 
     def refresh(self, lag_ms: float) -> None:
@@ -213,7 +213,7 @@ def _wall_ahead_ns() -> int:
 
 
 def _free_bytes(root: Path) -> int | None:
-    """In steps of 100 MB, the last 1 GB in steps of 1 MB; None where the disk is gone."""
+    """Measure free space in steps of 100 MB, the last 1 GB in steps of 1 MB; None where the disk is gone."""
     try:
         free = shutil.disk_usage(root).free
     except OSError:

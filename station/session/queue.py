@@ -50,7 +50,7 @@ class PoseQueue:
 
     @property
     def plan(self) -> Plan:
-        """With every change that was made since it was loaded."""
+        """Return the plan with every change that was made since it was loaded."""
         return msgspec.structs.replace(self._plan, poses=tuple(self._poses.values()))
 
     @property

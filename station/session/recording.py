@@ -220,7 +220,7 @@ class SessionRecording:
         return CameraModel(width=rough.width if rough else 0, height=rough.height if rough else 0)
 
     def robot_state(self, state: RobotState) -> None:
-        """From the reader's thread."""
+        """Record a state, from the reader's thread."""
         if (recorder := self.recorder) is not None:
             recorder.robot_state(state)
 
@@ -343,7 +343,7 @@ class Logbook(logging.Handler):
         self._recording = recording
 
     def emit(self, record: logging.LogRecord) -> None:
-        """From any thread; never raises, a log must not harm what it describes."""
+        """Record a log line from any thread; never raises, a log must not harm what it describes."""
         recording = self._recording()
         recorder = recording.recorder if recording is not None else None
         if recorder is None or record.name == "station.events":

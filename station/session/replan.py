@@ -217,7 +217,7 @@ class Estimator:
                     recording.show_frames(estimate.camera_pose, estimate.board_pose, stamps_now())
 
     async def _estimate(self, camera: CameraModel) -> EstimateStatus:
-        """With advice on the next pose, where one more would help."""
+        """Estimate with advice on the next pose, where one more would help."""
         context, config = self._context, self._context.cell.config
         seen = list(context.seen.values())
         estimate = await context.workers.call(

@@ -58,7 +58,7 @@ class Run:
         self._tried_again = False
 
     async def drive(self) -> None:
-        """From checking to paused, stopped, fault or idle; raises only when cancelled."""
+        """Drive from checking to paused, stopped, fault or idle; raises only when cancelled."""
         try:
             if await self._begin():
                 await self._poses()
@@ -180,7 +180,7 @@ class Run:
             context.show_poses(index)
 
     async def _move_to(self, index: int) -> None:
-        """From where the arm really is. LimitError when that path is not free."""
+        """Move from where the arm really is. LimitError when that path is not free."""
         context = self._context
         robot, queue = context.cell.robot, context.require_queue()
         await RestingCheck(robot.check).news()
@@ -212,7 +212,7 @@ class Run:
         self._context.store.update_session(elapsed_s=elapsed_s, remaining_s=round(remaining_s, 1))
 
     async def _rest(self) -> None:
-        """Where the session stands when its approval is used up."""
+        """Enter the state in which the session stands when its approval is used up."""
         context = self._context
         queue = context.require_queue()
         await context.cell.robot.end_control()  # before finishing: heartbeats end with the run

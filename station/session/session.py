@@ -102,7 +102,7 @@ class Session:
         self._tasks = [asyncio.create_task(loop) for loop in loops]
 
     async def close(self) -> None:
-        """In this order: the arm stands, the recording is finished, devices and worker end."""
+        """End in this order: the arm stands, the recording is finished, devices and worker end."""
         context = self.context
         self.approvals.void()
         if self.store.state in RUNNING:
@@ -209,7 +209,7 @@ class Session:
         return self.approvals.voids
 
     def _show_offer(self, summary: MotionPreview) -> None:
-        """To every watcher, without the token that is for the one who asked."""
+        """Show the offer to every watcher, without the token that is for the one who asked."""
         self.store.update(go=msgspec.structs.replace(summary, token=""))
 
     def _require_unchanged(self, client_id: int, voids: int) -> None:

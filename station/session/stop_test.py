@@ -180,7 +180,7 @@ class StopTestRun(Run):
             context.store.enter(StationState.IDLE, said, STOP_TESTED)
 
     async def _give_stop(self, driving: asyncio.Task[None]) -> None:
-        """In the middle of the move, and told to the microsecond. RobotError where a way is not there."""
+        """Give the stop in mid-move, timed to the microsecond. RobotError where a way is not there."""
         robot, test = self._context.cell.robot, self._test
         start, target = (np.array(q) for q in (self._go.start_joints_rad, test.target_rad))
         way = test.way

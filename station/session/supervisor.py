@@ -53,7 +53,7 @@ class SessionSupervisor:
         """Delay of each round."""
 
     async def run(self) -> None:
-        """For the daemon's life."""
+        """Run for the daemon's life."""
         due_s, number = time.monotonic(), 0
         while True:
             now_s = time.monotonic()

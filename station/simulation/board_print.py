@@ -39,7 +39,7 @@ class BoardPrint:
 
 
 class _Ink:
-    """Where the print is black."""
+    """Print of a board, by where it is black."""
 
     def black(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
         raise NotImplementedError

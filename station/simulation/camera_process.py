@@ -95,7 +95,7 @@ class CameraFaults:
             raise ValueError(f"no camera fault '{name}'; there are {known}")
 
     def take(self, name: str) -> bool:
-        """Whether this fault is due now; uses it up."""
+        """Tell whether this fault is due now; uses it up."""
         due = self._armed[name] > 0
         self._armed[name] -= due
         return due
@@ -207,7 +207,7 @@ class CameraProcess:
         return inverse(self._mount) @ base_from_flange @ self._place
 
     def _flange_at(self, host_monotonic_ns: int) -> Array:
-        """Where the flange truly is then: the controller's admin port waits for times to come."""
+        """Ask where the flange truly is then: the controller's admin port waits for times to come."""
         try:
             if self._admin is None:
                 self._admin = AdminClient(self._host)

@@ -184,7 +184,7 @@ def rendered_source(camera: CameraProcess) -> Source:
 
 
 class NumberedSource:
-    """For throughput: frame n is `numbered_picture(n)`, at next to no cost. `clock`: the device's, ns."""
+    """Source for throughput: frame n is `numbered_picture(n)`, nearly free. `clock`: the device's, ns."""
 
     def __init__(self, clock: Callable[[], int], still: NDArray[np.uint8] | None = None) -> None:
         self.next_number = 0

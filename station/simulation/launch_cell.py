@@ -41,7 +41,7 @@ class SimulationOptions:
     """With `gige`: free-running at this rate. Drawing takes longer than a frame, so its images are numbered
     ones of the board as the camera sees it from where the arm starts."""
     control: ControlPath | None = None
-    """What drives the arm; None = what is installed."""
+    """Driver of the arm; None = what is installed."""
     robot: str = "UR10"
     """Another arm at the same place; its own start shows the board for seed 0."""
     free_space_bytes: int = 200_000_000

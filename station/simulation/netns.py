@@ -18,7 +18,7 @@ _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
 
 
 def is_isolated() -> bool:
-    """Whether this process sees no network interface but `lo`, and that is up."""
+    """Tell whether this process sees no network interface but `lo`, and that is up."""
     return [name for _, name in socket.if_nameindex()] == ["lo"] and bool(_lo_flags() & _IFF_UP)
 
 

@@ -1,4 +1,4 @@
-"""Where camera, board and arm of a simulated cell stand, so that the arm can show the board in many ways.
+"""Places of camera, board and arm of a simulated cell, so that the arm can show the board in many ways.
 
 A place counts when enough of the planner's own candidate poses are reachable and free from there.
 """
@@ -152,7 +152,7 @@ def _comfortable_start(scene: Scene, base_from_flange: Array, rng: np.random.Gen
 
 
 def _sees(scene: Scene, joints_rad: Array) -> bool:
-    """Whether no part of the arm is between the camera and the board's corners."""
+    """Tell whether no part of the arm is between the camera and the board's corners."""
     flange = forward(MODELS[ROBOT], joints_rad)
     in_hand = scene.mount == "eye-in-hand"
     base_from_board = scene.Y if in_hand else flange @ scene.Y
@@ -166,7 +166,7 @@ def _sees(scene: Scene, joints_rad: Array) -> bool:
 
 
 def _roomy(scene: Scene, start: Array, rng: np.random.Generator) -> bool:
-    """Whether enough varied views are reachable without changing the arm branch."""
+    """Tell whether enough varied views are reachable without changing the arm branch."""
     found = find_candidates(scene, replace(view_range(scene), doubt=0.0), _TRIED_VIEWS, rng, start)
     if len(found) == 0:
         return False

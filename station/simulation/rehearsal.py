@@ -31,7 +31,7 @@ REPEATABILITY_M, REPEATABILITY_RAD = 1e-4, 1.7e-4
 _WITHIN = 1.5
 """Sigmas of a guess that the simulated cell is at most away from it."""
 _FOCAL_SHARE, _K1 = 0.02, -0.05
-"""How a lens that is roughly known may differ: focal length either way, radial distortion."""
+"""Deviations of a lens that is roughly known: focal length either way, radial distortion."""
 _NORMAL_EXPOSURE_US = 10_000.0
 
 

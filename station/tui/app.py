@@ -172,7 +172,7 @@ class StationApp(ResultsDesk):
         dress(self)
 
     def get_theme_variable_defaults(self) -> dict[str, str]:
-        """For the themes that Textual brings."""
+        """Return defaults for the themes that Textual brings."""
         return TOKENS
 
     def on_mount(self) -> None:
@@ -250,7 +250,7 @@ class StationApp(ResultsDesk):
         self._show()
 
     def _show(self) -> None:
-        """On every screen and question that stands over another."""
+        """Show the status on every screen and question that stands over another."""
         known = self.known()
         for screen in self.screen_stack:
             # Closing, the app takes the screens' parts away before its workers end.
@@ -301,7 +301,7 @@ class StationApp(ResultsDesk):
 
     @work(exit_on_error=False)
     async def learn_cell(self) -> None:
-        """What the scenes are drawn from; an older daemon does not tell."""
+        """Learn the cell that the scenes are drawn from; an older daemon does not tell."""
         if self.link is not None:
             with contextlib.suppress(OSError, StationError):
                 self.configuration = await self.link.call(Configuration())

@@ -31,7 +31,7 @@ NOT_READY = "This list looks again every few seconds."
 
 
 def checklist_text(checks: list[Check], width: int) -> Content:
-    """What is missing first; the remedy stands below it."""
+    """Draw the checklist: what is missing first, its remedy below it."""
 
     def hanging(text: str, indent: int) -> str:
         return f"\n{' ' * indent}".join(textwrap.wrap(text, max(20, width - indent)))

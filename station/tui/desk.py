@@ -76,7 +76,7 @@ class Desk(App[None]):
     graphics: Graphics | None = None
     """The terminal's own graphics; None: half blocks only."""
     configuration: StationConfig | None = None
-    """Of the cell; None until the daemon told it."""
+    """Facts of the cell; None until the daemon told them."""
     _own_id: int | None = None
     """The daemon's number of this connection, once it had control."""
     _newest: StationStatus | None = None
@@ -106,7 +106,7 @@ class Desk(App[None]):
         return Known(self.status, silent_s=self.silent_s, busy=self.busy, trouble=self.trouble)
 
     def newest(self) -> Known:
-        """With the newest status there ever was; it outlives the daemon."""
+        """Return what is known, with the newest status there ever was; it outlives the daemon."""
         return replace(self.known(), status=self._newest)
 
     def common_actions(self) -> list[str]:
@@ -183,7 +183,7 @@ class Desk(App[None]):
         await self.ask(verb)
 
     def has_control(self) -> bool:
-        """This screen has control, and no other."""
+        """Tell whether this screen has control."""
         holder = None if self.status is None else self.status.lease.client_id
         return holder is not None and holder == self._own_id
 

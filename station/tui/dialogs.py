@@ -241,7 +241,7 @@ class JobScreen(Question[int]):
         self.call_after_refresh(self.run_job)  # the width of its lines is known then
 
     def _say_how_long(self) -> None:
-        """It may say nothing for a while; the seconds tell that it works."""
+        """Count the seconds: they tell that it works while it says nothing."""
         if self._exit_code is None:
             spent = duration(time.monotonic() - self._begun_s)
             self.query_one("#job-title", Label).update(f"{spent} {self._title} …")

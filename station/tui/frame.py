@@ -25,7 +25,7 @@ R = TypeVar("R")
 STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
 STOP_NARROW = "STOP F12", "STOPPED"
 DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
-"""What drives the arm."""
+"""Driver of the arm."""
 RAIL_WIDE = 96
 """Cells from which on a step has a second line of its own."""
 GO_TO = (("1-6", "step"), ("7", "sessions"), ("8", "log"))
@@ -101,12 +101,12 @@ class Frame(Horizontal):
 
 
 def bar_line(known: Known, title: str, width: int) -> Content:
-    """Where one is, state, robot, speed and safety; what is less important gives way first."""
+    """Draw screen, state, robot, speed and safety; what is less important gives way first."""
     return fitting(list(_bar_parts(known, title)), width)
 
 
 def fitting(parts: list[Content], width: int) -> Content:
-    """As many parts as fit, most important first; two always."""
+    """Keep as many parts as fit, most important first; two always."""
     for count in range(len(parts), 1, -1):
         line = Content("").join(parts[:count])
         if line.cell_length <= width:
@@ -240,7 +240,7 @@ def _pairs(bindings: list[Binding], display: Callable[[Binding], str]) -> list[t
 
 
 def keys_line(groups: list[tuple[str, list[tuple[str, str]]]], width: int) -> Content:
-    """As full as the width allows: first the groups' names go, then where to go becomes short, then words."""
+    """Draw the keys that fit: first the groups' names go, then where to go becomes short, then words."""
     groups = [group for group in groups if group[1]]
     short = [(name, [("1-8", "go to")] if name == "go to" else pairs) for name, pairs in groups]
     short[-1] = ("", [("F1", "help")])
@@ -266,7 +266,7 @@ class Knowing(Protocol):
     def known(self) -> Known: ...
 
     def newest(self) -> Known:
-        """With the newest status there ever was; it outlives the daemon."""
+        """Return what is known, with the newest status there ever was; it outlives the daemon."""
 
     def common_actions(self) -> list[str]: ...
 

@@ -186,7 +186,7 @@ class Result:
 
 
 def read_result(path: str) -> Result:
-    """For a thread. What cannot be read is said in `problem`."""
+    """Read the result, for a thread. What cannot be read is said in `problem`."""
     try:
         root = state_root(path)
         calibration = read_calibration(Path(path))

@@ -74,7 +74,7 @@ class Panel(Static):
         self.border_title = f"{self._title}: OLD" if old else self._title
 
     def show(self, known: Known) -> None:
-        """What was known last stands there while there is no status, marked old."""
+        """Show the status; without one the last one known, marked old."""
         self.old = bool(known.trouble) or known.silent_s is not None
         if known.status is None or not self.display:
             return
@@ -160,7 +160,7 @@ def counted_line(session: SessionStatus) -> Content:
 
 
 def progress_lines(known: Known, width: int, height: int) -> Content:
-    """How many are saved, the steps of this pose, a chip a pose."""
+    """Draw how many are saved, the steps of this pose, a chip a pose."""
     status = known.status or StationStatus()
     session, pose = status.session, _under_way(status)
     saved = sum(pose.counts for pose in session.poses)

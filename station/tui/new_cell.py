@@ -42,7 +42,7 @@ from station.tui.widgets.graphics import Graphics
 from station.tui.widgets.preview import PreviewPane
 
 Ending = Literal["", "serve", "rehearse"]
-"""What a person wants next: nothing, the cell itself, or its rehearsal."""
+"""Next wish of the person: nothing, the cell itself, or its rehearsal."""
 ARM_PERIOD_S, CAMERA_PERIOD_S, LOOK_S = 0.1, 0.15, 1.0
 SHOWN_WIDTH_PX = 640
 NO_CAMERA = "No camera answers. Check its power, cable and network; this list looks again every few seconds."
@@ -50,7 +50,7 @@ AXIS = Style(color="black", bgcolor="bright_yellow", bold=True)
 
 
 class BoardPicture(PreviewPane):
-    """What the camera sees, the board's corners, and its origin and axes in letters."""
+    """Live picture, the board's corners, and its origin and axes in letters."""
 
     axes: tuple[tuple[str, float, float], ...] = ()
     """Letter, x and y as shares of the image."""
@@ -115,7 +115,7 @@ class NewCell(App[Ending]):
         dress(self)
 
     def get_theme_variable_defaults(self) -> dict[str, str]:
-        """For the themes that Textual brings."""
+        """Return defaults for the themes that Textual brings."""
         return TOKENS
 
     def compose(self) -> ComposeResult:

@@ -44,7 +44,7 @@ class StepPage:
 
     @property
     def typed(self) -> str:
-        """What stands in the line to type in at first."""
+        """Return the text that the input line begins with."""
         return ""
 
     @property
@@ -56,7 +56,7 @@ class StepPage:
         return []
 
     async def accept(self, typed: str) -> bool:
-        """Whether the step is done. Raises CodedError, OSError."""
+        """Take the answer; tell whether the step is done. Raises CodedError, OSError."""
         raise NotImplementedError
 
 

@@ -36,7 +36,7 @@ SIGMA_SHOWN_MM = 100.0
 BAR_CELLS = 7
 TURN_DEG, ZOOM = 15.0, 1.25
 _SEEN = re.compile(r"^\d+ mm, tilt \d+°, |board ")
-"""What the columns beside it say of the planned pose."""
+"""Part of the reason that the columns beside it say already."""
 _STATES: dict[str, tuple[Mark, str]] = {
     "planned": ("todo", "planned"),
     "done": ("done", "saved"),

@@ -98,7 +98,7 @@ class ReplayLink:
         """Do nothing: a recording is never outdated."""
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
-        """Until the end, which stays on the screen."""
+        """Yield statuses until the end, which stays on the screen."""
         seen_s = time.monotonic()
         while not self._closed:
             now_s = time.monotonic()

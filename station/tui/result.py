@@ -87,7 +87,7 @@ def _accuracy(calibration: Calibration) -> str:
 
 
 def _against(result: Result, calibration: Calibration) -> list[str]:
-    """What speaks against it, or who installed it all the same."""
+    """Say what speaks against it, or who installed it all the same."""
     if result.installed and result.state.now is not None and (taken := result.state.now.override) is not None:
         return [f"Override by {taken.who}: “{taken.reason}”"]
     end = after_solve(calibration, () if result.installed else result.objections)
@@ -135,7 +135,7 @@ def proof_card(calibration: Calibration) -> Content:
 
 
 def change_card(result: Result) -> Content:
-    """What installing would change."""
+    """Draw what installing would change."""
     calibration, installed = result.calibration, result.state.now
     if calibration is None:
         return Content()
@@ -203,7 +203,7 @@ def residual_lines(calibration: Calibration, width: int, height: int) -> Content
 
 
 class ResultScreen(StationScreen):
-    """What the three have in common: the verdict on top, and what may be done with a calibration."""
+    """Common base of the three: the verdict on top, and what may be done with a calibration."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("i", "install", "Install", tooltip="Make this the cell's calibration; b undoes it"),
@@ -337,7 +337,7 @@ class SolveScreen(ResultScreen):
 
 
 class VerifyScreen(ResultScreen):
-    """What proves it apart from the images it was made of: the touch test, and drift checks over time."""
+    """Proofs apart from the images it was made of: the touch test, and drift checks over time."""
 
     MODE, NAME = "verify", "Verify"
     HELP = "h starts the touch test: a tip over corners of the board, by hand. d on 7 captures a drift check."
@@ -450,7 +450,7 @@ def _span(days: float) -> str:
 
 
 class InstallScreen(ResultScreen):
-    """This one beside the installed one, what speaks against it, and every version before."""
+    """Comparison with the installed one, what speaks against this one, and every version before."""
 
     MODE, NAME = "install", "Install"
     HELP = "i installs the shown calibration, b goes back to the one before; e writes it for other programs."

@@ -40,7 +40,7 @@ class ResultsDesk(Desk):
     """The calibration file that the result screen shows; empty: that of the session just captured."""
 
     result: reactive[Result | None] = reactive(None, repaint=False)
-    """What the screens say of that file; None: there is none."""
+    """Facts of that file for the screens; None: there is none."""
     looked: reactive[int] = reactive(0, repaint=False)
     """Counts the times that anything below the root was found changed."""
     checks: tuple[Check, ...] = ()

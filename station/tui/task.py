@@ -41,7 +41,7 @@ class Action:
     """A person should look first."""
 
     def on(self, mode: str) -> Action:
-        """With the key that leads there, on any other screen."""
+        """Add the key that leads there, on any other screen."""
         if not self.at or self.at == mode:
             return self
         return Action(DIGITS[self.at], self.label, f"then {self.key}. {self.why}", look=self.look)
@@ -54,7 +54,7 @@ class Known:
     status: StationStatus | None = None
     checks: Sequence[Check] = ()
     result: Result | None = None
-    """What the session gave, or what was picked; None: nothing is solved."""
+    """Result of the session, or the picked one; None: nothing is solved."""
     silent_s: float | None = None
     busy: str = ""
     trouble: str = ""
@@ -177,7 +177,7 @@ def next_action(known: Known) -> Action:
 
 
 def _by_state(known: Known, status: StationStatus) -> Action | None:
-    """Where the arm works or is held; None at rest."""
+    """Choose the action where the arm works or is held; None at rest."""
     state, held = status.state, status.robot.held
     if state in LATCHED:
         why = " ".join(words for words in ("Look at the cell first; nothing moves.", status.reason) if words)

@@ -195,7 +195,7 @@ def few_signs() -> bool:
 
 
 class NoColour(LineFilter):
-    """For NO_COLOR: what had a background of its own is reversed, so that chips and STOP stay to be seen."""
+    """Filter for NO_COLOR: what had a background of its own is reversed, so that chips and STOP show."""
 
     def apply(self, segments: list[Segment], background: Color) -> list[Segment]:
         return [

@@ -77,7 +77,7 @@ class ChooseCorner(Question[int | None]):
 
 
 class Touching(Question[Touch | None]):
-    """From the start of the motion to what the hand found. None: nothing was."""
+    """Question from the start of the motion to what the hand found. None: nothing was."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "leave", "Leave out", tooltip="Leave this corner out")

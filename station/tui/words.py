@@ -42,7 +42,7 @@ BAR, TRACK, LIMIT = "━", "─", "┃"
 
 
 def shortened(text: str, cells: int, parts: bool = False) -> str:
-    """As many whole words as fit, then `…`; `parts`: as many parts between commas, without a sign."""
+    """Keep as many whole words as fit, then `…`; `parts`: as many parts between commas, without a sign."""
     while parts and len(text) > cells and ", " in text:
         text = text.rpartition(", ")[0]
     if len(text) <= cells:
@@ -89,7 +89,7 @@ def rich_text(content: Content, variables: dict[str, str]) -> Text:
 
 
 def signed(value: float, digits: int = 2) -> str:
-    """With its sign always, and a minus as wide as a plus."""
+    """Write a number with its sign always, and a minus as wide as a plus."""
     return f"{value:+.{digits}f}".replace("-", "−")
 
 

@@ -24,7 +24,7 @@ OPTICAL_FROM_OPENGL: Array = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class ExportError(CalibrationError):
-    """This calibration cannot be written in that format, or there is no such format."""
+    """Calibration that a format cannot hold, or no such format."""
 
     code = "export-format"
     exit_code = 2
@@ -43,7 +43,7 @@ class FrameNames:
     camera: str = "camera_optical_frame"
     body: str = "camera_link"
     validity: Validity | None = None
-    """Of the installed calibration, for the file's comment; None: of a file that may never be installed."""
+    """Validity of the installed calibration, for the comment; None: of a file that may never be installed."""
     follow: tuple[str, ...] = ()
     """Command that prints every change of the installed calibration; empty: of a file."""
 

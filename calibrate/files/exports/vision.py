@@ -133,7 +133,7 @@ def _radial_tangential(camera: CameraModel) -> tuple[CameraModel, float]:
 
 
 def zivid(calibration: Calibration, frames: FrameNames) -> str:
-    """What `zivid.Matrix4x4(path)` reads: millimetres, the camera's pose in the robot's frame."""
+    """Write for `zivid.Matrix4x4(path)`: millimetres, the camera's pose in the robot's frame."""
     matrix = calibration.transform.matrix.copy()
     matrix[:3, 3] *= 1000
     plain = {"__version__": {"serializer": 1, "data": 1}, "FloatMatrix": {"Data": matrix.tolist()}}
@@ -141,7 +141,7 @@ def zivid(calibration: Calibration, frames: FrameNames) -> str:
 
 
 def halcon(calibration: Calibration, frames: FrameNames) -> str:
-    """What `read_pose` reads, as calibrate_hand_eye gives it: tool_in_cam_pose or base_in_cam_pose.
+    """Write for `read_pose`, as calibrate_hand_eye gives it: tool_in_cam_pose or base_in_cam_pose.
 
     Metres and degrees; representation 2 is 'Rp+T', 'abg', 'point': R = Rz Ry Rx.
     """

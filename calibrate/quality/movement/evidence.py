@@ -17,14 +17,14 @@ from calibrate.quality.movement.pictures import DEAD_BAND_M, DEAD_BAND_RAD
 from recordings.schema.messages import Mount
 
 ODDS = 1000.0
-"""What moved is named when it is so much likelier than everything else."""
+"""A cause is named when it is this much likelier than everything else."""
 _CAMERA_MOVES = ((0.3e-3, 0.05), (1.5e-3, 0.25))
 _TAG_MOVE = (0.5e-3, 0.1)
 """1σ of a move, metres and degrees per axis: a slip and a knock."""
 
 
 class Moved(StrEnum):
-    """What moved. The pictures cannot tell the members of a group apart."""
+    """Part that moved. The pictures cannot tell the members of a group apart."""
 
     CAMERA = "camera-or-joint-6"
     CAMERA_BASE = "camera-base-or-joint-1"

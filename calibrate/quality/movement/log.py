@@ -1,4 +1,4 @@
-"""What a monitor has seen, on the disk: pictures' corners and poses, so that a restart goes on where it was.
+"""Corners and poses that a monitor has seen, on the disk, so that a restart goes on where it was.
 
     ROOT/calibrations/…/watch.jsonl     one line a picture, behind a line for the tag that is watched
 
@@ -25,7 +25,7 @@ _MOST, _LATEST = 12_000, 3_000
 
 
 class WatchedTag(msgspec.Struct, frozen=True):
-    """What is watched, and by which installed version."""
+    """Tag that is watched, and the installed version that watches."""
 
     version: int
     tag: BoardSpec
@@ -93,7 +93,7 @@ class MonitorLog:
             append_line(self._path, WatchEntry(begun=self._watched))
 
     def knows(self, key: str) -> bool:
-        """Whether this picture was taken in before."""
+        """Tell whether this picture was taken in before."""
         return key in self._known
 
     def add(self, entry: WatchEntry) -> list[MovementEvent]:

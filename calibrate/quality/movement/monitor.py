@@ -41,7 +41,7 @@ _JUDGED_FOR = 20
 _CHANCE = 0.999
 """Quantile of the share of mere noise that a move must exceed."""
 _FEWEST_POSTURES, _LEAST_TURN_RAD = 3, float(np.radians(5.0))
-"""What moved is not named from fewer postures, or turned by less (1σ) about the second axis."""
+"""Fewest postures, and smallest turn (1σ) about the second axis, from which a cause is named."""
 _STARTS = 8
 _FACTORS = (0.25, 0.5, 1.0, 2.0)
 """Sizes of an arm's errors that are tried."""
@@ -49,7 +49,7 @@ Test = RepeatedPostures | FreePostures
 
 
 class EventKind(StrEnum):
-    """What there is to say."""
+    """Kinds of events."""
 
     LEARNED = "learned"
     NOT_FIXED = "not-fixed"

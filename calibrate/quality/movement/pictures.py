@@ -56,7 +56,7 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class CellModel:
-    """What is taken as known of a cell."""
+    """Facts of a cell that are taken as known."""
 
     mount: Mount
     camera: CameraModel

@@ -1,4 +1,4 @@
-"""Which pictures were taken in a posture that the arm was in before."""
+"""Pictures taken in a posture that the arm was in before."""
 
 from __future__ import annotations
 

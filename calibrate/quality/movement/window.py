@@ -1,4 +1,4 @@
-"""What both tests share: shortened outliers, windows of many lengths, and a fast lane for large moves.
+"""Parts that both tests share: shortened outliers, windows of many lengths, and a fast lane for large moves.
 
 A deviation from what the latest pictures showed is shortened to a limit before it counts, so one blurred
 picture cannot raise an alarm. A large move is then shortened too, over and over: the fast lane counts that.
@@ -95,7 +95,7 @@ class WindowTest(ABC, Generic[Entry]):
     """A sequential test of one kind of pictures."""
 
     log_likelihood: float
-    """Of the pictures learned from."""
+    """Log likelihood of the pictures learned from."""
     limit: float
     """Score that is an alarm."""
 

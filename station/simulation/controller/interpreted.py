@@ -62,7 +62,7 @@ class InterpretedProgram:
         """A motion that no thread waits for any more: for whoever moves or stops in the same cycle."""
 
     def _logged(self, name: str, builtin: Builtin) -> Builtin:
-        """With each call in the log, unless it only asks or waits. Motions log themselves."""
+        """Wrap a function with each call in the log, unless it only asks or waits. Motions log themselves."""
         if name.startswith(("get_", "is_")) or name in _QUIET:
             return builtin
 
@@ -299,7 +299,7 @@ class InterpretedProgram:
     def _move(
         self, name: str, goal: Six, make_path: Callable[[Six], Path], a: float, v: float, t: float
     ) -> Wait:
-        """Until the arm rests at the goal. The thread that moves controls the arm as long."""
+        """Move until the arm rests at the goal. The thread that moves controls the arm as long."""
         arm = self._robot.arm
         if not all(map(isfinite, (*goal, a, v, t))) or t < 0 or (t == 0 and (a <= 0 or v <= 0)):
             raise ScriptRuntimeError(f"{name} to {text_of(list(goal))} with a={a}, v={v}, t={t}")
@@ -341,7 +341,7 @@ class InterpretedProgram:
         goal, robot = rigid(pose), self._robot
 
         def way(tool: Rigid) -> tuple[Six, float]:
-            """What is left: a twist that would do it in 1 s, and its length [m]."""
+            """Return what is left: a twist that would do it in 1 s, and its length [m]."""
             move = tuple(goal[i] - tool[i] for i in (3, 7, 11))
             turn = to_rotvec(compose(goal, invert(tool)))
             return (*move, *turn), max(hypot(*move), ROTATION_WEIGHT_M * hypot(*turn))

@@ -1,4 +1,4 @@
-"""Where a motion leads and how fast it goes along it: paths over one parameter, and speed profiles.
+"""Paths of a motion over one parameter, and speed profiles along them.
 
 A path's parameter `s` runs from 0 to `length`: the leading joint's angle [rad] for joint moves, the
 distance [m] (or the angle [rad] of a pure rotation) for straight ones.

@@ -54,7 +54,7 @@ def version_message(robot: SimulatedRobot) -> bytes:
 
 
 def messages(robot: SimulatedRobot, kind: str, details: dict[str, object]) -> bytes:
-    """What the controller says of a program: text, popup, key (title, text) or exception (line, text)."""
+    """Encode a message of a program: text, popup, key (title, text) or exception (line, text)."""
     text = str(details.get("text", "")).encode()
     title = str(details.get("title", "")).encode()[:255]
     titled = bytes([len(title)]) + title + text

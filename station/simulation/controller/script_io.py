@@ -1,4 +1,4 @@
-"""What a script reads and writes outside the arm: registers, inputs and outputs, and TCP sockets."""
+"""Registers, inputs and outputs, and TCP sockets of a script."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from station.simulation.controller.urscript import Builtin, ScriptRuntimeError, 
 
 Wait = Generator[None, None, Value]
 OPEN_S = 2.0
-"""As long a connection may take to open."""
+"""Longest time that a connection may take to open."""
 READ_LIMIT = 1 << 20
 READS_PER_CYCLE = 10
 """Whose data never ends waits a cycle after so many reads: threads share the controller's time."""
@@ -195,7 +195,7 @@ class Sockets:
         return max(1, round(seconds / self._robot.dt_s))
 
     def _fill(self, name: str) -> bytearray:
-        """What has arrived. A connection that the other side ended is gone once all of it was read."""
+        """Read what has arrived. A connection that the other side ended is gone once all of it was read."""
         if name not in self._open:
             return bytearray()
         link, buffer = self._open[name]

@@ -79,7 +79,7 @@ def _to_number(text: Value) -> float:
 
 
 def text_of(value: Value) -> str:
-    """As `textmsg` and `to_str` write it."""
+    """Write a value as `textmsg` and `to_str` do."""
     if isinstance(value, list):
         return ("p" if isinstance(value, Pose) else "") + "[" + ", ".join(map(text_of, value)) + "]"
     return f"{value:g}" if isinstance(value, float) else str(value)

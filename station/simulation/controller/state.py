@@ -97,7 +97,7 @@ class Journal:
         self._entries.append((now_ns, entry))
 
     def count(self, source: str, verb: str) -> None:
-        """For what comes many times a second: counted only."""
+        """Count what comes many times a second."""
         self._counts[f"{source}: {verb}"] += 1
 
     @property
@@ -133,7 +133,7 @@ class ControllerState(ABC):
         """The program that the dashboard loaded."""
         self.user_role, self.operational_mode = "PROGRAMMER", "NONE"
         self.contact_cycles = 0
-        """What `tool_contact` answers: for so many cycles the tool has been touching something."""
+        """Answer of `tool_contact`: for so many cycles the tool has been touching something."""
         self.watchdog_s = 0.0
         """Longest silence of `watched`, an input variable, that is allowed; 0 = none."""
         self.watched = ""

@@ -33,7 +33,7 @@ CALL_DEPTH = 40
 
 
 class ScriptError(Exception):
-    """What the controller does not start, or stops, a program for."""
+    """Error for which the controller refuses or stops a program."""
 
     def __init__(self, text: str, line: int = 0) -> None:
         super().__init__(text)
@@ -152,7 +152,7 @@ class CallFrame:
         variables[name] = type(value)(value) if isinstance(value, list) else value
 
     def inner(self, function: Function) -> CallFrame:
-        """Of a function that is called from here."""
+        """Make the frame of a function that is called from here."""
         if self.depth >= CALL_DEPTH:
             raise ScriptRuntimeError(f"{function.name} is called too deeply")
         around: CallFrame | None = self
@@ -193,7 +193,7 @@ class Call:
     named: Mapping[str, Node]
     line: int
     function: Function | None = None
-    """What it means is found when the whole text was read: a function of the script, or a builtin."""
+    """Call whose meaning is found when the whole text was read: a function of the script, or a builtin."""
     builtin: Builtin | None = None
 
     def resolve(self, builtins: Mapping[str, Builtin]) -> None:
@@ -285,7 +285,7 @@ _ORDER: dict[str, Callable[[float, float], bool]] = {
 
 
 def truth(value: Value) -> bool:
-    """Of a condition; a number other than 0 is true (Universal Robots' own scripts rely on it)."""
+    """Evaluate a condition; a number other than 0 is true (Universal Robots' own scripts rely on it)."""
     if not isinstance(value, bool | int | float):
         raise ScriptRuntimeError(f"{value!r} is no boolean")
     return bool(value)
@@ -298,7 +298,7 @@ def _number(value: Value) -> float:
 
 
 def operate(sign: str, left: Value, right: Value) -> Value:
-    """On two numbers; on lists item by item, a number beside a list counting for each of its items."""
+    """Apply an operator to two numbers, or item by item to lists; a number counts for each item."""
     if sign in ("==", "!="):
         return (left == right) == (sign == "==")
     if sign in _ORDER:

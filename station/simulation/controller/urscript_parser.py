@@ -148,7 +148,7 @@ class _Parser:
         return function
 
     def _block(self, *others: str) -> list[Node]:
-        """From the colon to `end`, or to one of the other words, which stays."""
+        """Parse from the colon to `end`, or to one of the other words, which stays."""
         self._need(":")
         body = self._body("end", *others)
         if not self._is(*others):

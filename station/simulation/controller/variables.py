@@ -52,7 +52,7 @@ class VariableStore:
 
     def __init__(self, variables: dict[str, Variable], e_series: bool, version: tuple[int, ...]) -> None:
         self.types = {n: v.type for n, v in variables.items() if v.known_to(e_series, version)}
-        """What clients of this controller may ask for; the others have values too."""
+        """Variables that clients of this controller may ask for; the others have values too."""
         self._slots: dict[str, slice] = {}
         self.elements: list[float] = []
         for name, variable in variables.items():

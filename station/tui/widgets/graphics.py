@@ -42,7 +42,7 @@ GREYS = 16
 """Time and bytes of a sixel picture grow with its shades: 46 kB for 400×320 in 16, 186 kB in 256."""
 ANSWER_S = 1.0
 _KITTY_ID = 0x5741
-"""Of the one image that kitty holds for this screen: the next one takes its place."""
+"""Number of the one image that kitty holds for this screen: the next one takes its place."""
 _VERSION = re.compile(rb"\x1bP>\|(?:kitty\((\d+)\.(\d+)|ghostty)")
 _KITTY_LETTERS = (0, 28)
 """From this version on kitty shows images in letters."""
@@ -67,7 +67,7 @@ def detect() -> Graphics | None:
 
 
 def _drawn_by(stdin: int, stdout: int) -> tuple[bool, bool]:
-    """Whether it draws sixels, and kitty's images in letters.
+    """Tell whether it draws sixels, and kitty's images in letters.
 
     The first by the terminal's device attributes, which every terminal tells; 4 stands for sixels. The second
     by its name and version, which it tells before that; the others pass over the question.

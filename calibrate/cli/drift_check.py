@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 
 from calibrate.cli.contracts import DriftCheckJson, DriftPowerJson
@@ -24,7 +25,7 @@ from calibrate.quality.checks import CheckEntry, Trend, append_check, earlier_re
 from calibrate.quality.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
 from recordings.files import MAIN_CAMERA, state_root
 from recordings.reader import open_recording
-from recordings.schema.messages import SessionInfo
+from recordings.schema.messages import Mount, SessionInfo, Source
 
 DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
@@ -75,7 +76,7 @@ def drift_check(
         prepared = prepare_views(recording, options, progress, fewest=FEWEST_VIEWS)
     info = prepared.recording.info
     try:
-        require_same_cell(recording, info, calibration)
+        require_same_cell(str(recording), calibration, CellIdentity.of(info))
     except OtherCellError as other:
         if calibration_file is None:
             _doubt_devices(recording, info, root, camera, other)
@@ -166,18 +167,32 @@ def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
     return known or sha256 == provenance.recording_sha256
 
 
-def require_same_cell(recording: Path, info: SessionInfo, calibration: Calibration) -> None:
-    """Raise OtherCellError for a recording of another mounting, source, robot or camera."""
+class CellIdentity(msgspec.Struct, frozen=True):
+    """What pictures say of the cell that they are of."""
+
+    mount: Mount
+    source: Source
+    robot_serial: str
+    camera_serial: str
+
+    @classmethod
+    def of(cls, info: SessionInfo) -> CellIdentity:
+        """Of a recording's."""
+        return cls(info.mount, info.source, info.robot.serial, info.camera_identity.serial)
+
+
+def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) -> None:
+    """Raise OtherCellError for pictures of another mounting, source, robot or camera."""
     simulated = calibration.source == "simulated"
     for name, new, known, same in (
-        ("mounting", info.mount, calibration.mount, info.mount == calibration.mount),
-        ("source", info.source, calibration.source, (info.source == "simulated") == simulated),
-        ("robot", *_serials(info.robot.serial, calibration.robot.serial)),
-        ("camera", *_serials(info.camera_identity.serial, calibration.camera.serial)),
+        ("mounting", seen.mount, calibration.mount, seen.mount == calibration.mount),
+        ("source", seen.source, calibration.source, (seen.source == "simulated") == simulated),
+        ("robot", *_serials(seen.robot_serial, calibration.robot.serial)),
+        ("camera", *_serials(seen.camera_serial, calibration.camera.serial)),
     ):
         if not same:
             raise OtherCellError(
-                f"{recording} has {name} {new}, the calibration {known}: that is no drift.",
+                f"{where} has {name} {new}, the calibration {known}: that is no drift.",
                 remedy="Calibrate the new one.",
                 differs=name,
                 found=str(new),

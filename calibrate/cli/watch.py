@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shlex
 import time
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +20,7 @@ import typer
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import check_board, describe_board
 from calibrate.cli.contracts import WatchEventJson
-from calibrate.cli.drift_check import require_same_cell
+from calibrate.cli.drift_check import CellIdentity, require_same_cell
 from calibrate.cli.files import read_board
 from calibrate.cli.installed import CameraName, Root, named_or_installed
 from calibrate.cli.job import BoardFile, Threads
@@ -28,6 +29,7 @@ from calibrate.errors import InstallError
 from calibrate.files.calibration import Calibration
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
+from calibrate.files.lines import share
 from calibrate.files.loader import current_version, readable_folder
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
 from calibrate.kinematics import MODELS
@@ -42,9 +44,10 @@ from recordings.files import MAIN_CAMERA
 from recordings.images import IMAGE_LIMIT_BYTES, ImageError, decode_image, read_header
 from recordings.importers.dataset import DATASET_FILE, PoseRow, read_dataset, read_poses
 from recordings.reader import open_recording
-from recordings.schema.messages import BoardSpec, Mount
+from recordings.schema.messages import BoardSpec
 
 MOVED = 4
+LOCK = "watch.lock"
 _POLL_S = 2.0
 AsLines = Annotated[bool, typer.Option("--json", help="Print a JSON object for each event, one a line")]
 
@@ -57,14 +60,29 @@ class WatchSourceError(OutputError):
 
 
 @dataclass(frozen=True)
-class _Source:
+class WatchSource:
     """Source of pictures; `entries` can be asked again for what is new."""
 
-    path: Path
-    mount: Mount
     board: BoardSpec
     entries: Callable[[BoardSpec, Callable[[str], bool], int | None], Iterator[tuple[int, int, WatchEntry]]]
     """(done, of, picture) of those that are not known."""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """The calibration that pictures are held against."""
+
+    calibration: Calibration
+    validity: Validity | None
+    """None: of a file, where nothing is kept or noted."""
+    file: Path | None
+    root: Path | None
+    camera: str
+
+    @classmethod
+    def find(cls, file: Path | None, root: Path | None, camera: str) -> Watched:
+        """Read the file, or what is installed. Raises CalibrationError."""
+        return cls(*named_or_installed(file, root, camera), file, root, camera)
 
 
 def watch(
@@ -103,17 +121,34 @@ def watch(
 
     Exit codes: 0 nothing moved so far, 4 something moved, 1 sources unusable, 2 wrong options.
     """
-    calibration, validity = named_or_installed(calibration_file, root, camera)
-    opened = [_open(path, calibration) for path in sources]
-    tag = opened[0].board if board is None else read_board(board)
-    check_board(tag)
+    watched = Watched.find(calibration_file, root, camera)
+    opened = [_open(path, watched.calibration) for path in sources]
     if follow and not (sources[-1] / DATASET_FILE).is_file():
         raise OutputError(
             f"--follow: {sources[-1]} does not grow.",
             code="options",
             remedy=f"Give a folder with {DATASET_FILE} and poses.csv last.",
         )
-    folder = None if calibration_file is not None else readable_folder(root, camera)
+    tag = opened[0].board if board is None else read_board(board)
+    watch_pictures(opened, tag, watched, as_json, follow=follow, threads=threads)
+
+
+def watch_pictures(
+    sources: list[WatchSource],
+    tag: BoardSpec,
+    watched: Watched,
+    as_json: bool,
+    *,
+    follow: bool = False,
+    threads: int | None = None,
+) -> None:
+    """Hold pictures against a calibration and say what is found; Ctrl-C ends it.
+
+    Raises typer.Exit where something moved, CalibrationError.
+    """
+    check_board(tag)
+    calibration = watched.calibration
+    folder = None if watched.file is not None else readable_folder(watched.root, watched.camera)
     version = 0 if folder is None else current_version(folder)[0]
     cell = CellModel(
         calibration.mount,
@@ -122,20 +157,21 @@ def watch(
         np.array(calibration.covariance),
         MODELS.get(calibration.robot.model),
     )
+    teller = _Teller(watched, folder, version, as_json)
     try:
-        log = MonitorLog(None if folder is None else folder / FILE, WatchedTag(version, tag), cell)
-        if log.monitor.alarmed and validity is not None and validity.state is ValidityState.VALID:
-            log.begin_anew()  # a check has passed since
-        installed = calibration_file if folder is None else folder / "current"
-        teller = _Teller(installed or Path(), root, camera, None if folder is None else version, as_json)
-        with single_threaded_opencv():
-            for source in opened:
-                _read(source, tag, log, teller, threads)
-            while follow and not log.monitor.finished:
-                time.sleep(_POLL_S)
-                _read(opened[-1], tag, log, teller, threads)
-    except KeyboardInterrupt:
-        pass
+        with nullcontext() if folder is None else _alone(folder):
+            log = MonitorLog(None if folder is None else folder / FILE, WatchedTag(version, tag), cell)
+            if log.monitor.alarmed and watched.validity and watched.validity.state is ValidityState.VALID:
+                log.begin_anew()  # a check has passed since
+            try:
+                with single_threaded_opencv():
+                    for source in sources:
+                        _read(source, tag, log, teller, threads)
+                    while follow and not log.monitor.finished:
+                        time.sleep(_POLL_S)
+                        _read(sources[-1], tag, log, teller, threads)
+            except KeyboardInterrupt:
+                pass
     except OSError as problem:
         raise InstallError(
             f"{problem.filename or folder}: {problem.strerror}. What was seen cannot be kept.",
@@ -149,7 +185,24 @@ def watch(
         raise typer.Exit(1)
 
 
-def _read(source: _Source, tag: BoardSpec, log: MonitorLog, teller: _Teller, threads: int | None) -> None:
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """One watch of a camera at a time: two would mix their pictures. Raises InstallError, OSError."""
+    path = folder / LOCK
+    with path.open("a") as file:
+        share(path)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InstallError(
+                f"{folder} is being watched by another program.",
+                code="watched-already",
+                remedy="Let one watch take all pictures of a camera; several sources can be given to it.",
+            ) from None
+        yield
+
+
+def _read(source: WatchSource, tag: BoardSpec, log: MonitorLog, teller: _Teller, threads: int | None) -> None:
     with progress_bar("watching") if err.is_terminal else nullcontext() as bar:
         for done, total, entry in source.entries(tag, log.knows, threads):
             if bar is not None:
@@ -161,12 +214,12 @@ def _read(source: _Source, tag: BoardSpec, log: MonitorLog, teller: _Teller, thr
 
 
 # --- sources ---
-def _open(path: Path, calibration: Calibration) -> _Source:
+def _open(path: Path, calibration: Calibration) -> WatchSource:
     if (path / DATASET_FILE).is_file():
         return _open_folder(path, calibration)
     recording = open_recording(path)
     info, lens = recording.info, calibration.intrinsics.model
-    require_same_cell(path, info, calibration)
+    require_same_cell(str(path), calibration, CellIdentity.of(info))
 
     def entries(
         tag: BoardSpec, known: Callable[[str], bool], threads: int | None
@@ -183,10 +236,10 @@ def _open(path: Path, calibration: Calibration) -> _Source:
             found = None if isinstance(detection, BadImageError) else detection
             yield done, len(views), _with_corners(entry, found)
 
-    return _Source(path, info.mount, info.board, entries)
+    return WatchSource(info.board, entries)
 
 
-def _open_folder(folder: Path, calibration: Calibration) -> _Source:
+def _open_folder(folder: Path, calibration: Calibration) -> WatchSource:
     dataset, _ = read_dataset(folder / DATASET_FILE)
     lens = calibration.intrinsics
     if dataset.mount != calibration.mount:
@@ -206,7 +259,7 @@ def _open_folder(folder: Path, calibration: Calibration) -> _Source:
             )
             yield done, len(rows), _with_corners(entry, _detect(folder, row, tag, (lens.width, lens.height)))
 
-    return _Source(folder, dataset.mount, dataset.board, entries)
+    return WatchSource(dataset.board, entries)
 
 
 def _detect(folder: Path, row: PoseRow, tag: BoardSpec, size: tuple[int, int]) -> Detection:
@@ -244,16 +297,15 @@ def _with_corners(entry: WatchEntry, detection: Detection | None) -> WatchEntry:
 class _Teller:
     """Says what the monitor found, and puts the installed calibration in doubt."""
 
-    def __init__(
-        self, installed: Path, root: Path | None, camera: str, version: int | None, as_json: bool
-    ) -> None:
-        self._installed, self._root, self._camera = str(installed), root, camera
-        self._version, self._as_json = version, as_json
+    def __init__(self, watched: Watched, folder: Path | None, version: int, as_json: bool) -> None:
+        self._watched, self._version, self._as_json = watched, version, as_json
+        self._keeps = folder is not None
+        self._installed = str(watched.file if folder is None else folder / "current")
 
     def tell(self, event: MovementEvent) -> None:
         text = event_text(event)
         moved = event.kind in (EventKind.ALARM, EventKind.NAMED)
-        validity = self._doubt(event, text) if moved and self._version is not None else None
+        validity = self._doubt(event, text) if moved and self._keeps else None
         steps = next_steps(event.moved, self._installed) if event.moved is not None else []
         if self._as_json:
             line = WatchEventJson(
@@ -277,13 +329,13 @@ class _Teller:
             {"picture": event.picture, "moved": event.moved and event.moved.value, **event.values},
         )
         return note_check(
-            self._root,
+            self._watched.root,
             "watch",
             reason,
             passed=False,
             sensitive=True,
             when=datetime.now(UTC),
-            camera=self._camera,
+            camera=self._watched.camera,
             version=self._version,
         )
 

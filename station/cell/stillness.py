@@ -54,6 +54,8 @@ class StillnessMonitor:
         self._model = model
         self._limits = limits
         self._states: deque[RobotState] = deque(maxlen=KEPT_SAMPLES)
+        self.moved_ns = 0
+        """Host monotonic time of the newest sample in which a joint moved, or of the first one."""
 
     def add(self, state: RobotState) -> None:
         """One sample, in order; quick, from any one thread."""
@@ -61,6 +63,8 @@ class StillnessMonitor:
         now_s = state.stamps.controller_s
         if states and now_s <= states[-1].stamps.controller_s:
             states.clear()  # the controller restarted
+        if not states or max(map(abs, state.joint_speeds_rad_s)) > self._limits.joint_speed_rad_s:
+            self.moved_ns = state.stamps.host_monotonic_ns
         states.append(state)
         while states[0].stamps.controller_s < now_s - 1.5 * self._limits.window_s:
             states.popleft()

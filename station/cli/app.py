@@ -99,6 +99,11 @@ STATION = LazyGroup(
             ("station drift-check", "station drift-check --poses 12"),
             _APPROVED,
         ),
+        "watch": LazyCommand(
+            "station.cli.watch:watch_command",
+            "Notice through the station's own camera that camera, tag or arm moved.",
+            ("station watch --board tag.yaml", "station watch --every 10"),
+        ),
         "touch-test": LazyCommand(
             "station.cli.touch_test:touch_test_command",
             "Test a calibration by touching corners of the board by hand.",

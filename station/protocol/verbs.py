@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 import msgspec
 
 from recordings.files import MAIN_CAMERA
+from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, Vector6
 from station.cell import status
 from station.cell.acceptance import StopTestOffer, StopWay
 from station.cell.config import StationConfig
@@ -119,6 +120,25 @@ class PreviewImage(msgspec.Struct, frozen=True, omit_defaults=True):
     corners: tuple[tuple[float, float], ...] = ()
     """The board's, as shares of the image's sides."""
     sequence: int = 0
+
+
+class Observation(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The tag in an image, and the arm at mid-exposure."""
+
+    mount: Mount
+    source: Source
+    robot_serial: str
+    camera_serial: str
+    wall_ns: int
+    rested_s: float
+    """How long the arm had rested by then."""
+    base_from_flange: Matrix4
+    joints_rad: Vector6
+    width: int
+    height: int
+    corners: tuple[int, ...] = ()
+    """Rows of `calibrate.boards.model.board_points` that were found."""
+    pixels: tuple[tuple[float, float], ...] = ()
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -323,6 +343,15 @@ class Preview(Verb[PreviewImage], frozen=True):
     control = False
     width: int = 480
     height: int = 384
+
+
+class Observe(Verb[Observation], frozen=True):
+    """Look for a tag in a new image between sessions, while the arm rests. Nothing is kept."""
+
+    states = frozenset({S.IDLE})
+    control = False
+    spoken = "a look at the tag"
+    tag: BoardSpec
 
 
 class Doctor(Verb[list[Check]], frozen=True):

@@ -203,6 +203,9 @@ class SessionDispatcher:
     async def _preview(self, caller: _Caller, args: verbs.Preview) -> verbs.PreviewImage:
         return await self._session.previews.preview(args.width, args.height)
 
+    async def _observe(self, caller: _Caller, args: verbs.Observe) -> verbs.Observation:
+        return await self._session.previews.observe(args.tag)
+
     async def _doctor(self, caller: _Caller, args: verbs.Doctor) -> list[verbs.Check]:
         return await checklist(self._session.context, self._session.devices.troubles)
 

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from recordings.images import Pixels
-from recordings.schema.messages import FrameTime, Image, RobotState, Stamps, Stillness, View
+from recordings.schema.messages import Image, RobotState, Stamps, Stillness, View
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion, sight
 from station.cell.config import matrix4
@@ -54,13 +54,8 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
     _phase(context, index, StationState.CAPTURING, "capturing")
     image = context.require_recording().number(await take_image(context, index))
     show_frame(context, image)
-    if image.time is None:
-        raise PoseFailedError("The camera's driver gave an image without a time.", code="no-time")
-    state = await _state_at(context, image.time.host_monotonic_ns)
-    await resting.news()
-    context.stillness.require_rest(state)
-    view = _view(context, index, attempt, image, state, still, image.time)
-    _require_bound(context, view, image)
+    state, bound_s = await at_exposure(context, resting, image)
+    view = _view(context, index, attempt, image, state, still, bound_s)
     _phase(context, index, StationState.WRITING, "writing")
     await to_the_end(_write(context, index, image, view))
 
@@ -104,15 +99,40 @@ def show_frame(context: SessionContext, image: Image) -> None:
     context.store.update(camera=shown)
 
 
-async def _state_at(context: SessionContext, host_monotonic_ns: int) -> RobotState:
-    deadline_s = time.monotonic() + STATE_WAIT_S
+async def at_exposure(
+    context: SessionContext, resting: RestingCheck, image: Image
+) -> tuple[RobotState, float]:
+    """The arm, at rest, in the middle of an exposure, and the bound of that time, seconds.
+
+    PoseFailedError and NotStillError when it is not known or the arm moved; RobotError.
+    """
+    if image.time is None:
+        raise PoseFailedError("The camera's driver gave an image without a time.", code="no-time")
+    robot, deadline_s = context.cell.robot, time.monotonic() + STATE_WAIT_S
     while True:
         try:
-            return context.cell.robot.at(host_monotonic_ns)
+            state = robot.at(image.time.host_monotonic_ns)
+            break
         except StaleStateError:
             if time.monotonic() > deadline_s:
                 raise
             await asyncio.sleep(0.01)
+    await resting.news()
+    context.stillness.require_rest(state)
+    clock = robot.clock()
+    bound_s = image.time.bound_s + (clock.bound_s if clock else 0.0)
+    if bound_s > (limit_s := context.cell.config.capture.time_bound_s):
+        raise PoseFailedError(
+            f"Image time known to ±{1000 * bound_s:.1f} ms (limit {1000 * limit_s:.1f} ms, "
+            "capture.time_bound_s).",
+            code="time-unsure",
+            remedy="The camera's clock cannot be read: raise the limit, the arm is at rest."
+            if image.time.source == "arrival"
+            else "Reduce this computer's load.",
+            bound_s=bound_s,
+            limit_s=limit_s,
+        )
+    return state, bound_s
 
 
 def _view(
@@ -122,10 +142,8 @@ def _view(
     image: Image,
     state: RobotState,
     still: Stillness,
-    time: FrameTime,
+    bound_s: float,
 ) -> View:
-    robot_clock = context.cell.robot.clock()
-    bound_s = time.bound_s + (robot_clock.bound_s if robot_clock else 0.0)
     exposure_ns = state.stamps.host_monotonic_ns
     return View(
         index=index,
@@ -143,22 +161,6 @@ def _view(
         time_bound_s=bound_s,
         stillness=still,
     )
-
-
-def _require_bound(context: SessionContext, view: View, image: Image) -> None:
-    limit_s = context.cell.config.capture.time_bound_s
-    if view.time_bound_s is not None and view.time_bound_s > limit_s:
-        clockless = image.time is not None and image.time.source == "arrival"
-        raise PoseFailedError(
-            f"Image time known to ±{1000 * view.time_bound_s:.1f} ms (limit {1000 * limit_s:.1f} ms, "
-            "capture.time_bound_s).",
-            code="time-unsure",
-            remedy="The camera's clock cannot be read: raise the limit, the arm is at rest."
-            if clockless
-            else "Reduce this computer's load.",
-            bound_s=view.time_bound_s,
-            limit_s=limit_s,
-        )
 
 
 async def _write(context: SessionContext, index: int, image: Image, view: View) -> None:

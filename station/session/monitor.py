@@ -15,13 +15,15 @@ import cv2
 import msgspec
 import numpy as np
 
+from calibrate.boards.detect import detect
+from calibrate.boards.model import check_board
 from recordings.images import eight_bits
 from recordings.schema.clocks import ClockFit
-from recordings.schema.messages import Image, RobotState
+from recordings.schema.messages import BoardSpec, Image, RobotState
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, sight
 from station.cell.config import matrix4
-from station.cell.errors import CameraError, RobotError, StationError
+from station.cell.errors import CameraError, RefusedError, RobotError, StationError
 from station.cell.limits import SPEED_CAP_M_S, point_speed_m_s
 from station.cell.scene import flange_pose
 from station.cell.session_folder import CALIBRATION_FILE
@@ -33,9 +35,11 @@ from station.cell.status import (
     StationState,
     TriggerStatus,
 )
+from station.cell.stillness import NotStillError, RestingCheck
 from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
 from station.protocol.states import RUNNING
-from station.protocol.verbs import PreviewImage
+from station.protocol.verbs import Observation, Observe, PreviewImage
+from station.session.capture import at_exposure
 from station.session.context import SessionContext
 
 log = logging.getLogger(__name__)
@@ -50,6 +54,7 @@ JPEG_LIMIT_BYTES = 40_000
 """In base64 it must fit into one line of the protocol."""
 _QUALITIES = (75, 50, 30, 15)
 SIDES = (16, 1024)
+_OBSERVE_S = 5.0
 WALL_STEP_S = 0.5
 """Less is a clock that is being disciplined, or a moment between two readings on a busy computer."""
 
@@ -327,6 +332,41 @@ class Previewer:
         width, height = min(max(width, low), high), min(max(height, low), high)
         return await asyncio.to_thread(self._encode, self._picture, self._sighting, width, height)
 
+    async def observe(self, tag: BoardSpec) -> Observation:
+        """Find the tag's corners in a new image, with the arm's pose at mid-exposure.
+
+        Raises BoardError, RefusedError when a session runs, NotStillError when the arm moves; CameraError,
+        RobotError, WorkerError.
+        """
+        check_board(tag)
+        context, robot = self._context, self._context.cell.robot
+        async with self._taking:  # one at a time: a session that begins waits for one image at most
+            _require_between_sessions(context)
+            resting = RestingCheck(robot.check)
+            await resting.news()
+            if not context.stillness.at_rest:
+                raise NotStillError("The arm moves.", code="arm-moves", remedy="Ask again when it rests.")
+            image = await context.cell.camera.capture(_OBSERVE_S)
+            state, _ = await at_exposure(context, resting, image)
+            _require_between_sessions(context)
+            found = await context.workers.call(
+                detect, image.viewable(), tag, False, False, timeout_s=_OBSERVE_S
+            )
+        return Observation(
+            mount=context.cell.config.mount,
+            source=context.cell.source,
+            robot_serial=robot.identity.serial,
+            camera_serial=context.cell.camera.identity.serial,
+            wall_ns=state.stamps.host_wall_ns,
+            rested_s=(state.stamps.host_monotonic_ns - context.stillness.moved_ns) / 1e9,
+            base_from_flange=matrix4(flange_pose(state, robot.identity.tcp_offset)),
+            joints_rad=state.joints_rad,
+            width=image.pixels.shape[1],
+            height=image.pixels.shape[0],
+            corners=tuple(found.indices.tolist()),
+            pixels=tuple((float(u), float(v)) for u, v in found.pixels),
+        )
+
     async def _take(self) -> None:
         context = self._context
         self._taken_s = time.monotonic()
@@ -365,3 +405,10 @@ class Previewer:
                 data = base64.b64encode(jpeg.tobytes()).decode()
                 return PreviewImage(data, *size, corners, self._count)
         return PreviewImage()
+
+
+def _require_between_sessions(context: SessionContext) -> None:
+    if (refusal := Observe.refusal(context.store.state)) is not None:
+        raise refusal
+    if context.cell.source == "playback":
+        raise RefusedError("Played images are no new ones.", code="played", remedy="Use `calibrate watch`.")

@@ -36,7 +36,7 @@ PREVIEW_SCALE = 0.5
 Message = tuple[Json, NDArray[np.uint8] | None]
 ONE_SHOT = ("missed-trigger", "lost-frame", "double-frame")
 """value: how often, 1 if none is given"""
-LASTING = ("illumination", "exposure", "clock-step", "stamp-error", "cover", "board", "ringing")
+LASTING = ("illumination", "exposure", "clock-step", "stamp-error", "cover", "board", "ringing", "knock")
 
 
 class Ringing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,6 +69,8 @@ class CameraFaults:
         """Another board lies there"""
         self._covered = 0.0
         self._ringing: Ringing | None = None
+        self._knock_m = (0.0, 0.0, 0.0)
+        """Shift of the camera, in its own frame"""
 
     def inject(self, name: str, value: Any = None) -> None:
         """ValueError for an unknown name."""
@@ -90,6 +92,8 @@ class CameraFaults:
             ringing = None if value is None else msgspec.convert(value, Ringing)
             begun_ns = time.monotonic_ns()
             self._ringing = ringing and msgspec.structs.replace(ringing, begun_ns=begun_ns)
+        elif name == "knock":
+            self._knock_m = msgspec.convert(value, tuple[float, float, float])
         else:
             known = ", ".join((*ONE_SHOT, *LASTING, "unplugged"))
             raise ValueError(f"no camera fault '{name}'; there are {known}")
@@ -103,7 +107,8 @@ class CameraFaults:
     def bracket(self, host_monotonic_ns: int) -> Array:
         """Transform (4, 4) of the camera as it is now from the camera as it should be."""
         angle_rad = self._ringing.angle_rad(host_monotonic_ns) if self._ringing is not None else 0.0
-        return pose_from_rotvec((0.0, 0.0, 0.0), (angle_rad, 0.0, 0.0))
+        x, y, z = self._knock_m
+        return pose_from_rotvec((-x, -y, -z), (angle_rad, 0.0, 0.0))
 
     def cover(self, picture: NDArray[np.uint8]) -> None:
         """Something dark lies over the left share of the image, in place."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -210,3 +211,17 @@ def test_another_version_or_tag_begins_anew(tmp_path: Path) -> None:
     log.add(entry(pictures[0]))
     assert MonitorLog(tmp_path / FILE, WATCHED, model).knows(pictures[0].name)
     assert not MonitorLog(tmp_path / FILE, WatchedTag(2, TAG), model).knows(pictures[0].name)
+
+
+def test_two_watches_of_a_camera_do_not_mix(root: Path, tmp_path: Path) -> None:
+    production = Production(tmp_path / "pictures", root)
+    production.take(1)
+    assert watch(root, production.folder)[0] == 0
+    kept = (root / "calibrations" / FILE).read_bytes()
+    production.take(1)
+    with (root / "calibrations" / "watch.lock").open() as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        code, lines = watch(root, production.folder)
+        assert code == 1 and lines[-1]["error"]["code"] == "watched-already"
+        assert (root / "calibrations" / FILE).read_bytes() == kept
+    assert watch(root, production.folder)[1][-1]["pictures"] == 2

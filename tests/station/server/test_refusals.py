@@ -22,8 +22,9 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "pause": {}, "finish": {}, "retake": {"index": 0}, "skip": {"index": 1},
     "reorder": {"order": [1, 0, *range(2, POSES)]}, "add": {}, "drop": {"index": 1},
     "free_drive": {"on": True}, "record": {}, "stop_test": {"way": "both"},
+    "observe": {"tag": {"kind": "april-tag", "square_m": 0.05}},
 }  # fmt: skip
-FOR_ANYBODY = {"acknowledge", "pause"}
+FOR_ANYBODY = {"acknowledge", "pause", "observe"}
 """They only ever make the arm do less, or nothing."""
 
 

@@ -1,0 +1,115 @@
+"""A picture for `station watch`: between sessions, of an arm at rest, with its pose; nothing is kept."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.boards.model import board_points
+from recordings.errors import CodedError
+from recordings.schema.messages import BoardKind, BoardSpec, Image
+from station.analysis.worker import BoardDetection
+from station.cell.scene import flange_pose
+from station.cell.status import DetectionStatus
+from station.cell.status import StationState as S
+from station.protocol.verbs import Purpose
+from station.session import monitor
+from tests.codes import raises
+from tests.station.session_rig import TRUTH, NewRig, Rig
+
+TAG = BoardSpec(BoardKind.APRIL_TAG, square_m=0.05)
+
+
+@pytest.fixture(autouse=True)
+def tag_in_sight(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = BoardDetection(DetectionStatus(found=True), np.arange(4), 100 + 2000 * board_points(TAG)[:, :2])
+    monkeypatch.setattr(monitor, "detect", lambda *args: seen)
+
+
+async def test_corners_and_the_arms_pose_of_mid_exposure_without_control_or_session(rig: Rig) -> None:
+    rig.arm.rest()
+    told: list[int] = []
+    at = rig.arm.at
+    rig.arm.at = lambda ns: told.append(ns) or at(ns)  # type: ignore[method-assign, func-returns-value]
+    found = await rig.session.previews.observe(TAG)
+    state = rig.arm.latest()
+    assert (found.corners, found.joints_rad) == ((0, 1, 2, 3), state.joints_rad)
+    assert np.allclose(found.base_from_flange, flange_pose(state, rig.arm.identity.tcp_offset))
+    assert (found.width, found.height) == (TRUTH.camera.width, TRUTH.camera.height)
+    assert (found.robot_serial, found.camera_serial, found.source) == ("DOUBLE", "1", "simulated")
+    assert len(told) == 1 and rig.camera.taken == 1
+    assert 0 < found.rested_s < 10
+    assert rig.arm.log == [] and rig.state is S.IDLE
+    assert not list(rig.session.context.root.rglob("*.mcap*"))
+
+
+async def test_no_picture_is_taken_of_an_arm_that_moves(rig: Rig) -> None:
+    rig.arm.rest()
+    state = rig.arm.latest()
+    moving = msgspec.structs.replace(state, joint_speeds_rad_s=(0.1,) * 6)
+    rig.session.context.stillness.add(
+        msgspec.structs.replace(
+            moving,
+            stamps=msgspec.structs.replace(state.stamps, controller_s=state.stamps.controller_s + 0.008),
+        )
+    )
+    with raises("arm-moves"):
+        await rig.session.previews.observe(TAG)
+    assert rig.camera.taken == 0
+
+
+async def test_a_picture_that_the_arm_moved_in_is_not_told(rig: Rig) -> None:
+    rig.arm.rest()
+    at = rig.arm.at
+    rig.arm.at = lambda ns: msgspec.structs.replace(at(ns), joint_speeds_rad_s=(0.1,) * 6)  # type: ignore[method-assign]
+    with raises("moved-in-exposure"):
+        await rig.session.previews.observe(TAG)
+
+
+async def test_a_session_has_the_camera_for_itself(rig: Rig) -> None:
+    rig.arm.rest()
+    await rig.go_until_it_moves()
+    taken = rig.camera.taken
+    with raises("wrong-state"):
+        await rig.session.previews.observe(TAG)
+    assert rig.camera.taken == taken
+    await rig.pause_after_this_pose("anna")
+    with raises("wrong-state"):  # its recording is open
+        await rig.session.previews.observe(TAG)
+
+
+async def test_a_crowd_that_asks_delays_a_session_by_one_picture(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.arm.rest()
+    summary = await rig.session.prepare(1, Purpose.RUN)
+    capture, go_on = rig.camera.capture, asyncio.Event()
+
+    async def slow(timeout_s: float = 5.0) -> Image:
+        await go_on.wait()
+        return await capture(timeout_s)
+
+    monkeypatch.setattr(rig.camera, "capture", slow)
+    crowd = [asyncio.create_task(rig.session.previews.observe(TAG)) for _ in range(20)]
+    await asyncio.sleep(0)
+    rig.arm.slow = True
+    rig.session.go(1, summary.token)
+    await rig.until(S.MOVING)
+    go_on.set()
+    answers: list[Any] = await asyncio.gather(*crowd, return_exceptions=True)
+    assert {getattr(answer, "code", "") for answer in answers} == {"wrong-state"}
+    assert rig.camera.taken == 1 and all(isinstance(answer, CodedError) for answer in answers)
+
+
+async def test_what_cannot_be_looked_for_is_refused_before_a_picture(rig: Rig, new_rig: NewRig) -> None:
+    with raises("board-square"):
+        await rig.session.previews.observe(BoardSpec(BoardKind.APRIL_TAG))
+    played = await new_rig(with_plan=False, source="playback")
+    await played.until(S.IDLE)
+    with raises("played"):
+        await played.session.previews.observe(TAG)
+    assert rig.camera.taken == played.camera.taken == 0

@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from math import hypot, inf, isfinite, sqrt
 
-from station.simulation.controller.arm import JointMotion, Speeds
+from station.simulation.controller.arm import JOINT_SPEED_RAD_S, JointMotion, Speeds
+from station.simulation.controller.dynamics import DRIVES, Body, Posture
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
     Rigid,
@@ -38,6 +39,10 @@ _QUIET = frozenset({"sync", "sleep", "textmsg", "force", "tool_contact"})
 ROTATION_WEIGHT_M = 0.1
 """servoc turns a radian in the time in which it goes so far."""
 ARRIVED_M = 1e-5
+JOINT_RAD_S2 = 40.0
+"""The largest acceleration that the configuration message states."""
+TOOL_M_S = 1.0
+"""All that optimovel goes; the ramps take as long as those of optimovej."""
 
 
 class InterpretedProgram:
@@ -54,6 +59,7 @@ class InterpretedProgram:
             **self._sockets.builtins(),
             **{name: self._logged(name, builtin) for name, builtin in states.items()},
             **self._motions(),
+            **self._new(),
         }
         self._run = ScriptRun(parse(text, builtins))
         self._mover: Thread | None = None
@@ -373,6 +379,67 @@ class InterpretedProgram:
         finally:
             self._mover = None
             self._orphan = motion
+
+    def _optimovej(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
+        """a and v are shares of what the arm can do, as in optimovel."""
+        yield from self._movej(goal, a * JOINT_RAD_S2, v * JOINT_SPEED_RAD_S)
+
+    def _optimovel(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
+        yield from self._movel(goal, a * JOINT_RAD_S2 * TOOL_M_S / JOINT_SPEED_RAD_S, v * TOOL_M_S)
+
+    # -- torques ----------------------------------------------------------------------------------------
+
+    def _new(self) -> dict[str, Builtin]:
+        """What e-Series controllers have from 5.21 or 5.23 on; the scales of friction came with 5.25.1."""
+        robot, arm, settings = self._robot, self._robot.arm, self._robot.settings
+        if not settings.is_e_series or settings.version < (5, 21):
+            return {}
+        optimal: dict[str, Builtin] = {"optimovej": self._optimovej, "optimovel": self._optimovel}
+        if settings.version < (5, 23):
+            return optimal
+        drives = DRIVES[settings.model]
+
+        def posture() -> Posture:
+            return Posture(robot.table, arm.actual, arm.actual_speed)
+
+        def bodies() -> list[Body]:
+            x, y, z = robot.payload_cog
+            return [*drives.bodies, Body(6, robot.payload_kg, (x, y, z))]
+
+        def turn(torque: Sequence[float]) -> Wait:
+            asked, load = six(torque), bodies()
+
+            def wanted(joints: Six, dt_s: float) -> Six:
+                speeds = arm.stream_speeds
+                rates = Posture(robot.table, joints, speeds).accelerations(load, drives.most_nm, asked)
+                faster = tuple(v + dt_s * r for v, r in zip(speeds, rates, strict=True))
+                if max(map(abs, faster)) > JOINT_SPEED_RAD_S:
+                    raise UnreachableError("a joint exceeds its speed limit")
+                return faster
+
+            yield from self._flow("direct_torque", wanted, inf, robot.dt_s, lambda: True)
+
+        def scaled(
+            torque: Sequence[float],
+            viscous_scale: Sequence[float] = (1.0,) * 6,
+            coulomb_scale: Sequence[float] = (1.0,) * 6,
+            friction_comp: bool = True,
+        ) -> Wait:
+            for scale in (viscous_scale, coulomb_scale):
+                if len(scale) != 6 or not all(0 <= s <= 1 for s in scale):
+                    raise ScriptRuntimeError(f"direct_torque with a scale of {text_of(list(scale))}")
+            yield from turn(torque)
+
+        return optimal | {
+            "direct_torque": scaled
+            if settings.version >= (5, 25, 1)
+            else lambda torque, friction_comp=True: turn(torque),
+            "get_mass_matrix": lambda: posture().mass_matrix(bodies()),
+            "get_coriolis_and_centrifugal_torques": lambda: posture().coriolis(bodies()),
+            "get_jacobian": lambda: posture().jacobian(self._tool(arm.actual)),
+            "get_jacobian_time_derivative": lambda: posture().jacobian_rate(self._tool(arm.actual)),
+            "get_target_joint_accelerations": lambda: list(robot.outputs.vector("target_qdd")),
+        }
 
     def _stopj(self, a: float = 2.0) -> Wait:
         yield from self._stop("stopj", a)

@@ -132,15 +132,21 @@ def to_pose(A: Rigid) -> Six:
     return (A[3], A[7], A[11], *to_rotvec(A))
 
 
-def forward(table: ArmGeometry, joints_rad: Six) -> Rigid:
-    """base_from_flange."""
-    T = IDENTITY
+def frames(table: ArmGeometry, joints_rad: Six) -> list[Rigid]:
+    """The base's own frame, then that of every link, in base; the last is the flange's."""
+    found = [IDENTITY]
     for q, theta, a, d, alpha in zip(
         joints_rad, table.theta_rad, table.a_m, table.d_m, table.alpha_rad, strict=True
     ):
         ct, st, ca, sa = cos(q + theta), sin(q + theta), cos(alpha), sin(alpha)
-        T = compose(T, (ct, -st * ca, st * sa, a * ct, st, ct * ca, -ct * sa, a * st, 0.0, sa, ca, d))
-    return T
+        step = (ct, -st * ca, st * sa, a * ct, st, ct * ca, -ct * sa, a * st, 0.0, sa, ca, d)
+        found.append(compose(found[-1], step))
+    return found
+
+
+def forward(table: ArmGeometry, joints_rad: Six) -> Rigid:
+    """base_from_flange."""
+    return frames(table, joints_rad)[-1]
 
 
 def inverse_all(table: ArmGeometry, base_from_flange: Rigid) -> list[Six]:

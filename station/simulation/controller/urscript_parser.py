@@ -318,6 +318,8 @@ class _Parser:
             found = self._call(token).value if self._is("(") else _name(token.text)
         while self._take("["):
             found = _item(found, self._expression())
+            while self._take(","):  # a matrix is a list of its rows
+                found = _item(found, self._expression())
             self._need("]")
         return found
 

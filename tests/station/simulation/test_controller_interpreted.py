@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from station.devices.rtde import RuntimeState
+from station.devices.rtde import RuntimeState, SafetyMode
 from station.simulation.controller.programs import Upload
 
 GOAL = "[0.4, -1.5, 1.5, -1.5, -1.5, 0.1]"
@@ -18,9 +18,9 @@ STOPS = """
 """
 
 
-def started(context, text: str):
+def started(context, text: str, **settings: object):
     """The program plays in its first cycles."""
-    made = context()
+    made = context(**settings)
     made.robot.upload(Upload("prog", f"def prog():\n{text}\nend\n"))
     made.run_until(lambda: made.robot.runtime_state == RuntimeState.PLAYING)
     return made
@@ -304,3 +304,85 @@ def test_a_stream_waits_with_its_program_while_the_process_is_held_up(context) -
     assert made.robot.arm.command == before
     ended(made)
     assert made.robot.arm.command[0] == pytest.approx(0.5 * 1.0, abs=0.02)
+
+
+# -- torques --------------------------------------------------------------------------------------------
+
+TORQUES = {"model": "UR10e", "software": (5, 25, 1)}
+
+
+def test_no_torque_holds_the_arm_against_gravity_and_a_torque_turns_its_joint(context) -> None:
+    made = started(context, "  while True:\n    direct_torque([0, 0, 0, 0, 0, 0])\n  end", **TORQUES)
+    made.run(1.0)
+    assert list(made.robot.arm.command) == pytest.approx(made.robot.settings.start_joints_rad)
+    made = started(context, "  while True:\n    direct_torque([20, 0, 0, 0, 0, 0])\n  end", **TORQUES)
+    made.run(1.0)
+    before = made.robot.arm.command[0]
+    assert before > 0.1, "the base turns"
+    slow = started(
+        context, "  set_payload(10)\n  while True:\n    direct_torque([20, 0, 0, 0, 0, 0])\n  end", **TORQUES
+    )
+    slow.run(1.0)
+    assert 0.02 < slow.robot.arm.command[0] < before, "a load makes it slower"
+
+
+def test_who_commands_torques_no_more_holds_the_arm_where_it_is(context) -> None:
+    made = started(
+        context,
+        "  t = 0\n  while t < 0.5:\n    direct_torque([20, 0, 0, 0, 0, 0])\n    t = t + get_steptime()\n"
+        "  end\n  sleep(1.0)",
+        **TORQUES,
+    )
+    made.run(0.4)
+    assert made.robot.arm.command_speed[0] > 0.1
+    made.run(0.3)
+    assert speed(made) == 0.0 and made.robot.runtime_state == RuntimeState.PLAYING
+
+
+def test_a_joint_that_torques_make_too_fast_is_a_protective_stop(context) -> None:
+    made = started(context, "  while True:\n    direct_torque([0, 0, 0, 0, 0, 54])\n  end", **TORQUES)
+    made.run(1.0)
+    assert made.robot.safety_mode == SafetyMode.PROTECTIVE_STOP
+
+
+@pytest.mark.parametrize(
+    ("model", "version", "call", "starts"),
+    [
+        ("UR10", (3, 15, 8), "direct_torque([0, 0, 0, 0, 0, 0])", False),
+        ("UR10e", (5, 22), "direct_torque([0, 0, 0, 0, 0, 0])", False),
+        ("UR10e", (5, 22), "get_mass_matrix()", False),
+        ("UR10e", (5, 23), "direct_torque([0, 0, 0, 0, 0, 0], friction_comp=False)", True),
+        ("UR10e", (5, 23), "direct_torque([0, 0, 0, 0, 0, 0], viscous_scale=[1, 1, 1, 1, 1, 1])", False),
+        ("UR10e", (5, 25, 1), "direct_torque([0, 0, 0, 0, 0, 0], viscous_scale=[1, 1, 1, 1, 1, 1])", True),
+        ("UR10e", (5, 20), "optimovej([0, 0, 0, 0, 0, 0])", False),
+        ("UR10e", (5, 21), "optimovej([0, 0, 0, 0, 0, 0])", True),
+    ],
+)
+def test_an_older_controller_does_not_know_what_came_later(
+    context, model: str, version: tuple[int, ...], call: str, starts: bool
+) -> None:
+    made = context(model=model, software=version)
+    made.robot.upload(Upload("prog", f"def prog():\n  {call}\n  sleep(1)\nend\n"))
+    made.run(0.2)
+    assert (made.robot.runtime_state == RuntimeState.PLAYING) is starts
+    assert any(e["verb"] == "syntax error" for e in made.robot.journal.entries()) is not starts
+
+
+def test_a_scale_of_friction_is_a_share(context) -> None:
+    made = started(
+        context, "  sync()\n  direct_torque([0, 0, 0, 0, 0, 0], coulomb_scale=[2, 1, 1, 1, 1, 1])", **TORQUES
+    )
+    assert "scale" in ended(made)
+
+
+def test_a_matrix_is_read_by_row_and_column(context) -> None:
+    made = started(
+        context,
+        "  M = get_mass_matrix()\n  J = get_jacobian()\n  write_output_float_register(0, M[0, 0])\n"
+        "  write_output_float_register(1, M[1, 2] - M[2, 1])\n  write_output_float_register(2, J[5, 0])\n"
+        "  write_output_float_register(3, norm(get_coriolis_and_centrifugal_torques()))\n  sleep(1)",
+        **TORQUES,
+    )
+    made.run(0.05)
+    M00, odd, J50, rest = (made.output(f"output_double_register_{i}") for i in range(4))
+    assert M00 > 1.0 and odd == pytest.approx(0, abs=1e-12) and abs(J50 - 1) < 1e-12 and rest == 0

@@ -1,0 +1,194 @@
+"""The arm as masses that torques move, for programs that command torques instead of positions.
+
+Masses, centres of mass and largest torques: Universal Robots, "DH parameters for calculations of kinematics
+and dynamics" and "Max. joint torques". Each link counts as a point. Universal Robots publishes neither the
+rotors' inertia nor friction: both are assumed, of the size that MuJoCo Menagerie gives its UR10e.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from station.simulation.controller.kinematics import ArmGeometry, Rigid, Six, frames
+
+Vector = tuple[float, float, float]
+Matrix = list[list[float]]
+
+ROTOR_KG_M2 = 0.1
+"""Each joint's rotor, as its link feels it."""
+FRICTION_S = 0.03
+"""Viscous friction at 1 rad/s, as a share of the joint's largest torque. There is no other friction."""
+
+
+class Body(NamedTuple):
+    link: int
+    """1…6: behind which joint."""
+    mass_kg: float
+    place_m: Vector
+    """In the frame of its link."""
+
+
+class Drives(NamedTuple):
+    bodies: tuple[Body, ...]
+    most_nm: Six
+    """No joint gives more torque."""
+
+
+def _links(*masses: tuple[float, Vector]) -> tuple[Body, ...]:
+    return tuple(Body(i, *mass) for i, mass in enumerate(masses, 1))
+
+
+_LARGE = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)
+DRIVES = {
+    "UR3e": Drives(
+        _links(
+            (1.98, (0, -0.02, 0)), (3.4445, (0.13, 0, 0.1157)), (1.437, (0.05, 0, 0.0238)),
+            (0.871, (0, 0, 0.01)), (0.805, (0, 0, 0.01)), (0.261, (0, 0, -0.02)),
+        ), (54.0, 54.0, 28.0, 9.0, 9.0, 9.0),
+    ),
+    "UR5e": Drives(
+        _links(
+            (3.761, (0, -0.02561, 0.00193)), (8.058, (0.2125, 0, 0.11336)), (2.846, (0.15, 0, 0.0265)),
+            (1.37, (0, -0.0018, 0.01634)), (1.3, (0, 0.0018, 0.01634)), (0.365, (0, 0, -0.001159)),
+        ), (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
+    ),
+    "UR10e": Drives(
+        _links(
+            (7.369, (0.021, 0, 0.027)), (13.051, (0.38, 0, 0.158)), (3.989, (0.24, 0, 0.068)),
+            (2.1, (0, 0.007, 0.018)), (1.98, (0, 0.007, 0.018)), (0.615, (0, 0, -0.026)),
+        ), _LARGE,
+    ),
+    "UR16e": Drives(
+        _links(
+            (7.369, (0, -0.016, 0.03)), (10.45, (0.302, 0, 0.16)), (4.321, (0.194, 0, 0.065)),
+            (2.18, (0, -0.009, 0.011)), (2.033, (0, 0.018, 0.012)), (0.907, (0, 0, -0.044)),
+        ), _LARGE,
+    ),
+}  # fmt: skip
+"""Of the arms whose controllers take torques."""
+
+
+class Posture:
+    """Joints, and how fast they turn: what moves how, in base. M q̈ + C + friction = torques beside gravity's.
+
+    The columns of a point's Jacobian are z × (x − p) of every joint before it (z: the joint's axis, p: a
+    point on it), so M is the sum of m JᵀJ over the bodies, and C that of m Jᵀ J̇ q̇.
+    """
+
+    def __init__(self, table: ArmGeometry, joints_rad: Six, speeds_rad_s: Six) -> None:
+        self._frames = frames(table, joints_rad)
+        self._speeds = speeds_rad_s
+        self._axes: list[Vector] = [(T[2], T[6], T[10]) for T in self._frames[:-1]]
+        self._points: list[Vector] = [_place(T) for T in self._frames[:-1]]
+        self._velocities = [self._velocity(p, j) for j, p in enumerate(self._points)]
+        turns: list[Vector] = [(0.0, 0.0, 0.0)]
+        for axis, speed in zip(self._axes, speeds_rad_s, strict=True):
+            turns.append(_add(turns[-1], axis, speed))
+        self._axis_rates = [_cross(turn, axis) for turn, axis in zip(turns, self._axes, strict=False)]
+
+    def _columns(self, x: Vector, link: int) -> list[Vector]:
+        """How fast a point of a link moves per speed of each joint before it."""
+        pairs = zip(self._axes[:link], self._points, strict=False)
+        return [_cross(z, _add(x, p, -1)) for z, p in pairs]
+
+    def _velocity(self, x: Vector, link: int) -> Vector:
+        return _combined(self._columns(x, link), self._speeds)
+
+    def _column_rates(self, x: Vector, link: int) -> list[Vector]:
+        v = self._velocity(x, link)
+        return [
+            _add(
+                _cross(self._axis_rates[j], _add(x, self._points[j], -1)),
+                _cross(self._axes[j], _add(v, self._velocities[j], -1)),
+            )
+            for j in range(link)
+        ]
+
+    def _placed(self, body: Body) -> Vector:
+        T, (x, y, z) = self._frames[body.link], body.place_m
+        return (
+            T[0] * x + T[1] * y + T[2] * z + T[3],
+            T[4] * x + T[5] * y + T[6] * z + T[7],
+            T[8] * x + T[9] * y + T[10] * z + T[11],
+        )
+
+    def mass_matrix(self, bodies: Sequence[Body], rotor_kg_m2: float = ROTOR_KG_M2) -> Matrix:
+        """(6, 6) [kg m²]"""
+        M = [[rotor_kg_m2 * (i == j) for j in range(6)] for i in range(6)]
+        for body in bodies:
+            columns = self._columns(self._placed(body), body.link)
+            for i, a in enumerate(columns):
+                for j, b in enumerate(columns):
+                    M[i][j] += body.mass_kg * _dot(a, b)
+        return M
+
+    def coriolis(self, bodies: Sequence[Body]) -> list[float]:
+        """(6,) [Nm]"""
+        torques = [0.0] * 6
+        for body in bodies:
+            x = self._placed(body)
+            acceleration = _combined(self._column_rates(x, body.link), self._speeds)
+            for j, column in enumerate(self._columns(x, body.link)):
+                torques[j] += body.mass_kg * _dot(column, acceleration)
+        return torques
+
+    def accelerations(self, bodies: Sequence[Body], most_nm: Six, torques_nm: Six) -> list[float]:
+        """(6,) [rad/s²] that torques give beside those against gravity; none is larger than most_nm."""
+        left = [
+            max(-most, min(most, torque)) - c - FRICTION_S * most * speed
+            for torque, most, c, speed in zip(
+                torques_nm, most_nm, self.coriolis(bodies), self._speeds, strict=True
+            )
+        ]
+        return solved(self.mass_matrix(bodies), left)
+
+    def jacobian(self, base_from_tool: Rigid) -> Matrix:
+        """(6, 6): the tool's velocity [m/s] and rotation [rad/s] in base, per joint speed."""
+        return _rows(self._columns(_place(base_from_tool), 6), self._axes)
+
+    def jacobian_rate(self, base_from_tool: Rigid) -> Matrix:
+        return _rows(self._column_rates(_place(base_from_tool), 6), self._axis_rates)
+
+
+def solved(M: Matrix, right: Sequence[float]) -> list[float]:
+    """x of M x = right, M positive definite: Gauss's elimination needs no pivoting."""
+    rows = [[*row, value] for row, value in zip(M, right, strict=True)]
+    count = len(rows)
+    for i, row in enumerate(rows):
+        for other in rows[i + 1 :]:
+            share = other[i] / row[i]
+            for j in range(i, count + 1):
+                other[j] -= share * row[j]
+    found = [0.0] * count
+    for i in reversed(range(count)):
+        known = sum(rows[i][j] * found[j] for j in range(i + 1, count))
+        found[i] = (rows[i][count] - known) / rows[i][i]
+    return found
+
+
+def _rows(linear: Sequence[Vector], angular: Sequence[Vector]) -> Matrix:
+    return [list(row) for columns in (linear, angular) for row in zip(*columns, strict=True)]
+
+
+def _place(T: Rigid) -> Vector:
+    return (T[3], T[7], T[11])
+
+
+def _add(a: Vector, b: Vector, times: float = 1.0) -> Vector:
+    return (a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2])
+
+
+def _combined(vectors: Sequence[Vector], shares: Sequence[float]) -> Vector:
+    total: Vector = (0.0, 0.0, 0.0)
+    for vector, share in zip(vectors, shares, strict=False):
+        total = _add(total, vector, share)
+    return total
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 from station.cell.config import ControlPath
 from station.cell.errors import StationError
 from station.devices.ur import library_installed
+from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from tests.isolated_network import isolated_thread
 
@@ -76,17 +78,21 @@ def datasets() -> Path:
     return DATASETS
 
 
-@pytest.fixture
-def only_allowed_was_sent() -> Callable[[str], None]:
-    """`only_allowed_was_sent(host)`: what the simulated controller there was ever asked is on the list."""
-    return check_allow_list
+def functions_called(text: str) -> set[str]:
+    """By a URScript program, beside its own."""
+    own = set(re.findall(r"\b(?:def|thread)\s+(\w+)", text))
+    return set(re.findall(r"\b([A-Za-z_]\w*)\(", text)) - own
 
 
 def check_allow_list(host: str) -> None:
+    """What the simulated controller there was ever asked is on the list, and its moves within the caps."""
     with AdminClient(host) as admin:
-        counts: dict[str, int] = admin.ask("log")["counts"]
-    foreign = {c for c in counts if not c.startswith("controller: ")} - MAY_BE_SENT
+        log = admin.ask("log")
+    foreign = {c for c in log["counts"] if not c.startswith("controller: ")} - MAY_BE_SENT
     assert not foreign, f"sent to the robot, but not on the list: {sorted(foreign)}"
+    limits = {"v": JOINT_SPEED_LIMIT_RAD_S, "a": JOINT_ACCELERATION_LIMIT_RAD_S2}
+    moves = [entry for entry in log["entries"] if entry["verb"] == "movej"]
+    assert not [m for m in moves if any(m[name] > limit + 1e-9 for name, limit in limits.items())]
 
 
 @pytest.fixture
@@ -102,7 +108,7 @@ def controller() -> Iterator[Callable[..., SimulatedController]]:
     yield start
     try:
         for child in running:
-            if child.running:
+            if child.running:  # a test that ends one itself has looked before
                 check_allow_list(child.host)
     finally:
         for child in running:

@@ -21,7 +21,7 @@ from station.simulation.camera import RenderedCamera
 from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
 from station.simulation.scenes import make_cell
-from tests.conftest import asked
+from tests.conftest import asked, check_allow_list
 
 AT_REST_RAD_S = 1e-3
 FAR_RAD = 1.5
@@ -232,6 +232,7 @@ def strike(cell: MakeCell, fault_times: Callable[[Outcome], None]) -> Strike:
             if made is not None:
                 await made.robot.close()
                 await made.end()
+                check_allow_list(made.controller.host)
                 made.controller.stop()
         raise AssertionError("not reached")
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import ast
 import re
 import socket
-from collections.abc import Callable
+import time
 from pathlib import Path
 
 import pytest
 
 from station.devices.ur_dashboard import ALLOWED, PORT, Dashboard
+from station.devices.ur_script import SCRIPT_PORT, script
 from station.simulation.launch import start_controller
+from tests.conftest import check_allow_list, functions_called
 
 ROOT = Path(__file__).parents[2]
 DASHBOARD_COMMANDS = {
@@ -78,6 +80,21 @@ def test_the_search_finds_what_it_looks_for(offence: str) -> None:
     assert offences(offence)
 
 
+def test_six_calls_of_the_vendors_library_are_used_and_no_other() -> None:
+    control = pytest.importorskip("rtde_control").RTDEControlInterface
+    every = {name for name in dir(control) if not name.startswith("_")}
+    nodes = [node for path in sources("*.py") for node in ast.walk(ast.parse(path.read_text()))]
+    used = {node.attr for node in nodes if isinstance(node, ast.Attribute)} & every
+    assert used == {"moveJ", "stopJ", "stopScript", "setWatchdog", "kickWatchdog", "getTCPOffset"}
+
+
+def test_the_control_script_moves_the_arm_by_movej_alone() -> None:
+    only_asked = {"sync", "norm", "get_steptime", "get_tcp_offset"}
+    registers = {f"read_input_{kind}_register" for kind in ("integer", "float")}
+    registers |= {f"write_output_{kind}_register" for kind in ("integer", "float")}
+    assert functions_called(script(1)) - only_asked - registers == {"movej", "stopj"}
+
+
 def test_the_vendors_library_has_one_door() -> None:
     doors = []
     for path in sources("*.py"):
@@ -91,17 +108,45 @@ def test_the_vendors_library_has_one_door() -> None:
 
 @pytest.mark.process
 @pytest.mark.parametrize("order", ["power on", "unlock protective stop", "play", "popup hello"])
-def test_the_list_of_what_may_be_sent_is_enforced(
-    only_allowed_was_sent: Callable[[str], None], order: str
-) -> None:
+def test_the_list_of_what_may_be_sent_is_enforced(order: str) -> None:
     with start_controller() as running:
-        only_allowed_was_sent(running.host)
+        check_allow_list(running.host)
         with socket.create_connection((running.host, PORT), 2) as link:
             link.recv(200)
             link.sendall(order.encode() + b"\n")
             link.recv(200)
         with pytest.raises(AssertionError):
-            only_allowed_was_sent(running.host)
+            check_allow_list(running.host)
+
+
+_JOINTS = "[0, -1.5708, 1.5708, -1.5708, -1.5708, 0.01]"
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"movej({_JOINTS}, a=1.5, v=1.06)",
+        f"movej({_JOINTS}, a=1.6, v=0.5)",
+        f"movep(get_forward_kin({_JOINTS}))",
+        f"optimovej({_JOINTS})",
+        f"servoj({_JOINTS})",
+        "speedj([0, 0, 0, 0, 0, 0.1], 1, 0.01)",
+        "direct_torque([0, 0, 0, 0, 0, 1])",
+        "freedrive_mode()",
+        "force_mode(p[0, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [0, 0, -5, 0, 0, 0], 2, [1, 1, 1, 1, 1, 1])",
+    ],
+)
+def test_whatever_else_moves_an_arm_is_seen_even_in_a_program_of_the_right_name(line: str) -> None:
+    with start_controller("UR10e", options=("--software", "5.25.1")) as running, running.admin() as admin:
+        with socket.create_connection((running.host, SCRIPT_PORT), 2) as link:
+            link.sendall(f"def station_control():\n  {line}\nend\n".encode())
+            give_up_s = time.monotonic() + 10
+            while not [w for w in admin.ask("log")["counts"] if w.startswith(("script", "controller"))]:
+                assert time.monotonic() < give_up_s, "the line does nothing"
+        assert not [e for e in admin.ask("log")["entries"] if e["verb"] == "syntax error"]
+        with pytest.raises(AssertionError):
+            check_allow_list(running.host)
 
 
 @pytest.mark.parametrize("command", [*sorted(DASHBOARD_COMMANDS), "play", "load x", "shutdown"])

@@ -21,6 +21,7 @@ from station.cell.config_file import load_config
 from station.cell.scene import guess_matrix
 from station.simulation.cell import write_truth
 from station.simulation.launch import start_controller, start_gige
+from tests.conftest import check_allow_list
 from tests.station.operate.guided_views import guided_joints
 from tests.tui.terminal import ScreenProcess
 from tests.tui.test_new_cell import other_cell
@@ -94,6 +95,7 @@ def main(folder: Path) -> None:
             person.sees("Install this calibration")
             person.press("tab", "enter")
             person.sees("INSTALLED")
+            check_allow_list(HOST)
         finally:
             screen.end()
             end_daemon(home)

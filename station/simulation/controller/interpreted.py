@@ -278,16 +278,13 @@ class InterpretedProgram:
         return rigid(target) if isinstance(target, Pose) else self._tool(six(target))
 
     def _movej(self, q: list[float], a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Wait:
-        goal = self._joints(q)
-        yield from self._move("movej", goal, lambda start: JointPath(start, goal), a, v, t)
+        yield from self._turn("movej", q, a, v, t)
 
     def _movel(self, pose: list[float], a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Wait:
-        goal, tcp = self._pose(pose), from_pose(self._robot.tcp)
-        make_path = lambda start: LinePath(self._robot.table, tcp, start, goal)  # noqa: E731
-        yield from self._move("movel", to_pose(goal), make_path, a, v, t)
+        yield from self._line("movel", pose, a, v, t)
 
     def _movep(self, pose: list[float], a: float = 1.2, v: float = 0.25, r: float = 0) -> Wait:
-        yield from self._movel(pose, a, v)
+        yield from self._line("movep", pose, a, v)
 
     def _movec(
         self,
@@ -301,6 +298,15 @@ class InterpretedProgram:
         via, goal, tcp = self._pose(pose_via), self._pose(pose_to), from_pose(self._robot.tcp)
         make_path = lambda start: ArcPath(self._robot.table, tcp, start, via, goal)  # noqa: E731
         yield from self._move("movec", to_pose(goal), make_path, a, v, 0)
+
+    def _turn(self, name: str, target: list[float], a: float, v: float, t: float = 0) -> Wait:
+        goal = self._joints(target)
+        yield from self._move(name, goal, lambda start: JointPath(start, goal), a, v, t)
+
+    def _line(self, name: str, target: list[float], a: float, v: float, t: float = 0) -> Wait:
+        goal, tcp = self._pose(target), from_pose(self._robot.tcp)
+        make_path = lambda start: LinePath(self._robot.table, tcp, start, goal)  # noqa: E731
+        yield from self._move(name, to_pose(goal), make_path, a, v, t)
 
     def _move(
         self, name: str, goal: Six, make_path: Callable[[Six], Path], a: float, v: float, t: float
@@ -382,10 +388,12 @@ class InterpretedProgram:
 
     def _optimovej(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
         """a and v are shares of what the arm can do, as in optimovel."""
-        yield from self._movej(goal, a * JOINT_RAD_S2, v * JOINT_SPEED_RAD_S)
+        yield from self._turn("optimovej", goal, a * JOINT_RAD_S2, v * JOINT_SPEED_RAD_S)
 
     def _optimovel(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
-        yield from self._movel(goal, a * JOINT_RAD_S2 * TOOL_M_S / JOINT_SPEED_RAD_S, v * TOOL_M_S)
+        yield from self._line(
+            "optimovel", goal, a * JOINT_RAD_S2 * TOOL_M_S / JOINT_SPEED_RAD_S, v * TOOL_M_S
+        )
 
     # -- torques ----------------------------------------------------------------------------------------
 

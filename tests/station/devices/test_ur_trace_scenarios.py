@@ -23,6 +23,7 @@ from station.devices.ur_traces import (
 )
 from station.simulation.launch import start_controller
 from tests.codes import raises
+from tests.conftest import functions_called
 
 RECORDED = ("rtde-input-claimed-twice", "unknown-question", "stopj-hard", "silence-in-motion")
 
@@ -98,6 +99,13 @@ def test_what_is_no_record_is_refused(tmp_path: Path) -> None:
         (tmp_path / "t").write_bytes(content)
         with raises("no-traces"):
             read_traces(tmp_path / "t")
+
+
+def test_a_scenario_moves_the_arm_by_movej_alone() -> None:
+    every = list(scenarios())
+    texts = [t for s in every for t in (s.program, s.stop, *(e.program for e in s.events)) if t]
+    asked = {name for text in texts for name in functions_called(text)}
+    assert asked <= {"mark", "movej", "stopj", "stopl", "sleep", "sync", "read_input_integer_register"}
 
 
 @pytest.mark.process

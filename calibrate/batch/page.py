@@ -153,12 +153,6 @@ def _fleet_verdict(count: int, total: int) -> str:
     return f'<div class="verdict {kind}"><strong>{said}</strong></div>'
 
 
-def _to_look_at(rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
-    if rows:
-        yield html.heading("Cameras to look at")
-        yield html.table((*_FLEET_HEAD[:4], "why"), rows)
-
-
 def _drift(record: CameraRecord, name: str) -> Iterator[str]:
     if checks := record.current_checks:
         yield html.heading(name)

@@ -22,6 +22,7 @@ from calibrate.geometry import (
     rotation_exp,
     rotation_log,
 )
+from calibrate.handeye.estimate import FULL
 from calibrate.handeye.observations import Moved
 from calibrate.handeye.poses import BoardPoses, PoseFit, PoseViews, fit_poses
 from calibrate.handeye.solution import Explanation, Reading
@@ -78,7 +79,7 @@ def _fit(views: PoseViews, seed: int) -> PoseFit | None:
 
 
 def _share(fit: PoseFit | None) -> float:
-    return 0.0 if fit is None else float((fit.full > 0.35).mean())
+    return 0.0 if fit is None else float((fit.full > FULL).mean())
 
 
 def _readings(

@@ -147,6 +147,8 @@ def _robot_parts(status: StationStatus) -> Iterator[Content]:
     safe = robot.safety or "not known"
     style = "bold $strong" if robot.safety == "NORMAL" else "bold $warn"
     yield Content.assemble(("  safety ", "$dim"), (safe, style))
+    if robot.not_accepted:
+        yield Content.styled("  not accepted", "$warn")
     yield Content.assemble(
         ("  ", ""),
         (f"{robot.speed_m_s:.2f}", "bold $strong"),
@@ -159,8 +161,6 @@ def _robot_parts(status: StationStatus) -> Iterator[Content]:
         yield Content.styled(f"  {'remote' if robot.remote else 'LOCAL'}", "$dim")
     if robot.control_path:
         yield Content.styled(f"  {DRIVEN_BY[robot.control_path]}", "$dim")
-    if robot.not_accepted:
-        yield Content.styled("  not accepted", "$warn")
     if status.lease.holder:
         yield Content.styled(f"  control: {status.lease.holder}", "$dim")
     if status.session.elapsed_s:

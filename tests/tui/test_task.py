@@ -96,6 +96,17 @@ def test_the_bar_fits_and_keeps_state_and_simulated_first(
     assert "SIMULATED" in line
 
 
+@pytest.mark.parametrize("width", [60, 80, 160])
+@pytest.mark.parametrize("state", [StationState.IDLE, StationState.DISCONNECTED, StationState.MOVING])
+def test_the_bar_says_not_accepted_on_the_smallest_screen(width: int, state: StationState) -> None:
+    robot = RobotStatus(
+        connected=True, model="UR10e", safety="NORMAL", remote=True, speed_limit_m_s=0.25,
+        control_path="script", not_accepted="not accepted: its stops were never tested",
+    )  # fmt: skip
+    status = msgspec.structs.replace(idle(state), robot=robot, simulated=False)
+    assert "not accepted" in bar_line(Known(status), "Connect", width).plain
+
+
 @given(why=st.text(alphabet="abc ü…°", max_size=300), look=st.booleans(), width=st.integers(60, 160))
 def test_what_a_person_should_look_at_is_never_cut(why: str, look: bool, width: int) -> None:
     line = next_line(Action("F8", "Acknowledge", why, look=look), width).plain

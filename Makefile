@@ -44,12 +44,14 @@ check: $(READY)  ## ruff, mypy strict, import contracts
 # Other people's programs, apart from ours: half a gigabyte, and npm's part only where there is npm.
 FOREIGN := .foreign
 MCAP_CORE := @mcap/core@2.2.2
+FOXGLOVE_SCHEMAS := @foxglove/schemas@2.1.0
 
 $(FOREIGN)/.ready: $(READY) tests/foreign/requirements.txt
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet --no-deps --upgrade \
 		--target $(FOREIGN)/python -r tests/foreign/requirements.txt
 	@if command -v npm >/dev/null; then \
-		npm install --silent --no-audit --no-fund --ignore-scripts --prefix $(FOREIGN)/node $(MCAP_CORE); \
+		npm install --silent --no-audit --no-fund --ignore-scripts --prefix $(FOREIGN)/node \
+			$(MCAP_CORE) $(FOXGLOVE_SCHEMAS); \
 	else echo "npm is missing: @mcap/core will not judge. apt install npm, then rm -r $(FOREIGN)"; fi
 	@touch $@
 

@@ -158,15 +158,23 @@ def encode_png(image: Pixels) -> bytes:
     return data.tobytes()
 
 
-def pixel_format_of(pixels: Pixels) -> str:
-    """GenICam's name for an array as recordings hold it."""
+def pixel_format_of(pixels: Pixels, encoding: str = "") -> str:
+    """GenICam's name for an array as recordings hold it. `encoding`: foxglove's and ROS's name, if known."""
+    for name, (mosaic, _) in _BAYER.items():
+        if mosaic == encoding and pixels.ndim == 2 and pixels.dtype == np.uint8:
+            return name
     return "BGR8" if pixels.ndim == 3 else "Mono8" if pixels.itemsize == 1 else "Mono16"
+
+
+def mosaic_encoding(pixel_format: str) -> str:
+    """Foxglove's and ROS's name of a colour mosaic; '' for images of any other kind."""
+    return _BAYER[pixel_format][0] if pixel_format in _BAYER else ""
 
 
 def raw_encoding(image: Pixels, pixel_format: str) -> str:
     """The name foxglove.RawImage uses for this array's layout. ImageError for any other array."""
     if image.ndim == 2 and image.dtype == np.uint8:
-        return _BAYER[pixel_format][0] if pixel_format in _BAYER else "mono8"
+        return mosaic_encoding(pixel_format) or "mono8"
     if image.ndim == 2 and image.dtype == np.uint16:
         return "mono16"
     if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:

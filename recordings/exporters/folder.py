@@ -14,7 +14,7 @@ import msgspec
 from recordings.errors import disk_error, exists_error
 from recordings.exporters import Target
 from recordings.files import sync_folder
-from recordings.images import encode_png
+from recordings.images import encode_png, mosaic_encoding
 from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE
 from recordings.reader import Recording
 from recordings.schema.messages import ClockReading, Stamps, View
@@ -77,10 +77,12 @@ def _write_folder(recording: Recording, folder: Path) -> None:
 
 
 def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
-    """The stored file where there is one, else a lossless PNG; returns the pose's row."""
+    """The stored file where it shows the picture, else a lossless PNG; returns the pose's row."""
     image = recording.image(view)
     stored = recording.stored_image(view)
-    extension, data = ("png", encode_png(image.viewable())) if stored is None else stored
+    if stored is None or mosaic_encoding(image.pixel_format):
+        stored = "png", encode_png(image.viewable())
+    extension, data = stored
     name = f"images/{view.index:03d}.{_EXTENSIONS.get(extension, extension)}"
     (folder / name).write_bytes(data)
     T = view.base_from_flange

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.images import raw_encoding
+from recordings.images import mosaic_encoding, raw_encoding
 from recordings.reader import Recording
 from recordings.schema.definitions import PictureFacts
 from recordings.schema.messages import CameraModel, Matrix4, View
@@ -79,7 +79,7 @@ def _entries(messages: _Messages, recording: Recording, segment: RecordingSegmen
     return merge(
         _fixed_frames(messages, segment, first_ns),
         _arm(messages, segment),
-        _images(messages, segment, times, counted, camera),
+        _images(messages, segment, times, facts, counted, camera),
         key=lambda entry: entry.time_ns,
     )
 
@@ -124,6 +124,7 @@ def _images(
     messages: _Messages,
     segment: RecordingSegment,
     times: dict[int, int],
+    facts: dict[int, PictureFacts],
     counted: dict[int, View],
     camera: CameraModel,
 ) -> Iterator[_Entry]:
@@ -131,20 +132,24 @@ def _images(
         if view := counted.get(sequence):
             yield _Entry(time_ns, "/tf", messages.frames("base", "flange", view.base_from_flange, time_ns))
         yield _Entry(time_ns, "/camera/camera_info", messages.camera_info(camera, time_ns))
-        yield _image(messages, segment, sequence, time_ns)
+        yield _image(messages, segment, sequence, facts[sequence].pixel_format, time_ns)
 
 
-def _image(messages: _Messages, segment: RecordingSegment, sequence: int, time_ns: int) -> _Entry:
+def _image(
+    messages: _Messages, segment: RecordingSegment, sequence: int, pixel_format: str, time_ns: int
+) -> _Entry:
     header = messages.header(time_ns, CAMERA_FRAME)
     stored = segment.stored_image(sequence)
     if stored is not None:
-        file = np.frombuffer(stored[1], np.uint8)
-        message = messages.make("sensor_msgs/msg/CompressedImage", header, stored[0], file)
+        file_format, file = stored[0], np.frombuffer(stored[1], np.uint8)
+        if mosaic := mosaic_encoding(pixel_format):
+            file_format = f"{mosaic}; {file_format} compressed"  # as image_transport says it
+        message = messages.make("sensor_msgs/msg/CompressedImage", header, file_format, file)
         return _Entry(time_ns, "/camera/image_raw/compressed", message)
     image = segment.image(sequence)
     height, width = image.pixels.shape[:2]
     data = np.ascontiguousarray(image.pixels).view(np.uint8).ravel()
-    encoding = raw_encoding(image.pixels, image.pixel_format)
+    encoding = raw_encoding(image.pixels, pixel_format)
     message = messages.make(
         "sensor_msgs/msg/Image", header, height, width, encoding, 0, len(data) // height, data
     )

@@ -40,10 +40,8 @@ _LAYOUTS = {
     "mono8": (1, np.uint8, None), "8UC1": (1, np.uint8, None), "mono16": (1, np.uint16, None),
     "bgr8": (3, np.uint8, None), "8UC3": (3, np.uint8, None), "rgb8": (3, np.uint8, cv2.COLOR_RGB2BGR),
     "bgra8": (4, np.uint8, cv2.COLOR_BGRA2BGR), "rgba8": (4, np.uint8, cv2.COLOR_RGBA2BGR),
-    "bayer_rggb8": (1, np.uint8, cv2.COLOR_BayerRGGB2BGR),
-    "bayer_bggr8": (1, np.uint8, cv2.COLOR_BayerBGGR2BGR),
-    "bayer_gbrg8": (1, np.uint8, cv2.COLOR_BayerGBRG2BGR),
-    "bayer_grbg8": (1, np.uint8, cv2.COLOR_BayerGRBG2BGR),
+    "bayer_rggb8": (1, np.uint8, None), "bayer_bggr8": (1, np.uint8, None),
+    "bayer_gbrg8": (1, np.uint8, None), "bayer_grbg8": (1, np.uint8, None),
     "yuv422": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY), "uyvy": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY),
     "yuv422_yuy2": (2, np.uint8, cv2.COLOR_YUV2BGR_YUYV), "yuyv": (2, np.uint8, cv2.COLOR_YUV2BGR_YUYV),
 }  # fmt: skip
@@ -241,7 +239,8 @@ def _write_view(
 ) -> None:
     pixels, encoded = _pixels(message, stop.place)
     stamps = Stamps(host_wall_ns=stop.stamp_ns, device_ns=stop.stamp_ns)
-    image = Image(pixels, stamps, stop.place, index, pixel_format=pixel_format_of(pixels))
+    pixel_format = pixel_format_of(pixels, message.encoding)
+    image = Image(pixels, stamps, stop.place, index, pixel_format=pixel_format)
     writer.image(image, encoded)
     T: Matrix4 = tuple(tuple(map(float, row)) for row in stop.base_from_flange)
     writer.view(
@@ -259,7 +258,7 @@ def _write_view(
 
 
 def _size(image: ImageMessage) -> tuple[int, int]:
-    if image.encoding != "compressed":
+    if image.width:
         return image.width, image.height
     try:
         header = read_header(image.data)
@@ -271,7 +270,7 @@ def _size(image: ImageMessage) -> tuple[int, int]:
 def _pixels(image: ImageMessage, place: int) -> tuple[Pixels, bytes | None]:
     """(array as recordings hold it, file bytes to keep). ImportSourceError for what no camera here writes."""
     try:
-        if image.encoding == "compressed":
+        if not image.width:
             header = read_header(image.data)
             decoded = decode_image(image.data, header.width, header.height)
             return decoded, image.data if header.format in KEPT_FORMATS else encode_png(decoded)

@@ -1,10 +1,11 @@
-"""Messages of bags that an import can use, decoded from ROS 2 (CDR) or foxglove (protobuf).
+"""Messages of bags that an import can use, decoded from ROS 2 (CDR) or foxglove (protobuf, JSON).
 
 One type per kind of message, times in ns. ROS messages need `rosbags` (the extra `ros`).
 """
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.json_format import ParseDict
+from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError
@@ -46,11 +49,12 @@ class ImageMessage:
     stamp_ns: int
     frame: str
     width: int
+    """0 for a PNG or JPEG file, like height and step."""
     height: int
     encoding: str
-    """ROS's name: mono8, bgr8, bayer_rggb8 …; `compressed` for a PNG or JPEG file."""
+    """ROS's name: mono8, bgr8, bayer_rggb8 …; of a file: that of the pixels in it, where it is said."""
     step: int
-    """Bytes of a row; 0 for a file."""
+    """Bytes of a row."""
     data: bytes
 
 
@@ -82,7 +86,7 @@ class FrameMessage:
 Value = ImageMessage | CameraMessage | Joints | list[FrameMessage]
 
 
-CDR, PROTOBUF = "cdr", "protobuf"
+CDR, PROTOBUF, JSON = "cdr", "protobuf", "json"
 _FOXGLOVE: dict[str, tuple[Any, Kind]] = {
     "foxglove.RawImage": (RawImage, Kind.IMAGE),
     "foxglove.CompressedImage": (CompressedImage, Kind.IMAGE),
@@ -109,7 +113,7 @@ STAMP_BYTES = 12
 
 def kind_of(encoding: str, schema: str) -> Kind | None:
     """Return the content of such messages; None for kinds that are not used here."""
-    if encoding == PROTOBUF:
+    if encoding in (PROTOBUF, JSON):
         return _FOXGLOVE[schema][1] if schema in _FOXGLOVE else None
     return _ROS.get(schema) if encoding == CDR else None
 
@@ -119,12 +123,23 @@ def decoded(encoding: str, schema: str, data: bytes, time_ns: int) -> Value:
     try:
         if encoding == PROTOBUF:
             return _from_foxglove(schema, _FOXGLOVE[schema][0].FromString(data), time_ns)
+        if encoding == JSON:
+            fields = json.loads(data, object_hook=_protobufs_time)
+            message = ParseDict(fields, _FOXGLOVE[schema][0](), ignore_unknown_fields=True)
+            return _from_foxglove(schema, message, time_ns)
         message = ros_types().deserialize_cdr(data, schema)
     except ImportSourceError:
         raise
     except Exception as error:  # whatever rosbags makes of bytes that are no message
         raise _undecodable(schema, repr(error)) from error
     return _from_ros(schema, message, time_ns)
+
+
+def _protobufs_time(found: dict[str, Any]) -> object:
+    """A time of foxglove's JSON schemas as protobuf's JSON spells it; any other object as it is."""
+    if found.keys() != {"sec", "nsec"}:
+        return found
+    return Timestamp(seconds=found["sec"], nanos=found["nsec"]).ToJsonString()
 
 
 def _undecodable(schema: str, reason: str) -> ImportSourceError:
@@ -165,7 +180,7 @@ def _from_foxglove(schema: str, message: Any, time_ns: int) -> Value:
         size = (message.width, message.height)
         return ImageMessage(stamp_ns, frame, *size, message.encoding, message.step, message.data)
     if schema == "foxglove.CompressedImage":
-        return ImageMessage(stamp_ns, frame, 0, 0, "compressed", 0, message.data)
+        return ImageMessage(stamp_ns, frame, 0, 0, "", 0, message.data)
     if schema == "foxglove.CameraCalibration":
         return CameraMessage(frame, camera_model_of(message))
     if schema == "foxglove.JointStates":
@@ -200,7 +215,10 @@ def _from_ros(schema: str, message: Any, time_ns: int) -> Value:
         size = (message.width, message.height)
         return ImageMessage(stamp_ns, frame, *size, message.encoding, message.step, message.data.tobytes())
     if schema == "sensor_msgs/msg/CompressedImage":
-        return ImageMessage(stamp_ns, frame, 0, 0, "compressed", 0, message.data.tobytes())
+        encoding = message.format.partition(";")[
+            0
+        ]  # "bayer_rggb8; png compressed", as image_transport writes
+        return ImageMessage(stamp_ns, frame, 0, 0, encoding, 0, message.data.tobytes())
     if schema == "sensor_msgs/msg/CameraInfo":
         size = (message.width, message.height)
         return CameraMessage(frame, intrinsics(*size, message.k, message.d, message.distortion_model))

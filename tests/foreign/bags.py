@@ -6,17 +6,21 @@ pictures a second all the time. Nothing is stamped at the same moment as anythin
 
 from __future__ import annotations
 
+import base64
+import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.foreign.judges import FOLDER, missing
+from tests.foreign.judges import FOLDER, library, missing
 
 STOPS = 5
 START_NS = 1_700_000_000_000_000_000
@@ -94,7 +98,17 @@ class RosMessages:
             self.make("geometry_msgs/msg/Pose", at, turn),
         )  # fmt: skip
 
-    def message(self, stamp_ns: int, kind: str, time_s: float) -> tuple[str, Any]:
+    def image(self, stamp_ns: int, time_s: float, encoding: str) -> tuple[str, Any]:
+        """`encoding` like those of image_transport where it names a file."""
+        header, pixels = self.header(stamp_ns, "optical"), picture(time_s)
+        if "png" in encoding:
+            file = cv2.imencode(".png", pixels)[1]
+            return "/cam/image", self.make("sensor_msgs/msg/CompressedImage", header, encoding, file)
+        return "/cam/image_raw", self.make(
+            "sensor_msgs/msg/Image", header, HEIGHT, WIDTH, encoding, 0, WIDTH, pixels.ravel()
+        )
+
+    def message(self, stamp_ns: int, kind: str, time_s: float, encoding: str) -> tuple[str, Any]:
         if kind == "tf":
             frame = self.transform(stamp_ns, "base_link", "tool0", *pose(time_s))
             return "/tf", self.make("tf2_msgs/msg/TFMessage", [frame])
@@ -112,10 +126,7 @@ class RosMessages:
                 "sensor_msgs/msg/CameraInfo", self.header(stamp_ns, "optical"), HEIGHT, WIDTH, "plumb_bob",
                 np.zeros(5), np.array(K), np.eye(3).ravel(), np.zeros(12), 0, 0, roi,
             )  # fmt: skip
-        return "/cam/image_raw", self.make(
-            "sensor_msgs/msg/Image", self.header(stamp_ns, "optical"), HEIGHT, WIDTH, "mono8", 0, WIDTH,
-            picture(time_s).ravel(),
-        )  # fmt: skip
+        return self.image(stamp_ns, time_s, encoding)
 
 
 def write_rosbag2(path: Path, storage: str, compression: str = "none") -> Path:
@@ -129,7 +140,7 @@ def write_rosbag2(path: Path, storage: str, compression: str = "none") -> Path:
     with writer:
         connections: dict[str, Any] = {}
         for stamp_ns, kind, time_s in moments():
-            topic, message = ros.message(stamp_ns, kind, time_s)
+            topic, message = ros.message(stamp_ns, kind, time_s, "mono8")
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
             data = ros.store.serialize_cdr(message, message.__msgtype__)
@@ -137,7 +148,7 @@ def write_rosbag2(path: Path, storage: str, compression: str = "none") -> Path:
     return path
 
 
-def write_ros_mcap(path: Path, poses: bool = False, **options: Any) -> Path:
+def write_ros_mcap(path: Path, poses: bool = False, encoding: str = "mono8", **options: Any) -> Path:
     """The same in one MCAP file, by the reference library's writer and its `options`.
 
     `poses`: a PoseStamped instead of every frame.
@@ -150,7 +161,7 @@ def write_ros_mcap(path: Path, poses: bool = False, **options: Any) -> Path:
         writer.start("ros2")
         channels: dict[str, int] = {}
         for stamp_ns, kind, time_s in moments():
-            topic, message = ros.message(stamp_ns, kind, time_s)
+            topic, message = ros.message(stamp_ns, kind, time_s, encoding)
             if poses and kind == "tf":
                 topic, message = "/arm/pose", ros.pose(stamp_ns, time_s)
             if topic not in channels:
@@ -173,6 +184,51 @@ def write_by_foxglove_sdk(path: Path) -> Path:
     environment = {**os.environ, "PYTHONPATH": str(library)}
     subprocess.run([sys.executable, str(script), str(source), str(path)], env=environment, check=True)
     return path
+
+
+def write_foxglove_json(path: Path) -> Path:
+    """Foxglove's schemas in JSON, as its package @foxglove/schemas publishes and checks them."""
+    from mcap.writer import Writer
+
+    validate = library("jsonschema_rs", "jsonschema-rs").validate
+    modules, node = FOLDER / "node" / "node_modules", shutil.which("node")
+    if node is None or not (modules / "@foxglove" / "schemas").is_dir():
+        missing("@foxglove/schemas")
+    told = 'process.stdout.write(JSON.stringify(require("@foxglove/schemas/jsonschema")))'
+    environment = {**os.environ, "NODE_PATH": str(modules)}
+    published = json.loads(subprocess.check_output([str(node), "-e", told], env=environment))
+    with path.open("wb") as stream:
+        writer, channels = Writer(stream), dict[str, int]()
+        writer.start()
+        for stamp_ns, kind, time_s in moments():
+            topic, name, fields = _foxglove_fields(kind, time_s)
+            seconds, nanoseconds = divmod(stamp_ns, 10**9)
+            fields["timestamp"] = {"sec": seconds, "nsec": nanoseconds}
+            if topic not in channels:
+                validate(published[name], fields)
+                definition = json.dumps(published[name]).encode()
+                schema = writer.register_schema(f"foxglove.{name}", "jsonschema", definition)
+                channels[topic] = writer.register_channel(topic, "json", schema)
+            writer.add_message(channels[topic], stamp_ns, json.dumps(fields).encode(), stamp_ns)
+        writer.finish()
+    return path
+
+
+def _foxglove_fields(kind: str, time_s: float) -> tuple[str, str, dict[str, Any]]:
+    """Topic, schema, message."""
+    if kind == "tf":
+        position, q = (dict(zip("xyzw", numbers.tolist(), strict=False)) for numbers in pose(time_s))
+        names = {"parent_frame_id": "base_link", "child_frame_id": "tool0"}
+        return "/frames", "FrameTransform", {**names, "translation": position, "rotation": q}
+    if kind == "joints":
+        moved = [{"name": name, "position": progress_of(time_s)} for name in JOINTS]
+        return "/joints", "JointStates", {"joints": moved}
+    size = {"frame_id": "camera", "width": WIDTH, "height": HEIGHT}
+    if kind == "info":
+        lens = {"distortion_model": "plumb_bob", "D": [0.0] * 5, "K": K, "R": np.eye(3).ravel().tolist()}
+        return "/cam/calibration", "CameraCalibration", {**size, **lens, "P": [0.0] * 12}
+    data = base64.b64encode(picture(time_s).tobytes()).decode()
+    return "/cam/image", "RawImage", {**size, "encoding": "mono8", "step": WIDTH, "data": data}
 
 
 def write_foxglove_mcap(path: Path) -> Path:

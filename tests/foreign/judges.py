@@ -11,8 +11,11 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
@@ -27,6 +30,17 @@ Judge = Callable[[Path], list[str]]
 
 def missing(program: str) -> None:
     pytest.skip(f"the judge '{program}' is missing: run `make foreign`")
+
+
+def library(module: str, program: str) -> Any:
+    """A Python module of somebody else's; skips where it is not installed."""
+    sys.path.insert(0, str(FOLDER / "python"))
+    try:
+        return import_module(module)
+    except ImportError:
+        missing(program)
+    finally:
+        sys.path.pop(0)
 
 
 def mcap_python(path: Path) -> list[str]:
@@ -86,19 +100,22 @@ def mcap_core(path: Path) -> list[str]:
     return [*said["findings"], *backwards]
 
 
+def rerun(*arguments: str) -> str:
+    """What the viewer's command line says, and in a last line how it ended."""
+    program = FOLDER / "python" / "rerun_cli" / "rerun"
+    if not program.is_file():
+        missing("rerun")
+    done = subprocess.run([str(program), *arguments], capture_output=True, text=True, timeout=_TIMEOUT_S)
+    return f"{done.stdout}{done.stderr}\nexit {done.returncode}"
+
+
 def rerun_check(path: Path) -> list[str]:
     """`rerun mcap check`: decodes everything, and every chunk of a topic must follow the one before."""
-    rerun = FOLDER / "python" / "rerun_cli" / "rerun"
-    if not rerun.is_file():
-        missing("rerun mcap check")
-    done = subprocess.run(
-        [str(rerun), "mcap", "check", "--full", str(path)], capture_output=True, text=True, timeout=_TIMEOUT_S
-    )
-    lines = (done.stdout + done.stderr).splitlines()
+    lines = rerun("mcap", "check", "--full", str(path)).splitlines()
     rows = [line for line in lines if re.match(r"\w+\s+\d+\s+\d+\s+/", line)]
     bad = [line for line in rows if not line.startswith("ok")]
-    if done.returncode or not rows:
-        bad += lines[-5:] or ["it said nothing"]
+    if lines[-1] != "exit 0" or not rows:
+        bad += lines[-5:]
     return bad
 
 

@@ -12,7 +12,7 @@ from recordings.reader import open_recording
 from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
-from tests.foreign.judges import JUDGES
+from tests.foreign.judges import JUDGES, rerun
 from tests.recordings.small_recording import START_NS, make_info, make_picture, make_state, make_view
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "samples" / "paper-640.mcap"
@@ -87,3 +87,11 @@ def test_the_judges_see_what_is_wrong(tmp_path: Path) -> None:
             continue
         except Exception:
             continue  # the reference library raises
+
+
+def test_rerun_draws_pictures_frames_and_events_without_a_plugin(tmp_path: Path) -> None:
+    rerun("mcap", "convert", str(fresh(tmp_path)), "-o", str(tmp_path / "a.rrd"))
+    shown = rerun("rrd", "print", str(tmp_path / "a.rrd"))
+    for column in ("Image:buffer", "Pinhole:image_from_camera", "Transform3D:translation", "TextLog:text"):
+        assert column in shown, f"rerun shows no {column}"
+    assert "station.RobotState" in shown

@@ -15,7 +15,7 @@ import yaml
 from calibrate.files.calibration import decode_calibration
 from recordings.reader import open_recording
 from tests.calibrate.calling import run
-from tests.foreign.judges import FOLDER, missing
+from tests.foreign.judges import library
 
 ROOT = Path(__file__).parents[2]
 SAMPLE = ROOT / "recordings/samples/paper-640.mcap"
@@ -25,13 +25,7 @@ Findings = Callable[[str, Any], list[str]]
 @pytest.fixture(scope="module")
 def findings() -> Findings:
     """What jsonschema-rs finds wrong with a value, by the schema of that name."""
-    sys.path.insert(0, str(FOLDER / "python"))
-    try:
-        import jsonschema_rs
-    except ImportError:
-        missing("jsonschema-rs")
-    finally:
-        sys.path.pop(0)
+    jsonschema_rs = library("jsonschema_rs", "jsonschema-rs")
 
     def judge(name: str, value: Any) -> list[str]:
         schema = json.loads((ROOT / f"docs/schemas/{name}.json").read_text())
@@ -102,13 +96,7 @@ def test_files_that_people_write(findings: Findings) -> None:
 
 
 def test_prometheus_reads_the_metrics(tmp_path: Path) -> None:
-    sys.path.insert(0, str(FOLDER / "python"))
-    try:
-        from prometheus_client.parser import text_string_to_metric_families
-    except ImportError:
-        missing("prometheus-client")
-    finally:
-        sys.path.pop(0)
+    parse = library("prometheus_client.parser", "prometheus-client").text_string_to_metric_families
     place = ("--root", tmp_path / "cell")
     file = tmp_path / "c.yaml"
     assert run("solve", SAMPLE, "-o", file, cwd=tmp_path).returncode in (0, 4)
@@ -118,7 +106,7 @@ def test_prometheus_reads_the_metrics(tmp_path: Path) -> None:
         done = run("install", file, *named, *place, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
     run("withdraw", "a pallet hit it", "--camera", "overhead", *place, cwd=tmp_path)
-    families = list(text_string_to_metric_families(run("metrics", *place, cwd=tmp_path).stdout))
+    families = list(parse(run("metrics", *place, cwd=tmp_path).stdout))
     assert all(family.documentation and family.type == "gauge" for family in families)
     (states,) = (family for family in families if family.name == "calibration_validity")
     held = {sample.labels["camera"]: sample.labels["state"] for sample in states.samples if sample.value}

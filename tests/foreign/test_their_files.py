@@ -20,11 +20,14 @@ from station.cell.config import StillnessConfig
 from station.cell.stillness import LEAST_SAMPLES as STATION_LEAST_SAMPLES
 from tests.command_line import call
 from tests.foreign.bags import (
+    HEIGHT,
     START_NS,
     STOPS,
+    WIDTH,
     K,
     pose,
     write_by_foxglove_sdk,
+    write_foxglove_json,
     write_foxglove_mcap,
     write_ros_mcap,
     write_rosbag2,
@@ -51,6 +54,7 @@ SOURCES = {
     ),
     "mcap, poses instead of frames": lambda folder: write_ros_mcap(folder / "a.mcap", poses=True),
     "foxglove schemas": lambda folder: write_foxglove_mcap(folder / "a.mcap"),
+    "foxglove schemas, JSON": lambda folder: write_foxglove_json(folder / "a.mcap"),
     "foxglove schemas, foxglove-sdk": lambda folder: write_by_foxglove_sdk(folder / "a.mcap"),
 }  # fmt: skip
 
@@ -109,6 +113,16 @@ def test_the_stops_come_with_their_picture_and_the_right_pose(
         assert states[0].joints_rad == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (
             "base first, whatever order they came in"
         )
+
+
+@pytest.mark.parametrize("encoding", ["bayer_grbg8", "bayer_grbg8; png compressed "])
+def test_a_mosaic_stays_one(tmp_path: Path, description: Path, encoding: str) -> None:
+    """Raw, or in a file as ROS's image_transport writes it."""
+    import_bag(write_ros_mcap(tmp_path / "a.mcap", encoding=encoding), tmp_path / "out.mcap", description)
+    for number, (_, image) in enumerate(open_recording(tmp_path / "out.mcap").images()):
+        assert (image.pixels.shape, image.pixel_format) == ((HEIGHT, WIDTH), "BayerGR8")
+        assert np.unique(image.pixels) == 10 + 40 * number
+        assert image.viewable().shape == (HEIGHT, WIDTH, 3)
 
 
 def test_the_rule_for_standing_is_the_stations() -> None:

@@ -1,16 +1,14 @@
-"""Exports come back through other readers' own rules: import, csv, rosbags, rerun."""
+"""Exports come back through other readers' own rules: import, csv, rosbags."""
 
 from __future__ import annotations
 
 import csv
 import errno
 import os
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -38,7 +36,6 @@ from tests.recordings.small_recording import (
     make_state,
     make_view,
     refused,
-    write_small,
 )
 
 
@@ -267,20 +264,23 @@ def test_rosbags_reads_the_bag_back(tmp_path: Path, lossless_png: bool) -> None:
     np.testing.assert_array_equal(image.data.reshape(HEIGHT, WIDTH), make_image(1))
 
 
-def test_rerun_opens_the_recording_without_a_plugin(tmp_path: Path) -> None:
-    """Runs where the `rerun` program (package rerun-sdk) is installed: with 100 MB it is no dependency."""
-    rerun = shutil.which("rerun", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
-    if rerun is None:
-        pytest.skip("the rerun program (package rerun-sdk) is not installed")
-    path = write_small(tmp_path / "a.mcap")
-
-    def run(*arguments: str) -> str:
-        done = subprocess.run([rerun, *arguments], capture_output=True, text=True, check=True, timeout=60)
-        return done.stdout + done.stderr
-
-    run("mcap", "check", str(path))
-    run("mcap", "convert", str(path), "-o", str(tmp_path / "a.rrd"))
-    shown = run("rrd", "print", str(tmp_path / "a.rrd"))
-    for column in ("Image:buffer", "Pinhole:image_from_camera", "Transform3D:translation", "TextLog:text"):
-        assert column in shown, f"rerun shows no {column}"
-    assert "station.RobotState" in shown
+@pytest.mark.parametrize("lossless_png", [False, True])
+def test_a_colour_mosaic_leaves_as_what_it_is(tmp_path: Path, lossless_png: bool) -> None:
+    """ROS is told of the mosaic; a folder, where nothing could say so, gets colours."""
+    with RecordingWriter(tmp_path / "a.mcap", make_info(), lossless_png=lossless_png) as writer:
+        writer.image(msgspec.structs.replace(make_picture(0), pixel_format="BayerGR8"))
+        writer.view(make_view(0))
+        recording = open_recording(writer.finish())
+    found = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))
+    if lossless_png:
+        (message,) = found["/camera/image_raw/compressed"]
+        assert message.format == "bayer_grbg8; png compressed"
+        mosaic = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
+    else:
+        (message,) = found["/camera/image_raw"]
+        assert message.encoding == "bayer_grbg8"
+        mosaic = message.data.reshape(HEIGHT, WIDTH)
+    np.testing.assert_array_equal(mosaic, make_image(0))
+    folder = export_recording(recording, tmp_path / "out", Target.FOLDER)
+    shown = cv2.imread(str(folder / "images/000.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(shown, cv2.cvtColor(make_image(0), cv2.COLOR_BayerGRBG2BGR))

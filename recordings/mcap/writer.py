@@ -85,21 +85,25 @@ class McapFile:
 
         `more`: the next message belongs to this one and goes into the same chunk.
         """
-        if self._declared_at is None or self.size_bytes - self._declared_at > DECLARE_AGAIN_BYTES:
+        declares = self._declared_at is None or self.size_bytes - self._declared_at > DECLARE_AGAIN_BYTES
+        if declares:
             self._declare()
         chunk = self._chunk
         chunk.message(channel, pieces, time_ns, sequence & 0xFFFFFFFF)
-        if chunk.size_bytes > CHUNK_BYTES and not more:
+        if (declares or chunk.size_bytes > CHUNK_BYTES) and not more:
             self.end_chunk()
 
     def _declare(self) -> None:
-        """All schemas and channels so far, in a chunk of their own: damage elsewhere leaves them alone."""
+        """Begins a chunk with all schemas and channels so far; one message follows and ends it.
+
+        So damage elsewhere leaves them alone. Without a message the chunk's times would be 0, which viewers
+        take for the recording's beginning.
+        """
         self.end_chunk()
         self._declared_at = self.size_bytes
         for pair in self._declarations:
             for record in pair:
                 self._chunk.add(record)
-        self.end_chunk()
 
     def attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         content = struct.pack("<QQ", time_ns, time_ns) + _text(name) + _text(media_type)

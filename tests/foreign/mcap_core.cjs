@@ -41,6 +41,12 @@ async function main(path) {
     if (sorted(indexed) !== sorted(streamed)) findings.push("the index leads to other messages than the file has");
     if (Number(reader.statistics.messageCount) !== Object.values(indexed).reduce((a, b) => a + b, 0))
       findings.push("the statistics count other messages than the file has");
+    // Lichtblick takes a recording's beginning and end from here.
+    const starts = reader.chunkIndexes.map((chunk) => chunk.messageStartTime);
+    const ends = reader.chunkIndexes.map((chunk) => chunk.messageEndTime);
+    const { messageStartTime, messageEndTime } = reader.statistics;
+    if (starts.some((time) => time < messageStartTime) || ends.some((time) => time > messageEndTime))
+      findings.push("a chunk reaches beyond the first or last message");
   } catch (error) {
     findings.push(`in log order: ${error.message}`);
   }

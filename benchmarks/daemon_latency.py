@@ -50,9 +50,8 @@ def _row(name: str, values: list[float], goal: float) -> str:
 
 async def _stop_latencies() -> list[float]:
     """Presses on one connection while another asks for previews as fast as it can."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, simulated_daemon(Path(folder), []) as socket:
         async with (
-            simulated_daemon(Path(folder), []) as socket,
             await Client.connect(socket) as operator,
             await Client.connect(socket) as screen,
         ):

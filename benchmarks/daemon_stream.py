@@ -183,34 +183,37 @@ async def stream(fps: float, seconds: float, root: Path) -> StreamOutcome:
     outcome = StreamOutcome(fps, 0, Checked(), 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     waiting: list[Path] = []
     verified: list[Future[Checked]] = []
-    async with simulated_daemon(root, arguments) as socket, await Client.connect(socket) as client:
-        idle = await wait_until_idle(client)
-        await client.request("lease", action="take")
-        await client.request("load_plan", plan=msgspec.to_builtins(long_sweep(idle, min(seconds, SESSION_S))))
-        daemon = daemon_of_this_process()
-        usage = DaemonUsage(daemon)
+    with simulated_daemon(root, arguments) as socket:
+        async with await Client.connect(socket) as client:
+            idle = await wait_until_idle(client)
+            await client.request("lease", action="take")
+            await client.request(
+                "load_plan", plan=msgspec.to_builtins(long_sweep(idle, min(seconds, SESSION_S)))
+            )
+            daemon = daemon_of_this_process()
+            usage = DaemonUsage(daemon)
 
-        def look(status: StationStatus) -> None:
-            put_before_others(daemon, NICENESS)  # each go starts a control process
-            usage.sample()
-            outcome.dropped = max(outcome.dropped, status.recorder.drops)
-            if status.state is StationState.MOVING:
-                outcome.lag_ms = max(outcome.lag_ms, status.loop_lag_ms)
-                outcome.sync_ms = max(outcome.sync_ms, status.recorder.sync_ms)
+            def look(status: StationStatus) -> None:
+                put_before_others(daemon, NICENESS)  # each go starts a control process
+                usage.sample()
+                outcome.dropped = max(outcome.dropped, status.recorder.drops)
+                if status.state is StationState.MOVING:
+                    outcome.lag_ms = max(outcome.lag_ms, status.loop_lag_ms)
+                    outcome.sync_ms = max(outcome.sync_ms, status.recorder.sync_ms)
 
-        for _ in range(max(1, round(seconds / SESSION_S))):
-            ended = await carry_out(client, Purpose.RUN, approve_simulated, look)
-            if ended.exit_code != 0:
-                raise RuntimeError(f"{ended.status.state.value}: {ended.status.reason}")
-            outcome.sessions += 1
-            waiting.append(Path(ended.recording))
-            if len(waiting) > WAITING:
-                if verified:  # the disk has an end
-                    await asyncio.wrap_future(verified[-1])
-                verified.append(verifier.submit(verify, waiting.pop(0)))
-        outcome.station_cores = usage.cores(simulators=False)
-        outcome.simulator_cores = usage.cores(simulators=True)
-        outcome.memory_mib, outcome.load = usage.memory_mib(), os.getloadavg()[1]
+            for _ in range(max(1, round(seconds / SESSION_S))):
+                ended = await carry_out(client, Purpose.RUN, approve_simulated, look)
+                if ended.exit_code != 0:
+                    raise RuntimeError(f"{ended.status.state.value}: {ended.status.reason}")
+                outcome.sessions += 1
+                waiting.append(Path(ended.recording))
+                if len(waiting) > WAITING:
+                    if verified:  # the disk has an end
+                        await asyncio.wrap_future(verified[-1])
+                    verified.append(verifier.submit(verify, waiting.pop(0)))
+            outcome.station_cores = usage.cores(simulators=False)
+            outcome.simulator_cores = usage.cores(simulators=True)
+            outcome.memory_mib, outcome.load = usage.memory_mib(), os.getloadavg()[1]
     for done in (*verified, *(verifier.submit(verify, path) for path in waiting)):
         outcome.checked += await asyncio.wrap_future(done)
     verifier.shutdown()

@@ -14,7 +14,7 @@ from station.cell.acceptance import Acceptance, StopWay, write_acceptance
 from station.cell.errors import RefusedError
 from station.cell.socket_folder import default_socket
 from station.cell.status import MotionPreview
-from station.cli.attended import Attended, attended, ctrl_c_at_once
+from station.cli.attended import Attended, attended, confirmed
 from station.cli.console import AsJson, Socket, err, out
 from station.operate.acceptance import SPEEDS_M_S, AcceptanceTest, JudgedStop
 from station.operate.acceptance_report import acceptance_page, figure_text
@@ -108,14 +108,15 @@ class _ShellTester:
                 "No terminal.", code="no-person", remedy="A person must stand at the arm (docs: Safety)."
             )
         err.print("The arm will be stopped in mid-move, again and again, also by taking its control away.")
-        return self._said_yes("Is the emergency stop in your hand, and everybody out of the arm's reach?")
+        return confirmed("Is the emergency stop in your hand, and everybody out of the arm's reach?")
 
     async def approves(self, preview: MotionPreview) -> bool:
         return await self._shell.approves(preview)
 
     async def before(self, way: StopWay) -> None:
-        if way is StopWay.SLIDER:
-            self._wait_for("Draw the speed slider on the pendant down to 0.")
+        question = "Draw the speed slider on the pendant down to 0. Done?"
+        if way is StopWay.SLIDER and not confirmed(question):
+            raise RefusedError("The test was ended.", code="ended")
 
     async def meanwhile(self, way: StopWay) -> None:
         err.print("NOW pull the robot's network cable.", style="bold yellow")
@@ -135,18 +136,6 @@ class _ShellTester:
         figures = failed or [f for f in result.figures if f.name in ("reaction", "rest", "distance", "moved")]
         said = ", ".join(f"{f.name} {figure_text(f)}" for f in figures)
         err.print(f"{mark}  {result.way.value}, {result.speed_m_s:.2f} m/s: {said}", style=style)
-
-    def _said_yes(self, question: str) -> bool:
-        try:
-            with ctrl_c_at_once():
-                return typer.confirm(question, default=False, err=True)
-        except typer.Abort:
-            err.print()
-            return False
-
-    def _wait_for(self, what: str) -> None:
-        if not self._said_yes(f"{what} Done?"):
-            raise RefusedError("The test was ended.", code="ended")
 
 
 class _SimulatedTester(_ShellTester):

@@ -55,12 +55,7 @@ class Attended:
     async def plans_here(self, refusal: StationError) -> bool:
         """Ask whether to plan again from where the arm stands; the plan's file stays as it is."""
         err.print(refusal.text, style="yellow")
-        try:
-            with ctrl_c_at_once():
-                return typer.confirm("Plan again from here? Nothing moves.", default=True, err=True)
-        except typer.Abort:
-            err.print()
-            return False
+        return confirmed("Plan again from here? Nothing moves.", default=True)
 
     def _decides(self, preview: MotionPreview) -> bool:
         if self._approved:
@@ -141,16 +136,19 @@ async def stop_and_say(client: Client) -> None:
 
 
 def ask_person(preview: MotionPreview) -> bool:
-    """Show what would move, and ask; Ctrl-C is a no."""
+    """Show what would move, and ask."""
     err.print("\nThe arm will move", style="bold")
     for name, fact in motion_facts(preview):
         err.print(f"{name:<10} {fact}", style="yellow" if name == "WARNING" else None)
     err.print("The emergency stop on the pendant is the safety device. Ctrl-C stops too.")
+    return confirmed("Is everybody out of the arm's reach? Start motion?")
+
+
+def confirmed(question: str, default: bool = False) -> bool:
+    """Ask a person; Ctrl-C is a no."""
     try:
         with ctrl_c_at_once():
-            return typer.confirm(
-                "Is everybody out of the arm's reach? Start motion?", default=False, err=True
-            )
+            return typer.confirm(question, default=default, err=True)
     except typer.Abort:
         err.print()  # after the terminal's ^C
         return False

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
-import shutil
+import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,19 +30,17 @@ from station.cell.errors import ConfigError, StationError
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import MotionPreview
 from station.cli.console import AsJson, Headless, err, out
+from station.cli.daemon import own_daemon
 from station.cli.progress import SessionProgress
 from station.cli.session import PosesJson
 from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
-from station.operate.motion import carry_out, wait_until_idle
+from station.operate.motion import SessionOutcome, carry_out, wait_until_idle
 from station.plan.choose import Aim
 from station.protocol.client import Client
 from station.protocol.verbs import Lease, MakePlan, Purpose
 from station.simulation.cell import CellTruth
 from station.simulation.netns import is_isolated, isolated_command
 
-START_TIMEOUT_S = 120.0
-"""It took 70 s on a computer at load 14. A daemon that ends says so at once."""
-END_TIMEOUT_S = 15.0
 SOLVE_TIMEOUT_S = 300.0
 _GATE_FAILED = 4
 
@@ -77,9 +73,6 @@ class DemoJson(msgspec.Struct, frozen=True):
     holdout: HoldoutJson | None
     gates_passed: bool
     arm: DemoArmJson
-
-
-"""JSON: of `calibrate solve`, and our own."""
 
 
 class DemoError(StationError):
@@ -121,7 +114,7 @@ def demo_command(
     arguments += ["--time-scale", str(time_scale), *(["--gige"] if gige else [])]
     arguments += ["--control", control] if control else []
     progress, started_s = SessionProgress(err, quiet=headless or as_json), time.monotonic()
-    result = asyncio.run(_run(folder, arguments, poses, seed, progress, cell))
+    result = _run(folder, arguments, poses, seed, progress, cell)
     if as_json:
         print(msgspec.json.encode(result).decode())
     else:
@@ -151,32 +144,21 @@ def _show_demo(result: DemoJson, duration_s: float) -> None:
         out.print(sentence)
 
 
-async def _run(
+def _run(
     folder: Path, arguments: list[str], poses: int, seed: int, progress: SessionProgress, cell: dict[str, Any]
 ) -> DemoJson:
     """Return what `--json` prints. `arguments`: of `station serve`; `cell`: the same. Raises StationError."""
-    folder.mkdir(parents=True, exist_ok=True)
     progress.say(f"starting a simulated cell: {' '.join(arguments)}")
     # A worn arm is worth poses that tell its table from the rest.
     aim: Aim = "arm" if "high" in arguments else "camera"
-    async with (
-        simulated_daemon(folder, arguments) as socket,
-        await Client.connect(socket, "the demo") as client,
-    ):
-        await wait_until_idle(client)
-        await client.call(Lease("take"))
-        progress.say(f"planning {poses} poses")
-        await client.call(MakePlan(poses, seed, aim=aim), timeout_s=120.0)
-        with progress:
-            outcome = await carry_out(
-                client, Purpose.RUN, approve_simulated, progress, finish_with_loss=True, headless=True
-            )
+    with simulated_daemon(folder, arguments) as socket:
+        outcome = asyncio.run(_captured(socket, MakePlan(poses, seed, aim=aim), progress))
     if not outcome.recording:
         raise DemoError(f"No recording: {outcome.status.reason or outcome.status.state.value}")
     recording, session = Path(outcome.recording), Path(outcome.status.session.folder)
     calibration, report = session / CALIBRATION_FILE, session / "report.html"
     progress.say("solving the recording, in a process of its own")
-    solved = await _solve(recording, calibration, report)
+    solved = _solve(recording, calibration, report)
     arm = solved.arm_table
     # The camera's true pose is that on the true arm: the X of the corrected one is to be compared with it.
     own = solved.result if arm is None or arm.result is None else arm.result
@@ -199,70 +181,45 @@ async def _run(
     )
 
 
+async def _captured(socket: Path, plan: MakePlan, progress: SessionProgress) -> SessionOutcome:
+    async with await Client.connect(socket, "the demo") as client:
+        await wait_until_idle(client)
+        await client.call(Lease("take"))
+        progress.say(f"planning {plan.poses} poses")
+        await client.call(plan, timeout_s=120.0)
+        with progress:
+            return await carry_out(
+                client, Purpose.RUN, approve_simulated, progress, finish_with_loss=True, headless=True
+            )
+
+
 async def approve_simulated(_: MotionPreview) -> bool:
     """Approve a motion of a cell that `simulated_daemon` started: nothing real moves."""
     return True
 
 
-@asynccontextmanager
-async def simulated_daemon(root: Path, arguments: list[str]) -> AsyncIterator[Path]:
-    """`station serve --simulate` as a child; its socket. It ends with the block, or with this process."""
-    place = Path(tempfile.mkdtemp(prefix="station-demo-"))
-    socket, log = place / "control.sock", root / "daemon.log"
-    command = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
-    command += ["--root", str(root), "--socket", str(socket), *arguments]
-    with log.open("ab") as words:
-        child = await asyncio.create_subprocess_exec(
-            *command,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=words,
-            start_new_session=True,
-        )
-    assert child.stdin is not None and child.stdout is not None
-    try:
-        try:
-            async with asyncio.timeout(START_TIMEOUT_S):
-                said = await child.stdout.readline()
-        except TimeoutError:
-            said = b""
-        if not said:
-            tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
-            raise DemoError(f"The simulated daemon did not start; {log} ends with:\n{tail}", code="no-daemon")
-        yield socket
-    finally:
-        child.stdin.close()
-        try:
-            async with asyncio.timeout(END_TIMEOUT_S):
-                await child.wait()
-        except TimeoutError:
-            child.kill()
-            await child.wait()
-        shutil.rmtree(place, ignore_errors=True)
+def simulated_daemon(root: Path, arguments: Sequence[str]) -> AbstractContextManager[Path]:
+    """`station serve --simulate` as a child of this process; its socket."""
+    root.mkdir(parents=True, exist_ok=True)
+    return own_daemon(["--simulate", "--root", str(root), *arguments], root / "daemon.log")
 
 
-async def _solve(recording: Path, calibration: Path, report: Path) -> SolveJson:
+def _solve(recording: Path, calibration: Path, report: Path) -> SolveJson:
     """`calibrate solve` in a process of its own, as an operator's laptop would run it."""
     command = [sys.executable, "-m", "calibrate.cli", "solve", str(recording), "--json"]
     command += ["--output", str(calibration), "--report", str(report)]
-    child = await asyncio.create_subprocess_exec(
-        *command, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
-    )
     try:
-        async with asyncio.timeout(SOLVE_TIMEOUT_S):
-            out, words = await child.communicate()
-    except BaseException:
-        with contextlib.suppress(ProcessLookupError):
-            child.kill()
-        raise
-    if child.returncode not in (0, _GATE_FAILED):
+        done = subprocess.run(command, capture_output=True, timeout=SOLVE_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        raise DemoError(f"`calibrate solve` did not end within {SOLVE_TIMEOUT_S:.0f} s.") from None
+    if done.returncode not in (0, _GATE_FAILED):
         try:
-            problem = msgspec.json.decode(out, type=ErrorReport).error
+            problem = msgspec.json.decode(done.stdout, type=ErrorReport).error
         except msgspec.DecodeError:
-            said = words.decode(errors="replace").strip()
-            raise DemoError(said or f"`calibrate solve` ended with {child.returncode}.") from None
+            said = done.stderr.decode(errors="replace").strip()
+            raise DemoError(said or f"`calibrate solve` ended with {done.returncode}.") from None
         raise DemoError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
-    return msgspec.json.decode(out, type=SolveJson)
+    return msgspec.json.decode(done.stdout, type=SolveJson)
 
 
 def truth_error(recording: Path, found: Matrix4) -> tuple[float, float]:

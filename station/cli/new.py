@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -19,7 +18,7 @@ from station.cell.config import CameraConfig, RobotConfig
 from station.cell.errors import RobotError, StationError
 from station.cell.socket_folder import default_socket
 from station.cli.console import err
-from station.cli.screen import answers, ensure_daemon, tell_what_goes_on
+from station.cli.daemon import answers, ensure_daemon, own_daemon, tell_what_goes_on, user_config
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import found_cameras
 from station.devices.ur_condition import what_holds
@@ -27,13 +26,11 @@ from station.devices.ur_dashboard import STOP, DashboardError
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import probe
 from station.operate.draft import ArmReader, CameraChoice, CameraReader
-from station.operate.new_cell import default_place
 
 SERVICES = (
     "From PolyScope 5.17 on: ☰ → Settings → Security → Services, enable Dashboard Server, RTDE and the "
     "primary and secondary client interfaces."
 )
-READY_S = 60.0
 
 
 class LinkedArm:
@@ -168,7 +165,7 @@ def new_command(
         )
     from station.tui.new_cell import run
 
-    place = output or default_place()
+    place = output or user_config()
     match run(RealHardware(), state_root(root), place.absolute()):
         case "rehearse":
             _rehearse(place, root)
@@ -194,27 +191,11 @@ def _rehearse(config: Path, root: Path | None) -> None:
     """The rehearsal's own daemon lives as long as its screen."""
     from station.tui.app import run
 
-    with tempfile.TemporaryDirectory(prefix="rehearsal-") as folder:
-        socket, log = Path(folder) / "s.sock", Path(folder) / "daemon.log"
-        what = ["serve", "--config", str(config), "--rehearse", "--socket", str(socket), "--end-with-stdin"]
-        what += [] if root is None else ["--root", str(root)]
-        err.print(f"Starting the rehearsal of {config}: SIMULATED, nothing real moves …")
-        with log.open("wb") as words:
-            daemon = subprocess.Popen(
-                [sys.executable, "-m", "station.cli", *what],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=words,
-                start_new_session=True,
-            )
-        try:
-            assert daemon.stdout is not None
-            if not daemon.stdout.readline():
-                raise StationError(
-                    f"The rehearsal did not start: {log.read_text(errors='replace').strip()[-600:]}",
-                    code="no-daemon",
-                )
-            run(socket)
-        finally:
-            daemon.communicate(timeout=READY_S)
+    what = ["--config", str(config), "--rehearse", *([] if root is None else ["--root", str(root)])]
+    err.print(f"Starting the rehearsal of {config}: SIMULATED, nothing real moves …")
+    with (
+        tempfile.TemporaryDirectory(prefix="rehearsal-") as folder,
+        own_daemon(what, Path(folder) / "daemon.log") as socket,
+    ):
+        run(socket)
     err.print(f"The rehearsal has ended. `station new` opens the wizard again; {config} is as it was.")

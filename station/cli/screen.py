@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import struct
-import subprocess
 import sys
-import time
 from pathlib import Path
-from socket import AF_UNIX, SO_PEERCRED, SOL_SOCKET
-from socket import socket as connection
 from typing import Annotated
 
 import typer
 
-from recordings.files import state_root
 from station.cell.errors import StationError
 from station.cell.socket_folder import default_socket
 from station.cli.console import Socket
-from station.protocol.client import DaemonGoneError, ask
-from station.protocol.verbs import GetPlan
-
-START_WAIT_S = 30.0
+from station.cli.daemon import ensure_daemon, tell_what_goes_on
 
 
 def tui_command(
@@ -48,67 +38,3 @@ def tui_command(
     served = socket or ensure_daemon(default_socket())
     run(served)
     tell_what_goes_on(served)
-
-
-def find_config() -> Path | None:
-    """$STATION_CONFIG, the user's, or the system's; None where there is none."""
-    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    places = [home / "calibration-station" / "station.yaml", Path("/etc/station/station.yaml")]
-    if named := os.environ.get("STATION_CONFIG"):
-        places.insert(0, Path(named))
-    return next((place for place in places if place.is_file()), None)
-
-
-def ensure_daemon(socket: Path, config: Path | None = None) -> Path:
-    """The socket of a daemon that answers; starts one where none does. StationError when that fails.
-
-    `config`: the cell to serve; None: that of `find_config`.
-    """
-    if answers(socket):
-        return socket
-    root = state_root()
-    config = config or find_config()
-    what = ["--simulate"] if config is None else ["--config", str(config)]
-    cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
-    print(f"No daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
-    root.mkdir(parents=True, exist_ok=True)
-    log = root / "daemon.log"
-    with log.open("ab") as words:
-        child = subprocess.Popen(
-            [sys.executable, "-m", "station.cli", "serve", *what, "--socket", str(socket)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=words,
-            start_new_session=True,
-        )
-    give_up_s = time.monotonic() + START_WAIT_S
-    while time.monotonic() < give_up_s and child.poll() is None:
-        if answers(socket):
-            return socket
-        time.sleep(0.2)
-    tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
-    raise StationError(f"The daemon did not start; {log} ends with:\n{tail}", code="no-daemon")
-
-
-def tell_what_goes_on(socket: Path) -> None:
-    """Tell a person who closed the screen that the daemon goes on, and how to end it."""
-    with connection(AF_UNIX) as link:
-        try:
-            link.connect(str(socket))
-        except OSError:
-            return
-        credentials = link.getsockopt(SOL_SOCKET, SO_PEERCRED, struct.calcsize("3i"))
-    pid, user, _ = struct.unpack("3i", credentials)
-    own = pid and user == os.getuid()
-    ends = f"; `kill {pid}` ends it: the arm stops first, and the recording is finished" if own else ""
-    print(f"The station goes on without this screen. `station` opens it again{ends}.")
-
-
-def answers(socket: Path) -> bool:
-    try:
-        ask(socket, GetPlan())
-    except DaemonGoneError:
-        return False
-    except StationError:
-        return True
-    return True

@@ -6,7 +6,6 @@ kept after every step, so that a person may leave and take it up again.
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -240,12 +239,6 @@ def config_text(config: StationConfig) -> str:
         f"working_distance_m: {config.working_distance_m}",
     ]
     return "\n".join([*lines, ""])
-
-
-def default_place() -> Path:
-    """Return the place where `station` looks for the user's configuration."""
-    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    return home / "calibration-station" / "station.yaml"
 
 
 def write_config(draft: Draft, path: Path) -> StationConfig:

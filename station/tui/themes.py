@@ -14,129 +14,39 @@ from textual.filter import LineFilter
 from textual.theme import BUILTIN_THEMES, Theme
 
 R = TypeVar("R")
-_NAMES = [
-    "line",
-    "faint",
-    "dim",
-    "strong",
-    "accentbg",
-    "onaccent",
-    "ok",
-    "okbg",
-    "warn",
-    "warnbg",
-    "bad",
-    "badbg",
-    "stop",
-    "onstop",
-    "sim",
-    "simbg",
-    "h0",
-    "h1",
-    "h2",
-    "h3",
-    "h4",
-]
-_DARK = [
-    "#2F3A46",
-    "#6A7785",
-    "#97A3B0",
-    "#F5F8FB",
-    "#1D4E73",
-    "#0F1318",
-    "#84C98B",
-    "#1C4A2C",
-    "#E5B454",
-    "#5A4310",
-    "#F07C72",
-    "#7A1F1A",
-    "#C8231B",
-    "#FFFFFF",
-    "#C9A6F2",
-    "#4B3470",
-    "#1A222B",
-    "#1F4058",
-    "#2A6A86",
-    "#3D9FB2",
-    "#7FD1C4",
-]
-_LIGHT = [
-    "#C2C6C6",
-    "#7C858C",
-    "#505B64",
-    "#05090D",
-    "#C7E0F2",
-    "#FFFFFF",
-    "#1C6B33",
-    "#CDEBD3",
-    "#865B00",
-    "#F7E2AE",
-    "#A81F17",
-    "#F6CFCB",
-    "#C8231B",
-    "#FFFFFF",
-    "#5D35A0",
-    "#E4D8F7",
-    "#E8EAE6",
-    "#CFE3E6",
-    "#9CCBD4",
-    "#5BA7B8",
-    "#2A7F96",
-]
-_CONSOLE = [
-    "ansi_bright_black",
-    "ansi_white",
-    "ansi_white",
-    "ansi_bright_white",
-    "ansi_blue",
-    "ansi_black",
-    "ansi_bright_green",
-    "ansi_default",
-    "ansi_bright_yellow",
-    "ansi_default",
-    "ansi_bright_red",
-    "ansi_default",
-    "ansi_red",
-    "ansi_bright_white",
-    "ansi_bright_magenta",
-    "ansi_magenta",
-    "ansi_default",
-    "ansi_blue",
-    "ansi_blue",
-    "ansi_cyan",
-    "ansi_cyan",
-]
-_PAPER = [
-    "ansi_bright_black",
-    "ansi_bright_black",
-    "ansi_bright_black",
-    "ansi_black",
-    "ansi_cyan",
-    "ansi_white",
-    "ansi_green",
-    "ansi_default",
-    "ansi_magenta",
-    "ansi_default",
-    "ansi_red",
-    "ansi_default",
-    "ansi_red",
-    "ansi_bright_white",
-    "ansi_magenta",
-    "ansi_default",
-    "ansi_default",
-    "ansi_cyan",
-    "ansi_cyan",
-    "ansi_cyan",
-    "ansi_cyan",
-]
+_COLOURS = {  # dark, light, a console with 16 colours on black, and on white
+    "line": ("#2F3A46", "#C2C6C6", "ansi_bright_black", "ansi_bright_black"),
+    "faint": ("#6A7785", "#7C858C", "ansi_white", "ansi_bright_black"),
+    "dim": ("#97A3B0", "#505B64", "ansi_white", "ansi_bright_black"),
+    "strong": ("#F5F8FB", "#05090D", "ansi_bright_white", "ansi_black"),
+    "accentbg": ("#1D4E73", "#C7E0F2", "ansi_blue", "ansi_cyan"),
+    "onaccent": ("#0F1318", "#FFFFFF", "ansi_black", "ansi_white"),
+    "ok": ("#84C98B", "#1C6B33", "ansi_bright_green", "ansi_green"),
+    "okbg": ("#1C4A2C", "#CDEBD3", "ansi_default", "ansi_default"),
+    "warn": ("#E5B454", "#865B00", "ansi_bright_yellow", "ansi_magenta"),
+    "warnbg": ("#5A4310", "#F7E2AE", "ansi_default", "ansi_default"),
+    "bad": ("#F07C72", "#A81F17", "ansi_bright_red", "ansi_red"),
+    "badbg": ("#7A1F1A", "#F6CFCB", "ansi_default", "ansi_default"),
+    "stop": ("#C8231B", "#C8231B", "ansi_red", "ansi_red"),
+    "onstop": ("#FFFFFF", "#FFFFFF", "ansi_bright_white", "ansi_bright_white"),
+    "sim": ("#C9A6F2", "#5D35A0", "ansi_bright_magenta", "ansi_magenta"),
+    "simbg": ("#4B3470", "#E4D8F7", "ansi_magenta", "ansi_default"),
+    "h0": ("#1A222B", "#E8EAE6", "ansi_default", "ansi_default"),
+    "h1": ("#1F4058", "#CFE3E6", "ansi_blue", "ansi_cyan"),
+    "h2": ("#2A6A86", "#9CCBD4", "ansi_blue", "ansi_cyan"),
+    "h3": ("#3D9FB2", "#5BA7B8", "ansi_cyan", "ansi_cyan"),
+    "h4": ("#7FD1C4", "#2A7F96", "ansi_cyan", "ansi_cyan"),
+}
+_DARK, _LIGHT, _CONSOLE, _PAPER = (
+    dict(zip(_COLOURS, colours, strict=True)) for colours in zip(*_COLOURS.values(), strict=True)
+)
 
-TOKENS: dict[str, str] = dict(zip(_NAMES, _DARK, strict=True))
+TOKENS = _DARK
 """Colours that the screens name besides Textual's own; also for themes that lack them."""
 
 
-def _station(name: str, dark: bool, colours: list[str], plain: str) -> Theme:
+def _station(name: str, dark: bool, tokens: dict[str, str], plain: str) -> Theme:
     accent, foreground, background, surface, panel = plain.split()
-    tokens = dict(zip(_NAMES, colours, strict=True))
     return Theme(
         name,
         primary=tokens["accentbg"],
@@ -163,11 +73,11 @@ def _station(name: str, dark: bool, colours: list[str], plain: str) -> Theme:
     )
 
 
-def _console(name: str, colours: list[str], accent: str) -> Theme:
+def _console(name: str, tokens: dict[str, str], accent: str) -> Theme:
     """A console's dark blue cannot be read on black, and bold black is grey there."""
     theme = BUILTIN_THEMES[name]
-    tokens = dict(zip(_NAMES, colours, strict=True)) | {"block-cursor-text-style": "none"}
-    return replace(theme, accent=accent, variables=theme.variables | tokens)
+    variables = theme.variables | tokens | {"block-cursor-text-style": "none"}
+    return replace(theme, accent=accent, variables=variables)
 
 
 THEMES: tuple[Theme, ...] = (

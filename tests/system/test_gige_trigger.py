@@ -24,14 +24,12 @@ POSES = 3
 async def test_every_pose_has_the_picture_of_its_own_pulse(lonely_network: None, tmp_path: Path) -> None:
     truth = make_cell()
     plan = make_plan(cell_config(truth), start_joints_rad=truth.start_joints_rad, seed=0, count=POSES)
-    async with (
-        simulated_daemon(tmp_path, ["--gige", "--hardware-trigger"]) as socket,
-        await Client.connect(socket) as client,
-    ):
-        await wait_until_idle(client)
-        await client.request("lease", action="take")
-        await client.request("load_plan", plan=msgspec.to_builtins(plan))
-        ended = await carry_out(client, Purpose.RUN, approve_simulated, lambda status: None)
+    with simulated_daemon(tmp_path, ["--gige", "--hardware-trigger"]) as socket:
+        async with await Client.connect(socket) as client:
+            await wait_until_idle(client)
+            await client.request("lease", action="take")
+            await client.request("load_plan", plan=msgspec.to_builtins(plan))
+            ended = await carry_out(client, Purpose.RUN, approve_simulated, lambda status: None)
     assert ended.captured == POSES, ended.status.reason
     box = ended.status.trigger
     assert box.identity == "calibration-trigger SIM1" and box.pulses == box.frames > POSES, "glimpses too"

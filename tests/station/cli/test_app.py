@@ -24,7 +24,7 @@ from station.cell.plan import plan_sha256
 from station.cell.status import MotionPreview
 from station.cli import attended, main
 from station.cli.app import STATION
-from station.cli.screen import tell_what_goes_on
+from station.cli.daemon import tell_what_goes_on
 from station.plan.files import load_plan
 from station.protocol.client import NoAnswerError
 from station.protocol.states import RUNNING

@@ -37,7 +37,7 @@ def test_the_demo_finds_the_truth(tmp_path: Path) -> None:
     assert ("base", "board") in shown
 
 
-async def test_a_solve_that_failed_says_why_under_one_name(tmp_path: Path) -> None:
+def test_a_solve_that_failed_says_why_under_one_name(tmp_path: Path) -> None:
     with pytest.raises(DemoError) as failed:
-        await _solve(tmp_path / "none.mcap", tmp_path / "calibration.yaml", tmp_path / "report.html")
+        _solve(tmp_path / "none.mcap", tmp_path / "calibration.yaml", tmp_path / "report.html")
     assert str(tmp_path / "none.mcap") in str(failed.value)

@@ -1,0 +1,128 @@
+"""The daemon of a command: the one that serves already, or one that the command starts."""
+
+from __future__ import annotations
+
+import os
+import select
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from socket import AF_UNIX, SO_PEERCRED, SOL_SOCKET
+from socket import socket as connection
+
+from recordings.files import state_root
+from station.cell.errors import StationError
+from station.protocol.client import DaemonGoneError, ask
+from station.protocol.verbs import GetPlan
+
+ANSWER_S = 30.0
+READY_S = 120.0
+"""It took 70 s on a computer at load 14. A daemon that ends says so at once."""
+END_S = 60.0
+
+
+def user_config() -> Path:
+    """Where `station` looks for the user's configuration."""
+    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    return home / "calibration-station" / "station.yaml"
+
+
+def find_config() -> Path | None:
+    """$STATION_CONFIG, the user's, or the system's; None where there is none."""
+    places = [user_config(), Path("/etc/station/station.yaml")]
+    if named := os.environ.get("STATION_CONFIG"):
+        places.insert(0, Path(named))
+    return next((place for place in places if place.is_file()), None)
+
+
+def ensure_daemon(socket: Path, config: Path | None = None) -> Path:
+    """The socket of a daemon that answers; starts one where none does. StationError when that fails.
+
+    `config`: the cell to serve; None: that of `find_config`.
+    """
+    if answers(socket):
+        return socket
+    root = state_root()
+    config = config or find_config()
+    what = ["--simulate"] if config is None else ["--config", str(config)]
+    cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
+    print(f"No daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
+    root.mkdir(parents=True, exist_ok=True)
+    log = root / "daemon.log"
+    child = _started([*what, "--socket", str(socket)], log, subprocess.DEVNULL)
+    give_up_s = time.monotonic() + ANSWER_S
+    while time.monotonic() < give_up_s and child.poll() is None:
+        if answers(socket):
+            return socket
+        time.sleep(0.2)
+    raise _not_started(log)
+
+
+@contextmanager
+def own_daemon(arguments: Sequence[str], log: Path) -> Iterator[Path]:
+    """`station serve ARGUMENTS` as a child; its socket. It ends with the block, or with this process.
+
+    StationError when it does not start.
+    """
+    with tempfile.TemporaryDirectory(prefix="station-") as place:
+        socket = Path(place) / "control.sock"
+        child = _started([*arguments, "--socket", str(socket), "--end-with-stdin"], log, subprocess.PIPE)
+        assert child.stdin is not None and child.stdout is not None
+        try:
+            if not select.select([child.stdout], [], [], READY_S)[0] or not child.stdout.readline():
+                raise _not_started(log)
+            yield socket
+        finally:
+            child.stdin.close()
+            try:
+                child.wait(END_S)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+            child.stdout.close()
+
+
+def _started(arguments: Sequence[str], log: Path, channel: int) -> subprocess.Popen[bytes]:
+    """A session of its own: Ctrl-C in this terminal is not meant for it."""
+    with log.open("ab") as words:
+        return subprocess.Popen(
+            [sys.executable, "-m", "station.cli", "serve", *arguments],
+            stdin=channel,
+            stdout=channel,
+            stderr=words,
+            start_new_session=True,
+        )
+
+
+def _not_started(log: Path) -> StationError:
+    tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
+    return StationError(f"The daemon did not start; {log} ends with:\n{tail}", code="no-daemon")
+
+
+def tell_what_goes_on(socket: Path) -> None:
+    """Tell a person who closed the screen that the daemon goes on, and how to end it."""
+    with connection(AF_UNIX) as link:
+        try:
+            link.connect(str(socket))
+        except OSError:
+            return
+        credentials = link.getsockopt(SOL_SOCKET, SO_PEERCRED, struct.calcsize("3i"))
+    pid, user, _ = struct.unpack("3i", credentials)
+    own = pid and user == os.getuid()
+    ends = f"; `kill {pid}` ends it: the arm stops first, and the recording is finished" if own else ""
+    print(f"The station goes on without this screen. `station` opens it again{ends}.")
+
+
+def answers(socket: Path) -> bool:
+    try:
+        ask(socket, GetPlan())
+    except DaemonGoneError:
+        return False
+    except StationError:
+        return True
+    return True

@@ -8,14 +8,13 @@ from typing import ClassVar
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, Vertical, VerticalScroll
+from textual.containers import Horizontal, VerticalScroll
 from textual.content import Content
 from textual.widgets import Static
 
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Check, Doctor
-from station.tui.screen import StationScreen
-from station.tui.task import Known
+from station.tui.screen import Box, StationScreen
 from station.tui.widgets.preview import PreviewPane
 from station.tui.words import Mark, mark
 
@@ -63,7 +62,6 @@ class ConnectScreen(StationScreen):
 
     def on_mount(self) -> None:
         self.query_one("#checklist-scroll").border_title = "What a capture needs"
-        self.query_one("#connect-picture").border_title = "Camera"
         self.query_one("#checklist-scroll").focus()  # where much is missing, keys reach the end of it
         self.set_interval(AGAIN_S, self.look_again)
 
@@ -71,16 +69,12 @@ class ConnectScreen(StationScreen):
         with Horizontal(id="connect"):
             with VerticalScroll(id="checklist-scroll", classes="panel"):
                 yield Static("checking …", id="checklist")
-            with Vertical(id="connect-picture", classes="panel"):
+            with Box("Camera", id="connect-picture"):
                 yield PreviewPane(id="preview")
 
     def on_screen_resume(self) -> None:
         super().on_screen_resume()
         self.action_refresh_checks()
-
-    def show(self, known: Known) -> None:
-        super().show(known)
-        self.query_one(PreviewPane).old = bool(known.trouble) or known.silent_s is not None
 
     @work(exclusive=True, exit_on_error=False)
     async def action_refresh_checks(self) -> None:

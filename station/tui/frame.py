@@ -50,8 +50,10 @@ class StopBlock(Static):
 class Line(Static):
     """Text that is drawn anew only when it, or the width, changed."""
 
-    def __init__(self, line: Callable[[Known, int], Content], *, id: str, layout: bool = False) -> None:
-        super().__init__(id=id)
+    def __init__(
+        self, line: Callable[[Known, int], Content], *, id: str, layout: bool = False, classes: str = ""
+    ) -> None:
+        super().__init__(id=id, classes=classes)
         self._line, self._layout = line, layout
         self._known: Known | None = None
         self._shown = Content()
@@ -64,8 +66,15 @@ class Line(Static):
         self._known = known
         text = self._line(known, self.container_size.width if self._layout else self.size.width)
         if not text.is_same(self._shown):
+            layout = self._layout or self._grows(text)
             self._shown = text
-            self.update(text, layout=self._layout)
+            self.update(text, layout=layout)
+
+    def _grows(self, text: Content) -> bool:
+        """It is as tall as its text, and this one has other lines than the last."""
+        height = self.styles.height
+        lines, shown = (each.plain.count("\n") for each in (text, self._shown))
+        return lines != shown and height is not None and height.is_auto
 
 
 class Rail(Line):

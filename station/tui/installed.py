@@ -129,7 +129,7 @@ def local(iso: str) -> str:
         return iso
 
 
-def state_root(calibration: str) -> Path:
+def state_root(calibration: str | Path) -> Path:
     """A session lies in ROOT/sessions/NAME; what is installed lies below the same ROOT."""
     return Path(calibration).resolve().parents[2]
 

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
-from textual.reactive import reactive
 from textual.widgets import ProgressBar, RichLog, Static
 
 from station.cell.scene import Scene
 from station.cell.status import Event, PoseStatus, SessionStatus, StationState, StationStatus
 from station.protocol.states import LATCHED, RUNNING
-from station.tui.screen import StationScreen
+from station.tui.screen import Box, Panel, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
 from station.tui.widgets.preview import PreviewPane
@@ -48,43 +47,6 @@ def event_text(event: Event, width: int = 0) -> Content:
     if 0 < width <= len(when) + len(said):
         said = _FOLDERS.sub("…/", said)
     return Content.assemble((when, "$faint"), "  ", (said, _LEVELS[event.level]))
-
-
-class Panel(Static):
-    """A titled box that is drawn anew only when its own text, or its size, changes."""
-
-    old: reactive[bool] = reactive(False)
-    """No longer how it is; said in the title too."""
-
-    def __init__(
-        self, title: str, body: Callable[[Known, int, int], Content], *, id: str, below: str = ""
-    ) -> None:
-        """`body`: of what is known, in so many cells and rows. `below`: unit or keys, in the border."""
-        super().__init__(id=id, classes="panel")
-        self.border_title, self.border_subtitle = title, below
-        self._title, self._body = title, body
-        self._known: Known | None = None
-        self._shown = Content()
-
-    def on_resize(self) -> None:
-        if self._known is not None:
-            self.show(self._known)
-
-    def watch_old(self, old: bool) -> None:
-        self.border_title = f"{self._title}: OLD" if old else self._title
-
-    def show(self, known: Known) -> None:
-        """Show the status; without one the last one known, marked old."""
-        self.old = bool(known.trouble) or known.silent_s is not None
-        if known.status is None or not self.display:
-            return
-        self._known = known
-        size = self.content_size
-        text = self._body(known, size.width, size.height)
-        if not text.is_same(self._shown):
-            grown = text.plain.count("\n") != self._shown.plain.count("\n")
-            self._shown = text
-            self.update(text, layout=grown and self.styles.height is not None and self.styles.height.is_auto)
 
 
 def lines(*parts: Content) -> Content:
@@ -401,12 +363,12 @@ class LiveScreen(StationScreen):
     def body(self) -> ComposeResult:
         with Horizontal(id="live"):
             with Vertical(id="live-left"):
-                with Vertical(id="picture", classes="panel"):
+                with Box("Camera", id="picture", below="+ found corners"):
                     yield PreviewPane(id="preview")
                     yield Static(id="quality")
                 yield Events()
             with Vertical(id="live-right"):
-                with Vertical(id="progress", classes="panel"):
+                with Box("Poses", id="progress"):
                     yield ProgressBar(id="bar-of-poses", show_eta=False, show_percentage=False)
                     yield Panel("", progress_lines, id="poses")
                 yield Panel("Expected error of the camera's position (1σ)", error_lines, id="error")
@@ -419,27 +381,21 @@ class LiveScreen(StationScreen):
                 yield Panel("Devices", device_lines, id="devices")
         yield Stopped(id="stopped")
 
-    def on_mount(self) -> None:
-        self.query_one("#picture").border_title = "Camera"
-        self.query_one("#picture").border_subtitle = "+ found corners"
-
     def _coverage(self, known: Known, width: int, height: int) -> Content:
         status = known.status or StationStatus()
         return coverage_lines(known, width, height, cell_scene(self.desk.configuration, status))
 
     def show(self, known: Known) -> None:
         super().show(known)
-        for part in self.query("Panel, Stopped"):
-            part.show(known)  # type: ignore[attr-defined]
-        old = bool(known.trouble) or known.silent_s is not None
-        self.query_one(PreviewPane).old = old
+        self.draw_panels(known)
+        self.query_one(Stopped).show(known)
         status = known.status
         if status is None:
             return
         session = status.session
         place = 0 if session.current is None else session.current + 1
         title = f"Pose {place} of {len(session.poses)}" if place and status.state in RUNNING else "Poses"
-        self.query_one("#progress").border_title = f"{title}: OLD" if old else title
+        self.query_one("#progress").border_title = f"{title}: OLD" if known.old else title
         self.query_one("#picture").border_title = (
             f"Camera  {status.camera.model}"
             if status.camera.connected or status.playback

@@ -11,7 +11,6 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
-from textual.coordinate import Coordinate
 from textual.widgets import Static
 
 from station.cell.plan import PlannedPose
@@ -19,11 +18,10 @@ from station.cell.scene import Scene
 from station.cell.status import PoseStatus, StationStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
-from station.tui.live import Panel
-from station.tui.screen import Rows, StationScreen
+from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.scene import LEGEND, cell_scene, draw, view_of
-from station.tui.words import MARKS, UNKNOWN, Mark, degrees, facts, limit_bar, many, mark, mm, rich_text
+from station.tui.words import MARKS, UNKNOWN, Mark, degrees, facts, limit_bar, many, mark, mm
 
 COLUMNS = ("#", "error then", "", "distance", "tilt", "why it is there", "state")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
@@ -130,23 +128,20 @@ class PlanScreen(StationScreen):
 
     def __init__(self) -> None:
         super().__init__()
-        self._rows: list[tuple[Content, ...]] = []
         self._turn_deg, self._zoom = -60.0, 1.0
 
     def body(self) -> ComposeResult:
         yield Static(NO_PLAN, id="plan-facts")
         with Horizontal(id="plan"):
             with Vertical(id="plan-left"):
-                with Vertical(id="plan-poses", classes="panel"):
-                    yield Rows(id="plan-table")
+                with Box("Poses", id="plan-poses"):
+                    yield Rows(*COLUMNS, id="plan-table")
                 yield Panel("Why", self._why, id="plan-detail")
             with Vertical(id="plan-right"):
                 yield Panel("The cell", self._cell, id="plan-cell", below="\\[ ] turn  + − zoom")
                 yield Panel("From above", self._above, id="plan-above", below=LEGEND)
 
     def on_mount(self) -> None:
-        self.query_one("#plan-poses").border_title = "Poses"
-        self.table.add_columns(*COLUMNS)
         self.table.focus()
 
     @property
@@ -160,31 +155,12 @@ class PlanScreen(StationScreen):
             return  # what was known last stands there
         poses, goal_mm = status.session.poses, status.estimate.goal_mm or 0.5
         scene = cell_scene(self.desk.configuration, status)
-        rows = [row_of(pose, goal_mm, scene) for pose in poses]
         self.query_one("#plan-facts", Static).update(facts_line(status), layout=False)
-        variables = self.app.theme_variables
-        if len(rows) != self.table.row_count:
-            at = self.table.cursor_row
-            self.table.clear()
-            for row in rows:
-                self.table.add_row(*(rich_text(cell, variables) for cell in row))
-            self.table.move_cursor(row=at)  # a dropped pose leaves the next one marked
-        else:
-            for line, (row, before) in enumerate(zip(rows, self._rows, strict=True)):
-                for column, cell in enumerate(row):
-                    if not cell.is_same(before[column]):
-                        text = rich_text(cell, variables)
-                        self.table.update_cell_at(Coordinate(line, column), text, update_width=True)
-        self._rows = rows
-        self._explain(known)
+        self.table.show([row_of(pose, goal_mm, scene) for pose in poses])
+        self.draw_panels(known)
 
     def on_data_table_row_highlighted(self) -> None:
-        self._explain(self.desk.known())
-
-    def _explain(self, known: Known) -> None:
-        """The highlighted pose in words and in the scene."""
-        for panel in self.query(Panel):
-            panel.show(known)
+        self.draw_panels(self.desk.known())
 
     def _why(self, known: Known, width: int, height: int) -> Content:
         status = known.status or StationStatus()
@@ -213,11 +189,11 @@ class PlanScreen(StationScreen):
 
     def action_turn(self, by: int) -> None:
         self._turn_deg += by * TURN_DEG
-        self._explain(self.desk.known())
+        self.draw_panels(self.desk.known())
 
     def action_zoom(self, by: int) -> None:
         self._zoom = min(4.0, max(0.5, self._zoom * ZOOM**by))
-        self._explain(self.desk.known())
+        self.draw_panels(self.desk.known())
 
     def _selected(self) -> int | None:
         status = self.desk.status

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -20,14 +22,13 @@ from calibrate.files.verification import agrees, touch_sigmas
 from calibrate.files.versions import LogEntry, read_log
 from calibrate.geometry import difference
 from calibrate.quality.checks import CheckEntry, find_trend
-from recordings.files import MAIN_CAMERA
 from station.operate.ending import Way, after_drift_check, after_solve
 from station.tui.installed import Result, drift_history, local, state_root
-from station.tui.live import Panel
-from station.tui.screen import Rows, StationScreen
+from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
+from station.tui.touch_test import run_touch_test
 from station.tui.widgets.canvas import Series, curve
-from station.tui.words import UNKNOWN, Mark, facts, limit_bar, many, mark, rich_text, shortened, signed
+from station.tui.words import UNKNOWN, Mark, facts, limit_bar, many, mark, shortened, signed
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter shows older ones."
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
@@ -134,11 +135,9 @@ def proof_card(calibration: Calibration) -> Content:
     return _card(below, ("", f"{1000 * held.e_t_m:.2f}", "mm"), ("", f"{held.e_R:.4f}", "rotation"))
 
 
-def change_card(result: Result) -> Content:
+def change_card(result: Result, calibration: Calibration) -> Content:
     """Draw what installing would change."""
-    calibration, installed = result.calibration, result.state.now
-    if calibration is None:
-        return Content()
+    installed = result.state.now
     if result.installed:
         return mark("done", "this one is installed")
     if installed is None:
@@ -151,11 +150,9 @@ def change_card(result: Result) -> Content:
     return _card(below, ("", f"{moved_mm:.2f}", "mm"), ("", f"{turned_deg:.3f}", "°"))
 
 
-def pose_table(result: Result) -> Content:
+def pose_table(result: Result, calibration: Calibration) -> Content:
     """The camera pose, this one beside the installed one; positions in millimetres."""
-    calibration, installed = result.calibration, result.state.now
-    if calibration is None:
-        return Content()
+    installed = result.state.now
     beside = installed is not None and not result.installed and installed.mount == calibration.mount
     frame = f"{calibration.result.parent_frame}_from_{calibration.result.child_frame}"
     rows = [Content.styled(f"{frame:<26}" + ("installed        difference" if beside else ""), "$dim")]
@@ -206,11 +203,15 @@ class ResultScreen(StationScreen):
     """Common base of the three: the verdict on top, and what may be done with a calibration."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("i", "install", "Install", tooltip="Make this the cell's calibration; b undoes it"),
-        Binding("h", "touch_test", "Touch test", tooltip="Bring the tip onto corners of the board"),
-        Binding("e", "export", "Export", tooltip="Write it for ROS, OpenCV, URDF … beside the recording"),
-        Binding("b", "roll_back", "Roll back", tooltip="Back to the calibration that was installed before"),
-        Binding("x", "discard", "Discard", tooltip="Delete this result; the recording stays"),
+        Binding("i", "act('install')", "Install", tooltip="Make this the cell's calibration; b undoes it"),
+        Binding("h", "act('test')", "Touch test", tooltip="Bring the tip onto corners of the board"),
+        Binding(
+            "e", "act('export')", "Export", tooltip="Write it for ROS, OpenCV, URDF … beside the recording"
+        ),
+        Binding(
+            "b", "act('roll back')", "Roll back", tooltip="Back to the calibration that was installed before"
+        ),
+        Binding("x", "act('discard')", "Discard", tooltip="Delete this result; the recording stays"),
     ]
 
     def body(self) -> ComposeResult:
@@ -242,50 +243,46 @@ class ResultScreen(StationScreen):
         verdict.update(Content(NO_RESULT) if result is None else verdict_lines(result))
         self.query_one("#result").display = result is not None and result.calibration is not None
         if result is not None and result.calibration is not None:
-            self.tell(result, result.calibration)
-        for panel in self.query(Panel):
-            panel.show(known)
+            self.tell(result.calibration)
+        self.draw_panels(known)
 
-    def tell(self, result: Result, calibration: Calibration) -> None:
+    def tell(self, calibration: Calibration) -> None:
         """Fill what is no panel."""
 
-    def _of(self, line: str) -> Result | None:
-        """The shown result; None after saying that there is none."""
+    def action_act(self, what: str) -> None:
         result = self.desk.result
         if result is None or result.calibration is None:
-            self.notify(f"There is no result to {line}: F9 on 7 makes one.")
-            return None
-        return result
+            self.notify(f"There is no result to {what}: F9 on 7 makes one.")
+            return
+        desk, path = self.desk, Path(result.path)
+        match what:
+            case "install":
+                desk.install(path, result.state.end_of(result.calibration))
+            case "roll back":
+                desk.roll_back(path, result.calibration.camera_name)
+            case "export":
+                desk.export(path)
+            case "discard":
+                desk.discard(path)
+            case "test":
+                work = self._touch_test(path)
+                desk.run_worker(work, group="job", exclusive=True, exit_on_error=False)
 
-    def action_install(self) -> None:
-        if (result := self._of("install")) is not None and result.calibration is not None:
-            end = result.state.end_of(result.calibration)
-            before = "" if end is None else f"It was installed before, and {end.how} by {end.by}."
-            self.desk.install(result.path, before)
-
-    def action_roll_back(self) -> None:
-        if (result := self._of("roll back from")) is not None:
-            self.desk.roll_back(result.path)
-
-    def action_touch_test(self) -> None:
-        if (result := self._of("test")) is not None:
-            self.desk.touch_test(result.path)
-
-    def action_export(self) -> None:
-        if (result := self._of("export")) is not None:
-            self.desk.export(result.path)
-
-    def action_discard(self) -> None:
-        if (result := self._of("discard")) is not None:
-            self.desk.discard(result.path)
+    async def _touch_test(self, path: Path) -> None:
+        if await run_touch_test(self.desk, path):
+            await self.desk.show_result(str(path))
 
 
-def _panel(title: str, text, *, id: str, below: str = "") -> Panel:  # type: ignore[no-untyped-def]
+def _panel(
+    title: str, text: Callable[[Result, Calibration, int, int], Content], *, id: str, below: str = ""
+) -> Panel:
     """A panel of the shown result: `text` of it, and of the room."""
 
     def body(known: Known, width: int, height: int) -> Content:
         result = known.result
-        return Content() if result is None or result.calibration is None else text(result, width, height)
+        if result is None or result.calibration is None:
+            return Content()
+        return text(result, result.calibration, width, height)
 
     return Panel(title, body, id=id, below=below)
 
@@ -301,34 +298,28 @@ class SolveScreen(ResultScreen):
 
     def evidence(self) -> ComposeResult:
         with Horizontal(id="cards"):
-            yield _panel("Accuracy", lambda r, w, h: accuracy_card(r.calibration), id="accuracy")
-            yield _panel("Proof", lambda r, w, h: proof_card(r.calibration), id="proof")
-            yield _panel("Change", lambda r, w, h: change_card(r), id="change")
+            yield _panel("Accuracy", lambda r, c, w, h: accuracy_card(c), id="accuracy")
+            yield _panel("Proof", lambda r, c, w, h: proof_card(c), id="proof")
+            yield _panel("Change", lambda r, c, w, h: change_card(r, c), id="change")
         with Horizontal(id="solve"):
             with Vertical(id="solve-left"):
-                with Vertical(id="gates-box", classes="panel"):
-                    yield Rows(id="gates")
-                yield _panel("Camera pose", lambda r, w, h: pose_table(r), id="answer")
+                with Box("Quality gates", id="gates-box", below="Enter tells why"):
+                    yield Rows("gate", "value", "", "limit", "", id="gates")
+                yield _panel("Camera pose", lambda r, c, w, h: pose_table(r, c), id="answer")
             yield _panel(
                 "How well each view fits",
-                lambda r, w, h: residual_lines(r.calibration, w, h),
+                lambda r, c, w, h: residual_lines(c, w, h),
                 id="residuals",
                 below="reprojection error",
             )
 
     def on_mount(self) -> None:
         super().on_mount()
-        self.query_one("#gates-box").border_title = "Quality gates"
-        self.query_one("#gates-box").border_subtitle = "Enter tells why"
-        self.query_one(Rows).add_columns("gate", "value", "", "limit", "")
         self.query_one(Rows).focus()
 
-    def tell(self, result: Result, calibration: Calibration) -> None:
-        table = self.query_one(Rows)
-        table.clear()
+    def tell(self, calibration: Calibration) -> None:
         self._gates = sorted(calibration.quality.gates, key=lambda gate: (gate.passed, not gate.narrow))
-        for gate in self._gates:
-            table.add_row(*(rich_text(cell, self.app.theme_variables) for cell in gate_row(gate)))
+        self.query_one(Rows).show([gate_row(gate) for gate in self._gates])
         passed = sum(gate.passed for gate in self._gates)
         self.query_one("#gates-box").border_title = f"Quality gates  {passed} of {len(self._gates)} passed"
 
@@ -344,13 +335,11 @@ class VerifyScreen(ResultScreen):
 
     def evidence(self) -> ComposeResult:
         with Horizontal(id="verify"):
-            yield _panel(
-                "Touch test", lambda r, w, h: touch_lines(r.calibration), id="touches", below="h starts it"
-            )
-            yield _panel("Held-out views", lambda r, w, h: held_out_lines(r.calibration, w), id="held-out")
+            yield _panel("Touch test", lambda r, c, w, h: touch_lines(c), id="touches", below="h starts it")
+            yield _panel("Held-out views", lambda r, c, w, h: held_out_lines(c), id="held-out")
         yield _panel(
             "Drift checks of the installed calibration",
-            lambda r, w, h: drift_lines(drift_history(state_root(r.path), _camera(r)), w, h),
+            lambda r, c, w, h: drift_lines(drift_history(state_root(r.path), c.camera_name), w, h),
             id="drift",
             below="d on 7 captures one",
         )
@@ -382,7 +371,7 @@ def touch_lines(calibration: Calibration) -> Content:
     return Content("\n").join(rows)
 
 
-def held_out_lines(calibration: Calibration, width: int) -> Content:
+def held_out_lines(calibration: Calibration) -> Content:
     folds = calibration.quality.cross_validation
     rows = [proof_card(calibration)]
     if folds is not None:
@@ -440,8 +429,6 @@ def drift_lines(entries: Sequence[CheckEntry], width: int, height: int) -> Conte
 
 
 def _day(entry: CheckEntry) -> str:
-    import time
-
     return time.strftime("%d %b", time.localtime(entry.wall_s))
 
 
@@ -457,21 +444,20 @@ class InstallScreen(ResultScreen):
 
     def evidence(self) -> ComposeResult:
         with Horizontal(id="install"):
-            yield _panel("Camera pose", lambda r, w, h: pose_table(r), id="answer")
+            yield _panel("Camera pose", lambda r, c, w, h: pose_table(r, c), id="answer")
             yield _panel(
                 "What installing does",
-                lambda r, w, h: install_lines(r),
+                lambda r, c, w, h: install_lines(r, c),
                 id="change",
                 below="i installs  b rolls back",
             )
-        yield _panel("Installed so far", lambda r, w, h: log_lines(_log(r), h), id="versions")
+        yield _panel(
+            "Installed so far", lambda r, c, w, h: log_lines(_log(r.path, c.camera_name), h), id="versions"
+        )
 
 
-def install_lines(result: Result) -> Content:
-    calibration = result.calibration
-    if calibration is None:
-        return Content()
-    rows = [change_card(result)]
+def install_lines(result: Result, calibration: Calibration) -> Content:
+    rows = [change_card(result, calibration)]
     rows += [mark("look", objection) for objection in result.objections if not result.installed]
     if calibration.source != "real":
         rows.append(
@@ -481,13 +467,9 @@ def install_lines(result: Result) -> Content:
     return Content("\n").join(rows)
 
 
-def _camera(result: Result) -> str:
-    return MAIN_CAMERA if result.calibration is None else result.calibration.camera_name
-
-
-def _log(result: Result) -> Sequence[LogEntry]:
+def _log(path: str, camera: str) -> Sequence[LogEntry]:
     try:
-        return read_log(state_root(result.path), _camera(result))
+        return read_log(state_root(path), camera)
     except OSError:
         return ()
 

@@ -24,9 +24,8 @@ from station.operate.drift_check import check_arguments, judged, recorded, start
 from station.protocol.verbs import Check
 from station.tui.desk import Desk
 from station.tui.dialogs import ChooseFormat, Confirm, JobScreen, Reason
-from station.tui.installed import Marks, Result, local, marks, read_installed, read_result, state_root
+from station.tui.installed import Ended, Marks, Result, local, marks, read_installed, read_result, state_root
 from station.tui.task import Known
-from station.tui.touch_test import run_touch_test
 
 OVERRIDABLE = ("gate-failed", "objection")
 """Codes of refusals that a person may override with a reason."""
@@ -135,18 +134,13 @@ class ResultsDesk(Desk):
                 self.notify(str(end), title="Drift check", timeout=60, markup=False)
 
     @work(exclusive=True, group="job", exit_on_error=False)
-    async def touch_test(self, calibration: str) -> None:
-        if await run_touch_test(self, Path(calibration)):
-            await self.show_result(calibration)
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def install(self, path: str, ended: str) -> None:
+    async def install(self, path: Path, ended: Ended | None) -> None:
         """Ask, then install below the daemon's root. A simulated result only on a simulated cell's root.
 
-        `ended`: how this one stopped being installed before; empty: it never was.
+        `ended`: how this one stopped being installed before; None: it never was.
         """
         body = f"{path}\nbecomes what every consumer of this cell reads. b on 6 undoes it."
-        body += f"\n\n{ended}" if ended else ""
+        body += "" if ended is None else f"\n\nIt was installed before, and {ended.how} by {ended.by}."
         if not await self.push_screen_wait(Confirm("Install this calibration?", body, yes="Install")):
             return
         refusal = await self._install(path, "")
@@ -158,13 +152,13 @@ class ResultsDesk(Desk):
         if refusal is not None:
             self.notify(str(refusal), title="Not installed", severity="error", timeout=20, markup=False)
 
-    async def _install(self, path: str, reason: str) -> CalibrationError | None:
+    async def _install(self, path: Path, reason: str) -> CalibrationError | None:
         """Install; return the refusal, None when it is installed."""
         cell: Cell = "simulated" if self.status is not None and self.status.simulated else "real"
         try:
             made = await asyncio.to_thread(
                 install,
-                Path(path),
+                path,
                 state_root(path),
                 cell=cell,
                 override=reason,
@@ -177,14 +171,9 @@ class ResultsDesk(Desk):
         return None
 
     @work(exclusive=True, group="job", exit_on_error=False)
-    async def roll_back(self, path: str) -> None:
+    async def roll_back(self, path: Path, camera: str) -> None:
         """Ask, naming both, then switch back to the calibration before the installed one."""
         root = state_root(path)
-        try:
-            camera = read_calibration(Path(path)).camera_name
-        except CalibrationError as problem:
-            self.notify(str(problem), severity="error", markup=False)
-            return
         known = installed_versions(root, camera)
         current = next((g for g in known if g.current), None)
         older = before_current(known)
@@ -209,14 +198,14 @@ class ResultsDesk(Desk):
                 self.notify(f"{run.program}: {why}", title="A hook failed", severity="warning", markup=False)
 
     @work(exclusive=True, group="job", exit_on_error=False)
-    async def export(self, path: str) -> None:
+    async def export(self, path: Path) -> None:
         chosen = await self.push_screen_wait(ChooseFormat())
         if chosen is None:
             return
-        output = Path(path).with_name(f"calibration-{chosen}{FORMATS[chosen].suffix}")
+        output = path.with_name(f"calibration-{chosen}{FORMATS[chosen].suffix}")
 
         def write() -> Path:
-            calibration, root = read_calibration(Path(path)), state_root(path)
+            calibration, root = read_calibration(path), state_root(path)
             names = FrameNames.of_camera(calibration.camera_name)
             installed = read_installed(root, calibration.camera_name)
             if same_solve(calibration, installed.now):
@@ -229,10 +218,10 @@ class ResultsDesk(Desk):
             self.notify(f"Written: {output}", timeout=20, markup=False)
 
     @work(exclusive=True, group="job", exit_on_error=False)
-    async def discard(self, path: str) -> None:
+    async def discard(self, path: Path) -> None:
         body = f"{path}\nis deleted. The recording stays and can be solved again."
         if await self.push_screen_wait(Confirm("Discard this result?", body, yes="Discard")):
-            Path(path).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
             self.result_path = ""
             await self.switch_mode("sessions")
 

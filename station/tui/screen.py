@@ -1,17 +1,87 @@
-"""A full screen of the station under the frame, and its tables."""
+"""A full screen of the station under the frame, its panels and its tables."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import ClassVar, cast
 
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Container
+from textual.containers import Container, Vertical
+from textual.content import Content
+from textual.coordinate import Coordinate
+from textual.reactive import reactive
 from textual.widgets import DataTable
 
-from station.tui.frame import Frame, Framed, Keys
+from station.tui.frame import Frame, Framed, Keys, Line
 from station.tui.results import ResultsDesk
 from station.tui.task import Known
+from station.tui.widgets.preview import PreviewPane
+from station.tui.words import rich_text
+
+
+class Panel(Line):
+    """A titled box of text."""
+
+    old: reactive[bool] = reactive(False)
+    """No longer how it is; said in the title too."""
+
+    def __init__(
+        self, title: str, body: Callable[[Known, int, int], Content], *, id: str, below: str = ""
+    ) -> None:
+        """`body`: of what is known, in so many cells and rows. `below`: unit or keys, in the border."""
+        super().__init__(lambda known, _: body(known, *self.content_size), id=id, classes="panel")
+        self.border_title, self.border_subtitle = title, below
+        self._title = title
+
+    def watch_old(self, old: bool) -> None:
+        self.border_title = f"{self._title}: OLD" if old else self._title
+
+    def show(self, known: Known) -> None:
+        """Show the status; without one the last one known, marked old."""
+        self.old = known.old
+        if known.status is not None and self.display:
+            super().show(known)
+
+
+class Box(Vertical):
+    """A titled box of other widgets."""
+
+    def __init__(self, title: str, *, id: str, below: str = "") -> None:
+        super().__init__(id=id, classes="panel")
+        self.border_title, self.border_subtitle = title, below
+
+
+class Rows(DataTable[object]):
+    """A table of whole rows: one is marked, Home and End mark the first and the last."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("home", "scroll_top", show=False),
+        Binding("end", "scroll_bottom", show=False),
+    ]
+
+    def __init__(self, *columns: str, id: str) -> None:
+        super().__init__(id=id, cursor_type="row")
+        self.add_columns(*columns)
+        self._cells: Sequence[tuple[Content, ...]] = ()
+        self._variables: dict[str, str] = {}
+
+    def show(self, cells: Sequence[tuple[Content, ...]]) -> None:
+        """Draw these rows; of as many as before only what differs. The same line stays marked."""
+        variables = self.app.theme_variables
+        if len(cells) == len(self._cells) and variables == self._variables:
+            for line, (row, before) in enumerate(zip(cells, self._cells, strict=True)):
+                for column, (cell, was) in enumerate(zip(row, before, strict=True)):
+                    if not cell.is_same(was):
+                        text = rich_text(cell, variables)
+                        self.update_cell_at(Coordinate(line, column), text, update_width=True)
+        else:
+            at = self.cursor_row
+            self.clear()
+            for row in cells:
+                self.add_row(*(rich_text(cell, variables) for cell in row))
+            self.move_cursor(row=at)
+        self._cells, self._variables = cells, variables
 
 
 class StationScreen(Framed[None]):
@@ -35,17 +105,11 @@ class StationScreen(Framed[None]):
         yield from ()
 
     def show(self, known: Known) -> None:
-        self.set_class(bool(known.trouble) or known.silent_s is not None, "-old")
+        self.set_class(known.old, "-old")
+        for preview in self.query(PreviewPane):
+            preview.old = known.old
         super().show(known)
 
-
-class Rows(DataTable[object]):
-    """A table of whole rows: one is marked, Home and End mark the first and the last."""
-
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("home", "scroll_top", show=False),
-        Binding("end", "scroll_bottom", show=False),
-    ]
-
-    def __init__(self, *, id: str) -> None:
-        super().__init__(id=id, cursor_type="row")
+    def draw_panels(self, known: Known) -> None:
+        for panel in self.query(Panel):
+            panel.show(known)

@@ -11,20 +11,19 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
-from textual.widgets import DataTable, Static
+from textual.widgets import Static
 
 from calibrate.quality.checks import CheckEntry, read_checks
 from station.cell.session_folder import SessionSummary
 from station.operate.drift_check import POSES
 from station.protocol.verbs import Sessions
 from station.tui.installed import Installed, drift_history, read_installed, readable
-from station.tui.live import Panel
 from station.tui.replay import ReplayLink
 from station.tui.replay_screen import WATCHABLE, ReplayScreen
 from station.tui.result import drift_lines
-from station.tui.screen import Rows, StationScreen
+from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.words import UNKNOWN, facts, mark, rich_text, size
+from station.tui.words import UNKNOWN, facts, mark, size
 
 DRIFT = f"Drift check: capture {POSES} poses in place of the loaded plan (asks)"
 NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
@@ -56,8 +55,8 @@ class SessionsScreen(StationScreen):
     def body(self) -> ComposeResult:
         yield Static(NO_SESSION, id="sessions-none")
         with Horizontal(id="sessions"):
-            with Vertical(id="sessions-box", classes="panel"):
-                yield Rows(id="sessions-table")
+            with Box("Sessions", id="sessions-box"):
+                yield Rows(*COLUMNS, id="sessions-table")
             with Vertical(id="sessions-right"):
                 yield Panel(
                     "Drift of the installed calibration", self._drift, id="drift", below="mm over time"
@@ -65,8 +64,6 @@ class SessionsScreen(StationScreen):
                 yield Panel("Highlighted", self._highlighted, id="highlighted")
 
     def on_mount(self) -> None:
-        self.query_one("#sessions-box").border_title = "Sessions"
-        self.table.add_columns(*COLUMNS)
         self.table.focus()
         self.watch(self.desk, "looked", self._looked, init=False)
 
@@ -99,19 +96,13 @@ class SessionsScreen(StationScreen):
         self._sessions, self._checks = sessions, checks
         self.query_one("#sessions-none").display = not sessions
         self.query_one("#sessions").display = bool(sessions)
-        self.table.clear()
-        for row in rows:
-            self.table.add_row(*(rich_text(cell, self.app.theme_variables) for cell in row))
+        self.table.show(rows)
         names = [session.name for session in sessions]
         self.table.move_cursor(row=names.index(at) if at in names else 0)
-        self._tell()
+        self.draw_panels(self.desk.known())
 
-    def _tell(self) -> None:
-        for panel in self.query(Panel):
-            panel.show(self.desk.known())
-
-    def on_data_table_row_highlighted(self, event: DataTable.RowHighlighted) -> None:
-        self._tell()
+    def on_data_table_row_highlighted(self) -> None:
+        self.draw_panels(self.desk.known())
 
     def _drift(self, known: Known, width: int, height: int) -> Content:
         return drift_lines(self._checks, width, height)

@@ -60,6 +60,11 @@ class Known:
     trouble: str = ""
 
     @property
+    def old(self) -> bool:
+        """The status is no longer how it is."""
+        return bool(self.trouble) or self.silent_s is not None
+
+    @property
     def missing(self) -> Check | None:
         return next((check for check in self.checks if check.state == "failed"), None)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import logging
 import shutil
@@ -11,16 +10,15 @@ import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 
 from calibrate.boards.detect import detect
 from calibrate.boards.model import check_board
-from recordings.images import eight_bits
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import BoardSpec, Image, RobotState
 from station.analysis.pool import WorkerError
+from station.analysis.preview import preview_image
 from station.analysis.worker import BoardDetection, sight
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, RefusedError, RobotError, StationError
@@ -50,9 +48,6 @@ FPS_PERIOD_S = 2.0
 PAUSES = "pauses after this pose"
 FINISHES = "finishes after this pose"
 PREVIEW_PERIOD_S = 0.2
-JPEG_LIMIT_BYTES = 40_000
-"""In base64 it must fit into one line of the protocol."""
-_QUALITIES = (75, 50, 30, 15)
 SIDES = (16, 1024)
 _OBSERVE_S = 5.0
 WALL_STEP_S = 0.5
@@ -330,7 +325,8 @@ class Previewer:
             return PreviewImage()
         low, high = SIDES
         width, height = min(max(width, low), high), min(max(height, low), high)
-        return await asyncio.to_thread(self._encode, self._picture, self._sighting, width, height)
+        corners = np.zeros((0, 2)) if self._sighting is None else self._sighting.pixels
+        return await asyncio.to_thread(preview_image, self._picture, corners, width, height, self._count)
 
     async def observe(self, tag: BoardSpec) -> Observation:
         """Find the tag's corners in a new image, with the arm's pose at mid-exposure.
@@ -390,21 +386,6 @@ class Previewer:
         self._count += 1
         if sighting is not None and context.store.state is not StationState.WRITING:
             context.store.update(detection=sighting.status)
-
-    def _encode(self, taken: Image, sighting: BoardDetection | None, width: int, height: int) -> PreviewImage:
-        image = eight_bits(taken.viewable(), taken.pixel_format)
-        scale = min(width / image.shape[1], height / image.shape[0], 1.0)
-        size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        for quality in _QUALITIES:
-            ok, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
-            if ok and len(jpeg) <= JPEG_LIMIT_BYTES:
-                sides = image.shape[1::-1]
-                pixels = np.zeros((0, 2)) if sighting is None else (sighting.pixels + 0.5) / sides
-                corners = tuple((float(x), float(y)) for x, y in pixels.round(4))
-                data = base64.b64encode(jpeg.tobytes()).decode()
-                return PreviewImage(data, *size, corners, self._count)
-        return PreviewImage()
 
 
 def _require_between_sessions(context: SessionContext) -> None:

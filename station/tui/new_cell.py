@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
@@ -27,13 +25,13 @@ from textual.widgets.option_list import Option
 from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_points
 from recordings.errors import CodedError
-from recordings.schema.messages import BoardSpec
+from recordings.schema.messages import BoardSpec, Image
+from station.analysis.preview import preview_image
 from station.cell.errors import StationError
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
 from station.operate.guided_views import enough
-from station.protocol.verbs import PreviewImage
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
 from station.tui.new_cell_steps import DRAWINGS, SavePage, StepPage, pages
 from station.tui.task import Step
@@ -206,26 +204,20 @@ class NewCell(App[Ending]):
         if image is None:
             return
         found = await asyncio.to_thread(self.setup.look, begun_s, image, step)
-        await self._show_picture(image.pixels, found)
+        await self._show_picture(image, found)
         if step is self.step is CellStep.VIEWS and self.setup.new_view():
             self._add_view()
         self._show()
 
-    async def _show_picture(self, pixels: NDArray[np.uint8 | np.uint16], found: Detection | None) -> None:
+    async def _show_picture(self, image: Image, found: Detection | None) -> None:
         pane, board = self.query_one(BoardPicture), self.setup.draft.board
         if not pane.display:
             return
-        height, width = pixels.shape[:2]
-        grey = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
-        small = cv2.resize(
-            grey, (SHOWN_WIDTH_PX, round(SHOWN_WIDTH_PX * height / width)), interpolation=cv2.INTER_AREA
-        )
-        shares = np.zeros((0, 2)) if found is None else found.pixels / (width, height)
-        pane.axes = () if found is None or board is None else _axes(board, found, shares)
         self._pictures += 1
-        jpeg = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode()
-        corners = tuple((float(x), float(y)) for x, y in shares)
-        await pane.show(PreviewImage(jpeg, small.shape[1], small.shape[0], corners, sequence=self._pictures))
+        corners = np.zeros((0, 2)) if found is None else found.pixels
+        preview = preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures)
+        pane.axes = () if found is None or board is None else _axes(board, found, preview.corners)
+        await pane.show(preview)
 
     def _add_view(self) -> None:
         self.setup.take_view()
@@ -398,7 +390,7 @@ class NewCell(App[Ending]):
 
 
 def _axes(
-    board: BoardSpec, found: Detection, shares: NDArray[np.float64]
+    board: BoardSpec, found: Detection, shares: Sequence[tuple[float, float]]
 ) -> tuple[tuple[str, float, float], ...]:
     """O at the board's origin, x and y two squares along its axes, where these corners are seen."""
     points = board_points(board)[:, :2]
@@ -408,7 +400,7 @@ def _axes(
         row = int(np.argmin(np.linalg.norm(points - place, axis=1)))
         at = np.flatnonzero(found.indices == row)
         if len(at):
-            marks.append((letter, float(shares[at[0], 0]), float(shares[at[0], 1])))
+            marks.append((letter, *shares[at[0]]))
     return tuple(marks)
 
 

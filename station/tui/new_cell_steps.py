@@ -29,6 +29,8 @@ class StepPage:
 
     step: ClassVar[CellStep]
     title: ClassVar[str]
+    words: ClassVar[str] = ""
+    """What it says, where that is always the same."""
     parts: ClassVar[Sequence[str]] = ()
     """Widgets it shows below its words."""
     placeholder: ClassVar[str] = ""
@@ -40,7 +42,8 @@ class StepPage:
 
     @property
     def about(self) -> str:
-        return ""
+        """What it says now."""
+        return self.words
 
     @property
     def typed(self) -> str:
@@ -64,13 +67,10 @@ class RobotPage(StepPage):
     step, title = CellStep.ROBOT, "Which robot?"
     parts = ("#typed",)
     placeholder, working = "address of the controller, e.g. 192.168.1.10", "Asking the controller …"
-
-    @property
-    def about(self) -> str:
-        return (
-            "Type the controller's address. The pendant shows it: the menu ☰ (top right) → About, or ☰ → "
-            "Settings → System → Network; on a CB3: Setup Robot → Network. The station only reads."
-        )
+    words = (
+        "Type the controller's address. The pendant shows it: the menu ☰ (top right) → About, or ☰ → "
+        "Settings → System → Network; on a CB3: Setup Robot → Network. The station only reads."
+    )
 
     @property
     def typed(self) -> str:
@@ -94,10 +94,7 @@ class RobotPage(StepPage):
 class CameraPage(StepPage):
     step, title = CellStep.CAMERA, "Which camera?"
     parts = ("#choice", "#picture")
-
-    @property
-    def about(self) -> str:
-        return "Is this what the camera should see? F5 and F6 make it darker and brighter."
+    words = "Is this what the camera should see? F5 and F6 make it darker and brighter."
 
     @property
     def next(self) -> Action:
@@ -112,10 +109,7 @@ class CameraPage(StepPage):
 class MountingPage(StepPage):
     step, title = CellStep.MOUNTING, "Where is the camera?"
     parts = ("#drawings",)
-
-    @property
-    def about(self) -> str:
-        return "Choose the drawing that looks like your robot. The views of step 5 check it."
+    words = "Choose the drawing that looks like your robot. The views of step 5 check it."
 
     @property
     def next(self) -> Action:
@@ -130,15 +124,12 @@ class BoardPage(StepPage):
     step, title = CellStep.BOARD, "Which board?"
     parts: ClassVar[Sequence[str]] = ("#typed", "#picture")
     placeholder = "7x6 25"
-
-    @property
-    def about(self) -> str:
-        return (
-            "Type columns, rows and size in mm. 7x6 25 is a chessboard of 7 × 6 inner corners. Others by "
-            "name: charuco 8x6 30 (squares), circles 7x6 20, asymmetric-circles 4x11 20, april-grid 6x6 30 "
-            "(tags). Measure one square: a wrong size makes a wrong calibration. F4 prints this board as a "
-            "PDF, its origin and axes marked."
-        )
+    words = (
+        "Type columns, rows and size in mm. 7x6 25 is a chessboard of 7 × 6 inner corners. Others by "
+        "name: charuco 8x6 30 (squares), circles 7x6 20, asymmetric-circles 4x11 20, april-grid 6x6 30 "
+        "(tags). Measure one square: a wrong size makes a wrong calibration. F4 prints this board as a "
+        "PDF, its origin and axes marked."
+    )
 
     @property
     def typed(self) -> str:
@@ -217,10 +208,7 @@ class LimitsPage(StepPage):
     step, title = CellStep.LIMITS, "Where may the arm move?"
     parts = ("#typed",)
     placeholder = "table's height over the arm's base, mm; empty: as shown"
-
-    @property
-    def about(self) -> str:
-        return "The workspace lies around the guided views. F7: the table is as high as the tool is now."
+    words = "The workspace lies around the guided views. F7: the table is as high as the tool is now."
 
     @property
     def next(self) -> Action:

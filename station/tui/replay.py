@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import TypeVar, cast
 
-import cv2
 import msgspec
+import numpy as np
 
-from calibrate.boards.detect import detect
 from recordings.errors import RecordingError
 from recordings.files import MAIN_CAMERA
-from recordings.images import eight_bits
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.schema.messages import CaptureEvent, RobotState, View
+from station.analysis.preview import preview_image
+from station.analysis.worker import sight
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StationError
 from station.cell.scene import flange_pose
@@ -43,7 +42,6 @@ from station.tui.words import duration
 R = TypeVar("R")
 STEP_S = 0.1
 KEYS_TEXT = "space pauses, left/right: image, PgUp/PgDn: 10 s, Home: start"
-JPEG_QUALITY = 80
 WITHOUT_CLOCK_S = 1.0
 """Between the views of a recording that knows no time, such as an imported one."""
 MOVING_RAD_S = 0.01
@@ -149,26 +147,10 @@ class ReplayLink:
         except RecordingError as error:
             self._seen = DetectionStatus(reason=str(error))
             return PreviewImage()
-        image = taken.viewable()
-        seen = detect(image, self._timeline.recording.info.board, thorough=False)
-        self._seen = DetectionStatus(
-            found=seen.found,
-            reason=seen.reason,
-            corners=len(seen.pixels),
-            expected=seen.expected,
-            sharpness=round(float(seen.sharpness), 4),
-            saturated=round(float(seen.saturated), 4),
-            coverage=round(float(seen.coverage), 4),
-        )
-        image = eight_bits(image, taken.pixel_format)
-        rows, columns = image.shape[:2]
-        scale = min(width / columns, height / rows, 1.0)
-        size = (round(columns * scale), round(rows * scale))
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
-        corners = ((seen.pixels + 0.5) / (columns, rows)).tolist() if seen.found else []
-        found = tuple((x, y) for x, y in corners)
-        return PreviewImage(base64.b64encode(jpeg).decode(), *size, found, view.picture_sequence)
+        seen = sight(taken.viewable(), self._timeline.recording.info.board, None, thorough=False)
+        self._seen = seen.status
+        corners = seen.pixels if seen.status.found else np.zeros((0, 2))
+        return preview_image(taken, corners, width, height, view.picture_sequence)
 
 
 class Timeline:

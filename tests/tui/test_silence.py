@@ -18,8 +18,8 @@ from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 @pytest.fixture(autouse=True)
 def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attendance, "LISTEN_S", 0.02)
-    monkeypatch.setattr(attendance, "SILENT_S", 0.1)
+    monkeypatch.setattr(attendance, "LISTEN_S", 0.2)
+    monkeypatch.setattr(attendance, "SILENT_S", 0.2)
 
 
 async def test_a_daemon_that_does_not_answer_is_announced_and_what_it_said_is_old(link: FakeLink) -> None:

@@ -172,15 +172,16 @@ async def test_stop_stands_whole_on_every_screen_and_question(link: FakeLink, si
             await pilot.app.pop_screen()
 
 
-@pytest.mark.parametrize("theme", ["station-dark", "station-light", "ansi-dark", "ansi-light", "nord"])
-async def test_every_screen_can_be_drawn_in_every_theme(link: FakeLink, theme: str) -> None:
+async def test_every_screen_can_be_drawn_in_every_theme(link: FakeLink) -> None:
     link.answers["sessions"], link.answers["doctor"] = [], []
     async with opened(link, (120, 36)) as pilot:
-        pilot.app.theme = theme
         for key in DIGITS.values():
             await pilot.press(key)
-            await pilot.pause()
-            assert "SIMULATED" in pilot.app.export_screenshot()
+            for theme in ("station-dark", "station-light", "ansi-dark", "ansi-light", "nord"):
+                pilot.app.theme = theme
+                await pilot.pause()
+                drawn = pilot.app.screen._compositor.render_strips()
+                assert any("SIMULATED" in strip.text for strip in drawn)
 
 
 async def test_without_colours_stop_and_chips_are_reversed(

@@ -25,14 +25,13 @@ from station.cell.status import MotionPreview
 from station.cli import attended, main
 from station.cli.app import STATION
 from station.cli.daemon import tell_what_goes_on
+from station.cli.demo import simulated_daemon
 from station.plan.files import load_plan
 from station.protocol.client import NoAnswerError
 from station.protocol.states import RUNNING
 from tests.command_line import call
-from tests.system.conftest import short_folder
 
 pytestmark = pytest.mark.process
-__all__ = ["short_folder"]
 
 
 class Shell:
@@ -61,21 +60,10 @@ class Shell:
 
 
 @pytest.fixture
-def shell(short_folder: Path, tmp_path: Path) -> Iterator[Shell]:
+def shell(tmp_path: Path) -> Iterator[Shell]:
     """Beside a simulated daemon, faster than real time."""
-    socket = short_folder / "s"
-    command = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
-    command += ["--socket", str(socket), "--root", str(tmp_path), "--time-scale", "4"]
-    with (tmp_path / "log").open("wb") as words:
-        daemon = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
-    assert daemon.stdin is not None and daemon.stdout is not None
-    try:
-        assert json.loads(daemon.stdout.readline())["ready"]
+    with simulated_daemon(tmp_path, ["--time-scale", "4"]) as socket:
         yield Shell(socket)
-    finally:
-        daemon.stdin.close()
-        daemon.wait(15)
-        daemon.stdout.close()
 
 
 def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import signal
 import subprocess
 import sys
@@ -26,38 +25,30 @@ from station.cell.status import StationState, StationStatus
 from station.cli import bootstrap as cli_bootstrap
 from station.cli import main
 from station.cli.bootstrap import slow_plan
+from station.cli.demo import simulated_daemon
 from station.plan.planner import make_plan
 from station.protocol.client import Client
 from station.simulation.scenes import cell_config, make_cell
 from tests.command_line import call
-from tests.system.conftest import short_folder
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
-__all__ = ["short_folder"]
 SEED = 0
 TRUTH = make_cell("paper", SEED, "low", "eye-in-hand")
 
 
-@pytest.fixture
-def socket(short_folder: Path, tmp_path: Path) -> Iterator[Path]:
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("root")
+
+
+@pytest.fixture(scope="module")
+def socket(root: Path) -> Iterator[Path]:
     """Of a simulated daemon, faster than real time."""
-    command = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
-    command += ["--seed", str(SEED), "--socket", str(short_folder / "s"), "--root", str(tmp_path / "root")]
-    with (tmp_path / "log").open("wb") as words:
-        daemon = subprocess.Popen(
-            [*command, "--time-scale", "4"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words
-        )
-    assert daemon.stdin is not None and daemon.stdout is not None
-    try:
-        assert json.loads(daemon.stdout.readline())["ready"]
-        yield short_folder / "s"
-    finally:
-        daemon.stdin.close()
-        daemon.wait(60)
-        daemon.stdout.close()
+    with simulated_daemon(root, ["--seed", str(SEED), "--time-scale", "4"]) as socket:
+        yield socket
 
 
-def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, tmp_path: Path) -> None:
+def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, root: Path, tmp_path: Path) -> None:
     X = np.array(TRUTH.camera_mount)
     axis = np.array([0.6, -0.64, 0.48])
     wrong = pose(rotation_exp(np.deg2rad(30) * axis) @ X[:3, :3], X[:3, 3] + 0.1 * axis[::-1])
@@ -70,7 +61,7 @@ def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, tmp_path:
     done = call(main, "bootstrap", *options)
     assert done.returncode == 0, done.stderr
     found = yaml.safe_load(guesses.read_text())
-    assert 4 <= len(list((tmp_path / "root" / "sessions").iterdir())) <= 6, "the arm moves 3 to 5 times"
+    assert 4 <= len(list((root / "sessions").iterdir())) <= 6, "the arm moves 3 to 5 times"
     for name, truth in (("camera_guess", TRUTH.camera_mount), ("board_guess", TRUTH.board_place)):
         guess = found[name]
         off = difference(
@@ -79,7 +70,7 @@ def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, tmp_path:
         assert np.linalg.norm(off[:3]) < 0.02, name
         assert np.rad2deg(np.linalg.norm(off[3:])) < 2, name
     improved = msgspec.convert({**msgspec.to_builtins(bad), **found}, type(bad))
-    assert len(make_plan(improved, start_joints_rad=TRUTH.start_joints_rad).poses) == 25
+    assert len(make_plan(improved, start_joints_rad=TRUTH.start_joints_rad, count=10).poses) == 10
 
 
 def test_ctrl_c_in_mid_move_stops_the_arm_and_says_so(socket: Path, tmp_path: Path) -> None:

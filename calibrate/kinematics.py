@@ -249,9 +249,13 @@ def inverse_nearest(model: RobotModel, base_from_flange: Array, near_rad: ArrayL
     candidates = inverse_all(model, base_from_flange)
     if len(candidates) == 0:
         return None
-    turned = candidates + 2 * np.pi * np.round((near - candidates) / (2 * np.pi))
-    limit = model.joint_limit_rad
-    turned = np.where(
-        turned > limit, turned - 2 * np.pi, np.where(turned < -limit, turned + 2 * np.pi, turned)
-    )
+    turned = turned_near(model, candidates, near)
     return np.asarray(turned[np.argmin(np.abs(turned - near).max(axis=1))])
+
+
+def turned_near(model: RobotModel, joints_rad: Array, near_rad: Array) -> Array:
+    """Choose whole turns of joints (..., 6) so that they are within the limits and near `near_rad` (6,)."""
+    turned = joints_rad + 2 * np.pi * np.round((near_rad - joints_rad) / (2 * np.pi))
+    limit = model.joint_limit_rad
+    turned = np.where(turned > limit, turned - 2 * np.pi, turned)
+    return np.where(turned < -limit, turned + 2 * np.pi, turned)

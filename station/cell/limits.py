@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from calibrate.geometry import Array, difference
 from calibrate.kinematics import JOINT_NAMES, forward
 from station.cell.collision import CellGeometry, Contact, margins, moving_points, surface_speeds
+from station.cell.config import LimitsConfig
 from station.cell.plan import Plan, PlannedPose
 
 SPEED_CAP_M_S = 0.25
@@ -161,16 +162,20 @@ def _refused(name: str, problems: list[Problem]) -> MoveCheck:
 
 def allowed_speed(geometry: CellGeometry, samples: Array) -> tuple[float, float, float, float]:
     """Samples (m, 6) evenly along one move → leading joint's speed and acceleration, duration, top speed."""
-    limits = geometry.limits
     step_rad = float(np.abs(samples[-1] - samples[0]).max())
-    acceleration = min(limits.joint_acceleration_rad_s2, JOINT_ACCELERATION_CAP_RAD_S2)
-    speed = min(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
-    if step_rad < 1e-9:
-        return speed, acceleration, 0.0, 0.0
-    metres_per_rad = float(surface_speeds(geometry, samples, (samples[-1] - samples[0]) / step_rad).max())
-    speed = min(speed, _SPEED_RESERVE * min(limits.speed_m_s, SPEED_CAP_M_S) / max(metres_per_rad, 1e-9))
+    turn = (samples[-1] - samples[0]) / max(step_rad, 1e-9)
+    metres_per_rad = float(surface_speeds(geometry, samples, turn).max())
+    speed, acceleration = leading_speed(geometry.limits, metres_per_rad)
     duration, peak = trapezoid(step_rad, speed, acceleration)
     return float(speed), acceleration, float(duration), float(peak * metres_per_rad)
+
+
+def leading_speed(limits: LimitsConfig, metres_per_rad: ArrayLike) -> tuple[Array, float]:
+    """Speed (rad/s) and acceleration (rad/s²) of moves whose fastest point goes so far per rad (n,)."""
+    most_m_s = _SPEED_RESERVE * min(limits.speed_m_s, SPEED_CAP_M_S)
+    by_points = most_m_s / np.maximum(metres_per_rad, 1e-9)
+    speed = np.minimum(by_points, min(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S))
+    return speed, min(limits.joint_acceleration_rad_s2, JOINT_ACCELERATION_CAP_RAD_S2)
 
 
 def _joint_problems(geometry: CellGeometry, start: Array, target: Array, name: str) -> list[Problem]:
@@ -242,13 +247,24 @@ def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeo
 
 def with_plan_speeds(geometry: CellGeometry, plan: Plan) -> CellGeometry:
     """The plan may ask for slower joints than the configuration, never for faster ones."""
+    return slower(geometry, np.inf, plan.joint_speed_rad_s, plan.joint_acceleration_rad_s2)
+
+
+def slower(
+    geometry: CellGeometry,
+    speed_m_s: float = np.inf,
+    joint_speed_rad_s: float = np.inf,
+    joint_acceleration_rad_s2: float = np.inf,
+) -> CellGeometry:
+    """The cell with speed limits that are no higher than these."""
     limits = geometry.limits
-    slower = msgspec.structs.replace(
+    lower = msgspec.structs.replace(
         limits,
-        joint_speed_rad_s=min(limits.joint_speed_rad_s, plan.joint_speed_rad_s),
-        joint_acceleration_rad_s2=min(limits.joint_acceleration_rad_s2, plan.joint_acceleration_rad_s2),
+        speed_m_s=min(limits.speed_m_s, speed_m_s),
+        joint_speed_rad_s=min(limits.joint_speed_rad_s, joint_speed_rad_s),
+        joint_acceleration_rad_s2=min(limits.joint_acceleration_rad_s2, joint_acceleration_rad_s2),
     )
-    return replace(geometry, limits=slower)
+    return replace(geometry, limits=lower)
 
 
 def _plan_problems(plan: Plan, geometry: CellGeometry) -> list[Problem]:

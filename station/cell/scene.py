@@ -22,10 +22,19 @@ from calibrate.geometry import (
 from calibrate.kinematics import MODELS, RobotModel, forward
 from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
 from station.cell.collision import CellGeometry, gap_to_arm, plate
-from station.cell.config import Capsule, PoseGuess, RobotConfig, StationConfig, Vector3, vector3, vector6
+from station.cell.config import (
+    Capsule,
+    PoseGuess,
+    RobotConfig,
+    StationConfig,
+    Vector3,
+    matrix4,
+    vector3,
+    vector6,
+)
 from station.cell.errors import ConfigError, LimitError
 from station.cell.limits import SPACING_M
-from station.cell.plan import Plan
+from station.cell.plan import Plan, PlannedPose
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
 _DOUBT = 3.0
@@ -74,6 +83,12 @@ def camera_from_board(mount: Mount, base_from_flange: Array, X: Array, Y: Array)
     return np.asarray(inverse(X) @ base_from_flange @ Y)
 
 
+def pose_at(model: RobotModel, name: str, joints_rad: ArrayLike, why: str = "") -> PlannedPose:
+    """A pose of a plan, with where the flange is expected; joints (6,)."""
+    joints = np.asarray(joints_rad, dtype=float)
+    return PlannedPose(name, vector6(joints), matrix4(forward(model, joints)), why=why)
+
+
 def flange_poses(scene: Scene, plan: Plan) -> Array:
     """(n, 4, 4) base_from_flange of the plan's joints."""
     joints = np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6)
@@ -94,12 +109,6 @@ def printed_corners(board: BoardSpec) -> Array:
 
 def scene_of(config: StationConfig) -> Scene:
     """The scene that the configuration describes. ConfigError names what is missing."""
-    if config.robot.model not in MODELS:
-        raise ConfigError(
-            f"robot.model '{config.robot.model}' is unknown",
-            code="unknown-robot-model",
-            remedy=f"Use one of {', '.join(MODELS)}.",
-        )
     camera, mount_guess, place_guess = config.camera.model, config.camera_guess, config.board_guess
     if camera is None or camera.matrix is None:
         raise ConfigError(
@@ -154,8 +163,13 @@ def cell_geometry(config: StationConfig) -> CellGeometry:
 
 
 def arm_model(robot: RobotConfig) -> RobotModel:
-    """The configured arm, with its factory calibration where it is given."""
-    model = MODELS[robot.model]
+    """The configured arm, with its factory calibration where it is given. ConfigError: not known."""
+    if (model := MODELS.get(robot.model)) is None:
+        raise ConfigError(
+            f"robot.model '{robot.model}' is unknown",
+            code="unknown-robot-model",
+            remedy=f"Use one of {', '.join(MODELS)}.",
+        )
     if (k := robot.kinematics) is not None:
         model = model.calibrated(k.a_m, k.d_m, k.alpha_rad, k.theta_rad)
     return model

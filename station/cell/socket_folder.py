@@ -6,10 +6,13 @@ In a folder that somebody else may write to, anyone can put a socket that answer
 from __future__ import annotations
 
 import os
+import socket
 import stat
+import struct
 from pathlib import Path
 
 ROOT = 0
+_CREDENTIALS = struct.Struct("3i")
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
@@ -120,6 +123,12 @@ def _own_group_only(status: os.stat_result) -> bool:
     return (
         user.pw_gid == group.gr_gid and set(group.gr_mem) <= {user.pw_name} and user.pw_name == group.gr_name
     )
+
+
+def peer_of(link: socket.socket) -> tuple[int, int, int]:
+    """Process, user and group at the other end of a Unix socket, by the kernel's word."""
+    pid, uid, gid = _CREDENTIALS.unpack(link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+    return pid, uid, gid
 
 
 def user_name(uid: int) -> str:

@@ -6,9 +6,7 @@ import asyncio
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TypeVar
 
 import msgspec
 
@@ -17,7 +15,7 @@ from recordings.schema.messages import CameraIdentity, Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis_device import GenicamDevice
-from station.devices.base import Trigger
+from station.devices.base import DeviceThread, Trigger
 from station.devices.frames import (
     RETAKE,
     CameraCounts,
@@ -29,7 +27,6 @@ from station.devices.frames import (
 )
 from station.devices.genicam_settings import CHUNKS, TIME_CHUNKS
 
-T = TypeVar("T")
 _CLOCK_READINGS = 8
 _STREAM_POP_S = 0.1
 _GLIMPSE_S = 1.0
@@ -48,7 +45,7 @@ class AravisCamera:
         self._config = config
         self._trigger = trigger
         self._device: GenicamDevice | None = None
-        self._worker: ThreadPoolExecutor | None = None
+        self._worker = DeviceThread("aravis")
         self._busy = asyncio.Lock()
         self._clock = FrameClock(config.time_offset, config.trigger_delay_us)
         self._newest: Image | None = None
@@ -66,13 +63,13 @@ class AravisCamera:
 
     async def open(self) -> CameraIdentity:
         async with self._busy:
-            await self._run(self._open)
+            await self._worker.run(self._open)
         return self.identity
 
     async def settings(self) -> dict[str, object]:
         """Reads the settings back from the camera."""
         async with self._busy:
-            return await self._run(lambda: self._live().settings())
+            return await self._worker.run(lambda: self._live().settings())
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
         async with self._busy:
@@ -85,7 +82,7 @@ class AravisCamera:
             return await self._one(_GLIMPSE_S, sequenced=False)
 
     async def _one(self, timeout_s: float, *, sequenced: bool) -> Image:
-        await self._run(self._prepare)
+        await self._worker.run(self._prepare)
         pulse: TriggerPulse | None = None
         asked_ns = None if self.free_running else time.monotonic_ns()
         if self._config.trigger == "hardware":
@@ -93,7 +90,7 @@ class AravisCamera:
             pulse = await self._trigger.fire()
         count = None if pulse is None else pulse.count
         try:
-            picture = await self._run(partial(self._take, timeout_s))
+            picture = await self._worker.run(partial(self._take, timeout_s))
         except CameraError:
             self.counter.lost(count)
             raise
@@ -101,7 +98,7 @@ class AravisCamera:
         told = msgspec.structs.replace(picture, sequence=sequence, trigger_count=count)
         chunks = self._live().chunks
         if not chunks.issuperset(CHUNKS):  # held before the exposure: they must hold after it, too
-            exposure_us, gain_db = await self._run(lambda: self._live().check_settings())
+            exposure_us, gain_db = await self._worker.run(lambda: self._live().check_settings())
             told = msgspec.structs.replace(told, exposure_us=exposure_us, gain_db=gain_db)
         return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse, chunk=chunks.issuperset(TIME_CHUNKS))
 
@@ -124,20 +121,11 @@ class AravisCamera:
     async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
         """Free-running: every frame, in order, from the worker's thread, until `stop` is set."""
         async with self._busy:
-            await self._run(partial(self._stream_frames, callback, stop))
+            await self._worker.run(partial(self._stream_frames, callback, stop))
 
     async def close(self) -> None:
-        if self._worker is not None:
-            worker, self._worker = self._worker, None
-            device, self._device = self._device, None
-            if device is not None:
-                await asyncio.get_running_loop().run_in_executor(worker, device.close)
-            worker.shutdown(wait=False)
-
-    async def _run(self, job: Callable[[], T]) -> T:
-        if self._worker is None:
-            self._worker = ThreadPoolExecutor(1, "aravis")
-        return await asyncio.get_running_loop().run_in_executor(self._worker, job)
+        device, self._device = self._device, None
+        await self._worker.close(device.close if device is not None else lambda: None)
 
     def _open(self) -> None:
         device = GenicamDevice(self._config)

@@ -1,15 +1,40 @@
-"""The protocols behind which real, simulated and played-back devices are equals for the session."""
+"""The protocols behind which real, simulated and played-back devices are equals; the thread of a driver."""
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Callable, Sequence
-from typing import Protocol, runtime_checkable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol, TypeVar, runtime_checkable
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
 from station.cell.acceptance import StopWay
 from station.devices.frames import CameraCounts, FrameTiming, TriggerPulse
+
+T = TypeVar("T")
+
+
+class DeviceThread:
+    """The one thread that calls a blocking driver, which may be stuck in it for seconds."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._pool: ThreadPoolExecutor | None = None
+
+    def run(self, job: Callable[[], T]) -> asyncio.Future[T]:
+        """Begin a job behind those that were begun before."""
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(1, self._name)
+        return asyncio.get_running_loop().run_in_executor(self._pool, job)
+
+    async def close(self, last: Callable[[], object]) -> None:
+        """Run a last job and end the thread; nothing where it never ran."""
+        if (pool := self._pool) is not None:
+            self._pool = None
+            await asyncio.get_running_loop().run_in_executor(pool, last)
+            pool.shutdown(wait=False)
 
 
 class Robot(Protocol):

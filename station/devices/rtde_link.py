@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from station.devices.rtde import (
     IN_USE,
+    NOT_FOUND,
     PROTOCOL_VERSION,
     PacketReader,
     PacketType,
@@ -32,9 +33,7 @@ class RtdeLink:
         self._link = link
         self.packets = PacketReader()
         self.pending: deque[tuple[int, bytes]] = deque()
-        """Data that arrived and was not yet read: after `start`, the first data."""
-
-    def speak(self) -> None:
+        """What arrived and was not yet read: after `start`, the first data."""
         accepted = self._ask(PacketType.PROTOCOL_VERSION, struct.pack(">H", PROTOCOL_VERSION))
         if accepted != b"\x01":
             raise RtdeError(f"the controller does not speak RTDE version {PROTOCOL_VERSION}")
@@ -86,7 +85,7 @@ def _recipe(answer: bytes, names: Sequence[str]) -> Recipe:
     types = split_names(answer[1:])
     if len(types) != len(names):
         raise RtdeError(f"asked for {len(names)} variables, the controller answered {len(types)} types")
-    refused = [n for n, t in zip(names, types, strict=True) if t == "NOT_FOUND"]
+    refused = [n for n, t in zip(names, types, strict=True) if t == NOT_FOUND]
     if refused:
         raise RtdeError(f"the controller has no {', '.join(refused)}; update its software")
     return Recipe(answer[0], tuple(names), types)

@@ -5,19 +5,17 @@ The only module that touches `serial`. All waiting happens in one worker thread.
 
 from __future__ import annotations
 
-import asyncio
 import termios
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial, reduce
-from typing import Any, TypeVar
+from typing import Any
 
 from station.cell.config import TriggerConfig
 from station.cell.errors import TriggerError
+from station.devices.base import DeviceThread
 from station.devices.frames import TriggerPulse
 
-T = TypeVar("T")
 ANSWER_TIMEOUT_S = 1.0
 HANDSHAKE_TIMEOUT_S = 3.0
 """Many boards restart when their port is opened, and take two seconds for it."""
@@ -91,7 +89,7 @@ class SerialTrigger:
         self._config = config
         self._open_port = open_port or _open_port
         self._port: Any = None
-        self._worker: ThreadPoolExecutor | None = None
+        self._worker = DeviceThread("trigger")
         self._lines = LineReader()
         self._boot_id = ""
         self._opened = False
@@ -109,10 +107,10 @@ class SerialTrigger:
         return self._count - self._first_count
 
     async def open(self) -> str:
-        return await self._run(self._connect)
+        return await self._worker.run(self._connect)
 
     async def fire(self) -> TriggerPulse:
-        return await self._run(self._fire if self._config.mode == "box" else self._pulse_line)
+        return await self._worker.run(self._fire if self._config.mode == "box" else self._pulse_line)
 
     async def light(self, level: float) -> None:
         """0 = off, 1 = full. TriggerError where there is no light. Opening sets `config.light_level`."""
@@ -120,19 +118,11 @@ class SerialTrigger:
             raise TriggerError(
                 f"trigger.mode '{self._config.mode}' has no light; it needs a trigger box", code="no-light"
             )
-        await self._run(partial(self._set_light, level))
+        await self._worker.run(partial(self._set_light, level))
 
     async def close(self) -> None:
-        if self._worker is not None:
-            worker, self._worker = self._worker, None
-            self._opened = False
-            await asyncio.get_running_loop().run_in_executor(worker, self._disconnect)
-            worker.shutdown(wait=False)
-
-    async def _run(self, job: Callable[[], T]) -> T:
-        if self._worker is None:
-            self._worker = ThreadPoolExecutor(1, "trigger")
-        return await asyncio.get_running_loop().run_in_executor(self._worker, job)
+        self._opened = False
+        await self._worker.close(self._disconnect)
 
     def _connect(self) -> str:
         self._disconnect()

@@ -17,7 +17,6 @@ from collections.abc import Callable, Coroutine, Sequence
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from station.cell.acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
@@ -294,8 +293,7 @@ class UrRobot(UrLink):
             log.exception("a path of the stop failed")
         self._later(self._finish_stop(child, reply))  # whatever failed above
         both = (reply, child.stop_acknowledged if child is not None else None)
-        waits: list[asyncio.Future[Any]] = [w for w in both if w is not None]
-        if waits:
+        if waits := [w for w in both if w is not None]:
             await asyncio.wait(waits, timeout=STOP_WAIT_S)
 
     def stop_one_way(self, way: StopWay) -> None:

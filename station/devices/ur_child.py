@@ -212,7 +212,7 @@ class ControlChild:
     def _trouble(self, text: str, **values: float) -> RobotError:
         return RobotError(text, code="control-process", remedy=f"See {self._log_path}.", **values)
 
-    def _send(self, request: dict[str, Any]) -> bool:
+    def _send(self, request: dict[str, object]) -> bool:
         try:
             self._channel.send(json.dumps(request).encode())
         except OSError:  # full, or closed

@@ -11,7 +11,6 @@ import logging
 import time
 from collections.abc import Callable
 
-from calibrate.kinematics import MODELS
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState
 from station.cell.config import RobotConfig
@@ -35,13 +34,7 @@ RECONNECT_S = (0.2, 0.5, 1.0, 2.0)
 
 class UrLink:
     def __init__(self, config: RobotConfig) -> None:
-        """Raises RobotError for an unknown model."""
-        if config.model not in MODELS:
-            raise RobotError(
-                f"unknown robot.model {config.model!r}",
-                code="unknown-robot-model",
-                remedy=f"Use one of {', '.join(sorted(MODELS))}.",
-            )
+        """Raises ConfigError for an unknown model."""
         self.config = config
         self.model = arm_model(config)
         self.remote: bool | None = None

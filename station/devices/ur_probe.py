@@ -6,11 +6,10 @@ import asyncio
 import ipaddress
 import re
 import socket
-import struct
 from dataclasses import dataclass, field, replace
 
 from station.cell.errors import RobotError
-from station.cell.socket_folder import user_name
+from station.cell.socket_folder import peer_of, user_name
 from station.devices.ur_dashboard import Dashboard, DashboardError, connect_trouble
 
 SCRIPT_PORT = 30002
@@ -133,5 +132,5 @@ def _owner(address: str) -> str:
             link.connect(address)
         except OSError:
             return ""
-        pid, uid, _ = struct.unpack("3i", link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+        pid, uid, _ = peer_of(link)
     return f"pid {pid}, {user_name(uid)}"

@@ -229,7 +229,6 @@ class ScriptControl:
 
     def _start(self, host: str) -> None:
         self._rtde = RtdeLink(self._link)
-        self._rtde.speak()
         self._inputs = self._rtde.inputs(_INPUTS)
         self._outputs = self._rtde.outputs(RATE_HZ, _OUTPUTS)
         self._rtde.start()

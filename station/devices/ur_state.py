@@ -149,7 +149,6 @@ class StateReader(threading.Thread):
             self._stop_write.close()
 
     def _handshake(self, link: RtdeLink) -> Recipe:
-        link.speak()
         begun = time.perf_counter()
         self.version = link.version()
         self.clock.latency_s = (time.perf_counter() - begun) / 2

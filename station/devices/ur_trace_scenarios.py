@@ -108,9 +108,7 @@ class ScenarioRecorder:
         """RobotError where a program plays; RtdeError, OSError where it does not answer."""
         self.host = host
         with socket.create_connection((host, PORT), HANDSHAKE_S) as link:
-            rtde = RtdeLink(link)
-            rtde.speak()
-            version = rtde.version()
+            version = RtdeLink(link).version()
         self.controller = ".".join(map(str, version))
         self.rate_hz = 500.0 if version[0] > 3 else 125.0
         self._start_rad: float | None = None
@@ -211,7 +209,6 @@ class _Line:
         self._count, self._kicked_s = 0, 0.0
         try:
             self._rtde = RtdeLink(self._link)
-            self._rtde.speak()
             self._inputs: Recipe = self._rtde.inputs(_INPUTS)
             self._outputs: Recipe = self._rtde.outputs(rate_hz, _OUTPUTS)
             self._rtde.start()
@@ -280,7 +277,6 @@ def _rtde_answers(host: str, question: str, rate_hz: float) -> dict[str, str]:
     """Send RTDE one odd request and return its answer; '' where it said nothing wrong."""
     with socket.create_connection((host, PORT), HANDSHAKE_S) as link:
         rtde = RtdeLink(link)
-        rtde.speak()
         try:
             if question == "unknown-output":
                 rtde.outputs(rate_hz, ("timestamp", "no_such_output"))
@@ -292,9 +288,7 @@ def _rtde_answers(host: str, question: str, rate_hz: float) -> dict[str, str]:
                     link.close()
                     time.sleep(QUIET_S)
                 with socket.create_connection((host, PORT), HANDSHAKE_S) as second:
-                    other = RtdeLink(second)
-                    other.speak()
-                    other.inputs(_INPUTS)
+                    RtdeLink(second).inputs(_INPUTS)
             else:
                 return _stream(link, rtde, rate_hz / 4 if question == "slow-rate" else rate_hz, question)
         except (RtdeError, OSError) as error:

@@ -10,7 +10,6 @@ import asyncio
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -23,6 +22,7 @@ from recordings.schema.frame_time import by_arrival
 from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
+from station.devices.base import DeviceThread
 from station.devices.discovery import kernel_text
 from station.devices.frames import RETAKE, CameraCounts, FrameTiming
 
@@ -48,7 +48,7 @@ class WebcamCamera:
     def __init__(self, config: CameraConfig) -> None:
         self._config = config
         self._video: cv2.VideoCapture | None = None
-        self._worker: ThreadPoolExecutor | None = None
+        self._worker = DeviceThread("webcam")
         self._newest: Image | None = None
         self._fixed: dict[str, float] = {}
         """Exposure and focus as they were when it was opened; what the camera has not is not in it"""
@@ -96,17 +96,11 @@ class WebcamCamera:
         await self._run(partial(self._stream_frames, callback, stop))
 
     async def close(self) -> None:
-        if self._worker is None:
-            return
-        worker, self._worker = self._worker, None
-        await asyncio.get_running_loop().run_in_executor(worker, self._release)
-        worker.shutdown(wait=False)
+        await self._worker.close(self._release)
 
     async def _run(self, job: Callable[[], T], timeout_s: float | None = None) -> T:
-        """Call the driver in its one thread, which may be stuck in it for ten seconds."""
-        if self._worker is None:
-            self._worker = ThreadPoolExecutor(1, "webcam")
-        running = asyncio.get_running_loop().run_in_executor(self._worker, job)
+        """CameraError when the driver is stuck for longer."""
+        running = self._worker.run(job)
         done, _ = await asyncio.wait({running}, timeout=timeout_s and timeout_s + _PATIENCE_S)
         if not done:
             running.cancel()

@@ -41,8 +41,8 @@ class CandidateSet:
     """(n, 4, 4)"""
     camera_from_board: Array
     """(n, 4, 4) by the guess"""
-    branch: Array
-    """(n,) small integers"""
+    branch: NDArray[np.intp]
+    """(n,) of `inverse_many`"""
     margin_m: Array
     """(n,)"""
     lost: Counter[str] = field(default_factory=Counter)
@@ -103,14 +103,14 @@ def find_candidates(
     seen = seen_for_certain(scene, flange, view)
     lost = Counter({NOT_IN_PICTURE: int((~seen).sum())})
     views, flange = views[seen][:count], flange[seen][:count]
-    rows, joints = _all_branches(scene, flange, near_joints_rad)
+    rows, joints, branches = _all_branches(scene, flange, near_joints_rad)
     lost[OUT_OF_REACH] = len(views) - len(np.unique(rows))
     checks, worst = _checks(scene, view, joints, flange[rows])
     keep = np.logical_and.reduce(list(checks.values()))
     failing = np.sum([~good for good in checks.values()], axis=0)
     alone = Counter({name: int((~good & (failing == 1)).sum()) for name, good in checks.items()})
     lost += Counter({name: int((~good).sum()) for name, good in checks.items()})
-    kept = CandidateSet(joints, flange[rows], views[rows], branch_of(scene, joints), worst, lost, alone)
+    kept = CandidateSet(joints, flange[rows], views[rows], branches, worst, lost, alone)
     return kept.take(np.flatnonzero(keep))
 
 
@@ -143,15 +143,16 @@ def _limit_of(contact: Contact) -> str:
     return "the " + contact.other.removeprefix("the ")
 
 
-def _all_branches(scene: Scene, flange: Array, near: Array | None) -> tuple[NDArray[np.intp], Array]:
-    """Inverse kinematics of all poses: row in `flange` (m,), and joints (m, 6)."""
+def _all_branches(
+    scene: Scene, flange: Array, near: Array | None
+) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
+    """Inverse kinematics of all poses: row in `flange` (m,), joints (m, 6), and their branch (m,)."""
     low, high = joint_bounds(scene.geometry)
-    rows, q, _ = inverse_many(scene.geometry.model, flange)
-    branches = branch_of(scene, q)
+    rows, q, branches = inverse_many(scene.geometry.model, flange)
     for branch in np.unique(branches):
         here = branches == branch
         q[here] = _gather(q[here], near, low, high)
-    return rows, q
+    return rows, q, branches
 
 
 def _gather(q: Array, near: Array | None, low: Array, high: Array) -> Array:
@@ -162,18 +163,6 @@ def _gather(q: Array, near: Array | None, low: Array, high: Array) -> Array:
     q = mean + (q - mean + np.pi) % turn - np.pi
     q = np.where(q < low, q + turn, q)
     return np.where(q > high, q - turn, q)
-
-
-def branch_of(scene: Scene, joints_rad: Array) -> Array:
-    """Find the arm branch of joints (n, 6), one of 8: shoulder side, elbow, wrist flip, as bits (n,)."""
-    model = scene.geometry.model
-    q = np.asarray(joints_rad)
-    elbow = np.sin(q[:, 2]) > 0
-    wrist = np.sin(q[:, 4]) > 0
-    # Shoulder side: does the wrist's centre lie before or behind the shoulder axis, in the arm's plane?
-    a2, a3, d5 = model.a_m[1], model.a_m[2], model.d_m[4]
-    reach = a2 * np.cos(q[:, 1]) + a3 * np.cos(q[:, 1] + q[:, 2]) + d5 * np.sin(q[:, 1:4].sum(axis=1))
-    return np.asarray((reach > 0) * 4 + elbow * 2 + wrist * 1)
 
 
 def best_group(

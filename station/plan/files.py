@@ -12,14 +12,15 @@ import numpy as np
 import yaml
 
 from calibrate.geometry import Array, pose_from_quaternion
-from calibrate.kinematics import MODELS, forward, inverse_nearest
+from calibrate.kinematics import MODELS, inverse_nearest
 from recordings import strict_yaml
 from recordings.files import ASKED_FOR, write_atomically
 from recordings.reader import open_recording
 from recordings.schema.messages import Mount, Vector6
-from station.cell.config import matrix4, vector6
+from station.cell.config import vector6
 from station.cell.errors import ConfigError
 from station.cell.plan import Plan, PlannedPose
+from station.cell.scene import pose_at
 
 _POSE_LIMIT = 200
 _JOINTS_DEG = [f"j{i}_deg" for i in range(1, 7)]
@@ -144,15 +145,11 @@ def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
         raise ConfigError(
             f"{path} holds {len(views)} poses, {len(taught)} of them with the arm's joints", code="no-joints"
         )
-    poses = tuple(_plain_pose(robot, name, np.array(joints), "as taught") for name, joints in taught)
+    poses = tuple(pose_at(MODELS[robot], name, joints, "as taught") for name, joints in taught)
     plan = Plan(robot=robot, mount=mount, poses=poses, note=f"taught: the poses of {path.name}")
     if problems := _value_problems(plan):
         raise _report(str(path), problems)
     return plan
-
-
-def _plain_pose(robot: str, name: str, joints: Array, why: str) -> PlannedPose:
-    return PlannedPose(name, vector6(joints), matrix4(forward(MODELS[robot], joints)), why=why)
 
 
 def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[float] | None = None) -> Plan:
@@ -191,7 +188,7 @@ def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[
         name = row[0].strip() if named else f"p{len(poses) + 1:02d}"
         values = _numbers(row[1:] if named else row, len(columns), f"{path}, row {number}")
         near = _row_joints(values, columns, robot, near, f"{path}, row {number}")
-        poses.append(_plain_pose(robot, name, near, f"from {path.name}"))
+        poses.append(pose_at(MODELS[robot], name, near, f"from {path.name}"))
     plan = Plan(robot=robot, mount=mount, poses=tuple(poses), note=f"imported from {path.name}")
     if problems := _value_problems(plan):
         raise _report(str(path), problems)

@@ -10,22 +10,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
 
 from calibrate.boards.model import board_points, outer_corners
 from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, pose, rotation_exp, transform_points
-from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian
+from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian, turned_near
 from calibrate.quality.board_now import found_points, locate_board, offset_covariance
 from calibrate.views import BoardView
 from recordings.schema.messages import Vector6
 from station.cell.collision import CellGeometry, margins, plate
-from station.cell.config import Capsule, PointerConfig, StationConfig, matrix4, vector3, vector6
+from station.cell.config import Capsule, PointerConfig, StationConfig, vector3
 from station.cell.errors import LimitError
-from station.cell.limits import PlanCheck, check_plan
-from station.cell.plan import Plan, PlannedPose
-from station.cell.scene import board_extent, geometry_of
+from station.cell.limits import PlanCheck, check_plan, slower
+from station.cell.plan import Plan
+from station.cell.scene import board_extent, geometry_of, pose_at
 
 CLEARANCE_M = 0.05
 """Nothing that moves comes nearer to the board, on the path or at the end."""
@@ -162,15 +161,8 @@ def hover_geometry(
     along = np.array(pointer.along) / np.linalg.norm(pointer.along)
     end = np.array(pointer.tip_m) - pointer.radius_m * along
     rod = Capsule("pointer", (0.0, 0.0, 0.0), vector3(end), pointer.radius_m)
-    limits = config.limits
-    slow = msgspec.structs.replace(
-        limits,
-        speed_m_s=min(limits.speed_m_s, SPEED_M_S),
-        joint_acceleration_rad_s2=min(limits.joint_acceleration_rad_s2, _ACCELERATION_RAD_S2),
-    )
     return replace(
-        cell,
-        limits=slow,
+        slower(cell, speed_m_s=SPEED_M_S, joint_acceleration_rad_s2=_ACCELERATION_RAD_S2),
         solids=(*cell.solids, rod),
         obstacles=(*plate("board", base_from_board, low, high, _PLATE_RODS), *others),
         obstacle_clearance_m=CLEARANCE_M + doubt_m,
@@ -212,12 +204,8 @@ def _free_ends(geometry: CellGeometry, ways: list[tuple[Array, Array]]) -> list[
 
 def _postures(model: RobotModel, target: Array, near: Sequence[float]) -> Iterator[Array]:
     """Every arm posture (6,) for a flange pose, whole turns chosen near `near`."""
-    for joints in inverse_all(model, target):
-        turned = joints + 2 * np.pi * np.round((np.array(near) - joints) / (2 * np.pi))
-        limit = model.joint_limit_rad
-        turned = np.where(turned > limit, turned - 2 * np.pi, turned)
-        turned = np.where(turned < -limit, turned + 2 * np.pi, turned)
-        exact = _refined(model, target, turned)
+    for joints in turned_near(model, inverse_all(model, target), np.array(near)):
+        exact = _refined(model, target, joints)
         if exact is not None:
             yield exact
 
@@ -235,12 +223,9 @@ def _refined(model: RobotModel, target: Array, joints: Array) -> Array | None:
 
 
 def _plan(config: StationConfig, model: RobotModel, corner: int, high: Array, low: Array) -> Plan:
-    def stop(name: str, joints: Array, why: str) -> PlannedPose:
-        return PlannedPose(name, vector6(joints), matrix4(forward(model, joints)), why=why)
-
     poses = (
-        stop("approach", high, f"high over corner {corner}"),
-        stop("hover", low, f"the tip over corner {corner}"),
+        pose_at(model, "approach", high, f"high over corner {corner}"),
+        pose_at(model, "hover", low, f"the tip over corner {corner}"),
     )
     limits = config.limits
     return Plan(

@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 
 from calibrate.geometry import Array
 from station.cell.collision import CellGeometry, margins, moving_points, surface_speeds
-from station.cell.limits import (
-    JOINT_ACCELERATION_CAP_RAD_S2,
-    JOINT_SPEED_CAP_RAD_S,
-    SPACING_M,
-    SPEED_CAP_M_S,
-    leaving,
-    trapezoid,
-)
+from station.cell.limits import SPACING_M, leading_speed, leaving, trapezoid
 
 _SAMPLES = (9, 33, 129)
 """Along one move: few at first."""
@@ -60,10 +53,7 @@ def _sampled(
     step = np.abs(joints_to - joints_from).max(axis=1)
     per_rad = np.repeat((joints_to - joints_from) / np.maximum(step, 1e-9)[:, None], samples, axis=0)
     rate = surface_speeds(geometry, flat, per_rad).reshape(n, -1).max(axis=1)
-    limits = geometry.limits
-    speed = min(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
-    speed = np.minimum(speed, 0.97 * min(limits.speed_m_s, SPEED_CAP_M_S) / np.maximum(rate, 1e-9))
-    duration, _ = trapezoid(step, speed, min(limits.joint_acceleration_rad_s2, JOINT_ACCELERATION_CAP_RAD_S2))
+    duration, _ = trapezoid(step, *leading_speed(geometry.limits, rate))
     return duration, np.asarray(free), np.asarray(hopeless)
 
 

@@ -11,7 +11,6 @@ import contextlib
 import logging
 import os
 import socket
-import struct
 from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ import msgspec
 
 from recordings.errors import CodedError
 from station.cell.errors import RefusedError, StationError
-from station.cell.socket_folder import make_folder
+from station.cell.socket_folder import make_folder, peer_of
 from station.cell.status import StationStatus, changed_sections
 from station.protocol.messages import (
     CLIENT_LIMIT,
@@ -317,8 +316,7 @@ def _full(text: str, limit: int) -> RefusedError:
 
 
 def _peer_of(link: socket.socket, client_id: int) -> Peer:
-    raw = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
-    pid, uid, gid = struct.unpack("3i", raw)
+    pid, uid, gid = peer_of(link)
     log.debug("client %d: pid %d, uid %d, gid %d", client_id, pid, uid, gid)
     return Peer(client_id, pid, uid, gid)
 

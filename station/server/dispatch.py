@@ -161,7 +161,7 @@ class SessionDispatcher:
 
     async def _go(self, caller: _Caller, args: verbs.Go) -> None:
         asks, waiting = await self._asks(caller), self._session.approvals.waiting
-        if waiting is not None and waiting.beside_plan:
+        if waiting is not None and waiting.beside is not None:
             how = self._rule.by_person(asks, "This move")
         else:
             how = self._rule.approve(asks, args.plan_sha256, waiting.summary.plan_sha256 if waiting else "")

@@ -14,7 +14,7 @@ import numpy as np
 from recordings.images import Pixels
 from recordings.schema.messages import Image, RobotState, Stamps, Stillness, View
 from station.analysis.pool import WorkerError
-from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion, sight
+from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.scene import flange_pose
@@ -25,7 +25,6 @@ from station.session.recording import to_the_end
 
 STATE_WAIT_S = 1.0
 """The robot state of mid-exposure may come later than the image, on a busy computer by this much."""
-SIGHT_TIMEOUT_S = 20.0
 SATURATED_LIMIT = 0.05
 GAPS_S = (0.0, 0.03)
 """Between glimpses. Uneven, so that a ringing whose period fits one gap does not fit the other."""
@@ -186,16 +185,13 @@ async def _write(context: SessionContext, index: int, image: Image, view: View) 
     context.show_poses(index)
     corners = sighting.status.corners if sighting is not None else None
     text = "saved" if corners is None else f"saved, {corners} corners"
-    context.store.event("saved", text, pose_index=index, corners=corners)
+    context.store.event("saved", text, "info", index, corners=corners)
 
 
 async def _sighting(context: SessionContext, image: Image, index: int) -> BoardDetection | None:
     """None when the worker could not say: the data are kept, the offline stage looks again."""
-    config = context.cell.config
     try:
-        return await context.workers.call(
-            sight, image.viewable(), config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
-        )
+        return await context.look_at(image)
     except WorkerError as error:
         context.store.problem(error, "warning", index, "the image was not looked at: {}")
         return None

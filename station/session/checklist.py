@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 
-from calibrate.boards.model import BoardError, check_board, describe_board
+from calibrate.boards.model import describe_board
 from calibrate.errors import CalibrationError
 from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState, validity_text
@@ -30,7 +30,7 @@ async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[C
         await _camera_check(context, troubles),
         *await _wire_checks(context),
         _trigger_check(context, troubles),
-        _board_check(context),
+        Check("board", "ok", describe_board(context.cell.config.board)),
         await asyncio.to_thread(_calibration_check, context),
         _disk_check(context),
         _clock_check(context),
@@ -150,15 +150,6 @@ def _trigger_check(context: SessionContext, troubles: dict[str, str]) -> Check:
     if "trigger" in troubles:
         return Check("trigger", "failed", troubles["trigger"], "check the box's USB cable and trigger.port")
     return Check("trigger", "ok", "answers")
-
-
-def _board_check(context: SessionContext) -> Check:
-    board = context.cell.config.board
-    try:
-        check_board(board)
-    except BoardError as error:
-        return Check("board", "failed", str(error), "correct `board` in the configuration")
-    return Check("board", "ok", describe_board(board))
 
 
 def _calibration_check(context: SessionContext) -> Check:

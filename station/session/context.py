@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from calibrate.geometry import difference
 from calibrate.kinematics import forward
 from recordings.errors import RecordingError
 from recordings.recover import recover_recording
-from recordings.schema.messages import RobotState, Vector6
+from recordings.schema.messages import CameraModel, Image, RobotState, Vector6
 from station.analysis.pool import Workers
-from station.analysis.worker import CapturedView
+from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.collision import CellGeometry
 from station.cell.errors import RefusedError
 from station.cell.status import Event, SessionStatus, StationState
@@ -22,6 +23,8 @@ from station.devices.cell import Cell
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from station.session.store import StatusStore
+
+_LOOK_S = 20.0
 
 
 @dataclass
@@ -112,6 +115,13 @@ class SessionContext:
                     self.store.event("recovered", f"recovered {found.text}")
             recording.count_segments()
 
+    async def look_at(self, image: Image, lens: CameraModel | None = None) -> BoardDetection:
+        """The board in an image, by the configured lens where no other is given. Raises WorkerError."""
+        config = self.cell.config
+        return await self.workers.call(
+            sight, image.viewable(), config.board, lens or config.camera.model, timeout_s=_LOOK_S
+        )
+
     def forget_session(self, check: bool = False) -> None:
         """Clears what is shown of the last session when the next begins; `check`: as a drift check."""
         self.seen.clear()
@@ -144,8 +154,6 @@ class SessionContext:
 
 def displacement(context: SessionContext, before: Vector6, after: Vector6) -> str:
     """'84 mm and 22°' of the flange."""
-    poses = forward(context.geometry.model, [before, after])
-    distance_m = float(np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3]))
-    cosine = (np.trace(poses[0, :3, :3].T @ poses[1, :3, :3]) - 1) / 2
-    angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    return f"{1000 * distance_m:.0f} mm and {angle:.0f}°"
+    delta = difference(*forward(context.geometry.model, [after, before]))
+    distance_m, angle_rad = np.linalg.norm(delta[:3]), np.linalg.norm(delta[3:])
+    return f"{1000 * distance_m:.0f} mm and {np.degrees(angle_rad):.0f}°"

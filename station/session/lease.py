@@ -82,17 +82,10 @@ class MotionApproval:
     """None: a touch test, or a stop test."""
     replanned: PlanRevision | None = None
     """Poses that take the place of the session's with this approval."""
-    hover: HoverPath | None = None
-    """A path over one corner of the board instead of poses of the plan."""
-    stop_test: StopTestMove | None = None
-    """A move of the acceptance test instead of them."""
+    beside: HoverPath | StopTestMove | None = None
+    """Driven instead of poses of the plan; nothing is recorded then."""
     approval: str = ""
     """Who approved it, and how."""
-
-    @property
-    def beside_plan(self) -> bool:
-        """Tell whether it drives to no pose of the plan and records nothing."""
-        return self.hover is not None or self.stop_test is not None
 
     @property
     def said(self) -> str:
@@ -117,18 +110,17 @@ class ApprovalManager:
         self,
         summary: MotionPreview,
         client_id: int,
-        poses: tuple[int, ...],
-        hover: HoverPath | None = None,
+        poses: tuple[int, ...] = (),
         purpose: Purpose | None = None,
         replanned: PlanRevision | None = None,
-        stop_test: StopTestMove | None = None,
+        beside: HoverPath | StopTestMove | None = None,
     ) -> MotionApproval:
         """Offer a motion from where the summary begins. An older one is void."""
         start = summary.start_joints_rad
         assert start is not None
         expires_s = self._clock() + APPROVAL_LIFETIME_S
         self.waiting = MotionApproval(
-            summary, client_id, expires_s, start, poses, False, purpose, replanned, hover, stop_test
+            summary, client_id, expires_s, start, poses, False, purpose, replanned, beside
         )
         return self.waiting
 
@@ -156,7 +148,7 @@ class ApprovalManager:
         if asked.client_id != client_id:
             raise _void("approval-of-another", "Approval was asked for by another client.")
         before = asked.replanned.before_sha256 if asked.replanned else asked.summary.plan_sha256
-        if not asked.beside_plan and before != plan_sha256:  # those carry their own
+        if asked.beside is None and before != plan_sha256:  # what is beside carries its own
             raise _void("plan-changed", "The plan changed since the approval was asked for.")
         require_start(joints_rad, asked.start_joints_rad, "since the approval was asked for")
         return replace(asked, again=again)

@@ -13,7 +13,6 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.schema.messages import Image, Vector6
-from station.analysis.worker import sight
 from station.cell.errors import (
     CameraError,
     LimitError,
@@ -27,7 +26,7 @@ from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError, RestingCheck
 from station.devices.base import StreamingCamera
-from station.session.capture import SIGHT_TIMEOUT_S, PoseFailedError, show_frame, take_image, take_pose
+from station.session.capture import PoseFailedError, show_frame, take_image, take_pose
 from station.session.context import RunRequests, SessionContext
 from station.session.lease import MotionApproval, require_start
 from station.session.queue import BUSY
@@ -50,8 +49,11 @@ class Run:
     def __init__(self, context: SessionContext, go: MotionApproval) -> None:
         self._context = context
         self._go = go
-        geometry = geometry_from(context.cell.config, go.start_joints_rad)
-        self._geometry = with_plan_speeds(geometry, context.require_queue().plan)
+        if go.beside is not None:
+            self._geometry = go.beside.geometry
+        else:
+            geometry = geometry_from(context.cell.config, go.start_joints_rad)
+            self._geometry = with_plan_speeds(geometry, context.require_queue().plan)
         self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
         """Poses where something still moved."""
@@ -98,7 +100,8 @@ class Run:
             await context.cell.robot.start_control()
             here = context.cell.robot.latest().joints_rad  # starting control takes a second or two
             require_start(here, self._go.start_joints_rad, "while control was started")
-            await self._open_recording()
+            if self._go.beside is None:
+                await self._open_recording()
         except SafetyStopError:
             raise
         except (StationError, RecordingError) as error:
@@ -341,11 +344,8 @@ class SweepRun(Run):
 
     async def _open_recording(self) -> None:
         """StationError without the board in view: a sweep that sees none shows nothing."""
-        context, config = self._context, self._context.cell.config
-        image = await take_image(context)
-        seen = await context.workers.call(
-            sight, image.viewable(), config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
-        )
+        context = self._context
+        seen = await context.look_at(await take_image(context))
         if not seen.status.found:
             raise CameraError(
                 f"A sweep begins with the board in view: {seen.status.reason or 'no board in the image'}.",

@@ -11,6 +11,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,15 +29,16 @@ from station.cell.status import HoverOffer, LeaseStatus, MotionPreview, StationS
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
 from station.plan.choose import CRITERIA, Aim
+from station.plan.hover import HoverPath
 from station.plan.planner import make_plan
 from station.protocol import verbs
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import RunRequests, SessionContext
 from station.session.freedrive import FreedriveCapture
-from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
+from station.session.lease import ApprovalManager, LeaseManager, MotionApproval, StopTestMove
 from station.session.monitor import DeviceConnector, Previewer
-from station.session.queue import PoseQueue
+from station.session.queue import PlanRevision, PoseQueue
 from station.session.recording import Logbook, SessionRecording
 from station.session.replan import Estimator, Replanner
 from station.session.run import Run, SweepRun, close_or_seal, unmark_busy
@@ -169,55 +171,54 @@ class Session:
 
     async def prepare(self, client_id: int, purpose: Purpose, index: int | None = None) -> MotionPreview:
         """Checks the whole path from where the arm is and offers a one-use approval for it."""
-        self.permit(verbs.Prepare, client_id)
-        voids = await self._begin_offer()
+        offer = await self._begin_offer(verbs.Prepare, client_id)
         found = await self._replanner.replan(purpose) or begun_anew(self.context, purpose)
         poses = found.poses if found else poses_to_drive(self.context, purpose, index)
         queue, changes = (found.queue, found.changes) if found else (self.context.require_queue(), ())
         summary = await summarise(self.context, purpose, queue, poses, self._notes, changes)
-        self._require_unchanged(client_id, voids)
-        self.approvals.offer(summary, client_id, poses, purpose=purpose, replanned=found)
-        self._show_offer(summary)
+        offer(summary, poses, purpose, found)
         return summary
 
     async def prepare_hover(self, client_id: int, request: verbs.Hover) -> HoverOffer:
         """Offers a one-use approval for a slow path to a place over a corner of the board."""
-        self.permit(verbs.Hover, client_id)
-        self._require_no_session()
-        voids = await self._begin_offer()
-        hover, offer = await self._touch_tests.prepare(request)
-        self._require_unchanged(client_id, voids)
-        self.approvals.offer(offer.go, client_id, (), hover)
-        self._show_offer(offer.go)
-        return offer
+        offer = await self._begin_offer(verbs.Hover, client_id)
+        hover, found = await self._touch_tests.prepare(request)
+        offer(found.go, beside=hover)
+        return found
 
     async def prepare_stop_test(self, client_id: int, request: verbs.StopTest) -> StopTestOffer:
         """Offers a one-use approval for a short move that is ended in one way."""
-        self.permit(verbs.StopTest, client_id)
-        self._require_no_session()
-        voids = await self._begin_offer()
-        move, offer = await prepare_stop_test(self.context, request)
-        self._require_unchanged(client_id, voids)
-        self.approvals.offer(offer.go, client_id, (), stop_test=move)
-        self._show_offer(offer.go)
-        return offer
+        offer = await self._begin_offer(verbs.StopTest, client_id)
+        move, found = await prepare_stop_test(self.context, request)
+        offer(found.go, beside=move)
+        return found
 
-    async def _begin_offer(self) -> int:
-        """The number of voided approvals before the path is checked."""
+    async def _begin_offer(self, verb: type[Verb[object]], client_id: int) -> Callable[..., None]:
+        """What offers the motion once its path is checked; RefusedError when anything changed meanwhile."""
+        self.permit(verb, client_id)
+        if verb is not verbs.Prepare:
+            self._require_no_session()
         await self._run_ended()  # it is finished and shown; its control process may take a moment more
         self._void()
-        return self.approvals.voids
+        return partial(self._offer, client_id, self.approvals.voids)
 
-    def _show_offer(self, summary: MotionPreview) -> None:
-        """Show the offer to every watcher, without the token that is for the one who asked."""
-        self.store.update(go=msgspec.structs.replace(summary, token=""))
-
-    def _require_unchanged(self, client_id: int, voids: int) -> None:
+    def _offer(
+        self,
+        client_id: int,
+        voids: int,
+        summary: MotionPreview,
+        poses: tuple[int, ...] = (),
+        purpose: Purpose | None = None,
+        replanned: PlanRevision | None = None,
+        beside: HoverPath | StopTestMove | None = None,
+    ) -> None:
         self.permit(verbs.Prepare, client_id)
         if self.approvals.voids != voids:
-            raise RefusedError(
-                "Conditions changed during the preflight check.", code="changed", remedy="Retry."
-            )
+            text = "Conditions changed during the preflight check."
+            raise RefusedError(text, code="changed", remedy="Retry.")
+        self.approvals.offer(summary, client_id, poses, purpose, replanned, beside)
+        # To every watcher, without the token that is for the one who asked.
+        self.store.update(go=msgspec.structs.replace(summary, token=""))
 
     def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
         """A person approves exactly that summary. RefusedError when anything changed.
@@ -238,7 +239,7 @@ class Session:
             self.store.update(go=None)
         self._notes = ()
         context.requests = RunRequests()
-        if context.recording is None and not go.beside_plan:
+        if context.recording is None and go.beside is None:
             context.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
         if go.replanned is not None:
             self._replanner.adopt(go.replanned)
@@ -248,10 +249,10 @@ class Session:
         self._run = asyncio.create_task(run.drive())
 
     def _run_for(self, go: MotionApproval) -> Run:
-        if go.hover is not None:
-            return HoverRun(self.context, go, go.hover)
-        if go.stop_test is not None:
-            return StopTestRun(self.context, go, go.stop_test)
+        if isinstance(go.beside, HoverPath):
+            return HoverRun(self.context, go, go.beside)
+        if go.beside is not None:
+            return StopTestRun(self.context, go, go.beside)
         sweeps = self.context.require_queue().plan.motion == "sweep"
         return (SweepRun if sweeps else Run)(self.context, go)
 

@@ -9,20 +9,18 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 
-import msgspec
 import numpy as np
 
-from calibrate.kinematics import JOINT_NAMES, forward
+from calibrate.kinematics import JOINT_NAMES
 from recordings.schema.messages import Vector6
 from station.cell.acceptance import StopTestOffer, StopWay
 from station.cell.collision import CellGeometry
-from station.cell.config import matrix4, vector6
+from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError, RobotError, SafetyStopError, StaleStateError
-from station.cell.limits import PlanCheck, check_path, check_plan
-from station.cell.plan import Plan, PlannedPose, plan_sha256
-from station.cell.scene import geometry_from
+from station.cell.limits import PlanCheck, check_path, check_plan, slower
+from station.cell.plan import Plan, plan_sha256
+from station.cell.scene import geometry_from, pose_at
 from station.cell.status import StationState
 from station.cell.stillness import RestingCheck
 from station.protocol import verbs
@@ -105,23 +103,17 @@ def _free_move(
 ) -> tuple[Vector6, PlanCheck, CellGeometry, Plan]:
     """The first of some turns whose path is free: the longest first, in the wanted direction first."""
     geometry = geometry_from(context.cell.config, start)
-    limits = geometry.limits
-    slow = msgspec.structs.replace(
-        limits,
-        speed_m_s=min(limits.speed_m_s, request.speed_m_s),
-        joint_acceleration_rad_s2=min(limits.joint_acceleration_rad_s2, ACCELERATION_RAD_S2),
-    )
-    geometry = replace(geometry, limits=slow)
+    geometry = slower(geometry, request.speed_m_s, joint_acceleration_rad_s2=ACCELERATION_RAD_S2)
     refused: PlanCheck | None = None
     for turn_rad in _turns(geometry, request, start):
         target = vector6(np.array(start) + turn_rad * np.eye(6)[request.joint])
-        pose = PlannedPose(request.way.value, target, matrix4(forward(geometry.model, np.array(target))))
+        pose = pose_at(geometry.model, request.way.value, target)
         plan = Plan(
             context.cell.config.robot.model,
             context.cell.config.mount,
             (pose,),
-            joint_speed_rad_s=slow.joint_speed_rad_s,
-            joint_acceleration_rad_s2=slow.joint_acceleration_rad_s2,
+            joint_speed_rad_s=geometry.limits.joint_speed_rad_s,
+            joint_acceleration_rad_s2=geometry.limits.joint_acceleration_rad_s2,
             note="stop test",
         )
         check = check_plan(plan, start, geometry)
@@ -151,11 +143,8 @@ class StopTestRun(Run):
     """Carries out one approved stop test: one move, no image, nothing recorded."""
 
     def __init__(self, context: SessionContext, go: MotionApproval, test: StopTestMove) -> None:
-        self._context, self._go, self._test = context, go, test
-        self._geometry, self._failures = test.geometry, 0
-
-    async def _open_recording(self) -> None:
-        return None
+        super().__init__(context, go)
+        self._test = test
 
     async def _poses(self) -> None:
         context, robot, test = self._context, self._context.cell.robot, self._test

@@ -66,21 +66,9 @@ class StatusStore:
         self.update(state=state, reason=str(reason), cause=cause)
 
     def event(
-        self, code: str, text: str, level: Level = "info", pose_index: int | None = None, **values: Value
+        self, code: str, text: str, level: Level = "info", pose_index: int | None = None, /, **values: Value
     ) -> None:
         """Tells people, log and recording; `code` and `values` are for programs."""
-        self._tell(code, text, level, pose_index, values)
-
-    def problem(
-        self, error: Exception, level: Level = "warning", pose_index: int | None = None, said: str = "{}"
-    ) -> None:
-        """Tells of an error; `said` puts its text into a sentence."""
-        code, values = (error.code, error.values) if isinstance(error, CodedError) else ("internal", {})
-        self._tell(code, said.format(error), level, pose_index, values)
-
-    def _tell(
-        self, code: str, text: str, level: Level, pose_index: int | None, values: dict[str, Value]
-    ) -> None:
         text = text if len(text) <= EVENT_TEXT_LIMIT else text[: EVENT_TEXT_LIMIT - 1] + "…"
         event = Event(time.time_ns(), level, text, pose_index, code, values)
         pose = f"pose {pose_index + 1}: " if pose_index is not None else ""
@@ -88,3 +76,10 @@ class StatusStore:
         self.update(events=(*self.status.events, event)[-EVENTS_KEPT:])
         for listener in self._listeners:
             listener(event)
+
+    def problem(
+        self, error: Exception, level: Level = "warning", pose_index: int | None = None, said: str = "{}"
+    ) -> None:
+        """Tells of an error; `said` puts its text into a sentence."""
+        code, values = (error.code, error.values) if isinstance(error, CodedError) else ("internal", {})
+        self.event(code, said.format(error), level, pose_index, **values)

@@ -20,7 +20,6 @@ from calibrate.geometry import pose_from_rotvec
 from calibrate.kinematics import forward
 from calibrate.views import BoardView
 from recordings.schema.messages import Vector6
-from station.analysis.worker import sight
 from station.cell.config import PointerConfig, matrix4
 from station.cell.errors import LimitError, RefusedError, RobotError
 from station.cell.plan import plan_sha256
@@ -38,7 +37,7 @@ OVER_CORNER = "over-corner"
 """Cause of the state after a path over a corner: the tip stands there."""
 VIEW_LIFETIME_S = 900.0
 """From close above the board a camera on the flange sees nothing: one image serves several corners."""
-_SIGHT_S, _PLAN_S = 20.0, 60.0
+_PLAN_S = 60.0
 _SAME_PLACE_RAD = 1e-3
 """The arm stands where the image was taken: a board seen from elsewhere lies elsewhere."""
 
@@ -66,12 +65,10 @@ class TouchTestPlanner:
         robot, config = context.cell.robot, context.cell.config
         calibration = self._calibration(request)
         pointer, words = self._pointer(request)
-        if not 0 <= request.corner < len(board_points(config.board)):
-            last = len(board_points(config.board)) - 1
+        if not 0 <= request.corner <= (last := len(board_points(config.board)) - 1):
             text = f"The board has corners 0 to {last}, not {request.corner}."
             raise RefusedError(text, code="no-such-corner", corner=request.corner, last=last)
-        if not request.standoff_m >= least_standoff_m(0.0):
-            least_m = least_standoff_m(0.0)
+        if not request.standoff_m >= (least_m := least_standoff_m(0.0)):
             raise LimitError(
                 f"Tip {1000 * request.standoff_m:.0f} mm above the board (limit {1000 * least_m:.0f} mm).",
                 code="standoff",
@@ -161,10 +158,7 @@ class TouchTestPlanner:
         if np.abs(np.subtract(state.joints_rad, before)).max() > _SAME_PLACE_RAD:
             text = "The arm was moved while the image was taken."
             raise RefusedError(text, code="arm-moved", remedy="Leave it at rest, then retry.")
-        board = context.cell.config.board
-        sighting = await context.workers.call(
-            sight, image.viewable(), board, calibration.intrinsics.model, timeout_s=_SIGHT_S
-        )
+        sighting = await context.look_at(image, calibration.intrinsics.model)
         if not sighting.status.found:
             raise RefusedError(
                 sighting.status.reason or "No board in the image.",
@@ -172,7 +166,7 @@ class TouchTestPlanner:
                 remedy="Jog the arm or lay the board so that the camera sees it whole.",
             )
         flange = flange_pose(state, context.cell.robot.identity.tcp_offset)
-        points = board_points(board)[sighting.indices]
+        points = board_points(context.cell.config.board)[sighting.indices]
         view = BoardView(0, "verification", flange, points, sighting.pixels)
         self._board = _BoardSeen(view, place, time.monotonic())
         return self._board
@@ -232,11 +226,8 @@ class HoverRun(Run):
     """Carries out one approval over a corner: two moves, no image, nothing recorded."""
 
     def __init__(self, context: SessionContext, go: MotionApproval, hover: HoverPath) -> None:
-        self._context, self._go, self._hover = context, go, hover
-        self._geometry, self._failures = hover.geometry, 0
-
-    async def _open_recording(self) -> None:
-        return None
+        super().__init__(context, go)
+        self._hover = hover
 
     async def _poses(self) -> None:
         context, robot = self._context, self._context.cell.robot

@@ -24,6 +24,7 @@ from benchmarks.trials import table, trials
 from station.cell.status import StationState, StationStatus
 from station.daemon import Daemon
 from station.protocol.client import Client
+from station.protocol.verbs import Go, Prepare
 from station.simulation.launch_cell import SimulationOptions, simulated_cell
 from tests.tui.terminal import ScreenProcess
 
@@ -94,8 +95,8 @@ async def _measure(sixels: bool) -> tuple[list[float], float, float, int]:
 
 async def _cpu_share(operator: Client, screen: ScreenProcess) -> tuple[float, float]:
     """Of one core, by the screen's process, from the first move to the last picture."""
-    summary = await operator.request("prepare", purpose="run")
-    await operator.request("go", token=summary["token"])
+    summary = await operator.call(Prepare())
+    await operator.call(Go(summary.token))
     await _until(operator, lambda s: s.state in RUNNING)
     begun_s, used_s = time.monotonic(), _cpu_s(screen.process.pid)
     await _until(operator, lambda s: s.state not in RUNNING)

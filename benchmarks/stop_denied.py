@@ -25,6 +25,7 @@ from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from benchmarks.trials import table, trials
@@ -33,6 +34,7 @@ from station.cell.socket_folder import motion_page, stop_socket
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client
 from station.protocol.stop_client import Motion, open_page, read_page
+from station.protocol.verbs import GetPlan, Go, Prepare, Purpose
 
 TRIALS, MOVING, COMMANDS = 100, 4, 10
 CROWD = 1000
@@ -191,8 +193,8 @@ async def _move(operator: Client, plan: object) -> None:
         with suppress(RefusedError):  # a session is open
             await operator.request("load_plan", plan=plan)
             purpose = "run"
-        summary = await operator.request("prepare", purpose=purpose, timeout_s=60.0)
-        await operator.request("go", token=summary["token"])
+        summary = await operator.call(Prepare(Purpose(purpose)), timeout_s=60.0)
+        await operator.call(Go(summary.token))
         operator.outdate()
         states: list[StationState] = []
 
@@ -305,7 +307,7 @@ async def _measure() -> list[Found]:
             member = Member(control)
             await operator.request("lease", action="take")
             await operator.request("make_plan", poses=25, seed=1, timeout_s=120.0)
-            plan = (await operator.request("plan"))["plan"]
+            plan = msgspec.to_builtins((await operator.call(GetPlan())).plan)
             await operator.request("lease", action="release")
 
             async def situation(name: str, *what: tuple[int, str, int], moving: bool = True) -> Found:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -109,22 +108,15 @@ def _readable(plain: dict[str, object]) -> tuple[StationConfig, set[str]]:
         "camera": {},
         "board": {"kind": "chessboard", "columns": 7, "rows": 6, "square_m": 0.025},
     }
-    known = set(StationConfig.__struct_fields__)
-    values: dict[str, Any] = {}
+    known = set(StationConfig.__struct_fields__) - (stand_ins.keys() - plain.keys())
     for field in msgspec.structs.fields(StationConfig):
-        name = field.encode_name
-        try:
-            values[name] = msgspec.convert(plain[name], field.type) if name in plain else None
-        except msgspec.ValidationError:
-            known.discard(name)
-            values[name] = None
-        if values[name] is None and name not in plain:
-            known -= {name} & stand_ins.keys()
-        if values[name] is None and name in stand_ins:
-            values[name] = msgspec.convert(stand_ins[name], field.type)
-        elif values[name] is None:
-            del values[name]
-    return StationConfig(**values), known
+        if (name := field.encode_name) in plain:
+            try:
+                msgspec.convert(plain[name], field.type)
+                stand_ins[name] = plain[name]
+            except msgspec.ValidationError:
+                known.discard(name)
+    return msgspec.convert(stand_ins, StationConfig), known
 
 
 def _webcam_problems(camera: CameraConfig) -> Iterator[YamlProblem]:

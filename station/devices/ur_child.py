@@ -14,7 +14,9 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
+
+import msgspec
 
 from station.cell.config import ControlPath
 from station.cell.errors import RobotError
@@ -58,6 +60,25 @@ REFUSALS = {
 """By the code of the control process's refusal: what it is, what a person can do."""
 
 
+class _Answer(msgspec.Struct):
+    """Any message of the control process (`ur_control`), or that it died."""
+
+    tcp: tuple[float, ...] | None = None
+    refused: str | None = None
+    code: str = "control"
+    beat: int | None = None
+    kicked: bool = False
+    lost: bool = False
+    id: int | None = None
+    ok: bool = False
+    error: str = ""
+    stopped: bool = False
+    died: bool = False
+
+
+_ANSWER = msgspec.json.Decoder(_Answer)
+
+
 class ControlChild:
     """Belongs to the event loop it was started in. Not reusable: after `end` or `kill` start a new one."""
 
@@ -67,11 +88,11 @@ class ControlChild:
         channel.setblocking(False)  # the loop waits for no process, least of all for one that hangs
         self._log_path = log_path
         self._loop = asyncio.get_running_loop()
-        self._ready: asyncio.Future[dict[str, Any]] = self._loop.create_future()
+        self._ready: asyncio.Future[_Answer] = self._loop.create_future()
         self._kicked_ns = 0
         """Time of the newest heartbeat that kicked the watchdog."""
         self._news = asyncio.Event()
-        self._moves: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._moves: dict[int, asyncio.Future[_Answer]] = {}
         self._number = 0
         self._beat_ns = 0
         self._answered_ns = 0
@@ -125,15 +146,14 @@ class ControlChild:
                 f"the control process was not ready within {timeout_s:g} s and was killed", limit_s=timeout_s
             ) from None
         self._beat_ns = 0  # beats that waited for it to be ready are no sign of hanging
-        if "refused" in answer or "died" in answer:
+        if answer.refused is not None or answer.died:
             self.kill()
             await self.reap()
-            if "died" in answer:
+            if answer.died:
                 raise self._death()
-            code = str(answer.get("code", "control"))
-            text, remedy = REFUSALS.get(code, (f"control could not start: {answer['refused']}", ""))
-            raise RobotError(text + self.exit_description(), code=code, remedy=remedy)
-        return tuple(answer["tcp"]) if answer.get("tcp") else None
+            text, remedy = REFUSALS.get(answer.code, (f"control could not start: {answer.refused}", ""))
+            raise RobotError(text + self.exit_description(), code=answer.code, remedy=remedy)
+        return answer.tcp or None
 
     async def heard(self) -> None:
         """Waits for a fresh heartbeat that kicked the watchdog: without, no move is taken. RobotError."""
@@ -163,7 +183,7 @@ class ControlChild:
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Asks for an asynchronous move and waits until the script has taken it. Raises RobotError."""
         self._number += 1
-        answer: asyncio.Future[dict[str, Any]] = self._loop.create_future()
+        answer: asyncio.Future[_Answer] = self._loop.create_future()
         self._moves[self._number] = answer
         request = {
             "do": "move",
@@ -184,10 +204,10 @@ class ControlChild:
             ) from None
         finally:
             self._moves.pop(self._number, None)
-        if "died" in reply:
+        if reply.died:
             raise self._death()
-        if not reply["ok"]:
-            raise RobotError(f"the move was not started: {reply['error']}", code="move-refused")
+        if not reply.ok:
+            raise RobotError(f"the move was not started: {reply.error}", code="move-refused")
 
     def stop(self) -> None:
         """Puts the stop on the wire to the child, now. Never raises."""
@@ -271,18 +291,18 @@ class ControlChild:
         if not message:
             self._close()
             return
-        answer = json.loads(message)
-        if "beat" in answer:
-            self._answered_ns = max(self._answered_ns, int(answer["beat"]))
-            self.kicks_refused = bool(answer["lost"])
-            if answer["kicked"]:
-                self._kicked_ns = int(answer["beat"])
+        answer = _ANSWER.decode(message)
+        if answer.beat is not None:
+            self._answered_ns = max(self._answered_ns, answer.beat)
+            self.kicks_refused = answer.lost
+            if answer.kicked:
+                self._kicked_ns = answer.beat
             self._news.set()
-        elif "id" in answer:
-            waiter = self._moves.get(answer["id"])
+        elif answer.id is not None:
+            waiter = self._moves.get(answer.id)
             if waiter is not None and not waiter.done():
                 waiter.set_result(answer)
-        elif "stopped" in answer:
+        elif answer.stopped:
             if not self.stop_acknowledged.done():
                 self.stop_acknowledged.set_result(None)
         elif not self._ready.done():
@@ -296,7 +316,7 @@ class ControlChild:
         self._news.set()
         for waiter in (*self._moves.values(), self._ready):
             if not waiter.done():
-                waiter.set_result({"died": True})
+                waiter.set_result(_Answer(died=True))
         if not self.stop_acknowledged.done():
             self.stop_acknowledged.set_result(None)
 

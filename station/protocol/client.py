@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 
@@ -18,7 +18,7 @@ from recordings.files import MAIN_CAMERA
 from recordings.plain_text import plain_data
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus
-from station.protocol.messages import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Reply, Request
+from station.protocol.messages import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Request
 from station.protocol.stop_client import send_stop
 from station.protocol.verbs import Hello, Verb
 
@@ -61,7 +61,7 @@ def who_am_i() -> str:
 
 
 class _Incoming(msgspec.Struct):
-    """Any line from the daemon."""
+    """A line from the daemon: a `Reply`, or a `Notice`."""
 
     id: int | None = None
     ok: bool = False
@@ -78,7 +78,7 @@ class Client:
     def __init__(self, path: Path, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._path, self._reader, self._writer = path, reader, writer
         self._next_id = 1
-        self._waiting: dict[int, asyncio.Future[Reply]] = {}
+        self._waiting: dict[int, asyncio.Future[_Incoming]] = {}
         self._plain_status: dict[str, object] | None = None
         self._outdated = False
         self._fresh = asyncio.Event()
@@ -113,8 +113,7 @@ class Client:
             raise DaemonGoneError(f"{path}: the daemon does not answer ({error or 'timeout'}).") from None
         client = cls(path, reader, writer)
         try:
-            who = who or who_am_i()
-            hello = await client.call(Hello(who), timeout_s=CONNECT_S)
+            hello = await client.call(Hello(who or who_am_i()), timeout_s=CONNECT_S)
         except StationError:
             await client.close()
             raise
@@ -128,7 +127,7 @@ class Client:
         result: R = msgspec.convert(answer, verb.result())
         return result
 
-    async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: object) -> Any:
+    async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: object) -> object:
         """Calls a verb by its name; the result as plain data."""
         if verb == "stop":
             send_stop(self._path)  # nobody can hold this up; the request brings the answer
@@ -139,7 +138,7 @@ class Client:
         line = msgspec.json.encode(request) + b"\n"
         if len(line) > LINE_LIMIT_BYTES:
             return await self._request_in_pieces(verb, line, timeout_s)
-        answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        answer: asyncio.Future[_Incoming] = asyncio.get_running_loop().create_future()
         self._waiting[request.id] = answer
         try:
             self._writer.write(line)
@@ -158,10 +157,11 @@ class Client:
         finally:
             self._waiting.pop(request.id, None)
         if not reply.ok:
-            raise _refused(reply)
+            problem = reply.problem or ErrorData("refused", reply.error)
+            raise RefusedError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
         return reply.result
 
-    async def _request_in_pieces(self, verb: str, whole: bytes, timeout_s: float) -> Any:
+    async def _request_in_pieces(self, verb: str, whole: bytes, timeout_s: float) -> object:
         if len(whole) > REQUEST_LIMIT_BYTES:
             raise RefusedError(
                 f"{verb}: {len(whole) / 1e6:.1f} MB are more than the daemon takes "
@@ -227,9 +227,7 @@ class Client:
         if message.id is not None:
             answer = self._waiting.get(message.id)
             if answer is not None and not answer.done():
-                answer.set_result(
-                    Reply(message.id, message.ok, message.result, message.error, message.problem)
-                )
+                answer.set_result(message)
             return
         if message.status is not None:
             self._plain_status = message.status
@@ -246,11 +244,6 @@ class Client:
             code="unanswered",
             remedy="Look at the cell.",
         )
-
-
-def _refused(reply: Reply) -> RefusedError:
-    problem = reply.problem or ErrorData("refused", reply.error)
-    return RefusedError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
 
 
 def ask(path: Path, verb: Verb[R]) -> R:

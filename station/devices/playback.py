@@ -353,11 +353,11 @@ class PlaybackRobot:
         target = np.asarray(joints_rad, dtype=float)
         off = [float(np.abs(np.array(v.joints_rad) - target).max()) for v in self.views]
         nearest = int(np.argmin(off))
-        if not self.control or off[nearest] > _SAME_JOINTS_RAD:
-            reason, code = "the recorded arm never stood there", "not-recorded"
-            if not self.control:
-                reason, code = "motion is not approved", "no-control"
-            raise RobotError(f"playback cannot move to these joints: {reason}", code=code)
+        if not self.control:
+            raise RobotError("playback cannot move: motion is not approved", code="no-control")
+        if off[nearest] > _SAME_JOINTS_RAD:
+            text = "playback cannot move to these joints: the recorded arm never stood there"
+            raise RobotError(text, code="not-recorded")
         with self._lock:
             self._from, self._to, self._halted_at = self._to, self.views[nearest], None
             self._move_start_s = time.monotonic()

@@ -357,15 +357,12 @@ class UrRobot(UrLink):
     async def _dashboard_stop_anew(self) -> None:
         try:
             dashboard = await Dashboard.open(self.config.host, timeout_s=1.0)
+            try:
+                await dashboard.ask(STOP)
+            finally:
+                await dashboard.close()
         except RobotError as error:
             log.warning("dashboard stop: %s", error)
-            return
-        try:
-            await dashboard.ask(STOP)
-        except RobotError as error:
-            log.warning("dashboard stop: %s", error)
-        finally:
-            await dashboard.close()
 
     def on_link_lost(self, why: str) -> None:
         """ur_rtde would now reconnect by itself and load its program again: its process ends first."""

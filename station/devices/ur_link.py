@@ -232,18 +232,13 @@ class UrLink:
         assert reader is not None
         if reader.ended is not None:
             return link_lost(reader.ended)
-        text, remedy, code = (
-            f"no news from the robot for {age_s * 1000:.0f} ms",
-            "Check cable and network.",
-            "",
-        )
+        text, code = f"no news from the robot for {age_s * 1000:.0f} ms", ""
+        remedy, less_load = "Check cable and network.", "Reduce the load of this computer"
         if (waited := waited_share()) >= _BUSY_SHARE:
-            remedy = (
-                f"Reduce the load of this computer: programs wait for it {waited:.0%} of the time. {remedy}"
-            )
+            remedy = f"{less_load}: programs wait for it {waited:.0%} of the time. {remedy}"
         if reader.waits_unread():
             text = f"this computer was too busy for {age_s * 1000:.0f} ms to read the robot's state"
-            remedy, code = "Reduce the load of this computer.", "computer-busy"
+            remedy, code = f"{less_load}.", "computer-busy"
         if reader.stands_still:
             text = f"the controller's clock stands still since {age_s * 1000:.0f} ms"
             remedy = "Restart the controller."

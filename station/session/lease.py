@@ -72,20 +72,24 @@ class MotionApproval:
 
     summary: MotionPreview
     client_id: int
-    expires_s: float
-    start_joints_rad: Vector6
-    poses: tuple[int, ...]
+    poses: tuple[int, ...] = ()
     """Pose numbers it covers, in order; more may not be driven to with it."""
-    again: bool = False
-    """Nobody is there to be asked: poses that do not settle are tried once more at the end."""
     purpose: Purpose | None = None
     """None: a touch test, or a stop test."""
     replanned: PlanRevision | None = None
     """Poses that take the place of the session's with this approval."""
     beside: HoverPath | StopTestMove | None = None
     """Driven instead of poses of the plan; nothing is recorded then."""
+    expires_s: float = 0.0
+    again: bool = False
+    """Nobody is there to be asked: poses that do not settle are tried once more at the end."""
     approval: str = ""
     """Who approved it, and how."""
+
+    @property
+    def start_joints_rad(self) -> Vector6:
+        assert self.summary.start_joints_rad is not None
+        return self.summary.start_joints_rad
 
     @property
     def said(self) -> str:
@@ -106,22 +110,9 @@ class ApprovalManager:
     def new_token() -> str:
         return secrets.token_urlsafe(16)
 
-    def offer(
-        self,
-        summary: MotionPreview,
-        client_id: int,
-        poses: tuple[int, ...] = (),
-        purpose: Purpose | None = None,
-        replanned: PlanRevision | None = None,
-        beside: HoverPath | StopTestMove | None = None,
-    ) -> MotionApproval:
-        """Offer a motion from where the summary begins. An older one is void."""
-        start = summary.start_joints_rad
-        assert start is not None
-        expires_s = self._clock() + APPROVAL_LIFETIME_S
-        self.waiting = MotionApproval(
-            summary, client_id, expires_s, start, poses, False, purpose, replanned, beside
-        )
+    def offer(self, asked: MotionApproval) -> MotionApproval:
+        """From where its summary begins. An older one is void."""
+        self.waiting = replace(asked, expires_s=self._clock() + APPROVAL_LIFETIME_S)
         return self.waiting
 
     def void(self) -> bool:

@@ -36,9 +36,9 @@ from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import RunRequests, SessionContext
 from station.session.freedrive import FreedriveCapture
-from station.session.lease import ApprovalManager, LeaseManager, MotionApproval, StopTestMove
+from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
 from station.session.monitor import DeviceConnector, Previewer
-from station.session.queue import PlanRevision, PoseQueue
+from station.session.queue import PoseQueue
 from station.session.recording import Logbook, SessionRecording
 from station.session.replan import Estimator, Replanner
 from station.session.run import Run, SweepRun, close_or_seal, unmark_busy
@@ -176,49 +176,42 @@ class Session:
         poses = found.poses if found else poses_to_drive(self.context, purpose, index)
         queue, changes = (found.queue, found.changes) if found else (self.context.require_queue(), ())
         summary = await summarise(self.context, purpose, queue, poses, self._notes, changes)
-        offer(summary, poses, purpose, found)
+        offer(MotionApproval(summary, client_id, poses, purpose, found))
         return summary
 
     async def prepare_hover(self, client_id: int, request: verbs.Hover) -> HoverOffer:
         """Offers a one-use approval for a slow path to a place over a corner of the board."""
         offer = await self._begin_offer(verbs.Hover, client_id)
         hover, found = await self._touch_tests.prepare(request)
-        offer(found.go, beside=hover)
+        offer(MotionApproval(found.go, client_id, beside=hover))
         return found
 
     async def prepare_stop_test(self, client_id: int, request: verbs.StopTest) -> StopTestOffer:
         """Offers a one-use approval for a short move that is ended in one way."""
         offer = await self._begin_offer(verbs.StopTest, client_id)
         move, found = await prepare_stop_test(self.context, request)
-        offer(found.go, beside=move)
+        offer(MotionApproval(found.go, client_id, beside=move))
         return found
 
-    async def _begin_offer(self, verb: type[Verb[object]], client_id: int) -> Callable[..., None]:
+    async def _begin_offer(
+        self, verb: type[Verb[object]], client_id: int
+    ) -> Callable[[MotionApproval], None]:
         """What offers the motion once its path is checked; RefusedError when anything changed meanwhile."""
         self.permit(verb, client_id)
         if verb is not verbs.Prepare:
             self._require_no_session()
         await self._run_ended()  # it is finished and shown; its control process may take a moment more
         self._void()
-        return partial(self._offer, client_id, self.approvals.voids)
+        return partial(self._offer, self.approvals.voids)
 
-    def _offer(
-        self,
-        client_id: int,
-        voids: int,
-        summary: MotionPreview,
-        poses: tuple[int, ...] = (),
-        purpose: Purpose | None = None,
-        replanned: PlanRevision | None = None,
-        beside: HoverPath | StopTestMove | None = None,
-    ) -> None:
-        self.permit(verbs.Prepare, client_id)
+    def _offer(self, voids: int, asked: MotionApproval) -> None:
+        self.permit(verbs.Prepare, asked.client_id)
         if self.approvals.voids != voids:
             text = "Conditions changed during the preflight check."
             raise RefusedError(text, code="changed", remedy="Retry.")
-        self.approvals.offer(summary, client_id, poses, purpose, replanned, beside)
+        self.approvals.offer(asked)
         # To every watcher, without the token that is for the one who asked.
-        self.store.update(go=msgspec.structs.replace(summary, token=""))
+        self.store.update(go=msgspec.structs.replace(asked.summary, token=""))
 
     def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
         """A person approves exactly that summary. RefusedError when anything changed.

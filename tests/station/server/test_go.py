@@ -36,7 +36,7 @@ def offered(
         desk.new_token(), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1"
     )
     summary = msgspec.structs.replace(summary, start_joints_rad=HERE)
-    return desk.offer(summary, client_id, (0, 1, 2, 3), replanned=replanned)
+    return desk.offer(MotionApproval(summary, client_id, (0, 1, 2, 3), replanned=replanned))
 
 
 def test_a_go_is_for_one_use() -> None:

@@ -61,7 +61,7 @@ REFUSALS = {
 
 
 class _Answer(msgspec.Struct):
-    """Any message of the control process (`ur_control`), or that it died."""
+    """A message of the control process (`ur_control`), or that it died."""
 
     tcp: tuple[float, ...] | None = None
     refused: str | None = None

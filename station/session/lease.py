@@ -111,7 +111,7 @@ class ApprovalManager:
         return secrets.token_urlsafe(16)
 
     def offer(self, asked: MotionApproval) -> MotionApproval:
-        """From where its summary begins. An older one is void."""
+        """Let this one wait for a person, for two minutes. An older one is void."""
         self.waiting = replace(asked, expires_s=self._clock() + APPROVAL_LIFETIME_S)
         return self.waiting
 

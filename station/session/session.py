@@ -196,7 +196,7 @@ class Session:
     async def _begin_offer(
         self, verb: type[Verb[object]], client_id: int
     ) -> Callable[[MotionApproval], None]:
-        """What offers the motion once its path is checked; RefusedError when anything changed meanwhile."""
+        """Return what offers the checked motion; that raises RefusedError when anything changed meanwhile."""
         self.permit(verb, client_id)
         if verb is not verbs.Prepare:
             self._require_no_session()

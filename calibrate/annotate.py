@@ -62,7 +62,10 @@ def annotate(
             remedy="Name the calibration of this camera.",
         )
     if calibration.mount != info.mount:
-        raise AnnotateError(f"The calibration is {calibration.mount}, the recording {info.mount}.")
+        raise AnnotateError(
+            f"The calibration is {calibration.mount}, the recording {info.mount}.",
+            remedy="Name the calibration of this camera.",
+        )
     seen = load_views(recording, calibration.board, camera, progress, fewest=_FEWEST_VIEWS).detections
     rejected = {view.index: view.reason for view in calibration.views.rejected}
     chain = _camera_from_board(calibration)

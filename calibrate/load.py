@@ -136,7 +136,11 @@ def without_views(loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = F
     views = loaded.views
     if unknown := chosen - {view.index for view in (*views, *loaded.without_board)}:
         told = ", ".join(str(index + 1) for index in sorted(unknown))
-        raise BadViewsError(f"--without {told}: there is no view of that number.", code="no-such-view")
+        raise BadViewsError(
+            f"--without {told}: there is no view of that number.",
+            code="no-such-view",
+            remedy=f"Views count from 1 to {max(view.index for view in loaded.views) + 1}.",
+        )
     left = tuple(
         RejectedView(view.index, view.name, "excluded (--without)", "by-hand")
         for view in views

@@ -43,6 +43,8 @@ def _program(program: str, group: LazyGroup) -> list[str]:
 
 
 def _given(option: Any) -> str:
+    if isinstance(option.show_default, str):
+        return f"`{option.show_default}`"
     plain = isinstance(option.default, (str, int, float)) and not isinstance(option.default, bool)
     return f"`{option.default}`" if plain and str(option.default) else ""
 

@@ -119,7 +119,7 @@ class Recorder:
             raise RecordingError(
                 f"The image of pose {view.index + 1} was dropped: the disk is too slow",
                 code="image-dropped",
-                remedy="Take the pose again.",
+                remedy="Retake the pose.",
             )
         self._put(_Item(lambda: self._writer.view(view), _SMALL_BYTES))
 

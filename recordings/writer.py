@@ -45,7 +45,7 @@ SHOWN_PERIOD_NS = 40_000_000
 """Viewers get the arm at 25 Hz; the states themselves are kept at their full rate."""
 KEPT_IN_MEMORY_BYTES = 256 * 2**20
 """Limit per file: a session of single images stays for the solve that follows."""
-_FREE_SPACE = "Nothing is left of it: free space or name another disk, and begin again."
+_FREE_SPACE = "Nothing was kept: free space or name another disk, and begin again."
 _SECOND_NS = 1_000_000_000
 
 
@@ -153,7 +153,7 @@ class RecordingWriter:
             raise RecordingError(
                 f"View {view.index} names image {view.picture_sequence}, which is not in the recording",
                 code="no-image",
-                remedy="Take the pose again.",
+                remedy="Retake the pose.",
             )
         time_ns = self._time_ns(view.stamps, view.picture_sequence)
         self._add(Topic.VIEW, [encode(view)], time_ns)

@@ -62,7 +62,7 @@ class Cluster:
         scheme, _, place = self.address.partition("://")
         if scheme not in ("tcp", "tls") or ":" not in place:
             raise ClusterError(
-                f"The scheduler's address {self.address!r} is none.",
+                f"{self.address!r} is no address of a scheduler.",
                 code="cluster-address",
                 remedy="Write tcp://HOST:PORT or tls://HOST:PORT, as `dask scheduler` prints it.",
             )
@@ -75,7 +75,9 @@ class Cluster:
             )
         for path in given:
             if not path.is_file():
-                raise ClusterError(f"{path} does not exist or is no file.", code="cluster-file")
+                raise ClusterError(
+                    f"{path} does not exist or is no file.", code="cluster-file", remedy="Check the name."
+                )
 
 
 class _SchedulerFile(msgspec.Struct):

@@ -46,7 +46,11 @@ def _storage(url: str) -> Iterator[tuple[Any, str]]:
         ) from None
     except Exception as problem:  # every driver has its own
         reason = f"{type(problem).__name__}: {problem}"
-        raise BatchError(f"{url} cannot be read or written ({reason}).", code="storage") from None
+        raise BatchError(
+            f"{url} cannot be read or written ({reason}).",
+            code="storage",
+            remedy="Check the address, and the keys that the store's own tools use.",
+        ) from None
 
 
 def expand(place: str) -> list[str]:
@@ -56,7 +60,7 @@ def expand(place: str) -> list[str]:
     with _storage(place) as (fs, path):
         found = sorted(fs.unstrip_protocol(name) for name in fs.glob(path))
     if not found:
-        raise BatchError(f"{place} matches nothing.", code="storage-empty")
+        raise BatchError(f"{place} matches nothing.", code="storage-empty", remedy="Check the address.")
     return found
 
 

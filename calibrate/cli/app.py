@@ -82,7 +82,7 @@ COMMANDS = {
     ),
     "watch": LazyCommand(
         "calibrate.cli.watch:watch",
-        "Notice in production pictures that camera, tag or arm moved.",
+        "Notice in production images that camera, tag or arm moved.",
         (
             "calibrate watch monday.mcap --board tag.yaml",
             "calibrate watch pictures --follow  # until Ctrl-C; dataset.yaml states the tag",

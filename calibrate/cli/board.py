@@ -21,12 +21,20 @@ def board(
         Path | None,
         typer.Option("--board", help="YAML with a board: dataset.yaml, a station's configuration"),
     ] = None,
-    kind: Annotated[BoardKind, typer.Option(help="Of the pattern")] = BoardKind.CHESSBOARD,
-    columns: Annotated[int, typer.Option(help="Inner corners; circles; tags; charuco: squares")] = 7,
-    rows: Annotated[int, typer.Option(help="As columns")] = 6,
-    square_mm: Annotated[float, typer.Option(help="Square; circle distance; side of a tag")] = 25.0,
-    marker_mm: Annotated[float | None, typer.Option(help="charuco: marker; april-grid: gap")] = None,
-    dictionary: Annotated[str | None, typer.Option(help="Of markers, such as DICT_6X6_250")] = None,
+    kind: Annotated[BoardKind, typer.Option(help="Kind of the pattern")] = BoardKind.CHESSBOARD,
+    columns: Annotated[
+        int, typer.Option(help="Columns of inner corners, circles or tags; charuco: squares")
+    ] = 7,
+    rows: Annotated[int, typer.Option(help="Rows of the same")] = 6,
+    square_mm: Annotated[
+        float, typer.Option(help="Square, distance of circles, or side of a tag, mm")
+    ] = 25.0,
+    marker_mm: Annotated[
+        float | None, typer.Option(help="charuco: side of a marker, mm; april-grid: gap")
+    ] = None,
+    dictionary: Annotated[
+        str | None, typer.Option(help="Dictionary of the markers, such as DICT_6X6_250")
+    ] = None,
     tag_id: Annotated[int, typer.Option("--id", help="aruco, april-tag: number of the tag")] = 0,
     legacy: Annotated[bool, typer.Option(help="charuco: layout before OpenCV 4.6")] = False,
     paper: Annotated[

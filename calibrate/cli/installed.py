@@ -44,7 +44,8 @@ class CellKind(StrEnum):
 
 
 SameCell = Annotated[
-    CellKind | None, typer.Option("--cell", hidden=True, help="As of install; the root holds one kind only")
+    CellKind | None,
+    typer.Option("--cell", hidden=True, help="Kind of cell, as at install; a root holds one kind"),
 ]
 
 
@@ -161,7 +162,7 @@ def install(
         typer.Option(help="Kind of cell the root belongs to; others than real need --root"),
     ] = CellKind.real,
     cell_config: Annotated[
-        Path | None, typer.Option(help="The station's configuration: its robot, camera and oldest proof")
+        Path | None, typer.Option(help="The station's configuration: robot, camera, greatest age of a proof")
     ] = None,
     camera: Annotated[str, typer.Option(help="Name of the camera (default: as in the file)")] = "",
     max_age_days: Annotated[

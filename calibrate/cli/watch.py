@@ -90,7 +90,7 @@ def watch(
         list[Path],
         typer.Argument(
             metavar="SOURCE",
-            help="Recordings, session folders, or folders of pictures with dataset.yaml and poses.csv",
+            help="Recordings, session folders, or folders of images with dataset.yaml and poses.csv",
         ),
     ],
     board: BoardFile = None,
@@ -245,6 +245,7 @@ def _open_folder(folder: Path, calibration: Calibration) -> WatchSource:
     if dataset.mount != calibration.mount:
         raise WatchSourceError(
             f"{folder} is {dataset.mount}, the calibration {calibration.mount}.",
+            remedy="Correct dataset.yaml, or name the calibration of this camera.",
             found=dataset.mount,
             calibrated=calibration.mount,
         )
@@ -348,12 +349,12 @@ class _Teller:
         texts = {
             "moved": "Something moved."
             if monitor.finished
-            else f"Something moved; up to {NAMED_AFTER} more pictures may tell what.",
+            else f"Something moved; up to {NAMED_AFTER} more images may tell what.",
             "stopped": "Nothing can be watched.",
             "watching": "Nothing moved.",
-            "learning": f"Learning: at least {monitor.needed} more pictures are needed.",
+            "learning": f"Learning: at least {monitor.needed} more images are needed.",
         }
-        text = f"{monitor.pictures} pictures with the {describe_board(tag)}. {texts[state]}"
+        text = f"{monitor.pictures} images with the {describe_board(tag)}. {texts[state]}"
         if not self._as_json:
             out.print(text)
             return
@@ -370,7 +371,7 @@ _MOVED_TEXT = {
     Moved.CAMERA_BASE: "The camera moved, or the robot's base, or the zero of joint 1",
     Moved.TAG: "The tag moved, or the robot's base, or the zero of joint 1",
     Moved.TAG_GRIPPER: "The tag moved, or the gripper, or the zero of joint 6",
-    Moved.CANNOT_TELL: "Something moved; these pictures cannot tell what",
+    Moved.CANNOT_TELL: "Something moved; these images cannot tell what",
     **{joint: f"The zero of joint {joint[-1]} changed" for joint in Moved if joint.startswith("joint-")},
 }
 
@@ -385,10 +386,10 @@ def event_text(event: MovementEvent) -> str:
         EventKind.LEARNED: f"The tag's place is learned (misfit {values.get('median_misfit_px')} px).",
         EventKind.NOT_FIXED: f"These fit no fixed tag: misfit {values.get('median_misfit_px')} px (limit "
         f"{LARGEST_MISFIT_PX:g} px). Check that it is fixed, its size, and run `calibrate drift-check`.",
-        EventKind.TESTING: f"Learned; from now on pictures of {values.get('postures')} postures are tested.",
-        EventKind.ALARM: f"Something moved {values.get('since_pictures')} pictures ago or less.",
-        EventKind.PICTURES_WORSE: "The last 20 pictures are worse, none moved: check focus and light.",
-        EventKind.TAG_UNSEEN: f"No tag in the last {values.get('in_a_row')} pictures: nothing is watched.",
+        EventKind.TESTING: f"Learned; from now on images of {values.get('postures')} postures are tested.",
+        EventKind.ALARM: f"Something moved {values.get('since_pictures')} images ago or less.",
+        EventKind.PICTURES_WORSE: "The last 20 images are worse, none moved: check focus and light.",
+        EventKind.TAG_UNSEEN: f"No tag in the last {values.get('in_a_row')} images: nothing is watched.",
     }[event.kind]
 
 

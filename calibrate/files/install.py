@@ -181,8 +181,9 @@ def rollback(
             target = next((g for g in known if g.number == to), None) or no_such_version(folder, to, known)
         if target.calibration is None:
             raise InstallError(
-                f"InstalledVersion {target.number} is damaged and cannot be used: {target.problem}",
+                f"Version {target.number} is damaged and cannot be used: {target.problem}",
                 code="damaged-version",
+                remedy="Choose another one of `calibrate list`.",
                 generation=target.number,
             )
         before = None if current is None else current.calibration
@@ -257,6 +258,7 @@ def _change_validity(
             raise InstallError(
                 f"{folder}: version {number} is installed by now, version {version} was judged.",
                 code="other-version",
+                remedy="Check again.",
                 version=number,
                 judged=version,
             )

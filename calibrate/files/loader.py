@@ -266,6 +266,7 @@ def load_installed(
         raise InstallError(
             f"{found.path}: the installed calibration is {found.source}, not of a real cell.",
             code="not-real",
+            remedy="Install a calibration of the real cell; a trial loads it with allow_simulated=True.",
             source=found.source,
         )
     for name, serial, device in (

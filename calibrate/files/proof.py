@@ -29,6 +29,9 @@ def read_bounded(path: Path) -> bytes:
         raise CalibrationFileError(f"{path}: {problem.strerror or problem}.") from None
 
 
+_MEND = "Use the original, or solve the recording again."
+
+
 def proven_plain(content: bytes, where: str) -> dict[str, Any]:
     """A calibration file's plain data without `sha256`: hash and result are proven.
 
@@ -51,7 +54,9 @@ def proven_plain(content: bytes, where: str) -> dict[str, Any]:
         plain = strict_yaml.load_plain(content)
     except strict_yaml.StrictYamlError as problem:
         raise CalibrationFileError(
-            f"{where}: damaged, or no calibration file: {problem}.", code="damaged-calibration"
+            f"{where}: damaged, or no calibration file: {problem}.",
+            code="damaged-calibration",
+            remedy=_MEND,
         ) from None
     if not isinstance(plain, dict) or plain.get("format") != FORMAT_NAME:
         found = plain.get("format") if isinstance(plain, dict) else None
@@ -63,12 +68,14 @@ def proven_plain(content: bytes, where: str) -> dict[str, Any]:
     try:
         hash_now = content_sha256(plain)
     except (TypeError, ValueError) as problem:
-        raise CalibrationFileError(f"{where}: damaged ({problem}).", code="damaged-calibration") from None
+        raise CalibrationFileError(
+            f"{where}: damaged ({problem}).", code="damaged-calibration", remedy=_MEND
+        ) from None
     if plain.pop("sha256", None) != hash_now:
         raise CalibrationFileError(
             f"{where}: the content does not fit its hash: it was edited by hand or damaged.",
             code="damaged-calibration",
-            remedy="Use the original, or solve the recording again.",
+            remedy=_MEND,
         )
     return plain
 

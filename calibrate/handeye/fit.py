@@ -188,14 +188,16 @@ def require_plausible_noise(found: Estimate) -> None:
     """Raise PosesDisagreeError where robot and images have nothing to do with each other."""
     robot_m, robot_rad = found.scales.robot
     if found.used.sum() < FEWEST_USED:
-        raise PosesDisagreeError("Robot poses and images disagree in nearly every view.")
+        raise PosesDisagreeError("Robot poses and images disagree in nearly every view.", remedy=_MEND)
     if robot_m > MAX_ROBOT_M or robot_rad > MAX_ROBOT_RAD:
         raise PosesDisagreeError(
             f"Robot poses and images disagree by {robot_m * 1e3:.0f} mm, "
-            f"{np.degrees(robot_rad):.1f}° per axis."
+            f"{np.degrees(robot_rad):.1f}° per axis.",
+            remedy=_MEND,
         )
 
 
+_MEND = "Check the mounting, units and order of poses, and that each belongs to its image."
 _LEVER_M = 0.5
 _NEARER = 0.2
 """A turned board is believed when it brings the view this much nearer (the factor) to where the board is."""

@@ -121,7 +121,9 @@ def _reprojection_only(views: ViewSet) -> Array:
     """Pixels alone, robot poses taken as exact, intrinsics held; from Park and Martin's X."""
     observed = observe_views(views)
     if not observed.has_pixels:
-        raise CalibrationError("No corners in this recording.", code="no-corners")
+        raise CalibrationError(
+            "These views hold no corners.", code="no-corners", remedy="Use a recording with its images."
+        )
     H, C = _pose_arrays(views)
     X = opencv_hand_eye(H, C, HAND_EYE["Park-Martin"])
     lens = LensPrior.given(views.camera, _EXACT * np.maximum(np.abs(intrinsics_vector(views.camera)), 1.0))

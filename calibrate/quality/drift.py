@@ -139,6 +139,7 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
     if len(views) < FEWEST_VIEWS:
         raise TooFewViewsError(
             f"{len(views)} views are too few for a drift check (≥ {FEWEST_VIEWS}).",
+            remedy="Capture more: station drift-check.",
             views=len(views),
             needed=FEWEST_VIEWS,
         )

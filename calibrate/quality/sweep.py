@@ -251,7 +251,9 @@ def estimate_time_offset(
     """
     for name, times in (("robot", robot_s), ("camera", camera_s)):
         if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise BadViewsError(f"The {name}'s times are not in order.", code="bad-clock")
+            raise BadViewsError(
+                f"The {name}'s times are not in order.", code="bad-clock", remedy="Capture the sweep again."
+            )
     inside = (camera_s - LIMIT_S >= robot_s[0]) & (camera_s + LIMIT_S <= robot_s[-1])
     times, C = camera_s[inside], Rotation.from_matrix(camera_from_board[inside][:, :3, :3])
     if len(times) < FEWEST_PICTURES:

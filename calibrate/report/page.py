@@ -247,8 +247,8 @@ def _residuals(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
         misses = np.concatenate([found - shown for found, shown in pairs])
         yield html.figure(
             plots.residual_scatter(misses, pixels, job.solution.camera),
-            "Found corners against the lens and each picture's own board pose. Left: circles at 1, 2, 3 σ. "
-            "Right: over the picture; a pattern of arrows means that the lens model does not fit.",
+            "Found corners against the lens and each image's own board pose. Left: circles at 1, 2, 3 σ. "
+            "Right: over the image; a pattern of arrows means that the lens model does not fit.",
         )
 
 
@@ -268,7 +268,7 @@ def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]
         plots.holdout_samples(methods),
         f"Mean e_t {score.e_t_m * 1000:.4f} mm, e_R {score.e_R:.6f} over {len(score.pairs)} samples. These "
         "numbers are dominated by the noise of the held-out views: good methods cannot be ranked by them. "
-        "Curves of methods far worse than most leave the picture.",
+        "Curves of methods far worse than most leave the plot.",
     )
     yield html.paragraph(score.note, "note")
 

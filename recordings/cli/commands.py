@@ -115,7 +115,7 @@ def _print_info(facts: RecordingInfoJson) -> None:
 def _info_rows(facts: RecordingInfoJson) -> Iterator[tuple[str, str]]:
     created = datetime.fromtimestamp(facts["created_wall_ns"] / 1e9, UTC)
     camera, robot, views = facts["camera"], facts["robot"], facts["views"]
-    whole = "INCOMPLETE, what is here is finished" if facts["missing"] else "finished"
+    whole = "INCOMPLETE, the segments here are finished" if facts["missing"] else "finished"
     yield "recording", f"{facts['path']}  {facts['size_bytes'] / 1e6:.1f} MB  {whole}, all checksums good"
     yield "session", f"{facts['name']}  {facts['source']}  {facts['mount']}  {created:%Y-%m-%d %H:%M} UTC"
     if facts["parts"] > 1:

@@ -90,8 +90,8 @@ def improve(
     wary = replace(scene, geometry=geometry_from(known, here_rad))
     plan = plan_scene(wary, options, here_rad, captured=captured)
     if problems := check_plan(plan, here_rad, cell_geometry(better)).problems:
-        text = f"By what the images show the new path would not be free: {problems[0]}"
-        raise LimitError(text, code="path")
+        text = f"By the images the new path is not free: {problems[0]}"
+        raise LimitError(text, code="path", remedy="Continue with the plan as it is.")
     before, after = (_worth(scene, seen, poses, not lens_is_known) for poses in (left, plan))
     return Improvement(plan, before, after, guess.sigma_m, guess.sigma_rad)
 

@@ -49,7 +49,9 @@ class BootstrapError(StationError):
 
 def bootstrap_command(
     config: Annotated[Path, typer.Option(help="The configuration that the daemon runs with")],
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Where the guesses go (YAML)")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File for the poses that are found (YAML)")
+    ] = None,
     headless: Headless = False,
     socket: Socket = None,
 ) -> None:
@@ -71,7 +73,7 @@ def bootstrap_command(
         )
     believe(cell, [])  # says so when there is no camera_guess, before anything is asked
     if output is not None and output.exists():
-        raise ConfigError(f"{output} exists.", code="target-exists", remedy="Give the guesses another name.")
+        raise ConfigError(f"{output} exists.", code="target-exists", remedy="Give another name with -o.")
     glimpses = _make_moves(cell, socket, headless, hashlib.sha256(text).hexdigest())
     found = improved_config(cell, glimpses)
     assert found.camera_guess is not None and found.board_guess is not None

@@ -226,7 +226,11 @@ def truth_error(recording: Path, found: Matrix4) -> tuple[float, float]:
     """Distance (mm) and angle (deg) of the found X from the truth that rides in a simulated recording."""
     attachment = open_recording(recording).attachments().get("truth.json")
     if attachment is None:
-        raise DemoError(f"{recording} holds no truth.json.", code="not-simulated")
+        raise DemoError(
+            f"{recording} holds no truth.json.",
+            code="not-simulated",
+            remedy="Name a recording of a simulated cell.",
+        )
     truth = msgspec.json.decode(attachment, type=CellTruth)
     delta = difference(np.array(found), np.array(truth.camera_mount))
     translation_mm = 1000 * float(np.linalg.norm(delta[:3]))

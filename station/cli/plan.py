@@ -46,7 +46,7 @@ def plan_command(
     check: Annotated[Path | None, typer.Option(help="Check this plan instead of making one")] = None,
     from_list: Annotated[Path | None, typer.Option(help="CSV of joints or flange poses instead")] = None,
     taught: Annotated[
-        Path | None, typer.Option(help="Recording whose poses, guided by hand say, become the plan")
+        Path | None, typer.Option(help="Recording whose poses become the plan, e.g. guided by hand")
     ] = None,
     start: Annotated[
         str | None,
@@ -61,7 +61,7 @@ def plan_command(
         typer.Option("--for", help="camera, arm (its table too) or both (board and lens too)"),
     ] = "camera",
     d_optimal: Annotated[
-        bool, typer.Option("--d-optimal", help="Smallest error ellipsoid, not smallest error")
+        bool, typer.Option("--d-optimal", help="Minimize the error ellipsoid instead of the error")
     ] = False,
     picture: Annotated[Path | None, typer.Option(help="Save a picture of the plan (png, svg, pdf)")] = None,
     foxglove: Annotated[Path | None, typer.Option(help="Save a scene for Foxglove (mcap)")] = None,
@@ -350,7 +350,7 @@ def _show(
     if expected := _goal_text(plan, goal_m):
         out.print(expected)
     if cut:
-        out.print(f"by the guesses these do not show the whole board: {', '.join(cut)}")
+        out.print(f"by the initial poses these images cut the board: {', '.join(cut)}")
     if plan.note:
         out.print(f"note: {plan.note}")
     for problem in outcome.problems:

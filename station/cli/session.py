@@ -33,7 +33,7 @@ Approve = Annotated[str, typer.Option("--approve", help="Hash of the approved pl
 def capture_command(
     plan: Annotated[Path | None, typer.Option(help="Pose plan from `station plan`")] = None,
     sweep: Annotated[
-        bool, typer.Option("--sweep", help="Swing slowly about the arm's place, camera running")
+        bool, typer.Option("--sweep", help="Swing slowly about where the arm stands, camera running")
     ] = False,
     headless: Headless = False,
     approve: Approve = "",
@@ -68,7 +68,7 @@ def resume_command(
 
     Shows what would move and asks. After STOP or a fault first `station acknowledge`.
 
-    Exit codes: as of `station capture`.
+    Exit codes: those of `station capture`.
     """
     _finish(asyncio.run(session(socket, Purpose.RESUME, headless, approve, as_json)), as_json)
 

@@ -40,7 +40,9 @@ class AravisCamera:
     def __init__(self, config: CameraConfig, trigger: Trigger | None = None) -> None:
         if config.trigger == "hardware" and trigger is None:
             raise CameraError(
-                "camera.trigger is 'hardware' but no trigger box is configured", code="no-trigger"
+                "camera.trigger is 'hardware' but no trigger box is configured",
+                code="no-trigger",
+                remedy="Add `trigger: {port: /dev/ttyACM0}`, or choose camera.trigger: software.",
             )
         self._config = config
         self._trigger = trigger

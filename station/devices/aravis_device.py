@@ -288,7 +288,7 @@ class GenicamDevice:
                 f"frame {buffer.get_frame_id()} came incomplete ({buffer.get_status().value_nick}): packets "
                 "were lost",
                 code="frame-incomplete",
-                remedy="Check cable, network card and packet size, and take this pose again.",
+                remedy="Check cable, network card and packet size, and retake this pose.",
             )
         width, height = buffer.get_image_width(), buffer.get_image_height()
         if (width, height) != applied.region[2:]:

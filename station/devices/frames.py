@@ -16,7 +16,7 @@ from recordings.schema.frame_time import (
 from recordings.schema.messages import FrameTime, Image, TimeCorrection, TimeSource
 from station.cell.errors import CameraError
 
-RETAKE = "Take this pose again."
+RETAKE = "Retake this pose."
 
 
 class StreamCounts(msgspec.Struct, frozen=True):

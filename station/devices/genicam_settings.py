@@ -204,7 +204,7 @@ def _changed(
         f"the camera stands at {exposure_us:g} µs, gain {gain:g}{unit}; set were {wanted_us:g} µs, gain "
         f"{applied.gain:g}{unit}{more}",
         code="settings-changed",
-        remedy="Ask for what the camera can do, and end other programs that use it.",
+        remedy="Set what the camera can do, and end other programs that use it.",
         exposure_us=exposure_us,
         wanted_exposure_us=wanted_us,
         gain=gain,

@@ -54,7 +54,11 @@ class RtdeLink:
         """Claims these variables for this connection. RtdeError `registers-in-use` where another owns one."""
         answer = self._ask(PacketType.INPUT_SETUP, join_names(names))
         if IN_USE in split_names(answer[1:]):
-            raise RtdeError("another client owns the RTDE input registers", code="registers-in-use")
+            raise RtdeError(
+                "another client owns the RTDE input registers",
+                code="registers-in-use",
+                remedy="Close that program, or the field bus on the pendant, then try again.",
+            )
         return _recipe(answer, names)
 
     def start(self) -> None:

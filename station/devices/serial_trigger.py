@@ -191,7 +191,7 @@ class SerialTrigger:
                 raise TriggerError(
                     "the trigger box did not confirm a pulse",
                     code="pulse-count",
-                    remedy="Take this pose again.",
+                    remedy="Retake this pose.",
                 ) from None
             bound_s = (time.monotonic_ns() - asked_ns) / 2e9
             return TriggerPulse(self._count, 0, asked_ns + round(bound_s * 1e9), bound_s)

@@ -113,7 +113,11 @@ def open_control(path: str, host: str) -> Any:
     try:
         from rtde_control import RTDEControlInterface
     except ImportError as error:
-        raise RobotError(f"ur_rtde cannot be imported ({error})", code="ur-rtde-missing") from None
+        raise RobotError(
+            f"ur_rtde cannot be imported ({error})",
+            code="ur-rtde-missing",
+            remedy="Install it, or set robot.control: script in the configuration.",
+        ) from None
     try:
         return RTDEControlInterface(host)
     except RuntimeError as error:

@@ -240,12 +240,20 @@ class ScriptControl:
         if not self._wait(lambda: self._samples > SETTLE_SAMPLES, HANDSHAKE_S):
             raise RtdeError(f"no robot state came within {HANDSHAKE_S:g} s", code="no-state")
         if self._told.program not in (RuntimeState.STOPPED, RuntimeState.STOPPING):
-            raise RobotError("a program is playing on the robot", code="program-playing")
+            raise RobotError(
+                "a program is playing on the robot",
+                code="program-playing",
+                remedy="Stop it on the pendant, then try again.",
+            )
         with socket.create_connection((host, SCRIPT_PORT), HANDSHAKE_S) as upload:
             upload.sendall(script(sequence).encode("ascii"))
             # Open until the script answers: closed with unread data, it could take the text with it.
             if not self._wait(lambda: self._plays() and self._told.answer == sequence, START_S):
-                raise RobotError("the control script did not start", code="script-not-started")
+                raise RobotError(
+                    "the control script did not start",
+                    code="script-not-started",
+                    remedy="Power on, release the brakes, clear the pendant's messages.",
+                )
 
     # -- the six calls ----------------------------------------------------------------------------------
 

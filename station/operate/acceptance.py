@@ -221,7 +221,9 @@ class AcceptanceTest:
                         ended_by = str(mine[-1].values["ended_by"]) if mine else None
                         return _MoveEnd(status.state is StationState.IDLE, ended_by, moment_ns)
         except TimeoutError:
-            raise StationError("The move did not end.", code="no-end", limit_s=END_S) from None
+            raise StationError(
+                "The move did not end.", code="no-end", remedy="Press the emergency stop.", limit_s=END_S
+            ) from None
         raise DaemonGoneError("The daemon ended during the test.")
 
     async def _back(self, way: StopWay) -> None:
@@ -235,7 +237,10 @@ class AcceptanceTest:
             if way is StopWay.NETWORK and self.recorder.silent_s() < _LOOK_S and await self._connected():
                 return
         raise RefusedError(
-            f"{way.value}: the robot was not back within {BACK_S:.0f} s.", code="not-back", limit_s=BACK_S
+            f"{way.value}: the robot was not back within {BACK_S:.0f} s.",
+            code="not-back",
+            remedy="Check cable and slider, then begin again.",
+            limit_s=BACK_S,
         )
 
     async def _connected(self) -> bool:

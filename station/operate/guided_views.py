@@ -99,7 +99,7 @@ def what_is_missing(draft: Draft, joints_flange: Array | None) -> Missing:
     if enough(draft):
         return Missing("")
     if len(draft.views) >= MOST_GUIDED:
-        return Missing("These views say too little together: F3 takes the last one away")
+        return Missing("These views do not determine the camera pose: F3 drops the last one")
     text = _WANTED[len(draft.views)]
     if joints_flange is None:
         return Missing(text)

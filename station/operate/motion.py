@@ -84,7 +84,7 @@ async def status_now(socket: Path) -> StationStatus:
     async with await Client.connect(socket) as client:
         async for status in client.statuses():
             return status
-    raise DaemonGoneError("The daemon ended before it told its status.")
+    raise DaemonGoneError("The daemon ended before it told its status.", remedy="Start it again.")
 
 
 async def wait_until_idle(link: Link) -> StationStatus:

@@ -130,7 +130,7 @@ async def _arrival(link: Link, offer: HoverOffer) -> Hovering:
                 state=status.state.value,
             )
         return Hovering.arrived(offer, status.robot.base_from_flange, status.reason)
-    raise DaemonGoneError("The daemon ended on the way.", remedy="Look at the cell.")
+    raise DaemonGoneError("The daemon ended during the motion.", remedy="Look at the cell.")
 
 
 def touch_told(hovering: Hovering, said: str, status: StationStatus | None) -> Touch:
@@ -141,7 +141,11 @@ def touch_told(hovering: Hovering, said: str, status: StationStatus | None) -> T
     if said:
         return touch_of(hovering, told_offset_mm(hovering, two_lengths_mm(said)), "told by a person")
     if status is None or status.robot.base_from_flange is None:
-        raise RefusedError("The robot's position is not known now.", code="no-robot-state")
+        raise RefusedError(
+            "The robot's position is not known now.",
+            code="no-robot-state",
+            remedy="`station doctor` says why.",
+        )
     tip = tip_on_board_m(hovering.offer, status.robot.base_from_flange)
     return touch_of(hovering, read_offset_mm(hovering.offer, tip), "read from the arm")
 

@@ -92,6 +92,7 @@ def _read(path: Path) -> bytes:
             raise ConfigError(
                 f"{path} is larger than {strict_yaml.LIMIT_BYTES // 1024} kB: not a plan",
                 code="plan-too-large",
+                remedy="Check that it is the right file.",
                 limit_bytes=strict_yaml.LIMIT_BYTES,
             )
         return path.read_bytes()
@@ -143,7 +144,9 @@ def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
     taught = [(view.name, view.joints_rad) for view in views if view.joints_rad is not None]
     if not taught or len(taught) < len(views):
         raise ConfigError(
-            f"{path} holds {len(views)} poses, {len(taught)} of them with the arm's joints", code="no-joints"
+            f"{path} holds {len(views)} poses, {len(taught)} of them with the arm's joints",
+            code="no-joints",
+            remedy="Name a recording whose poses all have joints.",
         )
     poses = tuple(pose_at(MODELS[robot], name, joints, "as taught") for name, joints in taught)
     plan = Plan(robot=robot, mount=mount, poses=poses, note=f"taught: the poses of {path.name}")

@@ -143,6 +143,7 @@ def plan_hover(
     raise LimitError(
         f"No path to {where} is free. Nothing moved; the shortest one:\n{problems}",
         code="corner-path-blocked",
+        remedy="Choose another corner, or move the board.",
         corner=corner,
     )
 

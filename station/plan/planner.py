@@ -214,7 +214,7 @@ def _relaxed(view: ViewRange, start_roll_rad: float | None) -> list[tuple[ViewRa
     wide = replace(rolled, doubt=0.5, off_centre=0.1, distance_m=(0.85 * near, 1.3 * far))
     return [
         *views,
-        (doubtful, "the guess is rough: some images may cut the board"),
+        (doubtful, "the initial poses are rough: some images may cut the board"),
         (rolled, "poses of any roll had to be used, and some images may cut the board"),
         (wide, "unusual distances had to be used; images may cut the board"),
     ]

@@ -156,7 +156,9 @@ def sketch(scene: Scene, plan: Plan) -> str:
     if known:
         bars = "".join(_bar(s, known) for s in known)
         lines.append(
-            f"expected error of X  {bars}  {1000 * known[-1]:.2f} mm after {len(plan.poses)} poses"[:_WIDTH]
+            f"expected camera pose error  {bars}  {1000 * known[-1]:.2f} mm after {len(plan.poses)} poses"[
+                :_WIDTH
+            ]
         )
     return "\n".join(lines)
 

@@ -76,7 +76,7 @@ async def _from_outside(host: str) -> str:
         return "give robot.host in the configuration"
     found = await probe(host)
     if not found.answers:
-        return f"is the robot on, its network cable plugged in, and robot.host ({host}) its address?"
+        return f"switch the robot on, plug in its network cable, and check robot.host ({host})"
     who = f"{found.model} {found.serial}" if found.model else "something that is no UR robot"
     return "; ".join([f"{who} answers at {host}", *found.problems])
 

@@ -268,6 +268,7 @@ class SessionRecording:
             raise RecordingError(
                 f"The disk did not take the data of {self.folder} within {SYNC_TIMEOUT_S:.0f} s.",
                 code="disk-hangs",
+                remedy="Check the disk, or record elsewhere (--root).",
                 limit_s=SYNC_TIMEOUT_S,
             ) from error
 

@@ -348,7 +348,7 @@ class Session:
             try:
                 await context.recording.save_state(queue)
             except RecordingError as error:
-                text = f"It is changed, but a restart would forget it: {error}"
+                text = f"The change holds, but a restart would lose it: {error}"
                 raise RecordingError(text, code="change-not-saved") from None
         return result
 

@@ -44,7 +44,9 @@ def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None)
         raise RefusedError("No session is open.", code="no-session", remedy="Run the plan to begin one.")
     if purpose is Purpose.RETAKE:
         if index is None:
-            raise RefusedError("Missing: which pose to retake.", code="no-pose-named")
+            raise RefusedError(
+                "The pose to retake is missing.", code="no-pose-named", remedy="Give its number."
+            )
         if queue.status(index).state != "planned":
             queue.retake(index)
         return (index,)

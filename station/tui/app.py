@@ -63,10 +63,10 @@ STATUS_PERIOD_S = 0.25
 """Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
 SETTLED_S = 2.0
 RECONNECT_S = 1.0
-GONE = "The daemon ended: the arm decelerates by itself. This screen goes on as soon as one serves again."
+GONE = "The daemon ended: the controller stops the arm. This screen goes on when a daemon serves again."
 SILENT = (
-    "Daemon not responding: what stands below is old. The arm's own watchdog stops it; if the arm moves, "
-    "press the emergency stop."
+    "Daemon not responding: the data below are old. The arm's watchdog stops it; if it moves, press the "
+    "emergency stop."
 )
 
 
@@ -80,7 +80,7 @@ TOOLTIPS = {
     "connect": "What is missing, and its remedy",
     "plan": "All poses, their gain and reason",
     "capture": "The running capture",
-    "solve": "The verdict, and what it stands on",
+    "solve": "The verdict and its gates",
     "verify": "Touch test and drift checks",
     "install": "What is installed, and what would change",
     "sessions": "Past recordings",
@@ -142,7 +142,7 @@ class StationApp(ResultsDesk):
         ),
         Binding("f5", "start('run')", "Run", id="run", tooltip="Check the path, show the motion, and ask"),
         Binding("f6", "ask('pause')", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
-        Binding("f7", "finish", "Finish", id="finish", tooltip="Finish the recording with what is there"),
+        Binding("f7", "finish", "Finish", id="finish", tooltip="Finish the recording with the poses so far"),
         Binding(
             "f8",
             "acknowledge",

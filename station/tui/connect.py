@@ -26,7 +26,7 @@ STATES: dict[str, tuple[Mark, str]] = {
     "skipped": ("todo", "not used"),
 }
 READY = "Nothing is missing."
-NOT_READY = "This list looks again every few seconds."
+NOT_READY = "This list refreshes every few seconds."
 
 
 def checklist_text(checks: list[Check], width: int) -> Content:

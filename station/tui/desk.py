@@ -131,7 +131,7 @@ class Desk(App[None]):
             raise StationError("The station does not answer: nothing was sent.", code="no-answer")
         words = busy_words(verb)
         if words and self.busy:
-            raise RefusedError(f"One after the other: {self.busy}", code="busy")
+            raise RefusedError(f"Busy: {self.busy}", code="busy", remedy="Wait until it is done.")
         if words:
             self.tell_busy(words)
         try:

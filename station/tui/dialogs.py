@@ -114,7 +114,7 @@ class ConfirmMotion(Confirm):
         line += limit_bar(left_s, APPROVAL_LIFETIME_S, 24, "$warn", 1.0)
         self.query_one("#motion-holds", Static).update(line)
         if not left_s:
-            self.notify("The question was too old: nothing moved. F5 asks again.", severity="warning")
+            self.notify("The question expired: nothing moved. F5 asks again.", severity="warning")
             self.dismiss(False)
 
 
@@ -218,7 +218,7 @@ class JobScreen(Question[int]):
     BOX, NAME = "job", "At work"
     NEXT = Action("", "Wait", "This work runs beside the station; Escape ends it.")
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape", "cancel", "Cancel", tooltip="End this work; nothing half-written stays")
+        Binding("escape", "cancel", "Cancel", tooltip="End this work; no half-written file stays")
     ]
 
     def __init__(self, title: str, module: str, *args: str, close_on: tuple[int, ...] = (0, 4)) -> None:

@@ -43,7 +43,7 @@ Ending = Literal["", "serve", "rehearse"]
 """Next wish of the person: nothing, the cell itself, or its rehearsal."""
 ARM_PERIOD_S, CAMERA_PERIOD_S, LOOK_S = 0.1, 0.15, 1.0
 SHOWN_WIDTH_PX = 640
-NO_CAMERA = "No camera answers. Check its power, cable and network; this list looks again every few seconds."
+NO_CAMERA = "No camera answers. Check its power, cable and network; this list refreshes every few seconds."
 AXIS = Style(color="black", bgcolor="bright_yellow", bold=True)
 
 

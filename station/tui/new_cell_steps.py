@@ -99,7 +99,7 @@ class CameraPage(StepPage):
     @property
     def next(self) -> Action:
         if self.setup.camera is None:
-            return Action("", "Connect a camera", "This looks again every few seconds.")
+            return Action("", "Connect a camera", "This list refreshes every few seconds.")
         return Action("Enter", "This camera", "")
 
     async def accept(self, typed: str) -> bool:

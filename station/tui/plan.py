@@ -26,7 +26,7 @@ from station.tui.words import MARKS, UNKNOWN, Mark, degrees, facts, limit_bar, m
 COLUMNS = ("#", "error then", "", "distance", "tilt", "why it is there", "state")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
-SKIP = "Leave this pose out; of one that has a view only its retake"
+SKIP = "Skip this pose; of a captured one only its retake"
 POSE_VERBS = {"retake": Retake, "skip": Skip, "drop": Drop}
 MOVE = Binding.Group("order", compact=True)
 SIGMA_SHOWN_MM = 100.0

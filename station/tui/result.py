@@ -80,11 +80,13 @@ def _accuracy(calibration: Calibration) -> str:
     if quality.failed:
         return quality.failed[0].text.partition(" FAIL")[0]
     if quality.predicted_error_mm is None or quality.working_distance_m is None:
-        return f"The camera's position is right to ± {calibration.sigma.translation_mm:.2f} mm (1σ)."
+        return (
+            f"Standard uncertainty of the camera's position: {calibration.sigma.translation_mm:.2f} mm (1σ)."
+        )
     judged = next((gate for gate in quality.gates if gate.name == "predicted_error_m"), None)
     limit = f" The limit is {judged.shown(judged.limit)}." if judged is not None else ""
-    far = f"A point {quality.working_distance_m:.2f} m away is right to"
-    return f"{far} ± {quality.predicted_error_mm:.2f} mm (1σ).{limit}"
+    at = f"Predicted error at {quality.working_distance_m:.2f} m"
+    return f"{at}: {quality.predicted_error_mm:.2f} mm (1σ).{limit}"
 
 
 def _against(result: Result, calibration: Calibration) -> list[str]:
@@ -292,7 +294,7 @@ class SolveScreen(ResultScreen):
 
     MODE, NAME = "solve", "Solve"
     HELP = (
-        "The newest result, or the one picked on 7. Enter on a gate tells its sentence. Installing can be "
+        "The newest result, or the one picked on 7. Enter on a gate shows its details. Installing can be "
         "undone."
     )
 

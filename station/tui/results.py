@@ -139,7 +139,7 @@ class ResultsDesk(Desk):
 
         `ended`: how this one stopped being installed before; None: it never was.
         """
-        body = f"{path}\nbecomes what every consumer of this cell reads. b on 6 undoes it."
+        body = f"{path}\nbecomes what every program of this cell reads. b on 6 undoes it."
         body += "" if ended is None else f"\n\nIt was installed before, and {ended.how} by {ended.by}."
         if not await self.push_screen_wait(Confirm("Install this calibration?", body, yes="Install")):
             return
@@ -181,7 +181,7 @@ class ResultsDesk(Desk):
             there = "nothing is" if current is None else "only one was ever"
             self.notify(f"There is no older calibration to go back to: {there} installed.")
             return
-        body = f"Now: {_named(current)}\nBefore: {_named(older)}\nConsumers then read the one before."
+        body = f"Now: {_named(current)}\nBefore: {_named(older)}\nPrograms then read the one before."
         if not await self.push_screen_wait(
             Confirm("Go back to the calibration before?", body, yes="Go back")
         ):

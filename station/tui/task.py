@@ -166,7 +166,7 @@ def next_action(known: Known) -> Action:
     """Exactly one; alternatives stand in its sentence."""
     status = known.status
     if known.silent_s is not None:
-        why = f"No answer for {known.silent_s:.0f} s: what stands below is old. {known.trouble}"
+        why = f"No answer for {known.silent_s:.0f} s: the data below are old. {known.trouble}"
         return Action("", "EMERGENCY STOP if it moves", why, look=True)
     if status is None:
         return Action("", "Wait", known.trouble or "Connecting …", look=bool(known.trouble))

@@ -36,7 +36,7 @@ async def test_it_says_that_it_plans_for_as_long_as_it_does() -> None:
         await pilot.press("2", "n")
         await until(pilot, lambda: busy_words(verbs.MakePlan(25)) in text_of(pilot.app, "#next"))
         await pilot.press("n")
-        await until(pilot, lambda: any("One after the other" in n.message for n in pilot.app._notifications))
+        await until(pilot, lambda: any("Busy" in n.message for n in pilot.app._notifications))
         assert link.verbs.count("make_plan") == 1
         link.made.set()
         await until(pilot, lambda: "Wait" not in text_of(pilot.app, "#next"))

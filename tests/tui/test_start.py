@@ -37,9 +37,9 @@ async def test_a_long_checklist_is_read_to_its_end_with_keys(link: FakeLink) -> 
     async with opened(link) as pilot:
         await pilot.press("1")
         await until(pilot, lambda: "MISSING" in pilot.app.export_screenshot())
-        assert "This&#160;list&#160;looks" not in pilot.app.export_screenshot()
+        assert "This&#160;list&#160;refreshes" not in pilot.app.export_screenshot()
         await pilot.press("end")
-        await until(pilot, lambda: "This&#160;list&#160;looks" in pilot.app.export_screenshot())
+        await until(pilot, lambda: "This&#160;list&#160;refreshes" in pilot.app.export_screenshot())
 
 
 async def test_what_was_missing_is_looked_for_on_every_screen(

@@ -62,7 +62,7 @@ async def test_what_drives_the_arm_is_said(
         ("", "give robot.host in the configuration"),
         (
             "127.77.1.9",
-            "is the robot on, its network cable plugged in, and robot.host (127.77.1.9) its address?",
+            "switch the robot on, plug in its network cable, and check robot.host (127.77.1.9)",
         ),
     ],
 )

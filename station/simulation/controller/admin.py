@@ -12,11 +12,12 @@ from collections.abc import Awaitable, Callable, Sequence
 from math import inf, isfinite
 
 from station.simulation.controller.arm import Vibration
+from station.simulation.controller.interpreted import InterpretedProgram
 from station.simulation.controller.kinematics import ArmGeometry, Six
 from station.simulation.controller.machine import Machine
 from station.simulation.controller.network import Cut
-from station.simulation.controller.paths import Path, PolylinePath
-from station.simulation.controller.programs import ForeignProgram
+from station.simulation.controller.paths import JointPath, Path, UnreachableError
+from station.simulation.controller.robot import WAITS
 from station.simulation.controller.rtde_server import ADMIN
 
 PORT = 29990
@@ -195,7 +196,7 @@ def play(machine: Machine) -> dict[str, object]:
 
 def program(machine: Machine) -> dict[str, object]:
     """The text of the program that plays."""
-    return {"text": getattr(machine.robot.program, "text", "")}
+    return {"text": machine.robot.program.text if machine.robot.program else ""}
 
 
 def contact(machine: Machine, cycles: int = 10) -> None:
@@ -213,7 +214,7 @@ def wires(machine: Machine, digital: int = 0, analog: list[float] | None = None)
 
 def foreign(machine: Machine, name: str = "palletising.urp") -> None:
     """Somebody else's program starts."""
-    machine.robot.start_program(ForeignProgram(name))
+    machine.robot.start_program(InterpretedProgram(machine.robot, name, WAITS))
 
 
 def slider(machine: Machine, fraction: float) -> None:
@@ -252,9 +253,9 @@ def hand_move(machine: Machine, path: list[list[float]], speed_rad_s: float = 0.
     speed_rad_s = number("speed_rad_s", speed_rad_s, 1e-3, 100.0)
 
     def make_path(start: Six) -> Path:
-        return PolylinePath([start, *corners])
+        return JointPath(start, *corners)
 
-    length_rad = PolylinePath([robot.arm.command, *corners]).length
+    length_rad = JointPath(robot.arm.command, *corners).length
     if not robot.lead(make_path, speed_rad_s, HAND_RAD_S2):
         raise ValueError("the arm is not free: a program plays, a safety stop holds it, or it has no power")
     return {"length_rad": length_rad}
@@ -369,6 +370,6 @@ class AdminServer:
             result = command(self._machine, **request)
             if result is not None and not isinstance(result, dict):
                 result = await result
-        except (TypeError, ValueError, LookupError) as error:
+        except (TypeError, ValueError, LookupError, UnreachableError) as error:
             return {"ok": False, "error": f"{name}: {error}"}
         return {"ok": True, **(result or {})}

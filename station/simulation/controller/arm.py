@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import exp, inf, pi, sin
+from math import dist, exp, inf, pi, sin
 
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
     ArmGeometry,
     Rigid,
     Six,
+    between,
     compose,
     forward,
+    place,
 )
 from station.simulation.controller.paths import (
     Braking,
+    JointPath,
     Path,
-    PolylinePath,
     Profile,
     Trapezoid,
     UnreachableError,
@@ -59,7 +61,7 @@ class Stream(JointMotion):
     """A motion without an end, whose speeds are asked for in every cycle: servoj, speedj and their kin."""
 
     def __init__(self, wanted: Speeds, acceleration: float, speeds: Six) -> None:
-        super().__init__(lambda start: PolylinePath([start]), 0.0, acceleration)
+        super().__init__(JointPath, 0.0, acceleration)
         self.wanted = wanted
         self.speeds = speeds
 
@@ -71,7 +73,7 @@ class Stream(JointMotion):
             wanted = tuple(v * JOINT_SPEED_RAD_S / fastest for v in wanted)
         change = max(abs(w - v) for w, v in zip(wanted, self.speeds, strict=True))
         share = 1.0 if change <= self.acceleration * dt_s else self.acceleration * dt_s / change
-        self.speeds = tuple(v + share * (w - v) for w, v in zip(wanted, self.speeds, strict=True))
+        self.speeds = between(self.speeds, wanted, share)
         moved = tuple(q + v * dt_s * scale for q, v in zip(joints, self.speeds, strict=True))
         if any(abs(q) > JOINT_LIMIT_RAD for q in moved):
             raise UnreachableError("a joint reaches its limit")
@@ -173,7 +175,7 @@ class SimulatedArm:
         later = tuple(q + step_s * v for q, v in zip(self.command, self.command_speed, strict=True))
         here = compose(forward(self.table, self.command), self.flange_from_tcp)
         there = compose(forward(self.table, later), self.flange_from_tcp)
-        return float(sum((there[i] - here[i]) ** 2 for i in (3, 7, 11)) ** 0.5 / step_s)
+        return dist(place(here), place(there)) / step_s
 
     def _brake_in(self, duration_s: float) -> None:
         self._drop_next()
@@ -236,8 +238,7 @@ class SimulatedArm:
         self.command_speed = tuple((b - a) / dt_s for a, b in zip(self.command, joints, strict=True))
         self.command = joints
         share = min(1.0, motion.elapsed_s / profile.duration_s) if profile.duration_s > 0 else 1.0
-        before, after = self._misses
-        self.miss = tuple(a + share * (b - a) for a, b in zip(before, after, strict=True))
+        self.miss = between(*self._misses, share)
         if motion.elapsed_s >= profile.duration_s:
             self._end(motion)
 
@@ -267,9 +268,7 @@ class SimulatedArm:
         if goal != self._lagged:
             share = 1 - exp(-dt_s / LAG_S)
             near = max(abs(g - a) for g, a in zip(goal, self._lagged, strict=True)) < 1e-9
-            self._lagged = (
-                goal if near else tuple(a + share * (g - a) for a, g in zip(self._lagged, goal, strict=True))
-            )
+            self._lagged = goal if near else between(self._lagged, goal, share)
         self.actual = self._lagged
         if self.vibration is not None:
             self.vibration.time_s += dt_s
@@ -311,7 +310,7 @@ class History:
         t0, q0, m0 = self._ring[low % self._size]
         t1, q1, m1 = self._ring[high % self._size]
         u = (monotonic_ns - t0) / (t1 - t0) if t1 > t0 else 0.0
-        return _between(q0, q1, u), _between(m0, m1, u)
+        return between(q0, q1, u), between(m0, m1, u)
 
     def before(self, cycles: int) -> Six:
         """Joints so many cycles ago, or as long ago as is known."""
@@ -319,7 +318,3 @@ class History:
 
     def _time(self, index: int) -> int:
         return self._ring[index % self._size][0]
-
-
-def _between(first: Six, second: Six, share: float) -> Six:
-    return tuple(a + share * (b - a) for a, b in zip(first, second, strict=True))

@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from station.simulation.controller.kinematics import ArmGeometry, Rigid, Six, frames
+from station.simulation.controller.kinematics import ArmGeometry, Rigid, Six, cross, dot, frames, place, plus
 
-Vector = tuple[float, float, float]
 Matrix = list[list[float]]
 
 ROTOR_KG_M2 = 0.1
@@ -25,7 +24,7 @@ class Body(NamedTuple):
     link: int
     """1…6: behind which joint."""
     mass_kg: float
-    place_m: Vector
+    place_m: Six
     """In the frame of its link."""
 
 
@@ -35,7 +34,7 @@ class Drives(NamedTuple):
     """No joint gives more torque."""
 
 
-def _links(*masses: tuple[float, Vector]) -> tuple[Body, ...]:
+def _links(*masses: tuple[float, Six]) -> tuple[Body, ...]:
     return tuple(Body(i, *mass) for i, mass in enumerate(masses, 1))
 
 
@@ -79,33 +78,33 @@ class Posture:
     def __init__(self, table: ArmGeometry, joints_rad: Six, speeds_rad_s: Six) -> None:
         self._frames = frames(table, joints_rad)
         self._speeds = speeds_rad_s
-        self._axes: list[Vector] = [(T[2], T[6], T[10]) for T in self._frames[:-1]]
-        self._points: list[Vector] = [_place(T) for T in self._frames[:-1]]
+        self._axes: list[Six] = [(T[2], T[6], T[10]) for T in self._frames[:-1]]
+        self._points: list[Six] = [place(T) for T in self._frames[:-1]]
         self._velocities = [self._velocity(p, j) for j, p in enumerate(self._points)]
-        turns: list[Vector] = [(0.0, 0.0, 0.0)]
+        turns: list[Six] = [(0.0, 0.0, 0.0)]
         for axis, speed in zip(self._axes, speeds_rad_s, strict=True):
-            turns.append(_add(turns[-1], axis, speed))
-        self._axis_rates = [_cross(turn, axis) for turn, axis in zip(turns, self._axes, strict=False)]
+            turns.append(plus(turns[-1], axis, speed))
+        self._axis_rates = [cross(turn, axis) for turn, axis in zip(turns, self._axes, strict=False)]
 
-    def _columns(self, x: Vector, link: int) -> list[Vector]:
+    def _columns(self, x: Six, link: int) -> list[Six]:
         """How fast a point of a link moves per speed of each joint before it."""
         pairs = zip(self._axes[:link], self._points, strict=False)
-        return [_cross(z, _add(x, p, -1)) for z, p in pairs]
+        return [cross(z, plus(x, p, -1)) for z, p in pairs]
 
-    def _velocity(self, x: Vector, link: int) -> Vector:
+    def _velocity(self, x: Six, link: int) -> Six:
         return _combined(self._columns(x, link), self._speeds)
 
-    def _column_rates(self, x: Vector, link: int) -> list[Vector]:
+    def _column_rates(self, x: Six, link: int) -> list[Six]:
         v = self._velocity(x, link)
         return [
-            _add(
-                _cross(self._axis_rates[j], _add(x, self._points[j], -1)),
-                _cross(self._axes[j], _add(v, self._velocities[j], -1)),
+            plus(
+                cross(self._axis_rates[j], plus(x, self._points[j], -1)),
+                cross(self._axes[j], plus(v, self._velocities[j], -1)),
             )
             for j in range(link)
         ]
 
-    def _placed(self, body: Body) -> Vector:
+    def _placed(self, body: Body) -> Six:
         T, (x, y, z) = self._frames[body.link], body.place_m
         return (
             T[0] * x + T[1] * y + T[2] * z + T[3],
@@ -120,7 +119,7 @@ class Posture:
             columns = self._columns(self._placed(body), body.link)
             for i, a in enumerate(columns):
                 for j, b in enumerate(columns):
-                    M[i][j] += body.mass_kg * _dot(a, b)
+                    M[i][j] += body.mass_kg * dot(a, b)
         return M
 
     def coriolis(self, bodies: Sequence[Body]) -> list[float]:
@@ -130,7 +129,7 @@ class Posture:
             x = self._placed(body)
             acceleration = _combined(self._column_rates(x, body.link), self._speeds)
             for j, column in enumerate(self._columns(x, body.link)):
-                torques[j] += body.mass_kg * _dot(column, acceleration)
+                torques[j] += body.mass_kg * dot(column, acceleration)
         return torques
 
     def accelerations(self, bodies: Sequence[Body], most_nm: Six, torques_nm: Six) -> list[float]:
@@ -145,10 +144,10 @@ class Posture:
 
     def jacobian(self, base_from_tool: Rigid) -> Matrix:
         """(6, 6): the tool's velocity [m/s] and rotation [rad/s] in base, per joint speed."""
-        return _rows(self._columns(_place(base_from_tool), 6), self._axes)
+        return _rows(self._columns(place(base_from_tool), 6), self._axes)
 
     def jacobian_rate(self, base_from_tool: Rigid) -> Matrix:
-        return _rows(self._column_rates(_place(base_from_tool), 6), self._axis_rates)
+        return _rows(self._column_rates(place(base_from_tool), 6), self._axis_rates)
 
 
 def solved(M: Matrix, right: Sequence[float]) -> list[float]:
@@ -167,28 +166,12 @@ def solved(M: Matrix, right: Sequence[float]) -> list[float]:
     return found
 
 
-def _rows(linear: Sequence[Vector], angular: Sequence[Vector]) -> Matrix:
+def _rows(linear: Sequence[Six], angular: Sequence[Six]) -> Matrix:
     return [list(row) for columns in (linear, angular) for row in zip(*columns, strict=True)]
 
 
-def _place(T: Rigid) -> Vector:
-    return (T[3], T[7], T[11])
-
-
-def _add(a: Vector, b: Vector, times: float = 1.0) -> Vector:
-    return (a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2])
-
-
-def _combined(vectors: Sequence[Vector], shares: Sequence[float]) -> Vector:
-    total: Vector = (0.0, 0.0, 0.0)
+def _combined(vectors: Sequence[Six], shares: Sequence[float]) -> Six:
+    total: Six = (0.0, 0.0, 0.0)
     for vector, share in zip(vectors, shares, strict=False):
-        total = _add(total, vector, share)
+        total = plus(total, vector, share)
     return total
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

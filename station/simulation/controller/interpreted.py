@@ -1,48 +1,25 @@
 """Uploaded programs: URScript's interpreter joined to this controller's arm.
 
 One table of builtins: what only computes (`script_pure`), registers, inputs, outputs and sockets
-(`script_io`), and here what moves the arm or asks for its state.
+(`script_io`), what moves the arm (`script_motion`), and here what asks for its state or sets it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from math import hypot, inf, isfinite, sqrt
+from math import inf
 
-from station.simulation.controller.arm import JOINT_SPEED_RAD_S, JointMotion, Speeds
-from station.simulation.controller.dynamics import DRIVES, Body, Posture
-from station.simulation.controller.kinematics import (
-    JOINT_LIMIT_RAD,
-    Rigid,
-    Six,
-    compose,
-    forward,
-    from_pose,
-    from_rotvec,
-    inverse_nearest,
-    invert,
-    to_pose,
-    to_rotvec,
-)
-from station.simulation.controller.paths import ArcPath, JointPath, LinePath, Path, UnreachableError
+from station.simulation.controller.kinematics import forward
 from station.simulation.controller.script_io import Sockets, Wait, inputs_and_outputs, registers
-from station.simulation.controller.script_pure import PURE, pose_of, rigid, six, text_of
-from station.simulation.controller.state import ControllerState, twist_between
-from station.simulation.controller.urscript import Builtin, Pose, ScriptRun, ScriptRuntimeError, Thread
+from station.simulation.controller.script_motion import ArmMotions
+from station.simulation.controller.script_pure import PURE, pose_of, six, text_of
+from station.simulation.controller.state import ControllerState
+from station.simulation.controller.urscript import Builtin, Pose, ScriptRun, ScriptRuntimeError
 from station.simulation.controller.urscript_parser import parse
 
-KILLED_RAD_S2 = 40.0
-"""Deceleration of an arm whose moving thread was killed and that nobody stops: very sudden."""
 STEADY_RAD_S = 1e-3
 _QUIET = frozenset({"sync", "sleep", "textmsg", "force", "tool_contact"})
-ROTATION_WEIGHT_M = 0.1
-"""servoc turns a radian in the time in which it goes so far."""
-ARRIVED_M = 1e-5
-JOINT_RAD_S2 = 40.0
-"""The largest acceleration that the configuration message states."""
-TOOL_M_S = 1.0
-"""All that optimovel goes; the ramps take as long as those of optimovej."""
 
 
 class InterpretedProgram:
@@ -52,20 +29,16 @@ class InterpretedProgram:
         self.name, self.text = name, text
         self._robot = robot
         self._sockets = Sockets(robot)
+        self._motions = ArmMotions(robot, lambda: self._run.thread)
         states = {**inputs_and_outputs(robot), **self._states()}
         builtins = {
             **PURE,
             **registers(robot),
             **self._sockets.builtins(),
             **{name: self._logged(name, builtin) for name, builtin in states.items()},
-            **self._motions(),
-            **self._new(),
+            **self._motions.builtins(),
         }
         self._run = ScriptRun(parse(text, builtins))
-        self._mover: Thread | None = None
-        """The thread that controls the arm."""
-        self._orphan: JointMotion | None = None
-        """A motion that no thread waits for any more: for whoever moves or stops in the same cycle."""
 
     def _logged(self, name: str, builtin: Builtin) -> Builtin:
         """Wrap a function with each call in the log, unless it only asks or waits. Motions log themselves."""
@@ -82,9 +55,7 @@ class InterpretedProgram:
     def step(self) -> bool:
         """One cycle; False when the program has ended. Raises ScriptRuntimeError, UnreachableError."""
         goes_on = self._run.step()
-        if self._orphan is not None and not self._orphan.done:
-            self._robot.arm.brake(KILLED_RAD_S2)
-        self._orphan = None
+        self._motions.brake_orphan()
         return goes_on
 
     def end(self) -> None:
@@ -131,10 +102,6 @@ class InterpretedProgram:
             "get_target_tcp_speed": pose("target_TCP_speed"),
             "get_actual_tool_flange_pose": lambda: pose_of(forward(robot.table, arm.actual)),
             "get_target_tool_flange_pose": lambda: pose_of(forward(robot.table, arm.command)),
-            "get_forward_kin": self._forward,
-            "get_inverse_kin": self._inverse,
-            "get_inverse_kin_has_solution": self._has_solution,
-            "is_within_safety_limits": self._within_limits,
             "get_tcp_offset": lambda: Pose(robot.tcp),
             "set_tcp": self._set_tcp,
             "get_target_payload": lambda: robot.payload_kg,
@@ -170,11 +137,8 @@ class InterpretedProgram:
         yield
 
     def _sleep(self, t: float) -> Wait:
-        for _ in range(self._cycles(t)):
+        for _ in range(self._robot.cycles(t)):
             yield
-
-    def _cycles(self, seconds: float) -> int:
-        return max(1, round(seconds / self._robot.dt_s))
 
     def _textmsg(self, s1: object, s2: object = "") -> None:
         text = text_of(s1) + text_of(s2)
@@ -215,304 +179,3 @@ class InterpretedProgram:
             raise ScriptRuntimeError(f"a watchdog's action is no {action}")
         self._robot.watchdog_s = 0.0 if action == "ignore" else 1.0 / min_frequency
         self._robot.watched, self._robot.watchdog_pauses = variable_name, action == "pause"
-
-    # -- kinematics -------------------------------------------------------------------------------------
-
-    def _tool(self, joints: Six) -> Rigid:
-        return compose(forward(self._robot.table, joints), from_pose(self._robot.tcp))
-
-    def _forward(self, q: list[float] | None = None, tcp: Pose | None = None) -> Pose:
-        joints = self._robot.arm.actual if q is None else six(q)
-        offset = self._robot.tcp if tcp is None else six(tcp)
-        return pose_of(compose(forward(self._robot.table, joints), from_pose(offset)))
-
-    def _solved(self, pose: Rigid, near: Six, tcp: list[float] | None = None) -> Six | None:
-        offset = from_pose(self._robot.tcp if tcp is None else six(tcp))
-        return inverse_nearest(self._robot.table, compose(pose, invert(offset)), near)
-
-    def _inverse(
-        self,
-        x: Pose,
-        qnear: list[float] | None = None,
-        maxPositionError: float = 1e-10,
-        maxOrientationError: float = 1e-10,
-        tcp: Pose | None = None,
-    ) -> list[float]:
-        joints = self._solved(rigid(x), self._robot.arm.command if qnear is None else six(qnear), tcp)
-        if joints is None:
-            raise ScriptRuntimeError(f"get_inverse_kin found no solution for {text_of(x)}")
-        return list(joints)
-
-    def _has_solution(self, *arguments: object, **named: object) -> bool:
-        try:
-            self._inverse(*arguments, **named)  # type: ignore[arg-type]
-        except ScriptRuntimeError:
-            return False
-        return True
-
-    def _within_limits(self, pose: list[float]) -> bool:
-        if isinstance(pose, Pose):
-            return self._has_solution(pose)
-        return all(abs(q) <= JOINT_LIMIT_RAD for q in pose)
-
-    # -- motion -----------------------------------------------------------------------------------------
-
-    def _motions(self) -> dict[str, Builtin]:
-        return {
-            "movej": self._movej,
-            "movel": self._movel,
-            "movep": self._movep,
-            "movec": self._movec,
-            "servoj": self._servoj,
-            "servoc": self._servoc,
-            "speedj": self._speedj,
-            "speedl": self._speedl,
-            "stopj": self._stopj,
-            "stopl": self._stopl,
-        }
-
-    def _joints(self, target: list[float]) -> Six:
-        return tuple(self._inverse(target)) if isinstance(target, Pose) else six(target)
-
-    def _pose(self, target: list[float]) -> Rigid:
-        return rigid(target) if isinstance(target, Pose) else self._tool(six(target))
-
-    def _movej(self, q: list[float], a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Wait:
-        yield from self._turn("movej", q, a, v, t)
-
-    def _movel(self, pose: list[float], a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Wait:
-        yield from self._line("movel", pose, a, v, t)
-
-    def _movep(self, pose: list[float], a: float = 1.2, v: float = 0.25, r: float = 0) -> Wait:
-        yield from self._line("movep", pose, a, v)
-
-    def _movec(
-        self,
-        pose_via: list[float],
-        pose_to: list[float],
-        a: float = 1.2,
-        v: float = 0.25,
-        r: float = 0,
-        mode: float = 0,
-    ) -> Wait:
-        via, goal, tcp = self._pose(pose_via), self._pose(pose_to), from_pose(self._robot.tcp)
-        make_path = lambda start: ArcPath(self._robot.table, tcp, start, via, goal)  # noqa: E731
-        yield from self._move("movec", to_pose(goal), make_path, a, v, 0)
-
-    def _turn(self, name: str, target: list[float], a: float, v: float, t: float = 0) -> Wait:
-        goal = self._joints(target)
-        yield from self._move(name, goal, lambda start: JointPath(start, goal), a, v, t)
-
-    def _line(self, name: str, target: list[float], a: float, v: float, t: float = 0) -> Wait:
-        goal, tcp = self._pose(target), from_pose(self._robot.tcp)
-        make_path = lambda start: LinePath(self._robot.table, tcp, start, goal)  # noqa: E731
-        yield from self._move(name, to_pose(goal), make_path, a, v, t)
-
-    def _move(
-        self, name: str, goal: Six, make_path: Callable[[Six], Path], a: float, v: float, t: float
-    ) -> Wait:
-        """Move until the arm rests at the goal. The thread that moves controls the arm as long."""
-        arm = self._robot.arm
-        if not all(map(isfinite, (*goal, a, v, t))) or t < 0 or (t == 0 and (a <= 0 or v <= 0)):
-            raise ScriptRuntimeError(f"{name} to {text_of(list(goal))} with a={a}, v={v}, t={t}")
-        if t > 0:  # in this time, a quarter of it for each ramp
-            v = max(make_path(arm.command).length, 1e-9) / (0.75 * t)
-            a = v / (0.25 * t)
-        self._take_arm(name)
-        self._robot.journal.note("script", name, goal=list(goal), a=a, v=v)
-        yield from self._hold(arm.start(make_path, v, a))
-
-    def _servoj(
-        self,
-        q: list[float],
-        a: float = 0,
-        v: float = 0,
-        t: float = 0.002,
-        lookahead_time: float = 0.1,
-        gain: float = 300,
-    ) -> Wait:
-        """Follows the goal with the lookahead as its time constant; `gain` has no effect."""
-        goal, lag_s = six(q), max(0.03, min(0.2, lookahead_time))
-
-        def wanted(joints: Six, dt_s: float) -> Six:
-            return tuple((g - c) / max(lag_s, dt_s) for g, c in zip(goal, joints, strict=True))
-
-        yield from self._flow("servoj", wanted, inf, t, lambda: True)
-
-    def _speedj(self, qd: list[float], a: float = 1.4, t: float = 0) -> Wait:
-        speeds, arm = six(qd), self._robot.arm
-        yield from self._flow("speedj", lambda _, __: speeds, a, t, lambda: arm.stream_speeds == speeds)
-
-    def _speedl(self, xd: list[float], a: float = 1.2, t: float = 0, aRot: object = "a") -> Wait:
-        goal = six(xd)
-        tool = _ToolSpeed(self._robot, lambda _: goal, a)
-        yield from self._flow("speedl", tool.joint_speeds, inf, t, lambda: tool.twist == goal)
-
-    def _servoc(self, pose: Pose, a: float = 1.2, v: float = 0.25, r: float = 0) -> Wait:
-        """Straight towards the pose, until it is reached or as near as the blend radius."""
-        goal, robot = rigid(pose), self._robot
-
-        def way(tool: Rigid) -> tuple[Six, float]:
-            """Return what is left: a twist that would do it in 1 s, and its length [m]."""
-            move = tuple(goal[i] - tool[i] for i in (3, 7, 11))
-            turn = to_rotvec(compose(goal, invert(tool)))
-            return (*move, *turn), max(hypot(*move), ROTATION_WEIGHT_M * hypot(*turn))
-
-        def towards(tool: Rigid) -> Six:
-            twist, distance_m = way(tool)
-            speed = min(v, sqrt(2 * a * distance_m), distance_m / (4 * robot.dt_s))
-            return tuple(x * speed / distance_m for x in twist) if distance_m > 0 else twist
-
-        tool = _ToolSpeed(robot, towards, a)
-        near_m = max(r, ARRIVED_M)
-        yield from self._flow("servoc", tool.joint_speeds, inf, 0, lambda: way(tool.place)[1] < near_m)
-
-    def _flow(self, name: str, wanted: Speeds, a: float, t: float, arrived: Callable[[], bool]) -> Wait:
-        """Lets the arm follow: for the time t, else until it has arrived. The next call must take over."""
-        if not (a > 0 and isfinite(t)):
-            raise ScriptRuntimeError(f"{name} with a={a}, t={t}")
-        self._take_arm(name)
-        self._robot.journal.count("script", name)
-        motion = self._robot.arm.stream(wanted, a)
-        self._mover, self._orphan = self._run.thread, None
-        left = self._cycles(t) if t > 0 else 0
-        try:
-            while True:
-                yield
-                left -= 1
-                if motion.done or (left <= 0 if t > 0 else arrived()):
-                    return
-        finally:
-            self._mover = None
-            self._orphan = motion
-
-    def _optimovej(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
-        """a and v are shares of what the arm can do, as in optimovel."""
-        yield from self._turn("optimovej", goal, a * JOINT_RAD_S2, v * JOINT_SPEED_RAD_S)
-
-    def _optimovel(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
-        yield from self._line(
-            "optimovel", goal, a * JOINT_RAD_S2 * TOOL_M_S / JOINT_SPEED_RAD_S, v * TOOL_M_S
-        )
-
-    # -- torques ----------------------------------------------------------------------------------------
-
-    def _new(self) -> dict[str, Builtin]:
-        """What e-Series controllers have from 5.21 or 5.23 on; the scales of friction came with 5.25.1."""
-        robot, arm, settings = self._robot, self._robot.arm, self._robot.settings
-        if not settings.is_e_series or settings.version < (5, 21):
-            return {}
-        optimal: dict[str, Builtin] = {"optimovej": self._optimovej, "optimovel": self._optimovel}
-        if settings.version < (5, 23):
-            return optimal
-        drives = DRIVES[settings.model]
-
-        def posture() -> Posture:
-            return Posture(robot.table, arm.actual, arm.actual_speed)
-
-        def bodies() -> list[Body]:
-            x, y, z = robot.payload_cog
-            return [*drives.bodies, Body(6, robot.payload_kg, (x, y, z))]
-
-        def turn(torque: Sequence[float]) -> Wait:
-            asked, load = six(torque), bodies()
-
-            def wanted(joints: Six, dt_s: float) -> Six:
-                speeds = arm.stream_speeds
-                rates = Posture(robot.table, joints, speeds).accelerations(load, drives.most_nm, asked)
-                faster = tuple(v + dt_s * r for v, r in zip(speeds, rates, strict=True))
-                if max(map(abs, faster)) > JOINT_SPEED_RAD_S:
-                    raise UnreachableError("a joint exceeds its speed limit")
-                return faster
-
-            yield from self._flow("direct_torque", wanted, inf, robot.dt_s, lambda: True)
-
-        def scaled(
-            torque: Sequence[float],
-            viscous_scale: Sequence[float] = (1.0,) * 6,
-            coulomb_scale: Sequence[float] = (1.0,) * 6,
-            friction_comp: bool = True,
-        ) -> Wait:
-            for scale in (viscous_scale, coulomb_scale):
-                if len(scale) != 6 or not all(0 <= s <= 1 for s in scale):
-                    raise ScriptRuntimeError(f"direct_torque with a scale of {text_of(list(scale))}")
-            yield from turn(torque)
-
-        return optimal | {
-            "direct_torque": scaled
-            if settings.version >= (5, 25, 1)
-            else lambda torque, friction_comp=True: turn(torque),
-            "get_mass_matrix": lambda: posture().mass_matrix(bodies()),
-            "get_coriolis_and_centrifugal_torques": lambda: posture().coriolis(bodies()),
-            "get_jacobian": lambda: posture().jacobian(self._tool(arm.actual)),
-            "get_jacobian_time_derivative": lambda: posture().jacobian_rate(self._tool(arm.actual)),
-            "get_target_joint_accelerations": lambda: list(robot.outputs.vector("target_qdd")),
-        }
-
-    def _stopj(self, a: float = 2.0) -> Wait:
-        yield from self._stop("stopj", a)
-
-    def _stopl(self, a: float = 2.0, aRot: object = "a") -> Wait:
-        yield from self._stop("stopl", a)
-
-    def _stop(self, name: str, a: float) -> Wait:
-        if not (isfinite(a) and a > 0):
-            raise ScriptRuntimeError(f"{name} with a={a}")
-        self._take_arm(name)
-        self._robot.journal.note("script", name, a=a)
-        arm = self._robot.arm
-        (arm.brake if name == "stopj" else arm.brake_tool)(a)
-        if arm.motion is not None:
-            yield from self._hold(arm.motion)
-
-    def _take_arm(self, name: str) -> None:
-        if self._mover not in (None, self._run.thread):
-            raise ScriptRuntimeError(f"{name}: another thread is already controlling the robot")
-
-    def _hold(self, motion: JointMotion) -> Wait:
-        """Waits for its end. A thread killed meanwhile leaves it to whoever stops it in the same cycle."""
-        self._mover, self._orphan = self._run.thread, None
-        try:
-            while not motion.done:
-                yield
-        finally:
-            self._mover = None
-            if not motion.done:
-                self._orphan = motion
-
-
-class _ToolSpeed:
-    """Joint speeds for a tool speed that changes by at most the acceleration (m/s² and rad/s²)."""
-
-    def __init__(self, robot: ControllerState, wanted: Callable[[Rigid], Six], acceleration: float) -> None:
-        if not (isfinite(acceleration) and acceleration > 0):
-            raise ScriptRuntimeError(f"an acceleration of {acceleration}")
-        self._robot, self._wanted, self._acceleration = robot, wanted, acceleration
-        self._flange_from_tcp = from_pose(robot.tcp)
-        step_s, arm = 1e-4, robot.arm
-        ahead = tuple(q + step_s * v for q, v in zip(arm.command, arm.stream_speeds, strict=True))
-        self.place = self._at(arm.command)
-        """base_from_tcp"""
-        self.twist = twist_between(self.place, self._at(ahead), 1 / step_s)
-        """m/s and rad/s, in base"""
-
-    def _at(self, joints: Six) -> Rigid:
-        return compose(forward(self._robot.table, joints), self._flange_from_tcp)
-
-    def joint_speeds(self, joints: Six, dt_s: float) -> Six:
-        """Raises UnreachableError."""
-        self.place = place = self._at(joints)
-        goal = self._wanted(place)
-        change = max(abs(g - x) for g, x in zip(goal, self.twist, strict=True))
-        most = self._acceleration * dt_s
-        share = most / change if change > most else 1.0
-        self.twist = goal if share == 1.0 else tuple(
-            x + share * (g - x) for g, x in zip(goal, self.twist, strict=True)
-        )  # fmt: skip
-        x, y, z, *turn = (v * dt_s for v in self.twist)
-        moved = compose(from_rotvec(*turn), place)
-        goes = (*moved[:3], place[3] + x, *moved[4:7], place[7] + y, *moved[8:11], place[11] + z)
-        solved = inverse_nearest(self._robot.table, compose(goes, invert(self._flange_from_tcp)), joints)
-        if solved is None:
-            raise UnreachableError("the tool's way leaves the arm's reach")
-        return tuple((b - a) / dt_s for a, b in zip(joints, solved, strict=True))

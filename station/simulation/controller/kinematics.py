@@ -56,6 +56,27 @@ TABLES = {
 }
 
 
+def place(T: Rigid) -> Six:
+    """(3,) where its origin is."""
+    return (T[3], T[7], T[11])
+
+
+def between(first: Six, second: Six, share: float) -> Six:
+    return tuple(a + share * (b - a) for a, b in zip(first, second, strict=True))
+
+
+def plus(a: Six, b: Six, times: float = 1.0) -> Six:
+    return (a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2])
+
+
+def dot(a: Six, b: Six) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Six, b: Six) -> Six:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
 def compose(A: Rigid, B: Rigid) -> Rigid:
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11 = A
     b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11 = B

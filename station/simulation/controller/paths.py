@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import atan2, cos, pi, sin, sqrt
+from math import atan2, cos, hypot, pi, sin, sqrt
 from typing import Protocol
 
 from station.simulation.controller.kinematics import (
@@ -16,11 +16,16 @@ from station.simulation.controller.kinematics import (
     ArmGeometry,
     Rigid,
     Six,
+    between,
     compose,
+    cross,
+    dot,
     forward,
     from_rotvec,
     inverse_nearest,
     invert,
+    place,
+    plus,
     to_rotvec,
 )
 
@@ -38,20 +43,24 @@ class Path(Protocol):
 
 
 class JointPath:
-    """All joints together, each in proportion to its own way."""
+    """Through given joints one after the other, all joints together, each in proportion to its own way."""
 
-    def __init__(self, start: Six, goal: Six) -> None:
-        if any(not abs(q) <= JOINT_LIMIT_RAD for q in goal):
-            raise UnreachableError(f"joints {goal} are outside ±2π")
-        self._start = start
-        self._goal = goal
-        self.length = max(abs(g - s) for s, g in zip(start, goal, strict=True))
+    def __init__(self, start: Six, *goals: Six) -> None:
+        if any(not abs(q) <= JOINT_LIMIT_RAD for goal in goals for q in goal):
+            raise UnreachableError(f"joints {goals} are outside ±2π")
+        self._corners = (start, *goals)
+        self._ends = [0.0]
+        for first, second in pairwise(self._corners):
+            step = max(abs(b - a) for a, b in zip(first, second, strict=True))
+            self._ends.append(self._ends[-1] + step)
+        self.length = self._ends[-1]
 
     def at(self, s: float) -> Six:
-        if s >= self.length:
-            return self._goal
-        u = s / self.length
-        return tuple(a + u * (b - a) for a, b in zip(self._start, self._goal, strict=True))
+        for i, end in enumerate(self._ends[1:]):
+            if s < end:
+                begin = self._ends[i]
+                return between(self._corners[i], self._corners[i + 1], (s - begin) / (end - begin))
+        return self._corners[-1]
 
 
 class LinePath:
@@ -61,10 +70,10 @@ class LinePath:
         self._table = table
         self._tcp_from_flange = invert(flange_from_tcp)
         self._first = compose(forward(table, start), flange_from_tcp)
-        self._way = tuple(base_from_goal[i] - self._first[i] for i in (3, 7, 11))
+        self._way = plus(place(base_from_goal), place(self._first), -1)
         x, y, z = to_rotvec(compose(invert(self._first), base_from_goal))
         self._turn = (x, y, z)
-        distance, angle = sqrt(sum(w * w for w in self._way)), sqrt(x * x + y * y + z * z)
+        distance, angle = hypot(*self._way), hypot(x, y, z)
         self.length = distance if distance > 1e-6 else angle
         self._joints = start
         goal = inverse_nearest(table, compose(base_from_goal, self._tcp_from_flange), start)
@@ -73,7 +82,7 @@ class LinePath:
 
     def _place(self, u: float) -> Six:
         """The tool's point at this share of the way."""
-        return tuple(self._first[i] + u * w for i, w in zip((3, 7, 11), self._way, strict=True))
+        return plus(place(self._first), self._way, u)
 
     def at(self, s: float) -> Six:
         u = min(s / self.length, 1.0) if self.length > 0 else 1.0
@@ -100,58 +109,24 @@ class ArcPath(LinePath):
         base_from_goal: Rigid,
     ) -> None:
         super().__init__(table, flange_from_tcp, start, base_from_goal)
-        begin, via, end = (
-            tuple(T[i] for i in (3, 7, 11)) for T in (self._first, base_from_via, base_from_goal)
-        )
-        a, b = _minus(via, begin), _minus(end, begin)
-        normal = _cross(a, b)
-        area2 = _dot(normal, normal)
+        begin, via, end = map(place, (self._first, base_from_via, base_from_goal))
+        a, b = plus(via, begin, -1), plus(end, begin, -1)
+        normal = cross(a, b)
+        area2 = dot(normal, normal)
         if area2 < 1e-12:
             raise UnreachableError("three points on a line make no arc")
         # the circumcentre of a triangle, seen from its first corner
-        away = _cross(tuple(_dot(a, a) * y - _dot(b, b) * x for x, y in zip(a, b, strict=True)), normal)
+        away = cross(tuple(dot(a, a) * y - dot(b, b) * x for x, y in zip(a, b, strict=True)), normal)
         self._centre = tuple(p + w / (2 * area2) for p, w in zip(begin, away, strict=True))
-        self._u = _minus(begin, self._centre)
-        self._v = tuple(x / sqrt(area2) for x in _cross(normal, self._u))
-        last = _minus(end, self._centre)
-        self._angle = atan2(_dot(last, self._v), _dot(last, self._u)) % (2 * pi)
-        self.length = sqrt(_dot(self._u, self._u)) * self._angle
+        self._u = plus(begin, self._centre, -1)
+        self._v = tuple(x / sqrt(area2) for x in cross(normal, self._u))
+        last = plus(end, self._centre, -1)
+        self._angle = atan2(dot(last, self._v), dot(last, self._u)) % (2 * pi)
+        self.length = sqrt(dot(self._u, self._u)) * self._angle
 
     def _place(self, u: float) -> Six:
         c, s = cos(u * self._angle), sin(u * self._angle)
         return tuple(m + c * x + s * y for m, x, y in zip(self._centre, self._u, self._v, strict=True))
-
-
-def _minus(a: Six, b: Six) -> Six:
-    return tuple(x - y for x, y in zip(a, b, strict=True))
-
-
-def _dot(a: Six, b: Six) -> float:
-    return sum(x * y for x, y in zip(a, b, strict=True))
-
-
-def _cross(a: Six, b: Six) -> Six:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-class PolylinePath:
-    """Through given joints one after the other at one pace: an arm led by hand."""
-
-    def __init__(self, corners: list[Six]) -> None:
-        self._corners = corners
-        self._ends = [0.0]
-        for first, second in pairwise(corners):
-            step = max(abs(b - a) for a, b in zip(first, second, strict=True))
-            self._ends.append(self._ends[-1] + step)
-        self.length = self._ends[-1]
-
-    def at(self, s: float) -> Six:
-        for i in range(1, len(self._ends)):
-            if s < self._ends[i]:
-                u = (s - self._ends[i - 1]) / (self._ends[i] - self._ends[i - 1])
-                first, second = self._corners[i - 1], self._corners[i]
-                return tuple(a + u * (b - a) for a, b in zip(first, second, strict=True))
-        return self._corners[-1]
 
 
 class Profile(Protocol):

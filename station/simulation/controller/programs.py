@@ -1,10 +1,9 @@
-"""Programs that arrive as text: where one ends; and what every program is."""
+"""Programs that arrive as text, and where one ends."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Protocol
 
 LIMIT = 4_000_000
 """Characters of one unfinished program."""
@@ -50,29 +49,3 @@ class UploadReader:
         if len(self._text) > LIMIT:
             raise ValueError(f"a program of more than {LIMIT} characters without an end")
         return uploads
-
-
-class Program(Protocol):
-    name: str
-
-    def step(self) -> bool:
-        """One cycle; False when the program has ended. Raises ScriptError, UnreachableError."""
-
-    def end(self) -> None:
-        """Called once, whatever ended it."""
-
-
-class ForeignProgram:
-    """Somebody else's program: occupies the arm, answers nothing. Ends after `cycles`, or never (None)."""
-
-    def __init__(self, name: str, cycles: int | None = None) -> None:
-        self.name = name
-        self._left = cycles
-
-    def step(self) -> bool:
-        if self._left is not None:
-            self._left -= 1
-        return self._left is None or self._left >= 0
-
-    def end(self) -> None:
-        pass

@@ -20,14 +20,14 @@ from station.simulation.controller.kinematics import (
     from_rotvec,
 )
 from station.simulation.controller.paths import UnreachableError
-from station.simulation.controller.programs import ForeignProgram, Program, Upload
-from station.simulation.controller.state import ControllerState, Journal, Settings
+from station.simulation.controller.programs import Upload
+from station.simulation.controller.state import DIGITAL_BANKS, ControllerState, Journal, Settings
 from station.simulation.controller.urscript import ScriptError, ScriptSyntaxError
 
 PROGRAM_START_S = 0.05
 UNLOCK_AFTER_S = 5.0
-_DIGITAL_OUTPUTS = {"standard_digital": 0, "configurable_digital": 8, "tool_digital": 16}
-"""Kind → first bit of `actual_digital_output_bits`."""
+WAITS = "while True:\n  sync()\nend"
+"""A program that only occupies the arm."""
 
 
 class SimulatedRobot(ControllerState):
@@ -35,10 +35,10 @@ class SimulatedRobot(ControllerState):
         super().__init__(settings, journal)
         self._waiting: deque[tuple[int, tuple[str, ...], tuple[float, ...]]] = deque()
         """Inputs on their way: cycle in which they act, names, elements."""
-        self.program: Program | None = None
+        self.program: InterpretedProgram | None = None
         self._secondary: list[InterpretedProgram] = []
         """Run beside the program, without moving."""
-        self._starting: tuple[int, Program] | None = None
+        self._starting: tuple[int, InterpretedProgram] | None = None
         self._safety_since_s = -inf
         self._silence_s = 0.0
         self._hands: JointMotion | None = None
@@ -91,12 +91,10 @@ class SimulatedRobot(ControllerState):
                 else:
                     self.stop_program(f"watchdog: {self.watched} was silent")
                 return
-        if late and isinstance(self.program, InterpretedProgram):
-            return  # it counts its own time
-        if not self._step(self.program):
+        if not late and not self._step(self.program):
             self.stop_program("the program ended")
 
-    def _step(self, program: Program) -> bool:
+    def _step(self, program: InterpretedProgram) -> bool:
         """False when it has ended, by itself or by an error."""
         try:
             if program.step():
@@ -130,11 +128,12 @@ class SimulatedRobot(ControllerState):
         if "speed_slider_mask" in names and get("speed_slider_mask"):
             self.slider = max(0.0, min(1.0, get("speed_slider_fraction")))
             self.journal.note("rtde", "speed slider", fraction=self.slider)
-        for kind, first_bit in _DIGITAL_OUTPUTS.items():
-            if f"{kind}_output_mask" in names:
-                mask, wanted = int(get(f"{kind}_output_mask")), int(get(f"{kind}_output"))
+        for bank, (first_bit, _) in DIGITAL_BANKS.items():
+            output = f"{bank}_digital_output"
+            if f"{output}_mask" in names:
+                mask, wanted = int(get(f"{output}_mask")), int(get(output))
                 self.set_digital_outputs(mask << first_bit, wanted << first_bit)
-                self.journal.note("rtde", f"{kind}_output", mask=mask, value=wanted)
+                self.journal.note("rtde", output, mask=mask, value=wanted)
         if "standard_analog_output_mask" in names:
             mask = int(get("standard_analog_output_mask"))
             kept = int(self.outputs.get("analog_io_types")) & ~(mask << 2)
@@ -210,7 +209,7 @@ class SimulatedRobot(ControllerState):
             self.start_program(program)
         return True
 
-    def start_program(self, program: Program) -> None:
+    def start_program(self, program: InterpretedProgram) -> None:
         self.stop_program(f"replaced by {program.name}")
         self._starting = (round(PROGRAM_START_S / self.settings.time_scale / self.dt_s), program)
 
@@ -237,11 +236,7 @@ class SimulatedRobot(ControllerState):
         """Resumes a paused program, or starts the loaded one."""
         ready = self.safe and self.robot_mode == RobotMode.RUNNING
         if ready and self.runtime_state == RuntimeState.STOPPED and self.loaded:
-            text = self.settings.programs[self.loaded]
-            if text is None:
-                self.start_program(ForeignProgram(self.loaded))
-                return True
-            return self._start_upload(Upload(self.loaded, text))
+            return self._start_upload(Upload(self.loaded, self.settings.programs[self.loaded] or WAITS))
         if not ready or self.program is None or self.runtime_state != RuntimeState.PAUSED:
             return False
         self.runtime_state = RuntimeState.PLAYING

@@ -7,7 +7,7 @@ import re
 import socket
 from collections.abc import Generator
 
-from station.simulation.controller.state import ControllerState
+from station.simulation.controller.state import DIGITAL_BANKS, ControllerState
 from station.simulation.controller.urscript import Builtin, ScriptRuntimeError, Value
 
 Wait = Generator[None, None, Value]
@@ -72,13 +72,10 @@ def registers(robot: ControllerState) -> dict[str, Builtin]:
 
 # -- inputs and outputs ---------------------------------------------------------------------------------
 
-_BANKS: dict[str, tuple[int, int]] = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}
-"""First bit in `actual_digital_…_bits`, and how many there are."""
-
 
 def inputs_and_outputs(robot: ControllerState) -> dict[str, Builtin]:
     def digital(bank: str, number: int) -> int:
-        first, count = _BANKS[bank]
+        first, count = DIGITAL_BANKS[bank]
         if not 0 <= number < count:
             raise ScriptRuntimeError(f"there is no {bank} digital {number}")
         return first + number
@@ -110,7 +107,7 @@ def inputs_and_outputs(robot: ControllerState) -> dict[str, Builtin]:
         "get_tool_analog_in": lambda n: robot.outputs.get(f"tool_analog_input{int(n)}"),
         "set_tool_voltage": lambda voltage: robot.outputs.set("tool_output_voltage", int(voltage)),
     }
-    for bank in _BANKS:
+    for bank in DIGITAL_BANKS:
         found[f"set_{bank}_digital_out"] = lambda n, b, bank=bank: write(bank, n, b)
         found[f"get_{bank}_digital_out"] = lambda n, bank=bank: read("output", bank, n)
         found[f"get_{bank}_digital_in"] = lambda n, bank=bank: read("input", bank, n)
@@ -164,7 +161,7 @@ class Sockets:
         link.setblocking(False)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
-            for _ in range(self._cycles(OPEN_S)):
+            for _ in range(self._robot.cycles(OPEN_S)):
                 state = link.connect_ex((str(address), int(port)))
                 if state in (0, errno.EISCONN):
                     self._open[socket_name] = (link, bytearray())
@@ -191,9 +188,6 @@ class Sockets:
         except OSError:
             return False
 
-    def _cycles(self, seconds: float) -> int:
-        return max(1, round(seconds / self._robot.dt_s))
-
     def _fill(self, name: str) -> bytearray:
         """Read what has arrived. A connection that the other side ended is gone once all of it was read."""
         if name not in self._open:
@@ -212,7 +206,7 @@ class Sockets:
 
     def _take(self, name: str, timeout: float, pattern: bytes | int) -> Generator[None, None, bytes | None]:
         """The next so many bytes, or up to what matches; None when they do not come in time (0: for ever)."""
-        left = self._cycles(timeout) if timeout > 0 else 0
+        left = self._robot.cycles(timeout) if timeout > 0 else 0
         cycle, count = self._reads
         self._reads = (self._robot.ticks, count + 1 if cycle == self._robot.ticks else 1)
         if self._reads[1] > READS_PER_CYCLE:

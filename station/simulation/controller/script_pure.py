@@ -12,10 +12,13 @@ from collections.abc import Sequence
 from station.simulation.controller.kinematics import (
     Rigid,
     Six,
+    between,
     compose,
     from_pose,
     from_rotvec,
     invert,
+    place,
+    plus,
     to_pose,
 )
 from station.simulation.controller.urscript import Builtin, Pose, ScriptRuntimeError, Value
@@ -48,7 +51,7 @@ def _pose_sub(p_to: Pose, p_from: Pose) -> Pose:
 def _combined(a: Pose, b: Pose, sign: float) -> Pose:
     first, second = rigid(a), rigid(b)
     turn = compose(first, second if sign > 0 else invert(second))
-    shift = [p + sign * q for p, q in zip(six(a)[:3], six(b)[:3], strict=True)]
+    shift = plus(place(first), place(second), sign)
     return Pose([*shift, *to_pose(turn)[3:]])
 
 
@@ -56,7 +59,7 @@ def _interpolated(p_from: Pose, p_to: Pose, alpha: float) -> Pose:
     first, last = rigid(p_from), rigid(p_to)
     turn = to_pose(compose(invert(first), last))[3:]
     rotation = to_pose(compose(first, from_rotvec(*(alpha * r for r in turn))))[3:]
-    shift = [p + alpha * (q - p) for p, q in zip(six(p_from)[:3], six(p_to)[:3], strict=True)]
+    shift = between(place(first), place(last), alpha)
     return Pose([*shift, *rotation])
 
 

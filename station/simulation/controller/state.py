@@ -38,6 +38,8 @@ _SAFETY_BITS = {
     | SafetyStatus.EMERGENCY_STOPPED
     | SafetyStatus.STOPPED_DUE_TO_SAFETY,
 }
+DIGITAL_BANKS = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}
+"""First bit in `actual_digital_…_bits`, and how many there are."""
 _JOINT_MODE = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255}
 
 
@@ -152,6 +154,9 @@ class ControllerState(ABC):
             VariableStore(VARIABLES[side], self.settings.is_e_series, self.settings.version)
             for side in ("input", "output")
         )
+
+    def cycles(self, seconds: float) -> int:
+        return max(1, round(seconds / self.dt_s))
 
     @abstractmethod
     def protective_stop(self, reason: str) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from station.simulation.controller.arm import SimulatedArm, Vibration
 from station.simulation.controller.kinematics import TABLES, Six, compose, forward, from_pose
-from station.simulation.controller.paths import JointPath, LinePath, PolylinePath, Trapezoid, UnreachableError
+from station.simulation.controller.paths import JointPath, LinePath, Trapezoid, UnreachableError
 
 UR10 = TABLES["UR10"]
 HOME = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)
@@ -216,7 +216,7 @@ def test_freeze_is_at_once() -> None:
 
 def test_a_polyline_passes_its_corners() -> None:
     corners = [HOME, (0.5, *HOME[1:]), (0.5, -1.0, *HOME[2:])]
-    path = PolylinePath(list(corners))
+    path = JointPath(*corners)
     assert path.length == pytest.approx(1.0)
     assert path.at(0.5) == pytest.approx(corners[1]) and path.at(2.0) == corners[2]
     assert path.at(0.25)[0] == pytest.approx(0.25)

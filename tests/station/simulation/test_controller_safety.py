@@ -90,10 +90,10 @@ def test_pause_holds_the_motion_and_play_goes_on(script) -> None:
 
 
 def test_hands_move_the_arm_only_when_it_is_free(script) -> None:
-    from station.simulation.controller.paths import PolylinePath
+    from station.simulation.controller.paths import JointPath
 
     def lead() -> bool:
-        return script.robot.lead(lambda q: PolylinePath([q, tuple(GOAL)]), 0.5, 2.0)
+        return script.robot.lead(lambda q: JointPath(q, tuple(GOAL)), 0.5, 2.0)
 
     assert lead() is False
     script.command(1, [3.0, *HOME[1:], 0.2, 1.0], asynchronous=1)

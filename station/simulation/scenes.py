@@ -25,6 +25,7 @@ from station.simulation.placement import (
     place_fixed_camera,
     place_moving_camera,
 )
+from station.simulation.renderer import scaled
 
 PAPER_X = (
     (1.0000, -0.0032, -0.0026, -0.0013),
@@ -110,11 +111,7 @@ def _paper_scene() -> _PublishedScene:
 def _paper_binned_scene() -> _PublishedScene:
     """The paper's scene with 2 × 2 pixels read as one: small recordings."""
     paper = _paper_scene()
-    assert paper.camera.matrix is not None
-    (fx, _, cx), (_, fy, cy), _ = paper.camera.matrix
-    # Pixel 0 is centred on 0: the centre of the first pair lies at 0.5 of the old pixels.
-    binned = ((fx / 2, 0.0, cx / 2 - 0.25), (0.0, fy / 2, cy / 2 - 0.25), (0.0, 0.0, 1.0))
-    return paper._replace(camera=msgspec.structs.replace(paper.camera, width=640, height=512, matrix=binned))
+    return paper._replace(camera=scaled(paper.camera, 0.5))
 
 
 def _blog_scene() -> _PublishedScene:

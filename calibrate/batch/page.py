@@ -30,7 +30,6 @@ def trends_page(results: Sequence[BatchResult], cells: Sequence[CellHistory]) ->
     return html.page(
         "Calibrations over time",
         [
-            "<h1>Calibrations over time</h1>",
             html.paragraph(f"{len(results)} recordings, {solved} solved, {count}."),
             *_findings(cells),
             *(part for cell in cells for part in _section(cell)),
@@ -42,17 +41,15 @@ def trends_page(results: Sequence[BatchResult], cells: Sequence[CellHistory]) ->
 def _findings(cells: Sequence[CellHistory]) -> Iterator[str]:
     moved = [cell for cell in cells if cell.findings]
     if not moved:
-        kind = "verdict good" if not cells or any(cell.followed for cell in cells) else "stamp"
-        yield f'<div class="{kind}"><strong>{quiet_text(cells)}</strong></div>'
+        followed = not cells or any(cell.followed for cell in cells)
+        yield html.verdict("good", quiet_text(cells)) if followed else html.stamp(quiet_text(cells))
         return
     found = []
     for cell in moved:
         found += [f"{cell.name}: {finding.text}." for finding in cell.findings[:_FINDINGS_LISTED]]
         if (more := len(cell.findings) - _FINDINGS_LISTED) > 0:
             found.append(f"{cell.name}: and {more} more, in its table below.")
-    items = "<br>".join(html.escape(text) for text in found)
-    title = f"{len(moved)} of {len(cells)} cameras moved"
-    yield f'<div class="verdict bad"><strong>{title}</strong>{items}</div>'
+    yield html.verdict("bad", f"{len(moved)} of {len(cells)} cameras moved", *found)
 
 
 def _section(cell: CellHistory) -> Iterator[str]:
@@ -133,9 +130,10 @@ def fleet_page(records: Sequence[CameraRecord], now: datetime) -> str:
     return html.page(
         "Calibrations of a fleet",
         [
-            "<h1>Calibrations of a fleet</h1>",
             html.paragraph(f"{len(places)} cells, {len(records)} cameras, {now:%Y-%m-%d %H:%M} UTC."),
-            _fleet_verdict(len(found), len(records)),
+            html.verdict("bad", f"{len(found)} of {len(records)} cameras to look at")
+            if found
+            else html.verdict("good", "No camera is in doubt"),
             html.cards((str(number), state.replace("-", " ")) for number, state in count),
             html.heading("Cameras to look at") if found else "",
             html.table((*_FLEET_HEAD[:4], "why"), [(*rows[id(r)][:4], r.why) for r in found])
@@ -145,12 +143,6 @@ def fleet_page(records: Sequence[CameraRecord], now: datetime) -> str:
             html.folded("All cameras", [html.table(_FLEET_HEAD, rows.values(), (4, 5))]),
         ],
     )
-
-
-def _fleet_verdict(count: int, total: int) -> str:
-    kind = "bad" if count else "good"
-    said = f"{count} of {total} cameras to look at" if count else "No camera is in doubt"
-    return f'<div class="verdict {kind}"><strong>{said}</strong></div>'
 
 
 def _drift(record: CameraRecord, name: str) -> Iterator[str]:

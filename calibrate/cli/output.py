@@ -7,23 +7,21 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import msgspec
-import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from calibrate.errors import CalibrationError, CalibrationFileError
 from calibrate.files.calibration import FORMAT, read_calibration
 from calibrate.load import Progress as LoadProgress
+from recordings.cli.console import AsJson as AsJson
 from recordings.cli.console import plain_console
+from recordings.cli.console import print_json as print_json
 from recordings.mcap.records import MAGIC
 
 _told_width = sys.stdout.isatty() or "COLUMNS" in os.environ
 out = plain_console(width=None if _told_width else 150)
 err = plain_console(stderr=True)
-
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else")]
 
 
 class OutputError(CalibrationError):
@@ -107,7 +105,3 @@ def _progress_line(done: int, total: int, name: str) -> None:
     if done == total or done % 5 == 0:
         sys.stderr.write(f"finding the board: {done} of {total}\n")
         sys.stderr.flush()
-
-
-def print_json(value: object) -> None:
-    sys.stdout.write(msgspec.json.encode(value).decode() + "\n")

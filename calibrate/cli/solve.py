@@ -31,7 +31,7 @@ from calibrate.cli.output import (
     print_json,
 )
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Touch, ViewWeight, write_calibration
+from calibrate.files.calibration import Touch, ViewWeight, write_calibration, write_output
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
 from calibrate.files.install import install_line, installed_calibration
 from calibrate.geometry import rotation_log
@@ -151,13 +151,14 @@ def _root_of(target: Path) -> Path | None:
 
 def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root: Path | None = None) -> None:
     from calibrate.handeye.peers import compare_all  # like matplotlib, slow to load
-    from calibrate.report.page import write_report
+    from calibrate.report.page import report_page
 
     try:
         peers = compare_all(job.views, solver_options(options, job))
     except CalibrationError:  # the report stands without the comparison
         peers = []
-    write_report(job, target, peers, history_rows(root, job.calibration.camera_name), _touches(job, root))
+    history = history_rows(root, job.calibration.camera_name)
+    write_output(target, report_page(job, peers, history, _touches(job, root)).encode())
 
 
 def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable, Sequence
 from html import escape as escape  # for the sections, too
+from typing import Literal
 
 STYLE = """
 :root { color-scheme: only light;
@@ -58,10 +59,21 @@ def page(title: str, sections: Iterable[str]) -> str:
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>\n"
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>\n<h1>{escape(title)}</h1>\n"
         + "\n".join(section for section in sections if section)
         + "\n</body></html>\n"
     )
+
+
+def verdict(kind: Literal["good", "reason", "bad"], words: str, *lines: str) -> str:
+    return (
+        f'<div class="verdict {kind}"><strong>{escape(words)}</strong>{"<br>".join(map(escape, lines))}</div>'
+    )
+
+
+def stamp(text: str) -> str:
+    """What must not be overlooked: where it may not be used."""
+    return f'<div class="stamp">{escape(text)}</div>'
 
 
 def heading(text: str) -> str:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 
 from calibrate.boards.corners import to_grey
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import Touch, source_stamp, write_output
+from calibrate.files.calibration import Touch, source_stamp
 from calibrate.files.formatting import (
     PEER_HEAD,
     arm_sentences,
@@ -37,27 +36,13 @@ _WIDTHS_PX = ((12, 480), (30, 320), (_PICTURES_LIMIT, 240))
 """Up to so many views, their pictures are so wide: a page stays below a megabyte."""
 
 
-def write_report(
-    job: SolvedRecording,
-    path: Path,
-    peers: Sequence[PeerResult] = (),
-    history: Sequence[Sequence[str]] = (),
-    touches: Sequence[Touch] = (),
-) -> None:
-    """Write the page atomically.
-
-    `history`: rows (version, time, action, change); `touches`: touch tests since.
-    """
-    content = report_page(job, peers, history, touches).encode()
-    write_output(path, content)
-
-
 def report_page(
     job: SolvedRecording,
     peers: Sequence[PeerResult] = (),
     history: Sequence[Sequence[str]] = (),
     touches: Sequence[Touch] = (),
 ) -> str:
+    """The whole page. `history`: rows (version, time, action, change); `touches`: touch tests since."""
     name = job.recording.info.name
     calibration = job.calibration
     passed = len(job.gates) - len(calibration.quality.failed)
@@ -91,26 +76,25 @@ def report_page(
     )
 
 
-_KINDS = {"PASS": "good", "PASS WITH A REASON": "reason", "FAIL": "bad"}
+_KINDS: dict[str, Literal["good", "reason", "bad"]] = {
+    "PASS": "good",
+    "PASS WITH A REASON": "reason",
+    "FAIL": "bad",
+}
 
 
 def _verdict(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[str]:
     """All that one screen holds: the verdict, and the figures it stands on."""
     calibration = job.calibration
     good, quality = calibration.verdict != "FAIL", calibration.quality
-    yield f"<h1>Calibration of {html.escape(job.recording.info.name)}</h1>"
     if stamp := source_stamp(calibration):
-        yield f'<div class="stamp">{html.escape(stamp)}. It is not installed on a real cell.</div>'
+        yield html.stamp(f"{stamp}. It is not installed on a real cell.")
     yield html.paragraph(rehearsal_text(job))
     expected = " ".join(gate.text for gate in quality.failed)
     if good and quality.predicted_error_mm is not None and quality.working_distance_m is not None:
         distance_mm = quality.working_distance_m * 1000
         expected = f"Predicted error at {distance_mm:.0f} mm: {quality.predicted_error_mm:.2f} mm (1σ)."
-    yield (
-        f'<div class="verdict {_KINDS[calibration.verdict]}"><strong>'
-        f"{html.escape(verdict_text(calibration))}</strong>"
-        f"{html.escape(expected)}</div>"
-    )
+    yield html.verdict(_KINDS[calibration.verdict], verdict_text(calibration), expected)
     yield html.cards(_figures(job, touches))
     for warning in quality.warnings:
         yield html.paragraph(warning, "warning")

@@ -8,9 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 import typer
 
+from recordings.cli.console import AsJson, plain_console, print_json
 from recordings.exporters import Target
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
@@ -20,18 +20,17 @@ if TYPE_CHECKING:
     from recordings.info import PicturesInfoJson, RecordingInfoJson
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's folder", show_default=False)]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 _LOSSES_SHOWN = 20
 _STYLES = {"MISSING": "red", "lost": "yellow"}
 
 
-def info_command(recording: Rec, json_: Json = False) -> None:
+def info_command(recording: Rec, as_json: AsJson = False) -> None:
     """Show contents, rates, gaps and clock quality. Exit 3: segment missing."""
     from recordings.info import recording_info
 
     facts = recording_info(open_recording(recording, incomplete=True))
-    if json_:
-        print(json.dumps(facts))
+    if as_json:
+        print_json(facts)
     else:
         _print_info(facts)
     if facts["missing"]:
@@ -44,18 +43,18 @@ def export_command(
     to: Annotated[
         Target, typer.Option("--to", help="folder: images and poses, for `import`; csv: tables; ros2: a bag.")
     ],
-    json_: Json = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a folder of images and poses, CSV tables, or a ROS 2 bag."""
     from recordings.exporters.folder import export_recording
 
-    _print_written(export_recording(open_recording(recording), output, to), json_)
+    _print_written(export_recording(open_recording(recording), output, to), as_json)
 
 
 def excerpt_command(
     recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The smaller recording (.mcap) to write.")],
-    json_: Json = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a smaller recording that solves like the whole.
 
@@ -63,7 +62,7 @@ def excerpt_command(
     """
     from recordings.exporters.excerpt import write_excerpt
 
-    _print_written(write_excerpt(open_recording(recording), output), json_)
+    _print_written(write_excerpt(open_recording(recording), output), as_json)
 
 
 def recover_command(
@@ -74,12 +73,12 @@ def recover_command(
         Path | None,
         typer.Option("-o", "--output", help="Default: in place, and the damaged file is kept beside it."),
     ] = None,
-    json_: Json = False,
+    as_json: AsJson = False,
 ) -> None:
     """Rebuild an unfinished, cut or damaged recording. Exit 3: it had to."""
     results = recover_recording(recording, output)
-    if json_:
-        print(msgspec.json.encode(results, enc_hook=str).decode())
+    if as_json:
+        print_json(results)
     else:
         for result in results:
             _print_recovery(result)
@@ -88,16 +87,14 @@ def recover_command(
     raise typer.Exit(3 if any(result.rebuilt or result.missing for result in results) else 0)
 
 
-def _print_written(path: Path, json_: bool) -> None:
-    print(json.dumps({"output": str(path)}) if json_ else f"{path} written")
+def _print_written(path: Path, as_json: bool) -> None:
+    print(json.dumps({"output": str(path)}) if as_json else f"{path} written")
 
 
 def _print_info(facts: RecordingInfoJson) -> None:
     """Prints what `recording_info` found as two small tables."""
     from rich.table import Column, Table
     from rich.text import Text
-
-    from recordings.cli.console import plain_console
 
     console = plain_console()
     table = Table("", Column("", overflow="fold"), box=None, show_header=False, padding=(0, 2, 0, 0))

@@ -1,15 +1,25 @@
-"""A console that prints other people's text without obeying it."""
+"""Output of all command lines: a console that prints other people's text without obeying it, and JSON."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
+import typer
 from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderHook, RenderResult
 from rich.measure import Measurement
 from rich.segment import Segment
 
 from recordings.plain_text import plain_text
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else")]
+
+
+def print_json(value: object) -> None:
+    """Print a struct as one line."""
+    sys.stdout.write(msgspec.json.encode(value).decode() + "\n")
 
 
 def plain_console(**settings: Any) -> Console:

@@ -12,7 +12,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from recordings.cli.console import plain_console
+from recordings.cli.console import AsJson, plain_console, print_json
 from recordings.importers.bag import PAIR_WITHIN_S, BagPlan, import_bag
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE
 from recordings.importers.folder import import_folder
@@ -51,7 +51,7 @@ def import_command(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be taken; write nothing.")
     ] = False,
-    json_: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Turn other people's images and poses into a recording.
 
@@ -61,7 +61,7 @@ def import_command(
     if output is None and not dry_run:
         raise typer.BadParameter("name the recording to write with -o, or ask with --dry-run")
     target = None if dry_run else output
-    with _progress(not json_) as progress:
+    with _progress(not as_json) as progress:
         if (source / DATASET_FILE).is_file() and (source / POSES_FILE).is_file():
             done = import_folder(source, target, progress)
             facts = ImportJson(str(target or ""), done.images, done.size_bytes)
@@ -70,8 +70,8 @@ def import_command(
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg))
             plan = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
             facts = ImportJson(str(target or ""), plan.stops, plan.bytes_written, plan)
-    if json_:
-        print(msgspec.json.encode(facts).decode())
+    if as_json:
+        print_json(facts)
     else:
         _print_import(facts)
 

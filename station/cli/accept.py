@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
+import matplotlib
 import msgspec
+import numpy as np
 import typer
 
+from calibrate.report import html, plots
 from recordings.files import write_atomically
-from station.cell.acceptance import Acceptance, StopWay, write_acceptance
+from station.cell.acceptance import Acceptance, Figure, StopWay, write_acceptance
 from station.cell.errors import RefusedError
 from station.cell.socket_folder import default_socket
 from station.cell.status import MotionPreview
 from station.cli.attended import Attended, attended, confirmed
-from station.cli.console import AsJson, Socket, err, out
+from station.cli.console import AsJson, Socket, err, out, print_json
 from station.operate.acceptance import SPEEDS_M_S, AcceptanceTest, JudgedStop
-from station.operate.acceptance_report import acceptance_page, figure_text
+from station.operate.stop_judge import REACTION_S, Trace
 from station.protocol.verbs import Configuration
 
 SEEN_S = 0.3
 """The daemon has heard of a simulated slider after so long."""
 PULLED_S = 3.0
 """A simulated cable is out for so long."""
+SHOWN_S = -0.5, 2.0
+"""Around the stop; all of a move whose end a person made."""
+_POINTS = 400
+_BLUE, _RED, _GREY = "#0969da", "#b42318", "#8c959f"
 
 
 def accept_command(
@@ -50,7 +59,7 @@ def accept_command(
     """
     acceptance = asyncio.run(_accept(socket, joint - 1, speed, as_json))
     if as_json:
-        print(msgspec.json.encode(acceptance).decode())
+        print_json(acceptance)
     if not acceptance.accepted:
         raise typer.Exit(4 if any(result.failed for result in acceptance.results) else 1)
 
@@ -171,3 +180,74 @@ class _SimulatedTester(_ShellTester):
             self._admin.ask("black_hole", on=False)
         else:
             self._admin.ask("slider", fraction=1.0)
+
+
+def figure_text(measured: Figure) -> str:
+    """'0.012 s (≤ 0.15 s)'"""
+    sign = "≥" if measured.least else "≤"
+    value = "never" if measured.value is None else f"{measured.value:.3g}"
+    return f"{value} {measured.unit} ({sign} {measured.limit:.3g})".replace("  ", " ")
+
+
+def acceptance_page(acceptance: Acceptance, stops: Sequence[JudgedStop]) -> str:
+    """One self-contained HTML page, readable without a network."""
+    subject = acceptance.subject
+    when = datetime.fromtimestamp(acceptance.wall_ns / 1e9, UTC)
+    failed = [f"{stop.result.way.value}: {f.name}" for stop in stops for f in stop.result.failed]
+    why = ", ".join(failed) if failed else f"{len(stops)} moves, all figures within their limits"
+    accepted = acceptance.accepted
+    sections = [
+        html.verdict("good", "ACCEPTED", why) if accepted else html.verdict("bad", "NOT ACCEPTED", why)
+    ]
+    if subject.source != "real":
+        sections.append(html.stamp(f"{subject.source.upper()}: no real arm was tested."))
+    payload = f"{subject.payload[0]:.2f} kg" if subject.payload else "not told"
+    sections += [
+        html.cards(
+            [
+                (subject.controller_version or "not told", "firmware"),
+                (payload, "payload"),
+                (subject.control_path, "control path"),
+                (f"{acceptance.speed_m_s:.2f} m/s", "fastest stage that passed"),
+                (f"{when:%Y-%m-%d %H:%M} UTC", f"tested by {acceptance.who}"),
+            ]
+        ),
+        html.paragraph(
+            "It holds until arm, firmware, payload or control path change, up to the stage that passed. "
+            "It is no safety assessment."
+        ),
+    ]
+    for stop in stops:
+        sections.append(html.heading(f"{stop.result.way.value}, {stop.result.speed_m_s:.2f} m/s"))
+        rows = [["✓" if f.passed else "✗", f.name, figure_text(f), f.source] for f in stop.result.figures]
+        sections.append(
+            html.figure(_curves(stop), "Angle from its start, and speed, of the joint that moved.")
+        )
+        if again := stop.result.repeated:
+            sections.append(
+                html.paragraph(f"{again} moves before it ended too early: the computer was busy.")
+            )
+        sections.append(html.table(["", "figure", "measured (limit)", "where the limit comes from"], rows))
+    return html.page(f"Stops of {subject.model} {subject.serial}", sections)
+
+
+def _curves(stop: JudgedStop) -> str:
+    with matplotlib.rc_context(plots.STYLE):
+        drawn, axes = plots.new_figure(10, 2.2, 2)
+        if len(stop.states) > 1:
+            curve = Trace(stop.states, stop.move).curve()
+            low, high = SHOWN_S if stop.move.moment_ns is not None else (-np.inf, np.inf)
+            shown = np.flatnonzero((curve.time_s >= low) & (curve.time_s <= high))
+            shown = shown[:: max(1, len(shown) // _POINTS)]
+            time_s = curve.time_s[shown]
+            for axis, values, unit in (
+                (axes[0], np.rad2deg(curve.angle_rad[shown]), "angle, °"),
+                (axes[1], curve.speed_rad_s[shown], "speed, rad/s"),
+            ):
+                axis.plot(time_s, values, color=_BLUE, linewidth=1.2)
+                axis.set_xlabel("time after the stop, s" if stop.move.moment_ns else "time, s")
+                axis.set_ylabel(unit)
+                if stop.move.moment_ns is not None:
+                    axis.axvline(0.0, color=_GREY, linewidth=1)
+                    axis.axvline(REACTION_S[stop.move.way][0], color=_RED, linewidth=1, linestyle=":")
+        return plots.svg_text(drawn)

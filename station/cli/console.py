@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
+from recordings.cli.console import AsJson as AsJson
 from recordings.cli.console import plain_console
+from recordings.cli.console import print_json as print_json
 
 # What stands out does so by `style` or a Text.
 out = plain_console(soft_wrap=True)
@@ -15,4 +17,3 @@ err = plain_console(stderr=True, soft_wrap=True)
 
 Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
 Headless = Annotated[bool, typer.Option("--headless", help="Never prompt, no progress bar")]
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]

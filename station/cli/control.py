@@ -14,7 +14,7 @@ from rich.text import Text
 
 from station.cell.socket_folder import default_socket
 from station.cell.status import StationState, StationStatus
-from station.cli.console import AsJson, Socket, out
+from station.cli.console import AsJson, Socket, out, print_json
 from station.operate.motion import status_now
 from station.protocol.client import Client, ask
 from station.protocol.stop_client import stop_and_tell
@@ -40,7 +40,7 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     """
     status = status_of(socket)
     if as_json:
-        print(msgspec.json.encode(status).decode())
+        print_json(status)
         return
     _print_state(status)
     robot, session = status.robot, status.session
@@ -190,7 +190,7 @@ def doctor_command(
     checks = ask(socket or default_socket(), Doctor())
     good = all(check.state != "failed" for check in checks)
     if as_json:
-        print(msgspec.json.encode(DoctorJson(good, checks)).decode())
+        print_json(DoctorJson(good, checks))
     else:
         from rich.table import Table
 

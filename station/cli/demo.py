@@ -29,7 +29,7 @@ from recordings.schema.messages import Matrix4, Mount
 from station.cell.errors import ConfigError, StationError
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import MotionPreview
-from station.cli.console import AsJson, Headless, err, out
+from station.cli.console import AsJson, Headless, err, out, print_json
 from station.cli.daemon import own_daemon
 from station.cli.progress import SessionProgress
 from station.cli.session import PosesJson
@@ -116,7 +116,7 @@ def demo_command(
     progress, started_s = SessionProgress(err, quiet=headless or as_json), time.monotonic()
     result = _run(folder, arguments, poses, seed, progress, cell)
     if as_json:
-        print(msgspec.json.encode(result).decode())
+        print_json(result)
     else:
         _show_demo(result, time.monotonic() - started_s)
     if not result.gates_passed:

@@ -13,7 +13,7 @@ import typer
 
 from calibrate.kinematics import MODELS
 from recordings.files import state_root
-from recordings.schema.messages import Image, RobotIdentity, RobotState
+from recordings.schema.messages import Image
 from station.cell.config import CameraConfig, RobotConfig
 from station.cell.errors import RobotError, StationError
 from station.cell.socket_folder import default_socket
@@ -33,40 +33,21 @@ SERVICES = (
 )
 
 
-class LinkedArm:
-    """`draft.ArmReader` over the read-only half of the driver."""
-
-    def __init__(self, link: UrLink) -> None:
-        self._link = link
-
-    @property
-    def identity(self) -> RobotIdentity:
-        return self._link.identity
-
-    @property
-    def remote(self) -> bool | None:
-        return self._link.remote
-
-    def latest(self) -> RobotState:
-        return self._link.latest()
+class GuidedArm(UrLink):
+    """`draft.ArmReader`: the read-only half of the driver, and STOP."""
 
     def trouble(self) -> str:
         try:
-            state = self._link.latest()
+            return what_holds(self.latest())
         except RobotError as problem:
             return str(problem)
-        return what_holds(state)
 
     async def stop(self) -> None:
-        dashboard = self._link.dashboard
-        if dashboard is not None and dashboard.alive:
+        if self.dashboard is not None and self.dashboard.alive:
             try:
-                await dashboard.ask(STOP)
+                await self.dashboard.ask(STOP)
             except DashboardError as problem:
                 err.print(str(problem))
-
-    async def close(self) -> None:
-        await self._link.close()
 
 
 class GenicamReader:
@@ -128,9 +109,9 @@ class RealHardware:
                 code="unknown-robot-model",
                 remedy=f"Type it after the address, e.g. {address} UR10; known are {', '.join(MODELS)}.",
             )
-        link = UrLink(RobotConfig(model=model, host=address))
-        await link.connect()
-        return LinkedArm(link)
+        arm = GuidedArm(RobotConfig(model=model, host=address))
+        await arm.connect()
+        return arm
 
     async def cameras(self) -> tuple[CameraChoice, ...]:
         return tuple(

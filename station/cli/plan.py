@@ -24,7 +24,7 @@ from station.cell.limits import PlanCheck, Problem, check_plan
 from station.cell.plan import Plan, plan_sha256
 from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
 from station.cell.socket_folder import default_socket
-from station.cli.console import AsJson, Socket, err, out
+from station.cli.console import AsJson, Socket, err, out, print_json
 from station.operate.motion import status_now
 from station.plan.choose import CRITERIA, WITH_TABLE, Criterion
 from station.plan.files import import_list, load_plan, save_plan, taught_plan
@@ -98,7 +98,7 @@ def plan_command(
     if shown is not None and foxglove is not None:
         save_scene(shown, plan, foxglove)
     if as_json:
-        typer.echo(msgspec.json.encode(_summary(plan, told, outcome, arm)).decode())
+        print_json(_summary(plan, told, outcome, arm))
     else:
         drawn = sketch(shown, told) if shown is not None else ""
         _show(told, outcome, drawn, cut, output if check is None else None, cell.capture.goal_m)

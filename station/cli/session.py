@@ -19,7 +19,7 @@ from station.cell.errors import ConfigError, RefusedError
 from station.cell.plan import Plan
 from station.cell.status import StationState, StationStatus
 from station.cli.attended import attended
-from station.cli.console import AsJson, Headless, Socket, err, out
+from station.cli.console import AsJson, Headless, Socket, err, out, print_json
 from station.operate.drift_check import POSES, check_arguments, judged, start_drift_check
 from station.operate.ending import after_capture
 from station.operate.motion import SessionOutcome, wait_until_idle
@@ -174,7 +174,7 @@ class SessionJson(msgspec.Struct, frozen=True):
 def _finish(outcome: SessionOutcome, as_json: bool, judge: str = "solve") -> None:
     if as_json:
         poses = PosesJson(outcome.planned, outcome.captured)
-        print(msgspec.json.encode(SessionJson(outcome.status.state, poses, outcome.recording)).decode())
+        print_json(SessionJson(outcome.status.state, poses, outcome.recording))
     elif outcome.recording:
         out.print(f"{outcome.captured} of {outcome.planned} poses, finished: {outcome.recording}")
         out.print(str(after_capture(outcome.status.session)))

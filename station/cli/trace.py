@@ -7,13 +7,12 @@ import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
-import msgspec
 import typer
 from rich.table import Table
 
 from station.cell.errors import RefusedError, RobotError
 from station.cli.attended import ctrl_c_at_once
-from station.cli.console import AsJson, err, out
+from station.cli.console import AsJson, err, out, print_json
 from station.devices.ur_probe import RobotLock, lock_name, probe
 from station.devices.ur_trace_scenarios import Scenario, ScenarioRecorder, scenarios
 from station.devices.ur_traces import SHIPPED, Difference, TraceFile, compare, read_traces, write_traces
@@ -47,7 +46,7 @@ def trace_command(
     theirs = read_traces(Path(subject))
     differences = compare(read_traces(other or _shipped(theirs)), theirs)
     if as_json:
-        print(msgspec.json.encode(differences).decode())
+        print_json(differences)
     else:
         _print(differences)
     if not all(difference.passed for difference in differences):

@@ -39,12 +39,12 @@ class SessionsScreen(StationScreen):
         "End go to the newest and the oldest."
     )
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("f9", "solve", "Solve", tooltip="Solve this recording again, outside the daemon"),
-        Binding("v", "result", "Result", tooltip="Show this session's calibration; so does Enter"),
-        Binding("w", "watch", "Watch", tooltip="Play this recording in the live screen"),
-        Binding("k", "check", "Check", tooltip="Drift check on the views of this recording"),
+        Binding("f9", "act('solve')", "Solve", tooltip="Solve this recording again, outside the daemon"),
+        Binding("v", "act('result')", "Result", tooltip="Show this session's calibration; so does Enter"),
+        Binding("w", "act('watch')", "Watch", tooltip="Play this recording in the live screen"),
+        Binding("k", "act('check')", "Check", tooltip="Drift check on the views of this recording"),
         Binding("d", "drift", "Drift", tooltip=DRIFT),
-        Binding("c", "recover", "Recover", tooltip="Rebuild an unfinished recording"),
+        Binding("c", "act('recover')", "Recover", tooltip="Rebuild an unfinished recording"),
     ]
 
     def __init__(self) -> None:
@@ -132,52 +132,44 @@ class SessionsScreen(StationScreen):
         keys = "Enter result  " * bool(session.calibration) + "F9 solve  w play  k drift check on it"
         return Content("\n").join([*rows, Content(""), Content.styled(keys, "$accent")])
 
-    def _selected(self) -> SessionSummary | None:
+    async def action_act(self, what: str) -> None:
+        """Do what a key says with the highlighted session."""
         if not self._sessions:
             self.notify(NO_SESSION)
-            return None
-        return self._sessions[self.table.cursor_row]
-
-    def action_solve(self) -> None:
-        if (session := self._selected()) is not None:
-            if not session.sealed:
+            return
+        session = self._sessions[self.table.cursor_row]
+        match what:
+            case "solve" if not session.sealed:
                 self.notify("This recording was never finished: press c to recover it first.")
-                return
-            self.desk.solve(session.recording, session.folder)
-
-    async def action_result(self) -> None:
-        if (session := self._selected()) is not None:
-            if not session.calibration:
+            case "solve":
+                self.desk.solve(session.recording, session.folder)
+            case "result" if not session.calibration:
                 self.notify("Not solved yet: F9 solves it.")
-                return
-            await self.desk.show_result(session.calibration)
+            case "result":
+                await self.desk.show_result(session.calibration)
+            case "watch":
+                self.play(session)
+            case "check":
+                self.desk.check(session.recording, session.folder)
+            case "recover":
+                self.desk.recover(session.folder)
 
     async def on_data_table_row_selected(self) -> None:
         """Enter on a session: what it gave."""
-        await self.action_result()
-
-    def action_check(self) -> None:
-        if (session := self._selected()) is not None:
-            self.desk.check(session.recording, session.folder)
+        await self.action_act("result")
 
     def action_drift(self) -> None:
         self.desk.drift_check()
 
     @work(exclusive=True, group="job", exit_on_error=False)
-    async def action_watch(self) -> None:
-        session, status = self._selected(), self.desk.status
-        if session is None:
-            return
+    async def play(self, session: SessionSummary) -> None:
+        status = self.desk.status
         if status is not None and status.state not in WATCHABLE:
             self.notify(f"The cell is {status.state.value}: finish that first, then look at old recordings.")
             return
         link = await self.desk.attempt(asyncio.to_thread(ReplayLink, Path(session.folder)))
         if link is not None:
             await self.app.push_screen(ReplayScreen(link))
-
-    def action_recover(self) -> None:
-        if (session := self._selected()) is not None:
-            self.desk.recover(session.folder)
 
 
 def _beside(

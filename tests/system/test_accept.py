@@ -15,9 +15,9 @@ from station.cell.acceptance import Acceptance, StopWay, read_acceptance
 from station.cell.errors import RefusedError
 from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
+from station.cli.accept import acceptance_page
 from station.devices.ur_state import TraceRecorder
 from station.operate.acceptance import AcceptanceTest, JudgedStop
-from station.operate.acceptance_report import acceptance_page
 from station.protocol.client import Client
 from station.protocol.verbs import Lease, Stop
 from station.simulation.cell import write_truth

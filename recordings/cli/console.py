@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable
 from typing import Annotated, Any
@@ -18,8 +19,8 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on s
 
 
 def print_json(value: object) -> None:
-    """Print a struct as one line."""
-    sys.stdout.write(msgspec.json.encode(value).decode() + "\n")
+    """Print a struct, paths in it as text, in one line."""
+    sys.stdout.write(msgspec.json.encode(value, enc_hook=os.fspath).decode() + "\n")
 
 
 def plain_console(**settings: Any) -> Console:

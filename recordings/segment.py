@@ -100,8 +100,9 @@ class RecordingSegment:
     def fixed_frames(self) -> dict[tuple[str, str], Matrix4]:
         """(parent, child) → parent_from_child of what does not move, as it was known last."""
         found = {}
-        for frame in self.parsed(Topic.FIXED_TRANSFORM):
-            found[frame.parent_frame_id, frame.child_frame_id] = matrix_of(frame)
+        for topic in (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM):
+            for frame in self.parsed(topic):
+                found[frame.parent_frame_id, frame.child_frame_id] = matrix_of(frame)
         return found
 
     def events(self) -> Iterator[CaptureEvent]:

@@ -183,7 +183,7 @@ class RecordingWriter:
         """A transform of what does not move, as known from then on (None: from the start), for viewers."""
         time_ns = self._start_ns if stamps is None else self._time_ns(stamps)
         message = viewing.frame_transform(parent, child, parent_from_child, time_ns)
-        self._show(Topic.FIXED_TRANSFORM, message, time_ns)
+        self._show(Topic.BOARD_TRANSFORM if child == "board" else Topic.FIXED_TRANSFORM, message, time_ns)
 
     def _show(self, topic: Topic, message: Any, time_ns: int) -> None:
         self._add(topic, [message.SerializeToString()], time_ns)

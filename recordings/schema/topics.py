@@ -32,6 +32,8 @@ class Topic(StrEnum):
     EVENT = "/session/event"
     TRANSFORM = "/tf"
     FIXED_TRANSFORM = "/tf_static"
+    """The camera's; the board has a topic of its own, since viewers that jump to a time take one message each."""
+    BOARD_TRANSFORM = "/tf_static/board"
     JOINTS = "/joint_states"
     ANNOTATIONS = "/camera/annotations"
     SCENE = "/scene"
@@ -50,6 +52,7 @@ _MESSAGES: dict[Topic, Any] = {
     Topic.EVENT: message_class(CaptureEvent),
     Topic.TRANSFORM: FrameTransform,
     Topic.FIXED_TRANSFORM: FrameTransform,
+    Topic.BOARD_TRANSFORM: FrameTransform,
     Topic.JOINTS: JointStates,
     Topic.ANNOTATIONS: ImageAnnotations,
     Topic.SCENE: SceneUpdate,
@@ -81,7 +84,7 @@ def identify(samples: list[bytes]) -> tuple[str, str, str, bytes] | None:
     topic's message has, and it says again the same number of bytes.
     """
     fitting = [topic for topic in Topic if all(_fits(topic, data) for data in samples)]
-    for twin in (Topic.FIXED_TRANSFORM, Topic.DRAWN_IMAGE):  # of /tf and of images; only annotated copies
+    for twin in (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM, Topic.DRAWN_IMAGE):  # of /tf and of images
         if len(fitting) > 1 and twin in fitting:
             fitting.remove(twin)
     if len(fitting) != 1 or not samples:

@@ -153,7 +153,7 @@ def _board_entity(calibration: Calibration) -> Entity:
     points = board_points(calibration.board)
     low, high = points.min(axis=0), points.max(axis=0)
     outline = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]], low[:2]])
-    line = Polyline(np.column_stack([outline, np.zeros(5)]), (1.0, 1.0, 1.0, 1.0))
+    line = Polyline(np.column_stack([outline, np.zeros(5)]), (0.2, 0.5, 1.0, 1.0))
     return Entity("board", calibration.board_place.child_frame, (line,), "board")
 
 

@@ -46,7 +46,9 @@ def test_the_command_writes_the_result_beside_the_pictures(tmp_path: Path, solve
     )
     assert ("base", "board") in part.fixed_frames
     for topic in ("/tf_static", "/tf_static/board"):
-        assert len(messages(path, topic)) == 1, "viewers that jump to a time take a topic's last message alone"
+        assert len(messages(path, topic)) == 1, (
+            "viewers that jump to a time take a topic's last message alone"
+        )
     marks = messages(path, "/camera/annotations")
     assert len(marks) == 25
     assert len(marks[0].points[0].points) == 42, "every corner"

@@ -32,7 +32,7 @@ class Topic(StrEnum):
     EVENT = "/session/event"
     TRANSFORM = "/tf"
     FIXED_TRANSFORM = "/tf_static"
-    """The camera's; the board has a topic of its own, since viewers that jump to a time take one message each."""
+    """The camera's. The board has its own: viewers that jump to a time take one message of each topic."""
     BOARD_TRANSFORM = "/tf_static/board"
     JOINTS = "/joint_states"
     ANNOTATIONS = "/camera/annotations"

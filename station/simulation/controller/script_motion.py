@@ -244,6 +244,37 @@ class ArmMotions:
             "optimovel", goal, a * JOINT_RAD_S2 * TOOL_M_S / JOINT_SPEED_RAD_S, v * TOOL_M_S
         )
 
+    def _stopj(self, a: float = 2.0) -> Wait:
+        yield from self._stop("stopj", a)
+
+    def _stopl(self, a: float = 2.0, aRot: object = "a") -> Wait:
+        yield from self._stop("stopl", a)
+
+    def _stop(self, name: str, a: float) -> Wait:
+        if not (isfinite(a) and a > 0):
+            raise ScriptRuntimeError(f"{name} with a={a}")
+        self._take_arm(name)
+        self._robot.journal.note("script", name, a=a)
+        arm = self._robot.arm
+        (arm.brake if name == "stopj" else arm.brake_tool)(a)
+        if arm.motion is not None:
+            yield from self._hold(arm.motion)
+
+    def _take_arm(self, name: str) -> None:
+        if self._mover not in (None, self._thread()):
+            raise ScriptRuntimeError(f"{name}: another thread is already controlling the robot")
+
+    def _hold(self, motion: JointMotion) -> Wait:
+        """Waits for its end. A thread killed meanwhile leaves it to whoever stops it in the same cycle."""
+        self._mover, self._orphan = self._thread(), None
+        try:
+            while not motion.done:
+                yield
+        finally:
+            self._mover = None
+            if not motion.done:
+                self._orphan = motion
+
     # -- torques ----------------------------------------------------------------------------------------
 
     def _new(self) -> dict[str, Builtin]:
@@ -297,37 +328,6 @@ class ArmMotions:
             "get_jacobian_time_derivative": lambda: posture().jacobian_rate(self._tool(arm.actual)),
             "get_target_joint_accelerations": lambda: list(robot.outputs.vector("target_qdd")),
         }
-
-    def _stopj(self, a: float = 2.0) -> Wait:
-        yield from self._stop("stopj", a)
-
-    def _stopl(self, a: float = 2.0, aRot: object = "a") -> Wait:
-        yield from self._stop("stopl", a)
-
-    def _stop(self, name: str, a: float) -> Wait:
-        if not (isfinite(a) and a > 0):
-            raise ScriptRuntimeError(f"{name} with a={a}")
-        self._take_arm(name)
-        self._robot.journal.note("script", name, a=a)
-        arm = self._robot.arm
-        (arm.brake if name == "stopj" else arm.brake_tool)(a)
-        if arm.motion is not None:
-            yield from self._hold(arm.motion)
-
-    def _take_arm(self, name: str) -> None:
-        if self._mover not in (None, self._thread()):
-            raise ScriptRuntimeError(f"{name}: another thread is already controlling the robot")
-
-    def _hold(self, motion: JointMotion) -> Wait:
-        """Waits for its end. A thread killed meanwhile leaves it to whoever stops it in the same cycle."""
-        self._mover, self._orphan = self._thread(), None
-        try:
-            while not motion.done:
-                yield
-        finally:
-            self._mover = None
-            if not motion.done:
-                self._orphan = motion
 
 
 class _ToolSpeed:

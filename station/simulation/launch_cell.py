@@ -73,11 +73,8 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
         )
     )
     config = cell_config(truth, controller.host)
-    config = msgspec.structs.replace(
-        config, robot=msgspec.structs.replace(config.robot, control=options.control)
-    )
     capture = msgspec.structs.replace(config.capture, free_space_bytes=options.free_space_bytes)
-    robot = msgspec.structs.replace(config.robot, model=options.robot)
+    robot = msgspec.structs.replace(config.robot, model=options.robot, control=options.control)
     config = msgspec.structs.replace(config, capture=capture, robot=robot)
     box: SimulatedTriggerBox | None = None
     trigger: Trigger | None = None

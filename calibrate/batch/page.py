@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import PurePosixPath
 
-import matplotlib
 import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
@@ -15,8 +14,7 @@ from calibrate.batch.run import BatchResult
 from calibrate.batch.trends import HEAD, NOT_FOLLOWED, CellHistory, place, quiet_text, rows
 from calibrate.files.validity import ValidityState, parse_time
 from calibrate.geometry import Array, difference
-from calibrate.report import html
-from calibrate.report.plots import STYLE, new_figure, svg_text
+from calibrate.report import html, plots
 
 _FINDINGS_LISTED = 3
 """Findings of one cell above all sections."""
@@ -82,33 +80,31 @@ def place_over_time(cell: CellHistory) -> str:
     )
 
 
+@plots.drawn(10, 2.8, 2)
 def _shift_over_time(
-    wall_s: Sequence[float], shifts: Array, covariances: Array, marked: Sequence[int]
-) -> str:
+    axes: plots.Axes, wall_s: Sequence[float], shifts: Array, covariances: Array, marked: Sequence[int]
+) -> None:
     """SVG: translation (mm) and rotation (°), (n, 6) in metres and radians, by axis, with sigmas."""
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     known = len(set(wall_s)) == len(wall_s)
     when = [datetime.fromtimestamp(second, UTC) for second in wall_s]
     across = np.array(when if known else range(1, len(when) + 1))
-    with matplotlib.rc_context(STYLE):
-        figure, axes = new_figure(10, 2.8, 2)
-        for axis, start, factor, unit in ((axes[0], 0, 1e3, "mm"), (axes[1], 3, np.degrees(1.0), "°")):
-            for k, name in enumerate("xyz"):
-                value, bar = shifts[:, start + k] * factor, sigma[:, start + k] * factor
-                axis.errorbar(
-                    across, value, bar, marker="o", markersize=3, linewidth=1, color=_COLOURS[k], label=name
-                )
-            for number in marked:
-                axis.axvline(across[number], color="#b42318", linewidth=1, alpha=0.6)
-            axis.set_ylabel(f"{'shift' if start == 0 else 'turn'}, {unit}")
-            if known:
-                dates = AutoDateLocator(maxticks=7)  # type: ignore[no-untyped-call]
-                axis.xaxis.set_major_locator(dates)
-                axis.xaxis.set_major_formatter(ConciseDateFormatter(dates))  # type: ignore[no-untyped-call]
-            else:
-                axis.set_xlabel("session")
-        axes[0].legend(fontsize=7, frameon=False, ncols=3)
-        return svg_text(figure)
+    for axis, start, factor, unit in ((axes[0], 0, 1e3, "mm"), (axes[1], 3, np.degrees(1.0), "°")):
+        for k, name in enumerate("xyz"):
+            value, bar = shifts[:, start + k] * factor, sigma[:, start + k] * factor
+            axis.errorbar(
+                across, value, bar, marker="o", markersize=3, linewidth=1, color=_COLOURS[k], label=name
+            )
+        for number in marked:
+            axis.axvline(across[number], color="#b42318", linewidth=1, alpha=0.6)
+        axis.set_ylabel(f"{'shift' if start == 0 else 'turn'}, {unit}")
+        if known:
+            dates = AutoDateLocator(maxticks=7)  # type: ignore[no-untyped-call]
+            axis.xaxis.set_major_locator(dates)
+            axis.xaxis.set_major_formatter(ConciseDateFormatter(dates))  # type: ignore[no-untyped-call]
+        else:
+            axis.set_xlabel("session")
+    axes[0].legend(fontsize=7, frameon=False, ncols=3)
 
 
 # --- validity and drift of a fleet ---

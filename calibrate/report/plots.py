@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeAlias
 
 import cv2
 import matplotlib
@@ -36,110 +37,113 @@ STYLE: Any = {
 }
 
 
-def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    axes = figure.subplots(1, columns)
-    return figure, axes
+Axes: TypeAlias = Any
+"""Matplotlib's Axes, or an array of them."""
+P = ParamSpec("P")
 
 
-def svg_text(figure: Figure) -> str:
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", dpi=_DPI, metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
+def drawn(
+    width: float, height: float, columns: int = 1, *, grid: bool = True
+) -> Callable[[Callable[Concatenate[Axes, P], None]], Callable[P, str]]:
+    """Make a function that fills axes one that returns them as SVG; sizes in inches."""
+
+    def decorate(fill: Callable[Concatenate[Axes, P], None]) -> Callable[P, str]:
+        @wraps(fill)
+        def svg(*args: P.args, **named: P.kwargs) -> str:
+            buffer = io.StringIO()
+            with matplotlib.rc_context(STYLE | {"axes.grid": grid}):
+                figure = Figure(figsize=(width, height), layout="constrained")
+                fill(figure.subplots(1, columns), *args, **named)
+                figure.savefig(buffer, format="svg", dpi=_DPI, metadata={"Date": None, "Creator": None})
+            text = buffer.getvalue()
+            return text[text.index("<svg") :]
+
+        return svg
+
+    return decorate
 
 
+@drawn(10, 2.6, 2)
 def residuals_by_view(
-    residual_px: Mapping[int, float], robot_mm: Mapping[int, float], limit_px: float | None
-) -> str:
+    axes: Axes, residual_px: Mapping[int, float], robot_mm: Mapping[int, float], limit_px: float | None
+) -> None:
     """Bars per pose: RMS of the corners, and pose residual of the robot."""
-    with matplotlib.rc_context(STYLE):
-        figure, axes = new_figure(10, 2.6, 2)
-        for axis, values, unit in (
-            (axes[0], residual_px, "corners, px rms"),
-            (axes[1], robot_mm, "robot, mm"),
-        ):
-            axis.bar([str(k + 1) for k in values], list(values.values()), color=_BLUE)
-            axis.set_xlabel("pose")
-            axis.set_ylabel(unit)
-            axis.tick_params(axis="x", labelsize=7)
-        if limit_px is not None and residual_px and max(residual_px.values()) > 0.3 * limit_px:
-            axes[0].axhline(limit_px, color=_RED, linewidth=1)
-        return svg_text(figure)
+    for axis, values, unit in (
+        (axes[0], residual_px, "corners, px rms"),
+        (axes[1], robot_mm, "robot, mm"),
+    ):
+        axis.bar([str(k + 1) for k in values], list(values.values()), color=_BLUE)
+        axis.set_xlabel("pose")
+        axis.set_ylabel(unit)
+        axis.tick_params(axis="x", labelsize=7)
+    if limit_px is not None and residual_px and max(residual_px.values()) > 0.3 * limit_px:
+        axes[0].axhline(limit_px, color=_RED, linewidth=1)
 
 
-def held_out_over_workspace(flange_m: Array, without_m: Array, with_table_m: Array) -> str:
+@drawn(10, 3.8, 2)
+def held_out_over_workspace(axes: Axes, flange_m: Array, without_m: Array, with_table_m: Array) -> None:
     """Held-out error without and with the arm's table (n,) where the flange stood (n, 3), from two sides."""
     largest = float(np.nanmax([without_m, with_table_m], initial=1e-6))
-    with matplotlib.rc_context(STYLE):
-        figure, axes = new_figure(10, 3.8, 2)
-        away = np.hypot(flange_m[:, 0], flange_m[:, 1])
-        for axis, x, y, names in (
-            (axes[0], flange_m[:, 0], flange_m[:, 1], ("x of base, m", "y of base, m")),
-            (axes[1], away, flange_m[:, 2], ("distance from the base's axis, m", "z of base, m")),
+    away = np.hypot(flange_m[:, 0], flange_m[:, 1])
+    for axis, x, y, names in (
+        (axes[0], flange_m[:, 0], flange_m[:, 1], ("x of base, m", "y of base, m")),
+        (axes[1], away, flange_m[:, 2], ("distance from the base's axis, m", "z of base, m")),
+    ):
+        for miss, colour, label in (
+            (without_m, _ORANGE, "without"),
+            (with_table_m, _BLUE, "with the table"),
         ):
-            for miss, colour, label in (
-                (without_m, _ORANGE, "without"),
-                (with_table_m, _BLUE, "with the table"),
-            ):
-                size = 300 * np.nan_to_num(miss) / largest
-                axis.scatter(x, y, s=size, facecolors="none", edgecolors=colour, linewidths=1.3, label=label)
-            axis.set(xlabel=names[0], ylabel=names[1], aspect="equal", adjustable="datalim")
-            axis.margins(0.2)
-        beside = {"loc": "center left", "bbox_to_anchor": (1.02, 0.5)}
-        title = f"area: error,\nlargest {1e3 * largest:.2f} mm"
-        axes[1].legend(fontsize=8, markerscale=0.5, title=title, **beside)
-        return svg_text(figure)
+            size = 300 * np.nan_to_num(miss) / largest
+            axis.scatter(x, y, s=size, facecolors="none", edgecolors=colour, linewidths=1.3, label=label)
+        axis.set(xlabel=names[0], ylabel=names[1], aspect="equal", adjustable="datalim")
+        axis.margins(0.2)
+    beside = {"loc": "center left", "bbox_to_anchor": (1.02, 0.5)}
+    title = f"area: error,\nlargest {1e3 * largest:.2f} mm"
+    axes[1].legend(fontsize=8, markerscale=0.5, title=title, **beside)
 
 
-def residual_scatter(misses: Array, pixels: Array, camera: CameraModel) -> str:
+@drawn(10, 3.6, 2)
+def residual_scatter(axes: Axes, misses: Array, pixels: Array, camera: CameraModel) -> None:
     """Residuals of the corners (n, 2) px: round zero, and over the image as arrows."""
-    with matplotlib.rc_context(STYLE):
-        figure, axes = new_figure(10, 3.6, 2)
-        reach = float(np.abs(misses).max(initial=1e-3)) * 1.05
-        axes[0].scatter(
-            misses[:, 0], misses[:, 1], s=3, color=_BLUE, alpha=0.5, linewidths=0, rasterized=True
-        )
-        axes[0].set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x miss, px", ylabel="y miss, px")
-        axes[0].set_aspect("equal")
-        sigma = float(np.sqrt(np.square(misses).mean()))
-        angle = np.linspace(0, 2 * np.pi, 100)
-        for k in (1, 2, 3):
-            axes[0].plot(k * sigma * np.cos(angle), k * sigma * np.sin(angle), color=_RED, linewidth=1)
-        keep = np.linspace(0, len(pixels) - 1, min(len(pixels), 1500)).astype(int)
-        axes[1].quiver(
-            pixels[keep, 0],
-            pixels[keep, 1],
-            misses[keep, 0],
-            misses[keep, 1],
-            angles="xy",
-            color=_BLUE,
-            width=0.0015,
-            rasterized=True,
-        )
-        axes[1].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
-        axes[1].set_aspect("equal")
-        return svg_text(figure)
+    reach = float(np.abs(misses).max(initial=1e-3)) * 1.05
+    axes[0].scatter(misses[:, 0], misses[:, 1], s=3, color=_BLUE, alpha=0.5, linewidths=0, rasterized=True)
+    axes[0].set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x miss, px", ylabel="y miss, px")
+    axes[0].set_aspect("equal")
+    sigma = float(np.sqrt(np.square(misses).mean()))
+    angle = np.linspace(0, 2 * np.pi, 100)
+    for k in (1, 2, 3):
+        axes[0].plot(k * sigma * np.cos(angle), k * sigma * np.sin(angle), color=_RED, linewidth=1)
+    keep = np.linspace(0, len(pixels) - 1, min(len(pixels), 1500)).astype(int)
+    axes[1].quiver(
+        pixels[keep, 0],
+        pixels[keep, 1],
+        misses[keep, 0],
+        misses[keep, 1],
+        angles="xy",
+        color=_BLUE,
+        width=0.0015,
+        rasterized=True,
+    )
+    axes[1].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
+    axes[1].set_aspect("equal")
 
 
-def holdout_samples(methods: Sequence[tuple[str, Array, Array]]) -> str:
+@drawn(10, 3.0, 2)
+def holdout_samples(axes: Axes, methods: Sequence[tuple[str, Array, Array]]) -> None:
     """Error per held-out sample, translation (mm) and rotation; ours first. The paper's figures 4 and 5."""
-    with matplotlib.rc_context(STYLE):
-        figure, axes = new_figure(10, 3.0, 2)
-        colours = matplotlib.colormaps["tab20"].colors  # type: ignore[attr-defined]
-        for place, (name, e_t_m, e_R) in enumerate(methods):
-            look: dict[str, Any] = {"linewidth": 0.8, "marker": ".", "alpha": 0.7}
-            look["color"] = colours[place % len(colours)]
-            if place == 0:
-                look = {"linewidth": 2, "marker": "o", "color": _RED, "zorder": 5}
-            samples = np.arange(1, len(e_t_m) + 1)
-            axes[0].plot(samples, e_t_m * 1000, label=name, **look)
-            axes[1].plot(samples, e_R, **look)
-        tops = (_top([1000 * e_t for _, e_t, _ in methods]), _top([e_R for _, _, e_R in methods]))
-        axes[0].set(xlabel="held-out sample", ylabel="translation error, mm", ylim=(0, tops[0]))
-        axes[1].set(xlabel="held-out sample", ylabel="rotation error e_R", ylim=(0, tops[1]))
-        figure.legend(loc="outside lower center", ncols=5, fontsize=7, frameon=False)
-        return svg_text(figure)
+    colours = matplotlib.colormaps["tab20"].colors  # type: ignore[attr-defined]
+    for place, (name, e_t_m, e_R) in enumerate(methods):
+        look: dict[str, Any] = {"linewidth": 0.8, "marker": ".", "alpha": 0.7}
+        look["color"] = colours[place % len(colours)]
+        if place == 0:
+            look = {"linewidth": 2, "marker": "o", "color": _RED, "zorder": 5}
+        samples = np.arange(1, len(e_t_m) + 1)
+        axes[0].plot(samples, e_t_m * 1000, label=name, **look)
+        axes[1].plot(samples, e_R, **look)
+    tops = (_top([1000 * e_t for _, e_t, _ in methods]), _top([e_R for _, _, e_R in methods]))
+    axes[0].set(xlabel="held-out sample", ylabel="translation error, mm", ylim=(0, tops[0]))
+    axes[1].set(xlabel="held-out sample", ylabel="rotation error e_R", ylim=(0, tops[1]))
+    axes[0].figure.legend(loc="outside lower center", ncols=5, fontsize=7, frameon=False)
 
 
 def _top(curves: Sequence[Array]) -> float:
@@ -148,21 +152,20 @@ def _top(curves: Sequence[Array]) -> float:
     return 1.05 * float(peaks[peaks <= _FAR_WORSE * np.median(peaks)].max())
 
 
-def error_shares(shares: Mapping[str, float]) -> str:
+@drawn(10, 0.95, grid=False)
+def error_shares(axis: Axes, shares: Mapping[str, float]) -> None:
     """One bar: where the error of X comes from."""
     colours = (_BLUE, _ORANGE, "#1a7f37", "#8250df", _GREY)
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure, axis = new_figure(10, 0.95)
-        left = 0.0
-        for (name, share), colour in zip(shares.items(), colours, strict=False):
-            axis.barh([0], [share], left=[left], color=colour, label=f"{name.replace('_', ' ')} {share:.0%}")
-            left += share
-        axis.set_axis_off()
-        figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
-        return svg_text(figure)
+    left = 0.0
+    for (name, share), colour in zip(shares.items(), colours, strict=False):
+        axis.barh([0], [share], left=[left], color=colour, label=f"{name.replace('_', ' ')} {share:.0%}")
+        left += share
+    axis.set_axis_off()
+    axis.figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
 
 
-def coverage_map(views: ViewSet) -> str:
+@drawn(10, 3.4, 2, grid=False)
+def coverage_map(axes: Axes, views: ViewSet) -> None:
     """Image coverage by boards and corners, and the distortion curve."""
     camera = views.camera
     seen = np.zeros((camera.height // 8 + 1, camera.width // 8 + 1), np.float32)
@@ -170,18 +173,13 @@ def coverage_map(views: ViewSet) -> str:
         mask = np.zeros(seen.shape, np.uint8)
         cv2.fillConvexPoly(mask, cv2.convexHull((view.pixels / 8).astype(np.float32)).astype(np.int32), 1)
         seen += mask
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure, axes = new_figure(10, 3.4, 2)
-        extent = (0, camera.width, camera.height, 0)
-        shown = axes[0].imshow(seen, extent=extent, cmap="Blues", interpolation="nearest")
-        figure.colorbar(shown, ax=axes[0], label="views", ticks=MaxNLocator(integer=True))
-        for view in views:
-            axes[0].plot(
-                view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color=_ORANGE, rasterized=True
-            )
-        axes[0].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
-        _distortion_curve(axes[1], camera)
-        return svg_text(figure)
+    extent = (0, camera.width, camera.height, 0)
+    shown = axes[0].imshow(seen, extent=extent, cmap="Blues", interpolation="nearest")
+    axes[0].figure.colorbar(shown, ax=axes[0], label="views", ticks=MaxNLocator(integer=True))
+    for view in views:
+        axes[0].plot(view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color=_ORANGE, rasterized=True)
+    axes[0].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
+    _distortion_curve(axes[1], camera)
 
 
 def _distortion_curve(axis: Any, camera: CameraModel) -> None:
@@ -195,18 +193,14 @@ def _distortion_curve(axis: Any, camera: CameraModel) -> None:
     axis.set(xlabel="distance from the principal point, px", ylabel="distortion removed, px")
 
 
-def uncertainty_map(known: LensUncertainty, views: ViewSet) -> str:
+@drawn(6, 3.6, grid=False)
+def uncertainty_map(axis: Axes, known: LensUncertainty, views: ViewSet) -> None:
     """SVG: 1σ in pixels over the picture, with the corners that fixed the lens."""
     camera, grid = known.camera, known.sigma_px
     u, v = np.linspace(0, camera.width, grid.shape[1]), np.linspace(0, camera.height, grid.shape[0])
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure, axis = new_figure(6, 3.6)
-        filled = axis.contourf(u, v, grid, levels=10, cmap="YlOrBr")
-        figure.colorbar(filled, ax=axis, label="1σ, px")
-        for view in views:
-            axis.plot(
-                view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color="#0969da", rasterized=True
-            )
-        axis.set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
-        axis.set_aspect("equal")
-        return svg_text(figure)
+    filled = axis.contourf(u, v, grid, levels=10, cmap="YlOrBr")
+    axis.figure.colorbar(filled, ax=axis, label="1σ, px")
+    for view in views:
+        axis.plot(view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color="#0969da", rasterized=True)
+    axis.set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
+    axis.set_aspect("equal")

@@ -8,7 +8,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
-import matplotlib
 import msgspec
 import numpy as np
 import typer
@@ -231,23 +230,22 @@ def acceptance_page(acceptance: Acceptance, stops: Sequence[JudgedStop]) -> str:
     return html.page(f"Stops of {subject.model} {subject.serial}", sections)
 
 
-def _curves(stop: JudgedStop) -> str:
-    with matplotlib.rc_context(plots.STYLE):
-        drawn, axes = plots.new_figure(10, 2.2, 2)
-        if len(stop.states) > 1:
-            curve = Trace(stop.states, stop.move).curve()
-            low, high = SHOWN_S if stop.move.moment_ns is not None else (-np.inf, np.inf)
-            shown = np.flatnonzero((curve.time_s >= low) & (curve.time_s <= high))
-            shown = shown[:: max(1, len(shown) // _POINTS)]
-            time_s = curve.time_s[shown]
-            for axis, values, unit in (
-                (axes[0], np.rad2deg(curve.angle_rad[shown]), "angle, °"),
-                (axes[1], curve.speed_rad_s[shown], "speed, rad/s"),
-            ):
-                axis.plot(time_s, values, color=_BLUE, linewidth=1.2)
-                axis.set_xlabel("time after the stop, s" if stop.move.moment_ns else "time, s")
-                axis.set_ylabel(unit)
-                if stop.move.moment_ns is not None:
-                    axis.axvline(0.0, color=_GREY, linewidth=1)
-                    axis.axvline(REACTION_S[stop.move.way][0], color=_RED, linewidth=1, linestyle=":")
-        return plots.svg_text(drawn)
+@plots.drawn(10, 2.2, 2)
+def _curves(axes: plots.Axes, stop: JudgedStop) -> None:
+    if len(stop.states) < 2:
+        return
+    curve = Trace(stop.states, stop.move).curve()
+    low, high = SHOWN_S if stop.move.moment_ns is not None else (-np.inf, np.inf)
+    shown = np.flatnonzero((curve.time_s >= low) & (curve.time_s <= high))
+    shown = shown[:: max(1, len(shown) // _POINTS)]
+    time_s = curve.time_s[shown]
+    for axis, values, unit in (
+        (axes[0], np.rad2deg(curve.angle_rad[shown]), "angle, °"),
+        (axes[1], curve.speed_rad_s[shown], "speed, rad/s"),
+    ):
+        axis.plot(time_s, values, color=_BLUE, linewidth=1.2)
+        axis.set_xlabel("time after the stop, s" if stop.move.moment_ns else "time, s")
+        axis.set_ylabel(unit)
+        if stop.move.moment_ns is not None:
+            axis.axvline(0.0, color=_GREY, linewidth=1)
+            axis.axvline(REACTION_S[stop.move.way][0], color=_RED, linewidth=1, linestyle=":")

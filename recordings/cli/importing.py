@@ -17,8 +17,9 @@ from recordings.importers.bag import PAIR_WITHIN_S, BagPlan, import_bag
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE
 from recordings.importers.folder import import_folder
 from recordings.importers.selection import Wanted
-from recordings.importers.stops import POSITION_M, ROTATION_RAD, StandstillLimits
+from recordings.importers.stops import StandstillLimits
 from recordings.plain_text import plain_text
+from recordings.schema.stillness import POSITION_M, ROTATION_RAD
 
 
 def import_command(

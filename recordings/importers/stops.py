@@ -1,8 +1,4 @@
-"""Stops of a recorded arm, by the station's own rule, and the image to take of each.
-
-The rule (station/stillness.py): over a window before the image the flange stays within `POSITION_M` of its
-mean place and `ROTATION_RAD` of its newest orientation, and no joint is faster than `JOINT_SPEED_RAD_S`.
-"""
+"""Stops of a recorded arm, by the station's own rule (`schema.stillness`), and the image to take of each."""
 
 from __future__ import annotations
 
@@ -14,12 +10,15 @@ from numpy.typing import NDArray
 from recordings.importers.frames import Track
 from recordings.importers.messages import Array
 from recordings.schema.messages import Stillness
+from recordings.schema.stillness import (
+    JOINT_SPEED_RAD_S,
+    LEAST_SAMPLES,
+    POSITION_M,
+    ROTATION_RAD,
+    WINDOW_S,
+    scatter,
+)
 
-WINDOW_S = 0.3
-POSITION_M = 0.00005
-ROTATION_RAD = 0.00005
-JOINT_SPEED_RAD_S = 0.002
-LEAST_SAMPLES = 8
 NEW_STOP_M = 0.001
 NEW_STOP_RAD = 0.001
 """Farther from the stop before, it is another one, also when nobody saw the arm move."""
@@ -95,12 +94,7 @@ def _stillness(
     window = stamps[first:last]
     if len(window) < LEAST_SAMPLES or np.diff(window).max() > window_s * 1e9 / 3:
         return None
-    T = track.at(window)
-    places, R = T[:, :3, 3], T[:, :3, :3]
-    turned = np.swapaxes(R, -1, -2) @ R[-1]
-    # the sine's arc: near zero the trace's would lose half of the digits
-    axis = np.stack([turned[:, 2, 1] - turned[:, 1, 2], turned[:, 0, 2] - turned[:, 2, 0],
-                     turned[:, 1, 0] - turned[:, 0, 1]], -1)  # fmt: skip
+    position_m, rotation_rad = scatter(track.at(window))
     fastest = 0.0
     if speeds is not None:
         a, b = np.searchsorted(speeds[0], [time_ns - window_s * 1e9, time_ns + 1])
@@ -108,8 +102,8 @@ def _stillness(
     return Stillness(
         window_s=float(window[-1] - window[0]) / 1e9,
         max_joint_speed_rad_s=fastest,
-        position_scatter_m=float(np.linalg.norm(places - places.mean(axis=0), axis=1).max()),
-        rotation_scatter_rad=float(np.arcsin(np.clip(np.linalg.norm(axis, axis=1) / 2, 0, 1)).max()),
+        position_scatter_m=position_m,
+        rotation_scatter_rad=rotation_rad,
     )
 
 

@@ -102,7 +102,7 @@ def sight(
         distance_m, tilt_rad = _distance_and_tilt(pixels, board_points(board)[found.indices], camera)
     advice = ""
     if exposure is not None:
-        advice = "; ".join(assess(image, found.pixels if found.found else None, *exposure).warnings)
+        advice = "; ".join(assess(image, found.pixels if found.found else None, *exposure).warnings.values())
     status = DetectionStatus(
         found=found.found,
         reason=found.reason,
@@ -179,10 +179,8 @@ class ExposureAdvice:
     """Share of pixels"""
     blur_px: float | None
     """Sigma of the sharpest edges; None where there is too little contrast to tell."""
-    warnings: tuple[str, ...]
-    """Sentences for people; empty = all is well."""
-    causes: tuple[str, ...] = ()
-    """Beside each of them, for programs: over-exposed, under-exposed, low-contrast, blurred."""
+    warnings: dict[str, str]
+    """Sentences for people by their cause (over-exposed, under-exposed, low-contrast, blurred)."""
 
 
 def assess(
@@ -204,23 +202,17 @@ def assess(
     wanted_us, wanted_db = _settings(exposure_us, gain_db, factor)
     blur_px = _blur(grey, white - black)
     advice = f"set {wanted_us:.0f} µs and {wanted_db:.1f} dB"
-    warnings, causes = [], []
+    warnings: dict[str, str] = {}
     if saturated > _SATURATED_SHARE or white > _BRIGHT_WHITE:
-        causes.append("over-exposed")
-        warnings.append(f"too bright: {saturated:.1%} of the pixels are saturated; {advice}")
+        warnings["over-exposed"] = f"too bright: {saturated:.1%} of the pixels are saturated; {advice}"
     elif white < _DARK_WHITE:
-        causes.append("under-exposed")
-        warnings.append(f"too dark: the board's white is at {white:.0%} of full scale; {advice}")
+        warnings["under-exposed"] = f"too dark: the board's white is at {white:.0%} of full scale; {advice}"
     elif white - black < _LOW_CONTRAST:
-        causes.append("low-contrast")
-        warnings.append(
-            f"low contrast: white {white:.0%}, black {black:.0%}; look for reflections and stray light"
-        )
+        text = f"low contrast: white {white:.0%}, black {black:.0%}; look for reflections and stray light"
+        warnings["low-contrast"] = text
     if blur_px is not None and blur_px > _BLUR_PX:
-        causes.append("blurred")
-        warnings.append(f"blurred: edges are {blur_px:.1f} px wide; focus the lens, or the arm moves")
-    told = tuple(warnings), tuple(causes)
-    return ExposureAdvice(wanted_us, wanted_db, white, black, saturated, blur_px, *told)
+        warnings["blurred"] = f"blurred: edges are {blur_px:.1f} px wide; focus the lens, or the arm moves"
+    return ExposureAdvice(wanted_us, wanted_db, white, black, saturated, blur_px, warnings)
 
 
 def _levels(image: Pixels) -> NDArray[np.float32]:

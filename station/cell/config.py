@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from recordings.files import MAIN_CAMERA
+from recordings.schema import stillness
 from recordings.schema.messages import (
     BoardKind,
     BoardSpec,
@@ -175,10 +176,10 @@ class PointerConfig(Section, frozen=True):
 
 
 class StillnessConfig(Section, frozen=True):
-    window_s: Positive = 0.3
-    joint_speed_rad_s: Positive = 0.002
-    position_m: Positive = 0.00005
-    rotation_rad: Positive = 0.00005
+    window_s: Positive = stillness.WINDOW_S
+    joint_speed_rad_s: Positive = stillness.JOINT_SPEED_RAD_S
+    position_m: Positive = stillness.POSITION_M
+    rotation_rad: Positive = stillness.ROTATION_RAD
     image_motion_px: Positive = 0.3
     timeout_s: Positive = 5.0
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from calibrate.geometry import rotation_angle
 from calibrate.kinematics import JOINT_NAMES, RobotModel, forward
 from recordings.schema.messages import RobotState, Stillness
+from recordings.schema.stillness import LEAST_SAMPLES, scatter
 from station.cell.config import StillnessConfig
 from station.cell.errors import StaleStateError, StationError
 
@@ -30,7 +30,6 @@ REST_PATIENCE_S = 1.0
 FIND_SHAKE = "Find what shakes the arm or the camera, or retake the pose later."
 UNSEEN = "image motion unknown, no images"
 CHECK_CAMERA = "Check the camera's cable and power, or retake the pose later."
-LEAST_SAMPLES = 8
 KEPT_SAMPLES = 4096
 
 
@@ -84,14 +83,12 @@ class StillnessMonitor:
         covered = kept[0].stamps.controller_s <= begin_s + 0.1 * self._limits.window_s
         if len(window) < LEAST_SAMPLES or not covered or np.diff(times).max() > self._limits.window_s / 3:
             return None
-        base_from_flange = forward(self._model, [s.joints_rad for s in window])
-        places = base_from_flange[:, :3, 3]
-        R = base_from_flange[:, :3, :3]
+        position_m, rotation_rad = scatter(forward(self._model, [s.joints_rad for s in window]))
         return Stillness(
             window_s=float(times[-1] - times[0]),
             max_joint_speed_rad_s=float(np.abs([s.joint_speeds_rad_s for s in window]).max()),
-            position_scatter_m=float(np.linalg.norm(places - places.mean(axis=0), axis=1).max()),
-            rotation_scatter_rad=float(rotation_angle(np.swapaxes(R, -1, -2) @ R[-1]).max()),
+            position_scatter_m=position_m,
+            rotation_scatter_rad=rotation_rad,
             image_motion_px=image_motion_px,
         )
 

@@ -54,7 +54,7 @@ def image_trouble(image: Image, found: Detection) -> tuple[str, str]:
     advice = assess(image.pixels, found.pixels if found.found else None, image.exposure_us, image.gain_db)
     if found.cause and found.cause != "not-found":
         return found.cause, found.reason
-    told = dict(zip(advice.causes, advice.warnings, strict=True))
+    told = dict(advice.warnings)
     if not found.found and advice.white > _LIT:
         told.pop("under-exposed", None)  # the board's paper is the brightest thing, and it is not there
         told.pop("low-contrast", None)

@@ -126,16 +126,17 @@ def choose(
     keep: tuple[int, ...] = (),
     sweeps: int = 6,
     progress: Callable[[float], None] = lambda done: None,
+    known: Array | None = None,
 ) -> list[int]:
     """Indices of `count` members of the pool (n, p, p): greedy, then exchanged until no swap helps.
 
-    `keep` stay in. Deterministic for a given rng state; ties go to the lower index.
+    `keep` stay in; `known` (p, p) is there beside them. Deterministic for a given rng state; ties go to the
+    lower index.
     """
     chosen = list(keep)
-    total = pool[chosen].sum(axis=0) if chosen else np.zeros(pool.shape[1:])
-    if not chosen:
+    if not chosen and known is None:
         chosen = [int(rng.integers(len(pool)))]
-        total = pool[chosen[0]].copy()
+    total = pool[chosen].sum(axis=0) + (0.0 if known is None else known)
     while len(chosen) < min(count, len(pool)):
         place, _ = _best_addition(pool, total, chosen, objective)
         chosen.append(place)

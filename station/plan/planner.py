@@ -262,23 +262,21 @@ def _choose_and_order(
     joints = pool.joints_rad if options.criterion in WITH_TABLE else None
     objective = objective_for(scene, options.criterion, options.free_intrinsics, joints)
     information = informations(scene, pool.base_from_flange, joints, options.noise)
-    known: Array | None = None
-    if captured is not None:
-        known = informations(scene, captured, noise=options.noise).sum(axis=0)
+    known = None if captured is None else informations(scene, captured, noise=options.noise).sum(axis=0)
     left = np.arange(len(pool))
     picked: list[int] = []
     while len(left) >= options.count:
         # The first choice is polished; when poses without a free path leave, only their places are filled.
         kept = tuple(int(k) for k in np.flatnonzero(np.isin(left, picked)))
-        chosen = _chosen(
+        chosen = choose(
             information[left],
-            known,
             options.count,
             objective,
             rng,
             keep=kept,
             sweeps=0 if kept else 6,
             progress=lambda done: progress("choosing", 0.3 + 0.5 * done),
+            known=known,
         )
         progress("ordering", 0.85)
         places = left[chosen]
@@ -293,24 +291,6 @@ def _choose_and_order(
         gone = places[blocked]
         left, picked = np.setdiff1d(left, gone), [p for p in places if p not in gone]
     raise explain_shortage(scene, options.count, pool.take(left), pool, start)
-
-
-def _chosen(
-    pool: Array,
-    known: Array | None,
-    count: int,
-    objective: Objective,
-    rng: np.random.Generator,
-    keep: tuple[int, ...],
-    sweeps: int,
-    progress: Callable[[float], None],
-) -> list[int]:
-    """`choose`, beside what is `known` (p, p): that counts as one more member, which stays in."""
-    if known is None:
-        return choose(pool, count, objective, rng, keep, sweeps, progress)
-    stays = (0, *(place + 1 for place in keep))
-    chosen = choose(np.concatenate([known[None], pool]), count + 1, objective, rng, stays, sweeps, progress)
-    return [place - 1 for place in chosen[1:]]
 
 
 def _ordered(scene: Scene, joints: Array, start: Array | None, seed: int) -> tuple[list[int], list[int]]:

@@ -27,16 +27,9 @@ _TRIES = 12
 
 
 @dataclass(frozen=True)
-class Forecast:
-    """Expected 1σ of X: translation as the root of the summed variances, rotation likewise."""
-
-    sigma_m: float
-    sigma_rad: float
-
-
-@dataclass(frozen=True)
 class Advice:
-    now: Forecast
+    sigma_m: float
+    """Expected 1σ of X now, translation."""
     enough: bool
     text: str
     next_pose: PlannedPose | None = None
@@ -88,7 +81,7 @@ def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
         return plan, cut
     expected = forecast_views(scene, flange)
     poses = tuple(
-        msgspec.structs.replace(pose, predicted_sigma_m=after.sigma_m)
+        msgspec.structs.replace(pose, predicted_sigma_m=after)
         for pose, after in zip(plan.poses, expected, strict=True)
     )
     return msgspec.structs.replace(plan, poses=poses), cut
@@ -99,15 +92,15 @@ def forecast_views(
     base_from_flange: Array,
     free_intrinsics: bool = True,
     noise: MeasurementNoise = USUAL_NOISE,
-) -> list[Forecast]:
-    """Expected sigma after each of the views taken from these flange poses (n, 4, 4).
+) -> list[float]:
+    """Expected 1σ of X (m) after each of the views taken from these flange poses (n, 4, 4).
 
     A view that by the guess does not show the whole board brings nothing.
     """
     objective = objective_for(scene, "A", free_intrinsics)
     gains = informations(scene, base_from_flange, noise=noise)
     gains[~_whole(scene, base_from_flange)] = 0.0
-    return [Forecast(*sigma_of(information, objective)) for information in gains.cumsum(axis=0)]
+    return [sigma_of(information, objective)[0] for information in gains.cumsum(axis=0)]
 
 
 def _whole(scene: Scene, base_from_flange: Array) -> NDArray[np.bool_]:
@@ -130,9 +123,9 @@ def advise(
     flange = np.asarray(captured, dtype=float).reshape(-1, 4, 4)
     objective = objective_for(scene, "A", free_intrinsics=True)
     known = informations(scene, flange).sum(axis=0)
-    now = Forecast(*sigma_of(known, objective))
-    state = f"expected error {1000 * now.sigma_m:.2f} mm after {len(flange)} views"
-    if now.sigma_m <= goal_m:
+    now = sigma_of(known, objective)[0]
+    state = f"expected error {1000 * now:.2f} mm after {len(flange)} views"
+    if now <= goal_m:
         return Advice(now, True, f"enough: {state}, the goal is {1000 * goal_m:.2f} mm")
     start = np.asarray(joints_now_rad, dtype=float)
     pool = find_candidates(scene, view_range(scene), pool_size, np.random.default_rng(0), start)

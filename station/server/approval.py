@@ -49,14 +49,18 @@ def _terminal_name(number: int) -> str:
     return f"terminal {major}:{minor}"
 
 
-@dataclass(frozen=True)
+@dataclass
 class Applicant:
-    """A client that asks for motion."""
+    """A client, and what is known of it when it asks for motion."""
 
+    client_id: int
     pid: int
     uid: int
-    user: str
-    began_ticks: int | None
+    who: str
+    """Its name in log, status and recording."""
+    user: str = ""
+    """The user's name, once that was looked up."""
+    began_ticks: int | None = None
     """Start of the process that made the connection; None: not known."""
 
 

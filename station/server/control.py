@@ -50,9 +50,9 @@ class Peer:
     """Process at the other end, by the kernel's word."""
 
     client_id: int
+    """0: it sent STOP without a connection."""
     pid: int
     uid: int
-    gid: int
 
 
 class Handler(Protocol):
@@ -318,7 +318,7 @@ def _full(text: str, limit: int) -> RefusedError:
 def _peer_of(link: socket.socket, client_id: int) -> Peer:
     pid, uid, gid = peer_of(link)
     log.debug("client %d: pid %d, uid %d, gid %d", client_id, pid, uid, gid)
-    return Peer(client_id, pid, uid, gid)
+    return Peer(client_id, pid, uid)
 
 
 def _remove_stale(path: Path) -> None:

@@ -18,7 +18,6 @@ from station.protocol import verbs
 from station.protocol.verbs import VERBS, Purpose
 from station.server.approval import Applicant, ApprovalRule, Process, process
 from station.server.control import Peer
-from station.server.stop_server import Sender
 from station.session.checklist import checklist
 from station.session.recording import software
 from station.session.session import Session
@@ -28,25 +27,6 @@ CONNECTION = {"watch", "stop", "part", "whole"}
 _WHO_LIMIT = 60
 
 
-class _Caller:
-    """A connection and what it said about itself."""
-
-    def __init__(self, peer: Peer) -> None:
-        self.client_id, self.pid, self.uid = peer.client_id, peer.pid, peer.uid
-        self.who = f"uid {peer.uid} (pid {peer.pid})"
-        self.began_ticks: int | None = None
-        """Start of its process, when it first asked for anything."""
-
-    def asks(self, user: str) -> Applicant:
-        return Applicant(self.pid, self.uid, user, self.began_ticks)
-
-    def introduce(self, user: str, who: str) -> None:
-        """The user's name is the kernel's word; the place is the client's."""
-        said = "".join(c for c in who if c.isprintable())[:_WHO_LIMIT] or user
-        told = said if said.split(" ")[0] == user else f"{user} ({said})"
-        self.who = f"{told} (pid {self.pid})"
-
-
 class SessionDispatcher:
     """Behind `station.server.control.Handler`."""
 
@@ -54,7 +34,7 @@ class SessionDispatcher:
         self._session, self._see = session, see
         cell = session.context.cell
         self._rule = ApprovalRule(cell.config.approval, cell.simulated, see)
-        self._callers: dict[int, _Caller] = {}
+        self._callers: dict[int, Applicant] = {}
         self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
         """Users by their number, once they were looked up."""
@@ -62,10 +42,12 @@ class SessionDispatcher:
 
     def stop_now(self, peer: Peer) -> Awaitable[object]:
         """STOP is on its way to the arm before anything else is looked at."""
-        caller = self._callers.get(peer.client_id) or _Caller(peer)  # the house may be full: nobody is kept
+        caller = self._callers.get(peer.client_id) or _applicant(
+            peer
+        )  # the house may be full: nobody is kept
         return self._to_the_end(self._session.stop(caller.who))
 
-    def stop_from(self, sender: Sender) -> None:
+    def stop_from(self, sender: Peer) -> None:
         """STOP without a connection; who has one as well is known by what was said there."""
         known = (c for c in self._callers.values() if (c.pid, c.uid) == (sender.pid, sender.uid))
         caller = next(known, None)
@@ -106,39 +88,42 @@ class SessionDispatcher:
         result = await self._methods[verb](self._caller(peer), request)
         return msgspec.to_builtins(verbs.Done() if result is None else result)
 
-    def _caller(self, peer: Peer) -> _Caller:
+    def _caller(self, peer: Peer) -> Applicant:
         if peer.client_id not in self._callers:
-            caller = self._callers[peer.client_id] = _Caller(peer)
+            caller = self._callers[peer.client_id] = _applicant(peer)
             seen = self._see(peer.pid)
             caller.began_ticks = seen.began_ticks if seen else None
         return self._callers[peer.client_id]
 
-    async def _hello(self, caller: _Caller, args: verbs.Hello) -> verbs.Welcome:
-        caller.introduce(await self._name(caller.uid), args.who)
+    async def _hello(self, caller: Applicant, args: verbs.Hello) -> verbs.Welcome:
+        user = caller.user = await self._name(caller.uid)  # the kernel's word; the place is the client's
+        said = "".join(c for c in args.who if c.isprintable())[:_WHO_LIMIT] or user
+        told = said if said.split(" ")[0] == user else f"{user} ({said})"
+        caller.who = f"{told} (pid {caller.pid})"
         context = self._session.context
         config, version = context.cell.config, software()["calibration-station"]
         rule_days = config.validity.max_age_days
         return verbs.Welcome(version, os.getpid(), str(context.root), config.camera.name, rule_days)
 
-    async def _lease(self, caller: _Caller, args: verbs.Lease) -> LeaseStatus:
+    async def _lease(self, caller: Applicant, args: verbs.Lease) -> LeaseStatus:
         if args.action == "take":
             return self._session.take_lease(caller.client_id, caller.who)
         ending = self._session.release_lease if args.action == "release" else self._session.lease_lost
         await self._to_the_end(ending(caller.client_id))
         return self._session.leases.lease
 
-    async def _acknowledge(self, caller: _Caller, args: verbs.Acknowledge) -> None:
+    async def _acknowledge(self, caller: Applicant, args: verbs.Acknowledge) -> None:
         self._session.acknowledge(caller.who)
 
-    async def _plan(self, caller: _Caller, args: verbs.GetPlan) -> verbs.LoadedPlan:
+    async def _plan(self, caller: Applicant, args: verbs.GetPlan) -> verbs.LoadedPlan:
         queue = self._session.context.queue
         return verbs.LoadedPlan() if queue is None else verbs.LoadedPlan(queue.plan, queue.sha256)
 
-    async def _load_plan(self, caller: _Caller, args: verbs.LoadPlan) -> verbs.PlanFacts:
+    async def _load_plan(self, caller: Applicant, args: verbs.LoadPlan) -> verbs.PlanFacts:
         self._session.load_plan(caller.client_id, args.plan)
         return self._plan_facts()
 
-    async def _make_plan(self, caller: _Caller, args: verbs.MakePlan) -> verbs.PlanFacts:
+    async def _make_plan(self, caller: Applicant, args: verbs.MakePlan) -> verbs.PlanFacts:
         await self._session.make_plan(caller.client_id, args.poses, args.seed, args.lens_known, args.aim)
         return self._plan_facts()
 
@@ -146,20 +131,20 @@ class SessionDispatcher:
         queue = self._session.context.require_queue()
         return verbs.PlanFacts(len(queue.statuses), queue.sha256)
 
-    async def _prepare(self, caller: _Caller, args: verbs.Prepare) -> MotionPreview:
+    async def _prepare(self, caller: Applicant, args: verbs.Prepare) -> MotionPreview:
         if args.purpose in (Purpose.REPLAN, Purpose.NEXT_POSE):
             self._rule.by_person(await self._asks(caller), "A changed plan")
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
 
-    async def _hover(self, caller: _Caller, args: verbs.Hover) -> HoverOffer:
+    async def _hover(self, caller: Applicant, args: verbs.Hover) -> HoverOffer:
         self._rule.by_person(await self._asks(caller), "A move over the board")
         return await self._session.prepare_hover(caller.client_id, args)
 
-    async def _stop_test(self, caller: _Caller, args: verbs.StopTest) -> StopTestOffer:
+    async def _stop_test(self, caller: Applicant, args: verbs.StopTest) -> StopTestOffer:
         self._rule.by_person(await self._asks(caller), "A stop test")
         return await self._session.prepare_stop_test(caller.client_id, args)
 
-    async def _go(self, caller: _Caller, args: verbs.Go) -> None:
+    async def _go(self, caller: Applicant, args: verbs.Go) -> None:
         asks, waiting = await self._asks(caller), self._session.approvals.waiting
         if waiting is not None and waiting.beside is not None:
             how = self._rule.by_person(asks, "This move")
@@ -168,50 +153,55 @@ class SessionDispatcher:
         approval = f"motion approved by {caller.who}, {how}"
         self._session.go(caller.client_id, args.token, approval, again=args.headless)
 
-    async def _asks(self, caller: _Caller) -> Applicant:
-        return caller.asks(await self._name(caller.uid))
+    async def _asks(self, caller: Applicant) -> Applicant:
+        caller.user = await self._name(caller.uid)
+        return caller
 
-    async def _pause(self, caller: _Caller, args: verbs.Pause) -> None:
+    async def _pause(self, caller: Applicant, args: verbs.Pause) -> None:
         self._session.pause(caller.who)
 
-    async def _finish(self, caller: _Caller, args: verbs.Finish) -> None:
+    async def _finish(self, caller: Applicant, args: verbs.Finish) -> None:
         await self._to_the_end(self._session.finish(caller.client_id))
 
-    async def _retake(self, caller: _Caller, args: verbs.Retake) -> None:
+    async def _retake(self, caller: Applicant, args: verbs.Retake) -> None:
         await self._session.edit(verbs.Retake, caller.client_id, lambda queue: queue.retake(args.index))
 
-    async def _skip(self, caller: _Caller, args: verbs.Skip) -> None:
+    async def _skip(self, caller: Applicant, args: verbs.Skip) -> None:
         await self._session.edit(verbs.Skip, caller.client_id, lambda queue: queue.skip(args.index))
 
-    async def _reorder(self, caller: _Caller, args: verbs.Reorder) -> None:
+    async def _reorder(self, caller: Applicant, args: verbs.Reorder) -> None:
         await self._session.edit(verbs.Reorder, caller.client_id, lambda queue: queue.reorder(args.order))
 
-    async def _add(self, caller: _Caller, args: verbs.Add) -> verbs.PoseNumber:
+    async def _add(self, caller: Applicant, args: verbs.Add) -> verbs.PoseNumber:
         return verbs.PoseNumber(
             await self._session.edit(verbs.Add, caller.client_id, lambda queue: queue.add(args.pose))
         )
 
-    async def _drop(self, caller: _Caller, args: verbs.Drop) -> None:
+    async def _drop(self, caller: Applicant, args: verbs.Drop) -> None:
         await self._session.edit(verbs.Drop, caller.client_id, lambda queue: queue.drop(args.index))
 
-    async def _free_drive(self, caller: _Caller, args: verbs.Freedrive) -> None:
+    async def _free_drive(self, caller: Applicant, args: verbs.Freedrive) -> None:
         await self._to_the_end(self._session.switch_free_drive(caller.client_id, args.on, args.auto))
 
-    async def _record(self, caller: _Caller, args: verbs.Record) -> verbs.PoseNumber:
+    async def _record(self, caller: Applicant, args: verbs.Record) -> verbs.PoseNumber:
         return verbs.PoseNumber(await self._session.record(caller.client_id))
 
-    async def _preview(self, caller: _Caller, args: verbs.Preview) -> verbs.PreviewImage:
+    async def _preview(self, caller: Applicant, args: verbs.Preview) -> verbs.PreviewImage:
         return await self._session.previews.preview(args.width, args.height)
 
-    async def _observe(self, caller: _Caller, args: verbs.Observe) -> verbs.Observation:
+    async def _observe(self, caller: Applicant, args: verbs.Observe) -> verbs.Observation:
         return await self._session.previews.observe(args.tag)
 
-    async def _doctor(self, caller: _Caller, args: verbs.Doctor) -> list[verbs.Check]:
+    async def _doctor(self, caller: Applicant, args: verbs.Doctor) -> list[verbs.Check]:
         return await checklist(self._session.context, self._session.devices.troubles)
 
-    async def _configuration(self, caller: _Caller, args: verbs.Configuration) -> StationConfig:
+    async def _configuration(self, caller: Applicant, args: verbs.Configuration) -> StationConfig:
         return self._session.context.cell.config
 
-    async def _sessions(self, caller: _Caller, args: verbs.Sessions) -> list[SessionSummary]:
+    async def _sessions(self, caller: Applicant, args: verbs.Sessions) -> list[SessionSummary]:
         # In a thread: hundreds of files are read, and the arm's heartbeat does not wait.
         return await asyncio.to_thread(list_sessions, self._session.context.root)
+
+
+def _applicant(peer: Peer) -> Applicant:
+    return Applicant(peer.client_id, peer.pid, peer.uid, f"uid {peer.uid} (pid {peer.pid})")

@@ -15,12 +15,12 @@ import struct
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 from station.cell.errors import StationError
 from station.cell.socket_folder import make_folder, motion_page, stop_socket
 from station.protocol.stop_client import Motion, Page, create_page, write_page
+from station.server.control import Peer
 
 log = logging.getLogger(__name__)
 
@@ -36,14 +36,6 @@ _CREDENTIALS = struct.Struct("3i")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_CREDENTIALS.size)
 
 
-@dataclass(frozen=True)
-class Sender:
-    """Sender of a STOP, by the kernel's word."""
-
-    pid: int
-    uid: int
-
-
 class StopServer:
     """`stop` is called at once, in the working loop. `latched`: STOP holds. `speed_rad_s`: of the fastest
     joint, None where it is not known."""
@@ -51,7 +43,7 @@ class StopServer:
     def __init__(
         self,
         control: Path,
-        stop: Callable[[Sender], None],
+        stop: Callable[[Peer], None],
         latched: Callable[[], bool],
         speed_rad_s: Callable[[], float | None],
     ) -> None:
@@ -128,9 +120,9 @@ class StopServer:
             number += 1
             sender = sender or _sender(ancillary)
         if number:
-            self._carry_out(sender or Sender(0, -1))
+            self._carry_out(sender or Peer(0, 0, -1))
 
-    def _carry_out(self, sender: Sender) -> None:
+    def _carry_out(self, sender: Peer) -> None:
         now_s = time.monotonic()
         self._stops += 1
         if not self._latched():
@@ -169,9 +161,9 @@ class StopServer:
             log.error("%s: %s; `station stop` cannot be confirmed", self._page_path, error)
 
 
-def _sender(ancillary: list[tuple[int, int, bytes]]) -> Sender | None:
+def _sender(ancillary: list[tuple[int, int, bytes]]) -> Peer | None:
     for level, kind, data in ancillary:
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS):
             pid, uid, _ = _CREDENTIALS.unpack(data[: _CREDENTIALS.size])
-            return Sender(pid, uid)
+            return Peer(0, pid, uid)
     return None

@@ -145,7 +145,7 @@ def what_it_brings(found: Advice, index: int) -> tuple[str, ...]:
     assert pose is not None and pose.predicted_sigma_m is not None
     return (
         f"added as pose {index + 1}: {pose.why}",
-        f"expected error: {1000 * found.now.sigma_m:.2f} → {1000 * pose.predicted_sigma_m:.2f} mm",
+        f"expected error: {1000 * found.sigma_m:.2f} → {1000 * pose.predicted_sigma_m:.2f} mm",
     )
 
 

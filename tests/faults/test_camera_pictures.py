@@ -47,9 +47,9 @@ async def test_26_over_and_under_exposure_are_named_with_what_to_set(
     camera: RenderedCamera, light: float, words: str
 ) -> None:
     good = await camera.capture()
-    assert assess(good.pixels, None, good.exposure_us, good.gain_db).warnings == ()
+    assert assess(good.pixels, None, good.exposure_us, good.gain_db).warnings == {}
     await camera.inject("illumination", light)
     bad = await camera.capture()
     advice = assess(bad.pixels, None, bad.exposure_us, bad.gain_db)
-    assert any(words in warning for warning in advice.warnings)
+    assert any(words in warning for warning in advice.warnings.values())
     assert (advice.exposure_us < bad.exposure_us) == (light > 1)

@@ -41,12 +41,12 @@ def test_following_the_advice_ends_at_a_well_exposed_board(
             break
         exposure_us, gain_db = advice.exposure_us, advice.gain_db
     final = look(exposure_us, gain_db, light)
-    assert final.warnings == () and 0.55 < final.white < 0.95 and final.saturated < 0.005
+    assert final.warnings == {} and 0.55 < final.white < 0.95 and final.saturated < 0.005
 
 
 def test_a_good_picture_is_left_alone() -> None:
     advice = look(10_000, 0.0)
-    assert advice.warnings == () and (advice.exposure_us, advice.gain_db) == (10_000, 0.0)
+    assert advice.warnings == {} and (advice.exposure_us, advice.gain_db) == (10_000, 0.0)
 
 
 def test_gain_is_raised_only_where_exposure_is_used_up() -> None:
@@ -65,13 +65,13 @@ def test_gain_is_raised_only_where_exposure_is_used_up() -> None:
     ],
 )
 def test_what_is_wrong_is_named(picture: dict[str, float], word: str) -> None:
-    assert any(word in warning for warning in look(10_000, 0.0, **picture).warnings)
+    assert any(word in warning for warning in look(10_000, 0.0, **picture).warnings.values())
 
 
 def test_a_veil_of_stray_light_is_low_contrast() -> None:
     picture = render(CAMERA, PAPER_BOARD, VIEW, Light(exposure_us=2000, pixel_noise=1.0))
     advice = assess(picture + np.uint8(90), corners(), 2000, 0.0)
-    assert any("low contrast" in warning for warning in advice.warnings)
+    assert any("low contrast" in warning for warning in advice.warnings.values())
 
 
 @pytest.mark.parametrize("blur_px", [0.7, 1.5, 3.0])

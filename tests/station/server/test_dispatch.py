@@ -313,7 +313,7 @@ async def test_neither_a_long_list_of_sessions_nor_a_slow_name_holds_the_loop_up
 
 async def test_who_is_turned_away_is_not_kept(served: Served) -> None:
     dispatcher = SessionDispatcher(served.rig.session)
-    await dispatcher.stop_now(Peer(client_id=99, pid=1, uid=0, gid=0))
+    await dispatcher.stop_now(Peer(client_id=99, pid=1, uid=0))
     assert not dispatcher._callers and "uid 0 (pid 1)" in served.rig.session.store.status.reason
 
 

@@ -16,7 +16,7 @@ from station.server.dispatch import SessionDispatcher
 from tests.codes import raises
 from tests.station.session_rig import POSES, Rig
 
-ANNA, BERT = Peer(1, 100, 0, 0), Peer(2, 101, 0, 0)
+ANNA, BERT = Peer(1, 100, 0), Peer(2, 101, 0)
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "acknowledge": {}, "load_plan": {}, "make_plan": {}, "prepare": {}, "hover": {}, "go": {"token": "t"},
     "pause": {}, "finish": {}, "retake": {"index": 0}, "skip": {"index": 1},

@@ -39,7 +39,7 @@ from station.protocol.stop_client import (
 )
 from station.server import stop_server
 from station.server.control import ControlServer
-from station.server.stop_server import BATCH, Sender, StopServer
+from station.server.stop_server import BATCH, Peer, StopServer
 from tests.station.server.test_control import RecordingHandler
 
 NOBODY = 65534
@@ -51,13 +51,13 @@ class Station:
 
     def __init__(self, control: Path) -> None:
         self.control = control
-        self.heard: list[Sender] = []
+        self.heard: list[Peer] = []
         self.latched = False
         self.speed_rad_s: float | None = 0.0
         self.server = StopServer(control, self._stop, lambda: self.latched, lambda: self.speed_rad_s)
         self._beating: asyncio.Task[None] | None = None
 
-    def _stop(self, sender: Sender) -> None:
+    def _stop(self, sender: Peer) -> None:
         self.heard.append(sender)
         self.latched = True
 
@@ -92,7 +92,7 @@ async def stopped(control: Path) -> Outcome:
 
 async def test_stop_is_confirmed_when_the_arm_rests(station: Station) -> None:
     assert await stopped(station.control) is Outcome.RESTS
-    assert station.heard == [Sender(os.getpid(), os.getuid())]
+    assert station.heard == [Peer(0, os.getpid(), os.getuid())]
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0" * 9, b'{"verb": "go"}', b"x" * 60_000])

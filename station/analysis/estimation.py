@@ -139,7 +139,7 @@ def _views(
 def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
     """X and Y in closed form (Park & Martin 1994, by OpenCV), from all views."""
     flange, board = views.base_from_flange, views.camera_from_board
-    gripper = flange if views.mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
+    gripper = flange if views.mount == "eye-in-hand" else inverse(flange)
     R, t = cv2.calibrateHandEye(
         list(gripper[:, :3, :3]),
         list(gripper[:, :3, 3]),

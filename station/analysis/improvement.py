@@ -15,7 +15,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, difference, inverse, perturb
+from calibrate.geometry import Array, difference, perturb
 from calibrate.projection import project
 from station.analysis.estimation import FEWEST_FOR_LENS, quick_sigma, solve_quickly
 from station.analysis.worker import CapturedView
@@ -25,6 +25,7 @@ from station.cell.limits import check_plan
 from station.cell.plan import Plan
 from station.cell.scene import (
     Scene,
+    board_place,
     cell_geometry,
     flange_poses,
     geometry_from,
@@ -110,9 +111,7 @@ def better_guesses(config: StationConfig, lens_is_known: bool, seen: Sequence[Ca
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         text = "The poses so far do not determine the camera pose."
         raise RefusedError(text, code="degenerate", remedy="Take more poses first.") from None
-    flange = views.base_from_flange
-    gripper = flange if config.mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
-    places = gripper @ X @ views.camera_from_board
+    places = board_place(config.mount, views.base_from_flange, X, views.camera_from_board)
     apart = difference(places, places[0])
     Y = perturb(places[0], apart.mean(axis=0))
     scatter = np.sqrt(((apart - apart.mean(axis=0)) ** 2).reshape(-1, 2, 3).mean(axis=(0, 2)))

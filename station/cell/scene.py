@@ -83,6 +83,13 @@ def camera_from_board(mount: Mount, base_from_flange: Array, X: Array, Y: Array)
     return np.asarray(inverse(X) @ base_from_flange @ Y)
 
 
+def board_place(mount: Mount, base_from_flange: Array, X: Array, camera_from_board: Array) -> Array:
+    """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)."""
+    if mount == "eye-in-hand":
+        return np.asarray(base_from_flange @ X @ camera_from_board)
+    return np.asarray(inverse(base_from_flange) @ X @ camera_from_board)
+
+
 def pose_at(model: RobotModel, name: str, joints_rad: ArrayLike, why: str = "") -> PlannedPose:
     """A pose of a plan, with where the flange is expected; joints (6,)."""
     joints = np.asarray(joints_rad, dtype=float)

@@ -42,35 +42,20 @@ class LineReader:
 
     def __init__(self) -> None:
         self.bad_lines = 0
-        self._pending = bytearray()
-        self._overlong = False
+        self._pending = b""
 
     def feed(self, data: bytes) -> list[str]:
-        """Contents of the complete good lines, without checksum. Never raises; memory is bounded."""
-        good = []
-        *ended_pieces, rest = data.split(b"\n")
-        for piece, ended in [*((p, True) for p in ended_pieces), (rest, False)]:
-            if len(self._pending) + len(piece) > LINE_LIMIT:
-                self._overlong = True
-                self._pending.clear()
-            elif not self._overlong:
-                self._pending += piece
-            if not ended:
-                continue
-            text = None if self._overlong else _checked(bytes(self._pending))
-            self._pending.clear()
-            self._overlong = False
-            if text is None:
-                self.bad_lines += 1
-            else:
-                good.append(text)
-        return good
+        """Return the complete good lines, without checksum. Never raises; memory is bounded."""
+        *lines, rest = (self._pending + data).split(b"\n")
+        self._pending = rest[: LINE_LIMIT + 1]  # how much too long a line is does not matter
+        texts = [_checked(line) for line in lines]
+        self.bad_lines += texts.count(None)
+        return [text for text in texts if text is not None]
 
     def restart(self) -> None:
-        """Forgets a line that has only begun: what comes next starts a new one."""
-        self.bad_lines += bool(self._pending) or self._overlong
-        self._pending.clear()
-        self._overlong = False
+        """Forget a line that has only begun: what comes next starts a new one."""
+        self.bad_lines += bool(self._pending)
+        self._pending = b""
 
 
 def _checked(line: bytes) -> str | None:
@@ -79,7 +64,7 @@ def _checked(line: bytes) -> str | None:
         text, _, given = line.decode("ascii").rstrip("\r").rpartition("*")
     except UnicodeDecodeError:
         return None
-    return text if text and given == checksum(text) else None
+    return text if text and len(line) <= LINE_LIMIT and given == checksum(text) else None
 
 
 class SerialTrigger:

@@ -23,7 +23,7 @@ from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, Rob
 from station.analysis.estimation import quick_sigma, solve_quickly
 from station.analysis.worker import CapturedView, assess
 from station.cell.config import matrix4
-from station.cell.scene import flange_pose
+from station.cell.scene import board_place, flange_pose
 from station.operate.draft import Draft, GuidedView
 
 FEWEST_GUIDED, MOST_GUIDED = 4, 6
@@ -234,9 +234,7 @@ def _rounded(camera: CameraModel) -> CameraModel:
 
 def _spread_m(mount: Mount, views: ViewSet, X: Array) -> float:
     """Root mean square distance of the board's places, one a view, from their middle."""
-    flange = views.base_from_flange
-    chain = flange if mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
-    places = (chain @ X @ views.camera_from_board)[:, :3, 3]
+    places = board_place(mount, views.base_from_flange, X, views.camera_from_board)[:, :3, 3]
     return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
@@ -247,7 +245,7 @@ def _scale(views: ViewSet, X: Array) -> float:
     Views that only turn about one point say nothing of it, so it begins as 1 ± `_SCALE_SIGMA`.
     """
     flange = views.base_from_flange
-    gripper = flange if views.mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
+    gripper = flange if views.mount == "eye-in-hand" else inverse(flange)
     left, right = (
         [np.array([[0.0, 0.0, 0.0, _TRAVEL_M / _SCALE_SIGMA]])],
         [np.array([_TRAVEL_M / _SCALE_SIGMA])],

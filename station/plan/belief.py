@@ -9,12 +9,11 @@ import msgspec
 import numpy as np
 from scipy.optimize import least_squares
 
-from calibrate.geometry import Array, difference, inverse, perturb
+from calibrate.geometry import Array, difference, perturb
 from calibrate.kinematics import forward
-from recordings.schema.messages import Mount
 from station.cell.config import StationConfig
 from station.cell.errors import ConfigError
-from station.cell.scene import arm_model, camera_from_board, guess_from, guess_matrix
+from station.cell.scene import arm_model, board_place, camera_from_board, guess_from, guess_matrix
 
 GOOD_M, GOOD_RAD = 0.006, 0.02
 """A belief this sharp (1 sigma per axis) is enough to plan from."""
@@ -115,13 +114,6 @@ def expected_after(
 
 def spread_of(covariance: Array) -> float:
     return float(np.trace(covariance[:3, :3]) + _LEVER_M**2 * np.trace(covariance[3:, 3:]))
-
-
-def board_place(mount: Mount, base_from_flange: Array, X: Array, camera_from_board: Array) -> Array:
-    """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)."""
-    if mount == "eye-in-hand":
-        return np.asarray(base_from_flange @ X @ camera_from_board)
-    return np.asarray(inverse(base_from_flange) @ X @ camera_from_board)
 
 
 def board_seen(config: StationConfig, glimpse: BootstrapView, X: Array) -> Array:

@@ -71,6 +71,10 @@ def parse_plan(content: bytes, name: str = "plan") -> Plan:
         plan = strict_yaml.load(content, Plan)
     except strict_yaml.StrictYamlError as error:
         raise _report(name, [str(problem) for problem in error.problems]) from None
+    return _checked(plan, name)
+
+
+def _checked(plan: Plan, name: str) -> Plan:
     if problems := _value_problems(plan):
         raise _report(name, problems)
     return plan
@@ -150,9 +154,7 @@ def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
         )
     poses = tuple(pose_at(MODELS[robot], name, joints, "as taught") for name, joints in taught)
     plan = Plan(robot=robot, mount=mount, poses=poses, note=f"taught: the poses of {path.name}")
-    if problems := _value_problems(plan):
-        raise _report(str(path), problems)
-    return plan
+    return _checked(plan, str(path))
 
 
 def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[float] | None = None) -> Plan:
@@ -193,9 +195,7 @@ def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[
         near = _row_joints(values, columns, robot, near, f"{path}, row {number}")
         poses.append(pose_at(MODELS[robot], name, near, f"from {path.name}"))
     plan = Plan(robot=robot, mount=mount, poses=tuple(poses), note=f"imported from {path.name}")
-    if problems := _value_problems(plan):
-        raise _report(str(path), problems)
-    return plan
+    return _checked(plan, str(path))
 
 
 def _numbers(cells: list[str], wanted: int, where: str) -> list[float]:

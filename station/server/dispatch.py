@@ -42,9 +42,8 @@ class SessionDispatcher:
 
     def stop_now(self, peer: Peer) -> Awaitable[object]:
         """STOP is on its way to the arm before anything else is looked at."""
-        caller = self._callers.get(peer.client_id) or _applicant(
-            peer
-        )  # the house may be full: nobody is kept
+        # The house may be full: nobody is kept.
+        caller = self._callers.get(peer.client_id) or _applicant(peer)
         return self._to_the_end(self._session.stop(caller.who))
 
     def stop_from(self, sender: Peer) -> None:

@@ -1,30 +1,38 @@
-"""The state that every part of a session works with."""
+"""The state that every part of a session works with, and the one status that watchers are told."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from calibrate.geometry import difference
 from calibrate.kinematics import forward
-from recordings.errors import RecordingError
+from recordings.errors import CodedError, RecordingError, Value
 from recordings.recover import recover_recording
 from recordings.schema.messages import CameraModel, Image, RobotState, Vector6
 from station.analysis.pool import Workers
 from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.collision import CellGeometry
 from station.cell.errors import RefusedError
-from station.cell.status import Event, SessionStatus, StationState
+from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
+from station.protocol.states import check_transition
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
-from station.session.store import StatusStore
+
+log = logging.getLogger("station.events")
 
 _LOOK_S = 20.0
+EVENTS_KEPT = 100
+EVENT_TEXT_LIMIT = 400
 
 
 @dataclass
@@ -157,3 +165,70 @@ def displacement(context: SessionContext, before: Vector6, after: Vector6) -> st
     delta = difference(*forward(context.geometry.model, [after, before]))
     distance_m, angle_rad = np.linalg.norm(delta[:3]), np.linalg.norm(delta[3:])
     return f"{1000 * distance_m:.0f} mm and {np.degrees(angle_rad):.0f}°"
+
+
+class StatusStore:
+    """Holds the newest immutable snapshot. Only the event loop's thread may call it."""
+
+    def __init__(self, status: StationStatus) -> None:
+        self.status = status
+        self._watchers: list[Callable[[], None]] = []
+        self._listeners: list[Callable[[Event], None]] = []
+
+    @property
+    def state(self) -> StationState:
+        return self.status.state
+
+    def watch(self, changed: Callable[[], None]) -> Callable[[], None]:
+        """`changed` is called after every change; returns what ends it, however often it is called."""
+        self._watchers.append(changed)
+
+        def end() -> None:
+            if changed in self._watchers:
+                self._watchers.remove(changed)
+
+        return end
+
+    def on_event(self, listener: Callable[[Event], None]) -> None:
+        """The recording keeps what people are told."""
+        self._listeners.append(listener)
+
+    def update(self, **sections: object) -> None:
+        changed = {k: v for k, v in sections.items() if getattr(self.status, k) != v}
+        if changed:
+            self.status = msgspec.structs.replace(self.status, **changed)
+            for watcher in list(self._watchers):
+                try:
+                    watcher()
+                except Exception:  # who only looks on must not come between STOP and the arm
+                    log.exception("a watcher of the status failed")
+
+    def update_session(self, **fields: object) -> None:
+        self.update(session=msgspec.structs.replace(self.status.session, **fields))
+
+    def enter(self, state: StationState, reason: str | CodedError = "", cause: str = "") -> None:
+        """`reason` for people, `cause` for programs. TransitionError for a step not in the table."""
+        if state is not self.state:
+            check_transition(self.state, state)
+        if isinstance(reason, CodedError):
+            cause = reason.code
+        self.update(state=state, reason=str(reason), cause=cause)
+
+    def event(
+        self, code: str, text: str, level: Level = "info", pose_index: int | None = None, /, **values: Value
+    ) -> None:
+        """Tells people, log and recording; `code` and `values` are for programs."""
+        text = text if len(text) <= EVENT_TEXT_LIMIT else text[: EVENT_TEXT_LIMIT - 1] + "…"
+        event = Event(time.time_ns(), level, text, pose_index, code, values)
+        pose = f"pose {pose_index + 1}: " if pose_index is not None else ""
+        log.log(getattr(logging, level.upper()), "%s%s", pose, text)
+        self.update(events=(*self.status.events, event)[-EVENTS_KEPT:])
+        for listener in self._listeners:
+            listener(event)
+
+    def problem(
+        self, error: Exception, level: Level = "warning", pose_index: int | None = None, said: str = "{}"
+    ) -> None:
+        """Tells of an error; `said` puts its text into a sentence."""
+        code, values = (error.code, error.values) if isinstance(error, CodedError) else ("internal", {})
+        self.event(code, said.format(error), level, pose_index, **values)

@@ -34,7 +34,7 @@ from station.plan.planner import make_plan
 from station.protocol import verbs
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
-from station.session.context import RunRequests, SessionContext
+from station.session.context import RunRequests, SessionContext, StatusStore
 from station.session.freedrive import FreedriveCapture
 from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
 from station.session.monitor import DeviceConnector, Previewer
@@ -43,7 +43,6 @@ from station.session.recording import Logbook, SessionRecording
 from station.session.replan import Estimator, Replanner
 from station.session.run import Run, SweepRun, close_or_seal, unmark_busy
 from station.session.stop_test import StopTestRun, prepare_stop_test
-from station.session.store import StatusStore
 from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.session.supervisor import SessionSupervisor
 from station.session.touch_test import HoverRun, TouchTestPlanner

@@ -10,7 +10,7 @@ from station.cell.status import StationState as S
 from station.cell.status import StationStatus
 from station.protocol.states import RUNNING, TRANSITIONS, TransitionError
 from station.protocol.verbs import VERBS, Acknowledge, Go, Prepare, Stop
-from station.session.store import StatusStore
+from station.session.context import StatusStore
 
 PAIRS = list(itertools.product(S, S))
 

@@ -140,8 +140,7 @@ class Daemon:
 
     def _healthy(self) -> bool:
         """systemd may restart us when this stays false."""
-        recording = self.session.context.recording
-        recorder = recording.recorder if recording is not None else None
+        recorder = self.session.context.recorder
         writing = recorder is None or recorder.error is not None or recorder.alive
         return writing and time.monotonic() - self._served_s < CONTROL_SERVED_S
 

@@ -84,10 +84,16 @@ class SessionContext:
         assert self.recording is not None
         return self.recording
 
+    @property
+    def recorder(self) -> Recorder | None:
+        """The writer of the open file. From any thread."""
+        recording = self.recording
+        return recording.recorder if recording is not None else None
+
     def record_state(self, state: RobotState) -> None:
         """Every sample of the arm, while a recording is open; from the reader's thread."""
-        if (recording := self.recording) is not None:
-            recording.robot_state(state)
+        if (recorder := self.recorder) is not None:
+            recorder.robot_state(state)
 
     def record_event(self, event: Event) -> None:
         if self.recording is not None:
@@ -99,9 +105,9 @@ class SessionContext:
 
         `check`: as a drift check. Raises RecordingError, StationError; all is as before then.
         """
-        before = self.recording
-        if before is not None and before.recorder is not None:
+        if self.recorder is not None:
             return
+        before = self.recording
         image = await self.cell.camera.capture() if self.cell.config.camera.model is None else None
         if before is not None:
             await self.recover_segments(before)

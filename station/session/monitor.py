@@ -178,9 +178,7 @@ class Monitor:
             self._free_checked_s = now_s
             self._free_bytes = _free_bytes(self._context.root)
             self._look_for_calibration()
-        recording = self._context.recording
-        recorder = recording.recorder if recording is not None else None
-        if recording is None or recorder is None:
+        if (recorder := self._context.recorder) is None:
             return RecorderStatus(free_bytes=self._free_bytes)
         return RecorderStatus(
             recording=True,

@@ -27,7 +27,6 @@ from recordings.schema.messages import (
     CaptureEvent,
     Image,
     Matrix4,
-    RobotState,
     SessionInfo,
     Stamps,
     View,
@@ -219,11 +218,6 @@ class SessionRecording:
         rough = self._cell.config.camera.model
         return CameraModel(width=rough.width if rough else 0, height=rough.height if rough else 0)
 
-    def robot_state(self, state: RobotState) -> None:
-        """Record a state, from the reader's thread."""
-        if (recorder := self.recorder) is not None:
-            recorder.robot_state(state)
-
     def event(self, event: Event) -> None:
         """Keeps what people were told; a failing disk is reported elsewhere."""
         if self.recorder is not None and self.recorder.error is None:
@@ -339,14 +333,13 @@ class SessionRecording:
 class Logbook(logging.Handler):
     """The log of `station`, also inside the recording. Events for people get there by themselves."""
 
-    def __init__(self, recording: Callable[[], SessionRecording | None]) -> None:
+    def __init__(self, recorder: Callable[[], Recorder | None]) -> None:
         super().__init__(logging.INFO)
-        self._recording = recording
+        self._recorder = recorder
 
     def emit(self, record: logging.LogRecord) -> None:
         """Record a log line from any thread; never raises, a log must not harm what it describes."""
-        recording = self._recording()
-        recorder = recording.recorder if recording is not None else None
+        recorder = self._recorder()
         if recorder is None or record.name == "station.events":
             return
         level: Level = next((word for number, word in _LEVELS if record.levelno >= number), "debug")

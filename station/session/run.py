@@ -113,7 +113,7 @@ class Run:
 
     async def _open_recording(self) -> None:
         context = self._context
-        if context.recording is not None and context.recording.recorder is not None:
+        if context.recorder is not None:
             return
         await context.open_recording(context.require_queue(), context.store.status.session.check)
         context.show_poses()

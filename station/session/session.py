@@ -90,7 +90,7 @@ class Session:
         cell.robot.subscribe(self.context.record_state)
         self.store.on_event(self.context.record_event)
         self.store.watch(self._estimator.poke)
-        self._logbook = Logbook(lambda: self.context.recording)
+        self._logbook = Logbook(lambda: self.context.recorder)
 
     async def start(self) -> None:
         """Connects, read-only, and keeps trying. Nothing moves. A session that a crash cut is found again."""
@@ -110,7 +110,7 @@ class Session:
             await self._halt(StationState.STOPPED, "The station is ending.", "station-ending")
         with contextlib.suppress(RefusedError):
             await self._run_ended()
-        if context.recording is not None and context.recording.recorder is not None:
+        if context.recording is not None and context.recorder is not None:
             with contextlib.suppress(RecordingError):
                 path = await context.recording.seal(context.require_queue())
                 self.store.event("finished", f"finished before the end: {path}", path=str(path))

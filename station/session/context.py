@@ -15,6 +15,7 @@ import numpy as np
 from calibrate.geometry import difference
 from calibrate.kinematics import forward
 from recordings.errors import CodedError, RecordingError, Value
+from recordings.recorder import Recorder
 from recordings.recover import recover_recording
 from recordings.schema.messages import CameraModel, Image, RobotState, Vector6
 from station.analysis.pool import Workers

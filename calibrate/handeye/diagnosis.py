@@ -184,7 +184,7 @@ def held_out_elsewhere(fit: CellFit, joints_rad: Array) -> Array | None:
     order = full[np.argsort(spread @ np.linalg.svd(spread)[2][0], kind="stable")]
     bare = replace(
         fit,
-        estimate=replace(fit.plain, scales=fit.estimate.scales),
+        estimate=replace(fit.plain, scales=replace(fit.estimate.scales, table=np.zeros(0))),
         observed=replace(fit.observed, table=None),
     )
     missed = np.full((2, len(fit.views)), np.nan)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import optimize, special
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
@@ -49,6 +49,9 @@ class Estimate:
     log_evidence: float
     steps: int
     converged: bool
+    averaged: tuple[Array, Array, Array] = (np.ones(1), np.ones(1), np.ones(1))
+    """(s,) chances of the estimates that this one is the mean of; the variance of each over the mean's, of X
+    and of the arm's table: the tails of a mean of normal distributions are heavier than one's."""
 
     @property
     def weight(self) -> Array:
@@ -62,9 +65,25 @@ class Estimate:
 
     @property
     def threshold(self) -> float:
-        """95 % region δᵀ C⁻¹ δ: 6·F(6, ν), ν = 3n - 6 of the n views that count."""
-        freedom = 3.0 * float(self.chances[:, 0].sum()) - 6.0 + ROBOT_PRIOR_COUNT
-        return float(6 * special.fdtri(6, max(freedom, 1.0), 0.95))
+        """95 % region δᵀ C⁻¹ δ of X: 6·F(6, ν), ν = 3n - 6 of the n views that count."""
+        return self._region(1)
+
+    @property
+    def table_threshold(self) -> float:
+        """The same for the six errors of a flange, by those of the arm's table."""
+        return self._region(2)
+
+    def _region(self, part: int) -> float:
+        freedom = max(3.0 * float(self.chances[:, 0].sum()) - 6.0 + ROBOT_PRIOR_COUNT, 1.0)
+        chances, ratio = self.averaged[0], self.averaged[part]
+        one = float(6 * special.fdtri(6, freedom, 0.95))
+        if len(chances) == 1:
+            return one
+
+        def outside(limit: float) -> float:
+            return float(chances @ special.fdtr(6, freedom, limit / (6 * ratio))) - 0.95
+
+        return float(optimize.brentq(outside, 0.9 * one * ratio.min(), 1.1 * one * ratio.max()))
 
 
 def estimate(

@@ -21,7 +21,15 @@ from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.estimate import Estimate, corner_weights, estimate
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.metrics import require_motion
-from calibrate.handeye.observations import SHAPE, CellState, Moved, Observations, Places, observe_views
+from calibrate.handeye.observations import (
+    SHAPE,
+    CellState,
+    Layout,
+    Moved,
+    Observations,
+    Places,
+    observe_views,
+)
 from calibrate.handeye.poses import BoardPoses, PoseViews, agreed_start, fit_poses
 from calibrate.handeye.priors import Priors
 from calibrate.views import BoardView, ViewSet
@@ -81,7 +89,10 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
             by_table = by_parameters(arm.model, arm.joints_rad) * RELATIVE_SIGMA
             motion = np.concatenate([by_table, flex], axis=2)
         try:
-            found, log_bayes = allow_for_table(replace(observed, table=motion), found, priors)
+            errors_of_table = motion.shape[2] - flex.shape[2]
+            found, log_bayes = allow_for_table(
+                replace(observed, table=motion), found, priors, errors_of_table
+            )
             observed = replace(observed, table=motion)
         except np.linalg.LinAlgError:
             pass
@@ -90,53 +101,98 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     return CellFit(views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified)
 
 
-_SIZES = np.array([1e-6, 0.05, 0.12, 0.3, 0.7, 1.5])
-"""1σ of the errors, mm and mrad; the first stands for none."""
-_BEFOREHAND = np.array([0.5, 0.1, 0.1, 0.1, 0.1, 0.1])
-_TABLE_STEPS = 2
+_SIZES = np.array([0.03, 0.06, 0.12, 0.25, 0.5, 1.0])
+"""1σ of the errors of an arm's table, mm and mrad: no arm is exactly its table."""
+_BENDS = np.array([1e-6, 0.1, 0.4, 1.6])
+"""1σ of a bracket's compliance, mrad; the first stands for a rigid one, half of all."""
+_BENDS_BEFOREHAND = np.array([3.0, 1.0, 1.0, 1.0]) / 6
+_NONE = 1e-6
+_ROUNDS = 3
+_WORTH_SOLVING = 1e-3
+"""Chance below which a size is left out of the second step."""
 
 
-def allow_for_table(observed: Observations, plain: Estimate, priors: Priors) -> tuple[Estimate, float]:
+@dataclass(frozen=True, eq=False)
+class _Sizes:
+    """What may be averaged over."""
+
+    sigma: Array
+    """(s, q) 1σ of each error, mm and mrad."""
+    beforehand: Array
+    """(s,) chances; the first is that of no errors, 0."""
+
+    @classmethod
+    def of(cls, table: int, bracket: int) -> _Sizes:
+        """Combine the sizes of `table` errors of a table and of `bracket` numbers of a bracket."""
+        by_table = _SIZES if table else np.array([_NONE])
+        pairs = np.array([(_NONE, _NONE), *((size, bend) for size in by_table for bend in _BENDS)])
+        chances = np.outer(np.full(len(by_table), 1 / len(by_table)), _BENDS_BEFOREHAND).ravel()
+        return cls(np.repeat(pairs, [table, bracket], axis=1), np.concatenate([[0.0], chances]))
+
+
+def allow_for_table(
+    observed: Observations, plain: Estimate, priors: Priors, errors_of_table: int
+) -> tuple[Estimate, float]:
     """Estimate anew with the `table` of the observations, from the estimate without it.
 
-    The size of its errors is not fitted but averaged over: one solution for each of a grid, weighed by its
-    evidence; no errors at all count as much beforehand as all other sizes together. So the price for an arm
-    without errors is small, and the stated uncertainty of one with errors is not.
+    The first `errors_of_table` errors are those of the arm's table, the others a bracket's. How large each of
+    the two is, is not fitted but averaged over: one solution for each pair of sizes, weighed by its evidence.
+    So the price for an arm without errors is small, and the stated uncertainty of one with errors is not.
 
     The second value is the log evidence of errors of any size against none; above 3 they are worth saying.
     Raises LinAlgError where it fails.
     """
-    state = replace(plain.state, table=np.zeros(np.asarray(observed.table).shape[2]))
+    columns = np.asarray(observed.table).shape[2]
+    sizes = _Sizes.of(errors_of_table, columns - errors_of_table)
+    state = replace(plain.state, table=np.zeros(columns))
     scales, weights = plain.scales, plain.corner_weights
-    for _ in range(_TABLE_STEPS):
+    chances, log_bayes = sizes.beforehand, 0.0
+    kept = np.arange(len(chances))
+    for last in (False, True):
         linear = Linear.at(observed, state, weights)
-        solutions = [linear.solve(priors.linearise(state, s), scales, "robot") for s in _SIZES]
-        log_evidence = np.array([s.log_evidence for s in solutions])
-        chances = special.softmax(log_evidence + np.log(_BEFOREHAND))
+        solutions = []
+        for i in kept:  # neighbours have nearly the same noise
+            start = solutions[-1].scales if solutions else scales
+            solutions.append(linear.solve(priors.linearise(state, sizes.sigma[i]), start, "robot", _ROUNDS))
+        log_evidence = np.array([solution.log_evidence for solution in solutions])
+        log_all = special.logsumexp(log_evidence, b=sizes.beforehand[kept])
+        chances = sizes.beforehand[kept] * np.exp(log_evidence - log_all)
         step = chances @ np.array([s.step for s in solutions])
         by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
         before, state = state, state.moved(step, by_view)
         weights = corner_weights(observed, state, scales.sigma_px)
-    covariance = sum(
-        chance * (linear.covariance(s) + np.outer(s.step - step, s.step - step))
-        for chance, s in zip(chances, solutions, strict=True)
-        if chance > 1e-6
-    )
-    best = solutions[int(chances.argmax())]
-    found = special.logsumexp(log_evidence[1:]) - np.log(len(_SIZES) - 1)
+        if not last:
+            log_bayes = float(log_all - log_evidence[0])
+            kept = kept[chances > _WORTH_SOLVING]
+    spread = np.array([
+        linear.covariance(solution) + np.outer(solution.step - step, solution.step - step)
+        for solution in solutions
+    ])  # fmt: skip
+    covariance = np.einsum("s,sij->ij", chances, spread)
+    best, at = solutions[int(chances.argmax())], Layout.of(state)
+    by_table = slice(at.table.start, at.table.start + errors_of_table)
     with_table = replace(
         plain,
         state=state,
-        scales=replace(best.scales, table=float(chances @ _SIZES)),
+        scales=replace(best.scales, table=chances @ sizes.sigma[kept]),
         chances=np.einsum("s,snk->nk", chances, [s.chances for s in solutions]),
-        covariance=np.asarray(covariance),
+        covariance=covariance,
         robot=linear.m + linear.J @ step,
-        robot_covariance=linear.predicted(best.scales, np.asarray(covariance)),
+        robot_covariance=linear.predicted(best.scales, covariance),
         board_poses=linear.seen_boards(before.C),
         corner_weights=weights,
-        log_evidence=float(special.logsumexp(log_evidence, b=_BEFOREHAND)),
+        log_evidence=float(log_all),
+        averaged=(chances, _against(spread, covariance, at.X), _against(spread, covariance, by_table)),
     )
-    return with_table, float(found - log_evidence[0])
+    return with_table, log_bayes
+
+
+def _against(spread: Array, mean: Array, part: slice) -> Array:
+    """Compare covariances (s, q, q) with their mean (q, q): the ratio (s,) of variances within `part`."""
+    if part.start == part.stop:
+        return np.ones(len(spread))
+    inverse_mean = np.linalg.inv(mean[part, part])
+    return np.asarray(np.einsum("ij,sji->s", inverse_mean, spread[:, part, part]) / (part.stop - part.start))
 
 
 def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Estimate:

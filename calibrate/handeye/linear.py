@@ -8,7 +8,7 @@ the board's pose, λ² on those of lens and board shape, σ² on the rest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -26,7 +26,7 @@ from calibrate.handeye.observations import (
 )
 from calibrate.handeye.priors import Quadratic
 
-_ROUNDS = 8
+ROUNDS = 8
 GAIN = np.array([1.0, 3.0, 10.0])
 """Robot noise of a view, in multiples of the usual one."""
 GARBAGE_M, GARBAGE_RAD = 0.3, 1.0
@@ -58,8 +58,8 @@ class Scales:
     sigma_px: float
     shares: Array
     """(K,) prior chance of each class."""
-    table: float = 0.0
-    """Errors of the kinematic table, mm and mrad."""
+    table: Array = field(default_factory=lambda: np.zeros(0))
+    """(q,) of each systematic error beforehand, mm and mrad."""
 
     @property
     def classes(self) -> Array:
@@ -210,10 +210,12 @@ class Linear:
         J[..., modes.shared] = -A @ modes.by_shared
         return cls(H, A, m + (A @ modes.to_optimum[..., None])[..., 0], J, modes)
 
-    def solve(self, prior: Quadratic, scales: Scales, fit: Fit = "all") -> LinearSolution:
+    def solve(
+        self, prior: Quadratic, scales: Scales, fit: Fit = "all", rounds: int = ROUNDS
+    ) -> LinearSolution:
         """Find the step and the noise scales to be fitted, by rounds of expectation and maximisation."""
         residual = self.m
-        for _ in range(1 if fit == "nothing" else _ROUNDS):
+        for _ in range(1 if fit == "nothing" else rounds):
             S, S_inverse = self._noise(scales)
             chances, _ = _chances(residual, S, S_inverse, scales.shares)
             WJ = np.einsum("nk,nkij->nij", chances, S_inverse) @ self.J

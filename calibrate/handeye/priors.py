@@ -100,12 +100,12 @@ class Priors:
     lens: LensPrior
     board: BoardTolerance = field(default_factory=BoardTolerance)
 
-    def linearise(self, state: CellState, table: float) -> Quadratic:
-        """Linearise around `state`, for errors of the kinematic table of size `table` (mm and mrad)."""
+    def linearise(self, state: CellState, table: Array | float) -> Quadratic:
+        """Linearise around `state`, for systematic errors of 1σ `table`, (q,) or all the same (mm, mrad)."""
         at = Layout.of(state)
         N, right = np.zeros((at.size, at.size)), np.zeros(at.size)
         vector = intrinsics_vector(state.camera)
-        table_sigma = np.full(len(state.table), TABLE_UNIT * table)
+        table_sigma = np.broadcast_to(TABLE_UNIT * np.asarray(table), (len(state.table),))
         sigma = np.concatenate([self.lens.sigma, self.board_sigma, table_sigma])
         value = np.concatenate([vector - self.lens.mean, state.shape, state.table])
         places = np.arange(at.lens.start, at.table.stop)

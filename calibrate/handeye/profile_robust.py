@@ -212,7 +212,7 @@ def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: flo
     value = unit * fit.estimate.state.table
     sigma = unit * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     errors = dict(zip(names, zip(value.tolist(), sigma.tolist(), strict=True), strict=True))
-    found = ArmTable(fit.log_bayes, fit.estimate.scales.table, errors, fit.arm is not None)
+    found = ArmTable(fit.log_bayes, float(fit.estimate.scales.table[0]), errors, fit.arm is not None)
     if fit.arm is None:
         return found
     return replace(found, result=table_result(fit, fit.arm, found.detected, distance_m, options.folds))

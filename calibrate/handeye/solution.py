@@ -120,6 +120,8 @@ class TableResult:
     corrected: RobotModel
     covariance: Array
     """(24, 24) of X, as in `Solution.parent_from_child`, and of the errors in the order of `PARAMETERS`."""
+    flange_threshold: float
+    """As `Solution.confidence_threshold`, of the six errors of a corrected flange by `covariance`."""
     for_uncorrected: Array
     """(4, 4) the X that serves the uncorrected arm best, over the workspace and where the views are."""
     uncorrected_covariance: Array

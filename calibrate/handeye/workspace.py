@@ -178,6 +178,7 @@ def table_result(
         factory=fit.views.arm is not None,
         corrected=corrected_model(arm.model, errors),
         covariance=covariance,
+        flange_threshold=found.table_threshold,
         for_uncorrected=perturb(state.X, by_errors @ errors),
         uncorrected_covariance=both @ covariance @ both.T,
         with_table_m=with_table_m,

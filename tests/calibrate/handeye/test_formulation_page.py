@@ -38,7 +38,12 @@ PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
         (priors.ASPECT_SIGMA, 0.001, "pixels square to 0.1 %"),
         (estimate.MAX_STEPS, 15, "At most 15 linearisations"),
         ([len(arm.PARAMETERS), len(arm.FLEX)], [18, 9], "18 errors of the Denavit-Hartenberg table and 9 of"),
-        ([fit._BEFOREHAND[0], fit._SIZES[-1]], [0.5, 1.5], "0 to 1.5 mm and mrad, s = 0 counting one half"),
+        (fit._SIZES[[0, -1]], [0.03, 1.0], "over six sizes from 0.03 to 1 mm and mrad"),
+        (
+            [fit._BENDS_BEFOREHAND[0], fit._BENDS[-1]],
+            [0.5, 1.6],
+            "a rigid bracket counts one half, others up to 1.6 mrad",
+        ),
         (readings._CLEAR, 10.0, "10 + ln n more"),
         (drift.FALSE_ALARM, 0.05, "F⁻¹(0.95; 6, ν)"),
         ([drift.SHIFT_M, np.degrees(drift.TURN_RAD)], [0.5e-3, 0.1], "d = 0.5 mm or 0.1°"),

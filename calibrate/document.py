@@ -37,6 +37,7 @@ from calibrate.files.gate import Gate
 from calibrate.geometry import Transform
 from calibrate.handeye.arm import HELD, PARAMETERS
 from calibrate.handeye.solution import Remark, Solution, TableResult
+from calibrate.handeye.workspace import Verification
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty
@@ -58,6 +59,7 @@ def make_calibration(
     gates: tuple[Gate, ...],
     options: dict[str, Any],
     lens_known: LensUncertainty | None = None,
+    verified: Verification | None = None,
 ) -> Calibration:
     """`options`: the choices that differ from the defaults."""
     info = recording.info
@@ -101,11 +103,11 @@ def make_calibration(
             recorded_wall_ns=info.created_wall_ns,
             plan_sha256=info.plan_sha256,
         ),
-        arm_table=None if arm is None else _arm_table(solution, arm),
+        arm_table=None if arm is None else _arm_table(solution, arm, verified),
     )
 
 
-def _arm_table(solution: Solution, arm: TableResult) -> CorrectedArm:
+def _arm_table(solution: Solution, arm: TableResult, verified: Verification | None) -> CorrectedArm:
     assert solution.arm is not None
     X, held_out = solution.parent_from_child, None
     if arm.held_out_m is not None:
@@ -125,10 +127,16 @@ def _arm_table(solution: Solution, arm: TableResult) -> CorrectedArm:
         without_table_mm=1e3 * arm.without_table_m,
         if_measured_mm={name: 1e3 * value for name, value in arm.if_measured_m.items()},
         held_out=held_out,
+        verified=None if verified is None else _verified(verified),
         refused=arm.refused or "",
         corrected=DhTable.of(arm.corrected) if arm.offered else None,
         result=FramePose.of(own) if arm.offered else None,
     )
+
+
+def _verified(found: Verification) -> HeldOutViews:
+    without_m, with_table_m = found.rms_m
+    return HeldOutViews(1e3 * without_m, 1e3 * with_table_m, len(found.flange_m), found.recording)
 
 
 @cache

@@ -20,6 +20,7 @@ from calibrate.files.gate import Gate
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Profile, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
+from calibrate.handeye.workspace import Verification, verify_elsewhere
 from calibrate.lens.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
@@ -94,6 +95,7 @@ class SolvedRecording(PreparedViews):
     """None without corners, or with the paper's profile."""
     gates: tuple[Gate, ...]
     calibration: Calibration
+    verified: Verification | None = None
 
     @property
     def passed(self) -> bool:
@@ -166,9 +168,15 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
 
 
 def solve_recording(
-    path: Path, options: JobOptions | None = None, progress: Progress | None = None
+    path: Path,
+    options: JobOptions | None = None,
+    progress: Progress | None = None,
+    verify: Path | None = None,
 ) -> SolvedRecording:
-    """Solve and judge a recording. Raises RecordingError or CalibrationError; each says what to do next."""
+    """Solve and judge a recording. Raises RecordingError or CalibrationError; each says what to do next.
+
+    `verify`: a recording of the same camera and board at other poses, which judges the arm's table.
+    """
     options = options or JobOptions()
     prepared = prepare_views(path, options, progress)
     recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
@@ -176,6 +184,11 @@ def solve_recording(
     with single_threaded_opencv():
         solution = solve_views(views, solver_options(options, prepared))
     watch.lap("solve")
+    verified = None
+    if verify is not None:
+        verified = _verify(verify, replace(options, board=loaded.board, square_m=None), solution, progress)
+        solution = _judged_by(verified, solution)
+        watch.lap("verify")
     used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
     coverage = picture_coverage(used)
     known = _lens_known(used, solution)
@@ -184,13 +197,33 @@ def solve_recording(
     )
     gates = judge(solution, inputs, options.limits)
     calibration = make_calibration(
-        recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen, known
+        recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen, known, verified
     )
     watch.lap("judge")
     made = vars(prepared) | {"stage_ms": prepared.stage_ms | watch.stage_ms}
     return SolvedRecording(
-        **made, solution=solution, coverage=coverage, lens_known=known, gates=gates, calibration=calibration
+        **made,
+        solution=solution,
+        coverage=coverage,
+        lens_known=known,
+        gates=gates,
+        calibration=calibration,
+        verified=verified,
     )
+
+
+def _verify(path: Path, options: JobOptions, solution: Solution, progress: Progress | None) -> Verification:
+    options = replace(options, camera=solution.camera, find_intrinsics=False, without=(), time_offset=None)
+    with single_threaded_opencv():
+        return verify_elsewhere(solution, _prepare(path, options, progress, 1).views, path.name)
+
+
+def _judged_by(verified: Verification, solution: Solution) -> Solution:
+    """Take the table's offer back where it does not help at the poses of a verification."""
+    arm = solution.arm
+    if verified.better or arm is None or arm.result is None or not arm.result.offered:
+        return solution
+    return replace(solution, arm=replace(arm, result=replace(arm.result, refused="not-better")))
 
 
 def _lens_known(used: ViewSet, solution: Solution) -> LensUncertainty | None:

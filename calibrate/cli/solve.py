@@ -40,6 +40,10 @@ from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve
 from calibrate.results import PeerResult
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
+Verify = Annotated[
+    Path | None,
+    typer.Option(help="A recording at other poses, same board: judges the arm's corrected table"),
+]
 GATE_FAILED = 4
 
 
@@ -52,6 +56,7 @@ def solve(
     ] = None,
     as_json: AsJson = False,
     report: Annotated[Path | None, typer.Option(help="Also write the report (HTML)")] = None,
+    verify: Verify = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
@@ -71,7 +76,7 @@ def solve(
                 remedy="Give --report another name.",
             )
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
-        job = solve_recording(recording, options, progress)
+        job = solve_recording(recording, options, progress, verify)
     write_calibration(job.calibration, target)
     if report is not None:
         _write_report(job, report, options)
@@ -127,6 +132,7 @@ def report(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Default: NAME.report.html in this folder")
     ] = None,
+    verify: Verify = None,
     root: Root = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
@@ -138,7 +144,7 @@ def report(
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
     check_target(target, "report")
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
-        job = solve_recording(recording, options, progress)
+        job = solve_recording(recording, options, progress, verify)
     _write_report(job, target, options, root)
     out.print(f"Written: {target}", soft_wrap=True)
 

@@ -172,6 +172,8 @@ class HeldOutViews(msgspec.Struct, frozen=True):
     without_table_mm: float
     with_table_mm: float
     views: int
+    recording: str = ""
+    """Of a verification: the recording that the views are in, none of which took part."""
 
 
 class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -198,6 +200,8 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     if_measured_mm: dict[str, float] = {}
     """`with_table_mm` if this (board, intrinsics) were known to 0.02 %."""
     held_out: HeldOutViews | None = None
+    verified: HeldOutViews | None = None
+    """By a recording of its own: distance of the board's middle from its mean place."""
     refused: str = ""
     """Why it is not offered: no-evidence, no-joints, not-nominal, not-better."""
     corrected: DhTable | None = None

@@ -176,6 +176,11 @@ def arm_sentences(calibration: Calibration) -> Iterator[str]:
             f"Views predicted from poses elsewhere: {arm.held_out.with_table_mm:.2f} mm with the table, "
             f"{arm.held_out.without_table_mm:.2f} mm without ({arm.held_out.views} views)."
         )
+    if (seen := arm.verified) is not None:
+        yield (
+            f"Verified at {seen.views} poses of {seen.recording}: {seen.with_table_mm:.2f} mm with the "
+            f"table, {seen.without_table_mm:.2f} mm without."
+        )
     if arm.offered:
         yield (
             "Where points far from the board count, give the robot program the corrected table (calibrate "

@@ -19,7 +19,7 @@ from calibrate.handeye.arm import (
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.estimate import Estimate, corner_weights, estimate
-from calibrate.handeye.linear import Linear
+from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.observations import (
     SHAPE,
@@ -150,7 +150,7 @@ def allow_for_table(
     kept = np.arange(len(chances))
     for last in (False, True):
         linear = Linear.at(observed, state, weights)
-        solutions = []
+        solutions: list[LinearSolution] = []
         for i in kept:  # neighbours have nearly the same noise
             start = solutions[-1].scales if solutions else scales
             solutions.append(linear.solve(priors.linearise(state, sizes.sigma[i]), start, "robot", _ROUNDS))

@@ -7,19 +7,23 @@ error: nothing that was recorded tells them from the place of the board.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.geometry import Array, difference, perturb, pose, random_rotation, skew
+from calibrate.errors import BadViewsError
+from calibrate.geometry import Array, difference, inverse, perturb, pose, random_rotation, skew
 from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA, ArmPostures, by_parameters, corrected_model
+from calibrate.handeye.corners import boards_by_corners
 from calibrate.handeye.diagnosis import held_out_elsewhere
 from calibrate.handeye.fit import CellFit
-from calibrate.handeye.observations import Layout
-from calibrate.handeye.solution import MEASURED, TableRefusal, TableResult
+from calibrate.handeye.observations import SHAPE, Layout, observe_views
+from calibrate.handeye.solution import MEASURED, Solution, TableRefusal, TableResult
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many
 from calibrate.projection import intrinsics_vector
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import Mount
 
 POSES = 400
@@ -187,6 +191,80 @@ def table_result(
         held_out_m=missed,
         refused=_refusal(fit, arm, detected, missed),
     )
+
+
+_ELSEWHERE_RAD = 0.1
+"""A view from where a joint differs by this from every view of the fit is one elsewhere."""
+_FEWEST_ELSEWHERE = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """The arm without and with its table at poses that took no part in the fit, n of them."""
+
+    recording: str
+    flange_m: Array
+    """(n, 3) where the flange stood."""
+    missed_m: Array
+    """(2, n) distance of the board's middle from its mean place: without, with the table."""
+
+    @property
+    def rms_m(self) -> tuple[float, float]:
+        without, with_table = np.sqrt(np.mean(self.missed_m**2, axis=1)).tolist()
+        return without, with_table
+
+    @property
+    def better(self) -> bool:
+        return self.rms_m[1] < self.rms_m[0]
+
+
+def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") -> Verification:
+    """Judge X and table by views of the same board, lying anywhere, that were not used to find them.
+
+    The board is in one place: its middle is seen there by each view, in base or in the flange. Views that
+    stand where the fit's do are left out. Raises BadViewsError where too few are left or have joints.
+    """
+    arm = None if solution.arm is None else solution.arm.result
+    if arm is None:
+        raise BadViewsError(
+            "No table of the arm was fitted, so there is none to verify.",
+            code="no-arm-table",
+            remedy="Record a robot whose model is known, at 8 poses or more.",
+        )
+    fitted = [view.joints_rad for view in solution.kept if view.joints_rad is not None]
+    far = [place for place, view in enumerate(views) if _stands_elsewhere(view, fitted)]
+    if len(far) < _FEWEST_ELSEWHERE:
+        raise BadViewsError(
+            f"Verification: {len(far)} of {len(views)} views have joints and stand elsewhere than the "
+            f"calibration's (minimum {_FEWEST_ELSEWHERE}).",
+            code="not-elsewhere",
+            remedy="Record poses in other parts of the workspace.",
+            views=len(far),
+            minimum=_FEWEST_ELSEWHERE,
+        )
+    views, shape = views.select(far), solution.board
+    observed = observe_views(views)
+    numbers = (
+        np.zeros(len(SHAPE)) if shape is None else np.array([shape.scale, shape.anisotropy, *shape.bend_m])
+    )
+    C = boards_by_corners(observed, solution.camera, views.camera_from_board, numbers)
+    joints = np.array([view.joints_rad for view in views], dtype=float)
+    middle = np.array([*observed.extent[0], 0.0, 1.0])
+    missed = []
+    for flange, X in (
+        (views.base_from_flange, arm.for_uncorrected),
+        (forward(arm.corrected, joints), solution.matrix),
+    ):
+        chain = flange @ X @ C if views.mount == "eye-in-hand" else inverse(flange) @ X @ C
+        at = (chain @ middle)[:, :3]
+        missed.append(np.linalg.norm(at - at.mean(axis=0), axis=1))
+    return Verification(recording, views.base_from_flange[:, :3, 3], np.array(missed))
+
+
+def _stands_elsewhere(view: BoardView, fitted: Sequence[Array]) -> bool:
+    if view.joints_rad is None:
+        return False
+    return all(np.abs(view.joints_rad - joints).max() > _ELSEWHERE_RAD for joints in fitted)
 
 
 def _of_X_and_table(covariance: Array, places: NDArray[np.intp]) -> Array:

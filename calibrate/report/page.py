@@ -267,6 +267,12 @@ def _arm(job: SolvedRecording) -> Iterator[str]:
     arm, table = job.solution.arm, job.calibration.arm_table
     if arm is None or arm.result is None or table is None:
         return
+    if job.verified is not None:
+        yield html.figure(
+            plots.held_out_over_workspace(job.verified.flange_m, *job.verified.missed_m),
+            f"Verification by {job.verified.recording}: distance of the board's middle from its mean place, "
+            "where the flange stood.",
+        )
     if arm.result.held_out_m is not None:
         without_m, with_table_m = arm.result.held_out_m
         yield html.figure(

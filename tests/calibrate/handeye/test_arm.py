@@ -11,6 +11,8 @@ from scipy import stats
 from benchmarks.kinematics import worn_cell
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye.arm import PARAMETERS, arm_postures, by_parameters
+from calibrate.handeye.fit import fit_cell
+from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.kinematics import MODELS, forward, link_frames
 from calibrate.views import ViewSet
@@ -69,6 +71,20 @@ def test_the_stated_region_is_wider_for_fewer_views_with_and_without_the_arm(cou
     expected = 6 * stats.f.ppf(0.95, 6, 3 * counted - 5)
     assert solution.confidence_threshold == pytest.approx(expected, rel=0.03)
     assert solution.confidence_threshold > 1.04 * stats.chi2.ppf(0.95, 6)
+
+
+def test_the_region_of_an_average_holds_95_percent_of_it():
+    """Of normal distributions of several widths: more lies far out than of one with their mean variance."""
+    views = worn_cell(np.random.default_rng(2), 0.3).views
+    found = fit_cell(views, Priors(LensPrior.given(views.camera)), 0)
+    assert found.estimate.scales.table[0] > 0.2 > found.estimate.scales.table[-1], "the bracket is rigid"
+    chances, widths = np.array([0.5, 0.3, 0.2]), np.array([0.2, 0.8, 3.3])
+    average = replace(found.estimate, averaged=(chances, widths, np.ones(3)))
+    rng, n = np.random.default_rng(0), 200_000
+    freedom = 3 * average.chances[:, 0].sum() - 5
+    drawn = rng.choice(widths, n, p=chances) * 6 * rng.f(6, freedom, n)
+    assert np.mean(drawn <= average.threshold) == pytest.approx(0.95, abs=0.002)
+    assert average.threshold > 1.5 * average.table_threshold
 
 
 def test_seven_views_are_too_few_for_eighteen_errors():

@@ -12,13 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.kinematics import Worn, worn_cell
+from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb, pose, random_rotation
 from calibrate.handeye.arm import HELD, PARAMETERS, by_parameters, corrected_model
 from calibrate.handeye.linear import inverse_of
 from calibrate.handeye.solution import Solution, TableResult
 from calibrate.handeye.solve import SolveOptions, solve_views
-from calibrate.handeye.workspace import Workspace, sample_workspace
+from calibrate.handeye.workspace import Workspace, sample_workspace, verify_elsewhere
 from calibrate.kinematics import MODELS, forward, with_near_axes
+from calibrate.views import BoardView, ViewSet
 
 UR10 = MODELS["UR10"]
 FACTORY = UR10.calibrated(
@@ -66,6 +68,38 @@ def test_held_out_poses_elsewhere_say_the_same(solved: Solution) -> None:
     assert missed is not None and missed.shape == (2, 25)
     without, with_table = np.sqrt(np.nanmean(missed**2, axis=1))
     assert with_table < 0.8 * without
+
+
+def elsewhere(worn: Worn) -> ViewSet:
+    """Poses that took no part, seen without noise; the board lies where it lay."""
+    nothing = np.zeros((0, 3)), np.zeros((0, 2))
+    views = (
+        BoardView(i, "", flange, *nothing, q, C)
+        for i, (flange, q, C) in enumerate(
+            zip(forward(UR10, worn.new_joints), worn.new_joints, worn.new_board_poses, strict=True)
+        )
+    )
+    return replace(worn.views, views=tuple(views))
+
+
+def test_a_recording_elsewhere_judges_the_table(worn: Worn, solved: Solution) -> None:
+    verified = verify_elsewhere(solved, elsewhere(worn), "second.mcap")
+    without, with_table = verified.rms_m
+    assert verified.better and with_table < 0.6 * without
+    assert solved.arm is not None
+    twice = corrected_model(UR10, -np.array([value for value, _ in solved.arm.errors.values()][:18]))
+    arm = replace(solved.arm, result=replace(table_of(solved), corrected=twice))
+    assert not verify_elsewhere(replace(solved, arm=arm), elsewhere(worn)).better
+
+
+def test_the_fit_s_own_poses_verify_nothing(worn: Worn, solved: Solution) -> None:
+    with pytest.raises(BadViewsError) as refused:
+        verify_elsewhere(solved, worn.views)
+    assert refused.value.code == "not-elsewhere"
+    bare = replace(elsewhere(worn), views=tuple(replace(v, joints_rad=None) for v in elsewhere(worn)))
+    with pytest.raises(BadViewsError) as refused:
+        verify_elsewhere(solved, bare)
+    assert refused.value.code == "not-elsewhere"
 
 
 def test_without_joints_the_table_is_not_offered(worn: Worn) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
+import ast
+import importlib.util
 import io
 import os
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, cast
 
 import msgspec
@@ -35,14 +37,22 @@ class LazyCommand(NamedTuple):
 
     where: str
     """`module:function`; the function is declared as typer declares it."""
-    help: str
-    """The first line of the function's docstring: a test compares them."""
     examples: tuple[str, ...] = ()
     """Command lines as a person types them, a remark behind `#`."""
     old_options: Mapping[str, str] = {}
     """Options by their names of the last release, and what they are called now."""
     passes_on: bool = False
     """All arguments are another program's, `--help` too."""
+
+    def first_line(self) -> str:
+        """First line of the function's docstring, by its source: importing it may take a second."""
+        module, _, function = self.where.partition(":")
+        found = importlib.util.find_spec(module)
+        assert found is not None and found.origin is not None
+        for node in ast.parse(Path(found.origin).read_text()).body:
+            if isinstance(node, ast.FunctionDef) and node.name == function:
+                return (ast.get_docstring(node) or "").partition("\n")[0]
+        return ""
 
     def load(self, name: str) -> TyperCommand:
         """Import the module and declare the command."""
@@ -63,9 +73,8 @@ class LazyGroup(TyperGroup):
     def __init__(
         self, commands: Mapping[str, LazyCommand], help: str, epilog: str, aliases: Mapping[str, str] = {}
     ) -> None:
-        stubs = {name: TyperCommand(name, help=command.help) for name, command in commands.items()}
         super().__init__(
-            commands=dict(stubs),
+            commands={name: TyperCommand(name) for name in commands},
             help=help,
             epilog=epilog,
             no_args_is_help=True,
@@ -74,6 +83,13 @@ class LazyGroup(TyperGroup):
             params=_group_options(),
         )
         self._lazy, self._aliases = commands, aliases
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command's line in the group's help."""
+        stub = super().get_command(ctx, cmd_name)
+        if stub is not None and stub.help is None:
+            stub.help = self._lazy[cmd_name].first_line()
+        return stub
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The loaded command in place of its line in the group's help."""

@@ -1,4 +1,4 @@
-"""All commands of `station`: where each one lives, its line of help, and examples."""
+"""All commands of `station`: where each one lives, and examples."""
 
 from __future__ import annotations
 
@@ -9,18 +9,14 @@ _APPROVED = {"--go": "--approve"}
 STATION = LazyGroup(
     {
         "tui": LazyCommand(
-            "station.cli.screen:tui_command",
-            "Open the operator screen; start a daemon if none runs.",
-            ("station tui", "station tui --replay session.mcap"),
+            "station.cli.screen:tui_command", ("station tui", "station tui --replay session.mcap")
         ),
         "demo": LazyCommand(
             "station.cli.demo:demo_command",
-            "Run the whole job on a simulated cell and compare with the truth.",
             ("station demo", "station demo --seed 3 --mount eye-to-hand --noise mid --out trial"),
         ),
         "serve": LazyCommand(
             "station.cli.serve:serve_command",
-            "Own the cell and serve it on a Unix socket.",
             (
                 "station serve --config station.yaml  # then, in another terminal: station",
                 "station serve --config station.yaml --rehearse  # the same with no hardware",
@@ -30,7 +26,6 @@ STATION = LazyGroup(
         ),
         "plan": LazyCommand(
             "station.cli.plan:plan_command",
-            "Make a pose plan, or check one. Nothing moves.",
             (
                 "station plan --config station.yaml -o plan.yaml  # from where the arm stands",
                 "station plan --config station.yaml --check plan.yaml --picture plan.png",
@@ -38,7 +33,6 @@ STATION = LazyGroup(
         ),
         "capture": LazyCommand(
             "station.cli.session:capture_command",
-            "Capture all poses of a plan into a recording. Ctrl-C stops the arm.",
             (
                 "station capture --plan plan.yaml",
                 "station capture --plan plan.yaml --headless --approve 0123456789ab",
@@ -47,66 +41,29 @@ STATION = LazyGroup(
             _APPROVED,
         ),
         "status": LazyCommand(
-            "station.cli.control:status_command",
-            "Show what the station is doing.",
-            ("station status", "station status --json"),
+            "station.cli.control:status_command", ("station status", "station status --json")
         ),
-        "stop": LazyCommand(
-            "station.cli.control:stop_command", "Stop the arm now (STOP).", ("station stop",)
-        ),
-        "acknowledge": LazyCommand(
-            "station.cli.control:acknowledge_command",
-            "Leave `stopped` or `fault` after looking at the cell. Nothing moves.",
-            ("station acknowledge",),
-        ),
-        "pause": LazyCommand(
-            "station.cli.control:pause_command", "Pause after the pose under way.", ("station pause",)
-        ),
-        "resume": LazyCommand(
-            "station.cli.session:resume_command",
-            "Continue a paused or interrupted session. Ctrl-C stops the arm.",
-            ("station resume",),
-            _APPROVED,
-        ),
-        "finish": LazyCommand(
-            "station.cli.control:finish_command",
-            "Finish the recording with the poses captured so far.",
-            ("station finish",),
-        ),
+        "stop": LazyCommand("station.cli.control:stop_command", ("station stop",)),
+        "acknowledge": LazyCommand("station.cli.control:acknowledge_command", ("station acknowledge",)),
+        "pause": LazyCommand("station.cli.control:pause_command", ("station pause",)),
+        "resume": LazyCommand("station.cli.session:resume_command", ("station resume",), _APPROVED),
+        "finish": LazyCommand("station.cli.control:finish_command", ("station finish",)),
         "retake": LazyCommand(
-            "station.cli.control:retake_command",
-            "Mark a pose to be captured again by the next run.",
-            ("station retake 7  # then: station resume",),
+            "station.cli.control:retake_command", ("station retake 7  # then: station resume",)
         ),
-        "skip": LazyCommand(
-            "station.cli.control:skip_command",
-            "Leave a pose out, in later runs of the plan too.",
-            ("station skip 7",),
-        ),
-        "replan": LazyCommand(
-            "station.cli.session:replan_command",
-            "Replan the remaining poses of a paused session from its images.",
-            ("station replan",),
-        ),
-        "next-pose": LazyCommand(
-            "station.cli.session:next_pose_command",
-            "Add the most useful pose to a paused session and capture it.",
-            ("station next-pose",),
-        ),
+        "skip": LazyCommand("station.cli.control:skip_command", ("station skip 7",)),
+        "replan": LazyCommand("station.cli.session:replan_command", ("station replan",)),
+        "next-pose": LazyCommand("station.cli.session:next_pose_command", ("station next-pose",)),
         "drift-check": LazyCommand(
             "station.cli.session:drift_check_command",
-            "Check on a few new poses whether the installed calibration holds.",
             ("station drift-check", "station drift-check --poses 12"),
             _APPROVED,
         ),
         "watch": LazyCommand(
-            "station.cli.watch:watch_command",
-            "Notice through the station's own camera that camera, tag or arm moved.",
-            ("station watch --board tag.yaml", "station watch --every 10"),
+            "station.cli.watch:watch_command", ("station watch --board tag.yaml", "station watch --every 10")
         ),
         "touch-test": LazyCommand(
             "station.cli.touch_test:touch_test_command",
-            "Test a calibration by touching corners of the board by hand.",
             (
                 "station touch-test --pointer-mm 120  # the installed one, over the four outermost corners",
                 "station touch-test cell.yaml --corner 0 --corner 20",
@@ -114,32 +71,23 @@ STATION = LazyGroup(
         ),
         "accept": LazyCommand(
             "station.cli.accept:accept_command",
-            "Test how the arm stops: STOP, watchdog, pulled cable, slider.",
             ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.05"),
         ),
         "trace": LazyCommand(
             "station.cli.trace:trace_command",
-            "Record what a controller does in 32 scenarios, or compare two records.",
             ("station trace record 192.168.56.101 -o ursim.json.gz", "station trace compare ursim.json.gz"),
         ),
-        "new": LazyCommand(
-            "station.cli.new:new_command",
-            "Set up a cell in a wizard that only reads.",
-            ("station new", "station new -o station.yaml"),
-        ),
+        "new": LazyCommand("station.cli.new:new_command", ("station new", "station new -o station.yaml")),
         "bootstrap": LazyCommand(
             "station.cli.bootstrap:bootstrap_command",
-            "Find camera pose and board pose by 3 to 5 small moves.",
             ("station bootstrap --config station.yaml -o guesses.yaml",),
         ),
         "doctor": LazyCommand(
             "station.cli.control:doctor_command",
-            "Check everything a capture needs; say how to mend what is missing.",
             ("station doctor --example > station.yaml", "station doctor --config station.yaml"),
         ),
         "board": LazyCommand(
             "station.cli.control:board_command",
-            "Make a printable calibration board (`calibrate board`).",
             passes_on=True,
         ),
     },

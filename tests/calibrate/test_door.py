@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 import calibrate
-from calibrate.cli.app import COMMANDS
 
 
 def example() -> str:
@@ -48,9 +47,3 @@ def test_neither_the_door_nor_the_help_loads_what_is_heavy(program: str) -> None
     asked = f"{program}\nimport sys\nprint('LOADED', *sys.modules)"
     done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
     assert not {"numpy", "scipy", "cv2", "matplotlib"} & set(done.stdout.partition("LOADED")[2].split())
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_the_short_help_is_the_first_line_of_the_commands_own(name: str) -> None:
-    own = COMMANDS[name].load(name).help or ""
-    assert own.splitlines()[0] == COMMANDS[name].help

@@ -133,7 +133,7 @@ class Camera(Protocol):
         """
 
     async def glimpse(self) -> Image | None:
-        """A image exposed after this call, of any size, that takes no number and is never recorded.
+        """An image exposed after this call, of any size, that takes no number and is never recorded.
 
         None where there is no such thing (played images). Raises CameraError within about a second.
         """

@@ -146,7 +146,9 @@ def cell_sentences(calibration: Calibration) -> list[str]:
         label, remedy, arm = name.replace("_", " "), _REMEDIES[name], calibration.arm_table
         if name == "kinematics" and arm is not None and arm.offered:
             remedy = "use the corrected table"
-        sentences.append(f"{label.capitalize()} make up {shares[0][1]:.0%} of the variance: {remedy}.")
+        sentences.append(
+            f"Largest error source: {label}, {shares[0][1]:.0%} of the variance. To lower it, {remedy}."
+        )
     return sentences
 
 

@@ -47,7 +47,7 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     seed: int | None = None
     note: str = ""
     motion: Literal["stops", "sweep"] = "stops"
-    """sweep: the arm swings through the poses without a stop for a image, while the camera runs."""
+    """sweep: the arm swings through the poses without a stop for an image, while the camera runs."""
 
 
 def plan_sha256(plan: Plan) -> str:

@@ -73,7 +73,7 @@ class PlayedSource(NamedTuple):
     name: str
     identity: CameraIdentity
     frames: Iterator[Played]
-    """In order; raises CameraError at a image that cannot be read."""
+    """In order; raises CameraError at an image that cannot be read."""
 
 
 def open_source(path: Path) -> PlayedSource:
@@ -256,7 +256,7 @@ class PlaybackCamera:
 class PlaybackRobot:
     """`station.devices.base.Robot` that stands where the recorded arm stood.
 
-    It can move only to joints that the recording has a image from.
+    It can move only to joints that the recording has an image from.
     """
 
     def __init__(self, recording: Path) -> None:

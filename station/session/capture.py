@@ -193,7 +193,7 @@ async def _sighting(context: SessionContext, image: Image, index: int) -> BoardD
     try:
         return await context.look_at(image)
     except WorkerError as error:
-        context.store.problem(error, "warning", index, "the image was not looked at: {}")
+        context.store.problem(error, "warning", index, "the image was not checked: {}")
         return None
 
 

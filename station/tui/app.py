@@ -154,7 +154,7 @@ class StationApp(ResultsDesk):
         ),
         Binding("f9", "solve_newest", "Solve", id="solve", tooltip="Solve the session just recorded"),
         Binding("f3", "freedrive", "Freedrive", id="freedrive", tooltip="Freedrive: move the arm by hand"),
-        Binding("f2", "ask('record')", "Grab", id="record", tooltip="Capture an image here (freedrive)"),
+        Binding("f2", "ask('record')", "Image", id="record", tooltip="Capture an image here (freedrive)"),
         Binding("f4", "release", "Release", show=False, id="release", tooltip="Release control of the arm"),
         *(
             Binding(DIGITS[mode], f"open('{mode}')", mode.title(), show=False, id=mode, tooltip=tooltip)

@@ -109,7 +109,7 @@ class ConfirmMotion(Confirm):
     def _count_down(self) -> None:
         left_s = max(0.0, self._until_s - time.monotonic())
         line = Content.assemble(
-            ("this question holds for ", "$dim"), (duration(left_s), "bold $strong"), "  "
+            ("this question expires in ", "$dim"), (duration(left_s), "bold $strong"), "  "
         )
         line += limit_bar(left_s, APPROVAL_LIFETIME_S, 24, "$warn", 1.0)
         self.query_one("#motion-holds", Static).update(line)
@@ -206,7 +206,7 @@ class Help(Question[None]):
         self.titled(self._title)
 
 
-READ = Action("", "Read what it says", "It is done; Enter closes this window.", look=True)
+READ = Action("", "Read the result", "It is done; Enter closes this window.", look=True)
 
 
 class JobScreen(Question[int]):

@@ -69,7 +69,7 @@ def quality_line(status: StationStatus) -> Content:
         + facts(("sharp", f"{seen.sharpness:.2f}", "")),
         mark("look" if burnt else "done")
         + Content(" ")
-        + facts(("light", f"{100 * seen.saturated:.1f} %", "burnt" if burnt else "good")),
+        + facts(("saturated", f"{100 * seen.saturated:.1f} %", "")),
     ]
     if seen.tilt_rad is not None:
         parts.append(facts(("tilt", degrees(seen.tilt_rad, 0), "")))

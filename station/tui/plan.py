@@ -23,7 +23,7 @@ from station.tui.task import Known
 from station.tui.widgets.scene import LEGEND, cell_scene, draw, view_of
 from station.tui.words import MARKS, UNKNOWN, Mark, degrees, facts, limit_bar, many, mark, mm
 
-COLUMNS = ("#", "error then", "", "distance", "tilt", "why it is there", "state")
+COLUMNS = ("#", "error after", "", "distance", "tilt", "reason", "state")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
@@ -107,7 +107,7 @@ class PlanScreen(StationScreen):
     MODE, NAME = "plan", "Plan"
     HELP = (
         "Poses in capture order. Nothing moves without your approval: F5, p and b show the motion and ask. "
-        "Home and End go to the first and the last pose. Error then: the expected error (1σ) after this "
+        "Home and End go to the first and the last pose. Error after: the expected error (1σ) after this "
         "pose, against the goal."
     )
     BINDINGS: ClassVar[list[BindingType]] = [

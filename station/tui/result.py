@@ -309,7 +309,7 @@ class SolveScreen(ResultScreen):
                     yield Rows("gate", "value", "", "limit", "", id="gates")
                 yield _panel("Camera pose", lambda r, c, w, h: pose_table(r, c), id="answer")
             yield _panel(
-                "How well each view fits",
+                "Reprojection error per view",
                 lambda r, c, w, h: residual_lines(c, w, h),
                 id="residuals",
                 below="reprojection error",

@@ -185,8 +185,9 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     """Choose the action where the arm works or is held; None at rest."""
     state, held = status.state, status.robot.held
     if state in LATCHED:
-        why = " ".join(words for words in ("Look at the cell first; nothing moves.", status.reason) if words)
-        return Action("F8", "Acknowledge", why, look=True)
+        return Action(
+            "F8", "Acknowledge", status.reason or "Look at the cell first; nothing moves.", look=True
+        )
     if state is StationState.DISCONNECTED:
         why = status.reason or "The robot does not answer."
         return Action("1", "See what is missing", why, look=True)

@@ -112,9 +112,9 @@ class Posture:
             T[8] * x + T[9] * y + T[10] * z + T[11],
         )
 
-    def mass_matrix(self, bodies: Sequence[Body], rotor_kg_m2: float = ROTOR_KG_M2) -> Matrix:
+    def mass_matrix(self, bodies: Sequence[Body]) -> Matrix:
         """(6, 6) [kg m²]"""
-        M = [[rotor_kg_m2 * (i == j) for j in range(6)] for i in range(6)]
+        M = [[ROTOR_KG_M2 * (i == j) for j in range(6)] for i in range(6)]
         for body in bodies:
             columns = self._columns(self._placed(body), body.link)
             for i, a in enumerate(columns):

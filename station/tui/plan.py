@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from textual import work
 from textual.app import ComposeResult
@@ -27,6 +27,7 @@ COLUMNS = ("#", "error after", "", "distance", "tilt", "reason", "state")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
+NEW_FOR_ARM = "Plan 25 poses that also tell the errors of the arm's table, board and lens"
 POSE_VERBS = {"retake": Retake, "skip": Skip, "drop": Drop}
 MOVE = Binding.Group("order", compact=True)
 SIGMA_SHOWN_MM = 100.0
@@ -111,7 +112,10 @@ class PlanScreen(StationScreen):
         "pose, against the goal."
     )
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("n", "make", "New", tooltip="Plan 25 poses from the configured initial poses (seconds)"),
+        Binding(
+            "n", "make('camera')", "New", tooltip="Plan 25 poses from the configured initial poses (seconds)"
+        ),
+        Binding("m", "make('both')", "New+arm", tooltip=NEW_FOR_ARM),
         Binding("r", "pose('retake')", "Retake", tooltip=RETAKE),
         Binding("s", "pose('skip')", "Skip", tooltip=SKIP),
         Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
@@ -227,5 +231,5 @@ class PlanScreen(StationScreen):
         self.desk.send(Add(PlannedPose(name, status.robot.joints_rad, why="added on the screen")))
 
     @work(exit_on_error=False)
-    async def action_make(self) -> None:
-        await self.desk.ask(MakePlan(25, seed=1), timeout_s=PREPARE_S)
+    async def action_make(self, aim: Literal["camera", "both"]) -> None:
+        await self.desk.ask(MakePlan(25, seed=1, aim=aim), timeout_s=PREPARE_S)

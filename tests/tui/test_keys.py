@@ -113,6 +113,7 @@ async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(link: Fa
         "ctrl+up": verbs.Reorder((0, 2, 1, *range(3, 25))),
         "ctrl+down": verbs.Reorder((0, 1, 3, 2, *range(4, 25))),
         "n": verbs.MakePlan(25, seed=1),
+        "m": verbs.MakePlan(25, seed=1, aim="both"),
     }
     async with opened(link, size=(120, 34)) as pilot:
         await pilot.press("2")

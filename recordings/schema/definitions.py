@@ -8,6 +8,7 @@ travels inside every file, and the reader refuses one that says something else t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -58,7 +59,7 @@ class SchemaError(ValueError):
 
 S = TypeVar("S", bound=msgspec.Struct)
 _Descriptor = descriptor_pb2.FieldDescriptorProto
-_FILLED_IN_BY_READER = {(View, "part")}
+_FILLED_IN_BY_READER: dict[type[msgspec.Struct], tuple[str, ...]] = {View: ("part",)}
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def _field(field: inspect.Field) -> _Field:
 def _fields(struct: type[msgspec.Struct]) -> list[_Field]:
     node = inspect.type_info(struct)
     assert isinstance(node, inspect.StructType)
-    return [_field(f) for f in node.fields if (struct, f.name) not in _FILLED_IN_BY_READER]
+    return [_field(f) for f in node.fields if f.name not in _FILLED_IN_BY_READER.get(struct, ())]
 
 
 _STRUCTS: tuple[type[msgspec.Struct], ...] = (
@@ -144,28 +145,29 @@ def message_class(struct: type[msgspec.Struct]) -> Any:
 
 def encode(value: msgspec.Struct) -> bytes:
     """Any of the structs above → protobuf bytes."""
-    return bytes(_to_proto(value).SerializeToString())
+    return bytes(_CLASSES[type(value)](**_content(value)).SerializeToString())
 
 
-def _to_proto(value: msgspec.Struct) -> Any:
-    struct = type(value)
-    arguments: dict[str, Any] = {}
-    for name, convert in _CONVERSIONS[struct]:
-        content = getattr(value, name)
-        if content is not None:
-            arguments[name] = content if convert is None else convert(content)
-    return _CLASSES[struct](**arguments)
+def _content(value: msgspec.Struct) -> dict[str, Any]:
+    """A struct's fields as protobuf takes them; it leaves out those that are None."""
+    content = msgspec.structs.asdict(value)
+    for name, convert in _CONVERSIONS[type(value)]:
+        if content[name] is not None:
+            content[name] = convert(content[name])
+    for name in _FILLED_IN_BY_READER.get(type(value), ()):
+        del content[name]
+    return content
 
 
 def _flat(matrix: Any) -> list[float]:
     return [number for row in matrix for number in row]
 
 
+_CONVERTED: dict[str, Callable[[Any], Any]] = {"message": _content, "matrix": _flat}
 _CONVERSIONS = {
-    struct: [(field.name, {"message": _to_proto, "matrix": _flat}.get(field.kind)) for field in fields]
+    struct: [(field.name, _CONVERTED[field.kind]) for field in fields if field.kind in _CONVERTED]
     for struct, fields in _PLAN.items()
 }
-"""Struct → its fields' names, and what turns their content into protobuf's."""
 
 
 def decode(struct: type[S], data: bytes) -> S:

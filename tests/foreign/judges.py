@@ -44,12 +44,15 @@ def library(module: str, program: str) -> Any:
 
 
 def mcap_python(path: Path) -> list[str]:
-    """The reference library: file order and log order, every checksum, every protobuf by its own schema."""
+    """The reference library: file order and log order, every checksum, every message by its own schema."""
     findings: list[str] = []
     channels: dict[int, Channel] = {}
     schemas: dict[int, Schema] = {}
     streamed = []
-    decoders = DecoderFactory()
+    factories = {
+        "protobuf": DecoderFactory(),
+        "cdr": library("mcap_ros2.decoder", "mcap-ros2-support").DecoderFactory(),
+    }
     with path.open("rb") as stream:
         for record in StreamReader(stream, validate_crcs=True).records:
             if isinstance(record, Schema):
@@ -59,9 +62,10 @@ def mcap_python(path: Path) -> list[str]:
             elif isinstance(record, Message):
                 channel = channels[record.channel_id]
                 streamed.append((channel.topic, record.log_time, record.sequence))
-                decode = decoders.decoder_for(channel.message_encoding, schemas.get(channel.schema_id))
-                if decode is not None:
-                    decode(record.data)
+                encoding, schema = channel.message_encoding, schemas.get(channel.schema_id)
+                decode = factories[encoding].decoder_for(encoding, schema)
+                if decode is None or decode(record.data) is None:
+                    findings.append(f"{channel.topic} cannot be decoded by its own schema")
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()

@@ -18,7 +18,7 @@ from station.cell.acceptance import Acceptance, Figure, StopWay, write_acceptanc
 from station.cell.errors import RefusedError
 from station.cell.socket_folder import default_socket
 from station.cell.status import MotionPreview
-from station.cli.attended import Attended, attended, confirmed
+from station.cli.attended import Attended, attended, confirmed, no_terminal
 from station.cli.console import AsJson, Socket, err, out, print_json
 from station.operate.acceptance import SPEEDS_M_S, AcceptanceTest, JudgedStop
 from station.operate.stop_judge import REACTION_S, Trace
@@ -71,9 +71,8 @@ async def _accept(socket: Path | None, joint: int, fastest_m_s: float, quiet: bo
         status = await shell.status()
         if status.playback:
             raise RefusedError("A played-back arm has no ways to stop.", code="playback")
-        if quiet and not status.simulated:
-            text = "Nothing moved: --json prompts nobody, and is for simulated cells only."
-            raise RefusedError(text, code="no-person")
+        if quiet:
+            shell.require_simulated()
         host = (await shell.client.call(Configuration())).robot.host
         tester = _SimulatedTester(shell, host, quiet) if status.simulated else _ShellTester(shell)
         speeds = [speed for speed in SPEEDS_M_S if speed <= fastest_m_s]
@@ -112,9 +111,7 @@ class _ShellTester:
 
     async def holds_emergency_stop(self) -> bool:
         if not self._shell.interactive:
-            raise RefusedError(
-                "No terminal.", code="no-person", remedy="A person must stand at the arm (docs: Safety)."
-            )
+            raise no_terminal()
         err.print("The arm will be stopped in mid-move, again and again, also by taking its control away.")
         return confirmed("Is the emergency stop in your hand, and everybody out of the arm's reach?")
 

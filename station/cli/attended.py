@@ -70,15 +70,17 @@ class Attended:
             return ask_person(preview)
         if self._simulated:
             return True
-        raise RefusedError(
-            "No terminal.",
-            code="no-person",
-            remedy="A person must review and approve the plan (docs: Safety).",
-        )
+        raise no_terminal("A person must review and approve the plan (docs: Safety).")
 
     async def status(self) -> StationStatus:
         """The status now, by a new connection: no status waited there while a person was asked."""
         return await status_now(self._socket)
+
+    def require_simulated(self) -> None:
+        """RefusedError on a real cell, where nothing moves without a person."""
+        if not self._simulated:
+            text = "Nothing moved: --json prompts nobody, and is for simulated cells only."
+            raise RefusedError(text, code="no-person")
 
     async def carry_out(self, purpose: Purpose) -> SessionOutcome:
         """One session, until it rests."""
@@ -133,6 +135,10 @@ async def stop_and_say(client: Client) -> None:
     except StationError as problem:
         told = f"STOP was not answered: {problem} If the arm still moves use the emergency stop."
     print(f"\n{told}", file=sys.stderr)
+
+
+def no_terminal(remedy: str = "A person must stand at the arm (docs: Safety).") -> RefusedError:
+    return RefusedError("No terminal.", code="no-person", remedy=remedy)
 
 
 def ask_person(preview: MotionPreview) -> bool:

@@ -27,7 +27,7 @@ from station.cell.errors import ConfigError, LimitError, StationError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.socket_folder import default_socket
 from station.cli.console import Headless, Socket, err, out
-from station.cli.session import load_into, session
+from station.cli.session import joints_of, load_into, session
 from station.operate.motion import wait_until_idle
 from station.plan.belief import BootstrapView, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
@@ -209,12 +209,7 @@ async def _standing(socket: Path, mount: Mount) -> Vector6:
             code="other-cell",
             remedy=_SAME_FILE,
         )
-    joints = status.robot.joints_rad
-    if joints is None:
-        raise BootstrapError(
-            "The robot's joints are not known.", code="no-robot-state", remedy="`station doctor` says why."
-        )
-    return joints
+    return joints_of(status)
 
 
 def _show(what: str, guess: PoseGuess) -> None:

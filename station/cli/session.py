@@ -15,6 +15,7 @@ import msgspec
 import typer
 from rich.text import Text
 
+from recordings.schema.messages import Vector6
 from station.cell.errors import ConfigError, RefusedError
 from station.cell.plan import Plan
 from station.cell.status import StationState, StationStatus
@@ -136,11 +137,16 @@ async def load_into(client: Client, plan: Plan) -> None:
 async def load_sweep(client: Client) -> None:
     """A sweep about where the arm stands now."""
     status = await wait_until_idle(client)
+    await load_into(client, sweep_plan(status.robot.model, status.mount, joints_of(status)))
+
+
+def joints_of(status: StationStatus) -> Vector6:
+    """Joints where the arm stands. Raises RefusedError."""
     if status.robot.joints_rad is None:
         raise RefusedError(
             "The robot's joints are not known.", code="no-robot-state", remedy="`station doctor` says why."
         )
-    await load_into(client, sweep_plan(status.robot.model, status.mount, status.robot.joints_rad))
+    return status.robot.joints_rad
 
 
 async def session(

@@ -75,10 +75,8 @@ async def _visit(
     quiet: bool,
 ) -> _ShellToucher:
     async with attended(socket) as shell:
-        if quiet and not (await shell.status()).simulated:
-            raise RefusedError(
-                "Nothing moved: --json prompts nobody, and is for simulated cells only.", code="no-person"
-            )
+        if quiet:
+            shell.require_simulated()
         root, camera = shell.client.root, shell.client.camera
         found = read_calibration(file) if file else installed_calibration(root, camera)
         visit = _ShellToucher(shell, found.board, corners, pointer_m, quiet)

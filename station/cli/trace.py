@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from station.cell.errors import RefusedError, RobotError
-from station.cli.attended import ctrl_c_at_once
+from station.cli.attended import ctrl_c_at_once, no_terminal
 from station.cli.console import AsJson, err, out, print_json
 from station.devices.ur_probe import RobotLock, lock_name, probe
 from station.devices.ur_trace_scenarios import Scenario, ScenarioRecorder, scenarios
@@ -100,9 +100,7 @@ def _is_simulated(host: str) -> bool:
 
 def _require_person(model: str, serial: str, host: str) -> None:
     if not sys.stdin.isatty():
-        raise RefusedError(
-            "No terminal.", code="no-person", remedy="A person must stand at the arm (docs: Safety)."
-        )
+        raise no_terminal()
     err.print(f"{model} {serial} at {host}: its loaded program will be replaced.", style="bold")
     err.print("Set the speed slider to 100 %. The emergency stop on the pendant is the safety device.")
     if not _yes("Is the emergency stop in your hand, and nothing within reach of wrist 3?"):

@@ -44,7 +44,6 @@ from station.tui.results import ResultsDesk
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.task import DIGITS
-from station.tui.themes import TOKENS, dress
 from station.tui.widgets.graphics import detect
 from station.tui.widgets.preview import PreviewPane
 
@@ -76,16 +75,16 @@ def freeze_startup() -> None:
     gc.freeze()
 
 
-TOOLTIPS = {
-    "connect": "What is missing, and its remedy",
-    "plan": "All poses, their gain and reason",
-    "capture": "The running capture",
-    "solve": "The verdict and its gates",
-    "verify": "Touch test and drift checks",
-    "install": "What is installed, and what would change",
-    "sessions": "Past recordings",
-    "log": "Event log",
-}
+SCREENS: tuple[type[StationScreen], ...] = (
+    ConnectScreen,
+    PlanScreen,
+    LiveScreen,
+    SolveScreen,
+    VerifyScreen,
+    InstallScreen,
+    SessionsScreen,
+    LogScreen,
+)
 
 
 async def listen(link: ScreenLink, tell: Callable[[float | None], None]) -> None:
@@ -122,16 +121,7 @@ class StationApp(ResultsDesk):
 
     TITLE = "Calibration station"
     CSS_PATH = "station.tcss"
-    MODES = {  # noqa: RUF012 - declared by App
-        "connect": ConnectScreen,
-        "plan": PlanScreen,
-        "capture": LiveScreen,
-        "solve": SolveScreen,
-        "verify": VerifyScreen,
-        "install": InstallScreen,
-        "sessions": SessionsScreen,
-        "log": LogScreen,
-    }
+    MODES: ClassVar[dict[str, type[StationScreen]]] = {screen.MODE: screen for screen in SCREENS}  # type: ignore[assignment]
     DEFAULT_MODE = "capture"
     _unanswered: int | None = None
     """Questions since the last answer; None: there was none yet."""
@@ -157,8 +147,8 @@ class StationApp(ResultsDesk):
         Binding("f2", "ask('record')", "Image", id="record", tooltip="Capture an image here (freedrive)"),
         Binding("f4", "release", "Release", show=False, id="release", tooltip="Release control of the arm"),
         *(
-            Binding(DIGITS[mode], f"open('{mode}')", mode.title(), show=False, id=mode, tooltip=tooltip)
-            for mode, tooltip in TOOLTIPS.items()
+            Binding(DIGITS[s.MODE], f"open('{s.MODE}')", s.MODE.title(), show=False, id=s.MODE, tooltip=s.TIP)
+            for s in SCREENS
         ),
         Binding(
             "ctrl+q", "leave", "Quit", show=False, id="quit", tooltip="Close this screen; the daemon goes on"
@@ -169,11 +159,6 @@ class StationApp(ResultsDesk):
         super().__init__()
         self._connect = connect
         self._greeted = False
-        dress(self)
-
-    def get_theme_variable_defaults(self) -> dict[str, str]:
-        """Return defaults for the themes that Textual brings."""
-        return TOKENS
 
     def on_mount(self) -> None:
         self.follow()
@@ -332,7 +317,7 @@ class StationApp(ResultsDesk):
             own = screen.BINDINGS
             ours = [kind for kind in type(self).__mro__ if kind.__module__.startswith("station.")]
             common = [binding for kind in ours for binding in vars(kind).get("BINDINGS", [])]
-            self.push_screen(Help(screen.NAME, screen.HELP or "", [*own, *common]))
+            self.push_screen(Help(screen.heading, screen.HELP or "", [*own, *common]))
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_new_cell(self) -> None:

@@ -54,7 +54,7 @@ def checklist_text(checks: list[Check], width: int) -> Content:
 class ConnectScreen(StationScreen):
     """The preflight check, looked at again while something is missing."""
 
-    MODE, NAME = "connect", "Connect"
+    MODE, TIP = "connect", "What is missing, and its remedy"
     HELP = "The same list as `station doctor`. It only looks: nothing moves and nothing is changed."
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("r", "refresh_checks", "Look again", tooltip="Look at every item again")

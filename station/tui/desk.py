@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from textual import work
-from textual.app import App
 from textual.content import Content
 from textual.reactive import reactive
 
@@ -26,6 +25,7 @@ from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.tui.dialogs import Confirm, ConfirmMotion
 from station.tui.task import Known
+from station.tui.themes import ThemedApp
 from station.tui.widgets.graphics import Graphics
 from station.tui.widgets.scene import cell_scene, draw
 
@@ -53,7 +53,7 @@ class ScreenLink(motion.Link, Protocol):
     async def close(self) -> None: ...
 
 
-class Desk(App[None]):
+class Desk(ThemedApp[None]):
     """Every wish goes through `call`; the daemon decides, nothing is decided here.
 
     For the flows of `station.operate` it is a link: it takes control where a verb needs it, and says on every

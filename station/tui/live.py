@@ -354,7 +354,7 @@ def stopped_text(status: StationStatus) -> Content:
 class LiveScreen(StationScreen):
     """The camera's picture as large as it can be; progress, error, coverage and devices beside it."""
 
-    MODE, NAME = "capture", "Capture"
+    MODE, TIP = "capture", "The running capture"
     HELP = (
         "The running capture. F5 asks before the arm moves; F12 stops it at once, on every screen. Poses: "
         f"{LEGEND}."
@@ -415,7 +415,7 @@ class LiveScreen(StationScreen):
 class LogScreen(StationScreen):
     """All events, newest last, to scroll through."""
 
-    MODE, NAME = "log", "Log"
+    MODE, TIP = "log", "Event log"
     HELP = "All events the daemon still holds; the same lines are in the journal and in the recording."
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 from textual import events, work
-from textual.app import App, ComposeResult
+from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
@@ -35,7 +35,7 @@ from station.operate.guided_views import enough
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
 from station.tui.new_cell_steps import DRAWINGS, SavePage, StepPage, pages
 from station.tui.task import Step
-from station.tui.themes import TOKENS, dress
+from station.tui.themes import ThemedApp
 from station.tui.widgets.graphics import Graphics
 from station.tui.widgets.preview import PreviewPane
 
@@ -69,7 +69,7 @@ class BoardPicture(PreviewPane):
         return strip
 
 
-class NewCell(App[Ending]):
+class NewCell(ThemedApp[Ending]):
     """One step after the other, each of them to be left and taken up again."""
 
     TITLE = "New cell"
@@ -110,11 +110,6 @@ class NewCell(App[Ending]):
         self.setup = CellSetup(hardware, root, output)
         self._pages = pages(self.setup)
         self._pictures = 0
-        dress(self)
-
-    def get_theme_variable_defaults(self) -> dict[str, str]:
-        """Return defaults for the themes that Textual brings."""
-        return TOKENS
 
     def compose(self) -> ComposeResult:
         with Horizontal(classes="frame"):

@@ -105,7 +105,7 @@ def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: Scene | None) 
 class PlanScreen(StationScreen):
     """The table is the plan as the daemon holds it; every change is asked of the daemon."""
 
-    MODE, NAME = "plan", "Plan"
+    MODE, TIP = "plan", "All poses, their gain and reason"
     HELP = (
         "Poses in capture order. Nothing moves without your approval: F5, p and b show the motion and ask. "
         "Home and End go to the first and the last pose. Error after: the expected error (1σ) after this "

@@ -292,7 +292,7 @@ def _panel(
 class SolveScreen(ResultScreen):
     """The gates with value and limit, the camera pose, the views."""
 
-    MODE, NAME = "solve", "Solve"
+    MODE, TIP = "solve", "The verdict, and what it stands on"
     HELP = (
         "The newest result, or the one picked on 7. Enter on a gate shows its details. Installing can be "
         "undone."
@@ -332,7 +332,7 @@ class SolveScreen(ResultScreen):
 class VerifyScreen(ResultScreen):
     """Proofs apart from the images it was made of: the touch test, and drift checks over time."""
 
-    MODE, NAME = "verify", "Verify"
+    MODE, TIP = "verify", "Touch test and drift checks"
     HELP = "h starts the touch test: a tip over corners of the board, by hand. d on 7 captures a drift check."
 
     def evidence(self) -> ComposeResult:
@@ -441,7 +441,7 @@ def _span(days: float) -> str:
 class InstallScreen(ResultScreen):
     """Comparison with the installed one, what speaks against this one, and every version before."""
 
-    MODE, NAME = "install", "Install"
+    MODE, TIP = "install", "What is installed, and what would change"
     HELP = "i installs the shown calibration, b goes back to the one before; e writes it for other programs."
 
     def evidence(self) -> ComposeResult:

@@ -89,13 +89,21 @@ class StationScreen(Framed[None]):
 
     MODE: ClassVar[str] = ""
     """Its step of the task, or its name."""
+    TIP: ClassVar[str] = ""
+    """What it is for, in a few words."""
+
     NAME: ClassVar[str] = ""
+    """Its name, where that is not its mode."""
+
+    @property
+    def heading(self) -> str:
+        return self.NAME or self.MODE.title()
 
     def compose(self) -> ComposeResult:
-        yield Frame(self.NAME, self.MODE)
+        yield Frame(self.heading, self.MODE)
         with Container(id="content"):
             yield from self.body()
-        yield Keys(self.NAME.lower())
+        yield Keys(self.heading.lower())
 
     @property
     def desk(self) -> ResultsDesk:

@@ -33,7 +33,7 @@ COLUMNS = ("session", "what became of it", "verdict", "predicted", "held-out", "
 class SessionsScreen(StationScreen):
     """Past recordings and their calibrations."""
 
-    MODE, NAME = "sessions", "Sessions"
+    MODE, TIP = "sessions", "Past recordings"
     HELP = (
         "Past recordings. Solving runs in its own process; the daemon and a running capture go on. Home and "
         "End go to the newest and the oldest."

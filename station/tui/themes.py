@@ -119,10 +119,17 @@ def _colourless(style: Style) -> Style:
     return Style(bold=style.bold, dim=style.dim, reverse=chip or style.reverse, underline=style.underline)
 
 
-def dress(app: App[R]) -> None:
-    """Give an app its themes, and the one that its terminal or a person's environment asks for."""
-    for theme in THEMES:
-        app.register_theme(theme)
-    app.theme = chosen_theme(app.no_color)
-    if app.no_color:
-        app._filters.append(NoColour())
+class ThemedApp(App[R]):
+    """An app in the theme that its terminal or a person's environment asks for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        for theme in THEMES:
+            self.register_theme(theme)
+        self.theme = chosen_theme(self.no_color)
+        if self.no_color:
+            self._filters.append(NoColour())
+
+    def get_theme_variable_defaults(self) -> dict[str, str]:
+        """Return defaults for the themes that Textual brings."""
+        return TOKENS

@@ -49,7 +49,7 @@ class LazyCommand(NamedTuple):
         module, _, function = self.where.partition(":")
         found = importlib.util.find_spec(module)
         assert found is not None and found.origin is not None
-        for node in ast.parse(Path(found.origin).read_text()).body:
+        for node in ast.parse(Path(found.origin).read_bytes()).body:
             if isinstance(node, ast.FunctionDef) and node.name == function:
                 return (ast.get_docstring(node) or "").partition("\n")[0]
         return ""

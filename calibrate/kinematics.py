@@ -115,30 +115,61 @@ def with_near_axes(model: RobotModel) -> RobotModel:
     """
     if not any(model.d_m[1:3]):
         return model
-    for i in (1, 2):
-        a, d, alpha = list(model.a_m), list(model.d_m), list(model.alpha_rad)
-        theta, beta = list(model.theta_offset_rad), list(model.beta_rad)
-        frames = link_frames(model, np.zeros(6))
-        step = np.linalg.inv(frames[i]) @ frames[i + 1]
-        axis, point = step[:3, 2], step[:3, 3]
-        along = point[2] / axis[2]
-        foot = point - along * axis  # where the next axis passes the plane of this joint
-        sign = -1.0 if model.a_m[i] < 0 else 1.0
-        theta[i] = float(np.arctan2(sign * foot[1], sign * foot[0]))
-        a[i], d[i] = float(sign * np.hypot(foot[0], foot[1])), 0.0
-        turned = _turn_z(theta[i]).T @ step[:3, :3]
-        alpha[i] = float(np.arctan2(-turned[1, 2], np.hypot(turned[0, 2], turned[2, 2])))
-        beta[i] = float(np.arctan2(turned[0, 2], turned[2, 2]))
-        ca, sa, cb, sb = np.cos(alpha[i]), np.sin(alpha[i]), np.cos(beta[i]), np.sin(beta[i])
-        tilt = np.array([[cb, 0.0, sb], [sa * sb, ca, -sa * cb], [-ca * sb, sa, ca * cb]])
-        rest = tilt.T @ turned  # a turn about the next axis
-        theta[i + 1] += float(np.arctan2(rest[1, 0], rest[0, 0]))
-        d[i + 1] += float(along)
-        model = replace(
-            model, a_m=tuple(a), d_m=tuple(d), alpha_rad=tuple(alpha), theta_offset_rad=tuple(theta),
-            beta_rad=tuple(beta),
-        )  # fmt: skip
-    return model
+    frames = link_frames(model, np.zeros(6))
+    return table_of_axes(model, frames[:6, :3, 2], frames[:6, :3, 3], frames[6])
+
+
+_PARALLEL = (1, 2)
+"""Joints, from 0, whose next axis is parallel to their own."""
+
+
+def table_of_axes(like: RobotModel, direction: Array, point: Array, flange: Array) -> RobotModel:
+    """Describe an arm by its axes with all joints at 0: d2 and d3 are 0, the parallel axes have a beta.
+
+    direction, point: (6, 3) of each axis in base; flange: base_from_flange (4, 4). Axis 1 is base's z; what
+    is behind joint 6, signs and name are as in `like`. ValueError where they are not so.
+    """
+    columns = np.zeros((5, 6))
+    before = np.eye(4)
+    for i in range(5):
+        R, t = before[:3, :3], before[:3, 3]
+        axis, at = R.T @ direction[i + 1], R.T @ (point[i + 1] - t)
+        sign = -1.0 if (like.a_m[i] if i in _PARALLEL else like.alpha_rad[i]) < 0 else 1.0
+        if i in _PARALLEL:
+            at = at - at[2] / axis[2] * axis  # where the next axis passes the plane of this joint
+            d, towards = 0.0, sign * at
+            a = sign * np.hypot(at[0], at[1])
+        else:
+            towards = sign * np.array([-axis[1], axis[0], 0.0])  # common normal
+            towards /= np.linalg.norm(towards)
+            a = at @ towards
+            across = at - a * towards  # its part along the next axis and z
+            d = across[2] - axis[2] * (across[:2] @ axis[:2]) / (axis[:2] @ axis[:2])
+        theta = np.arctan2(towards[1], towards[0])
+        turned = _turn_z(theta).T @ axis
+        beta = np.arcsin(turned[0]) if i in _PARALLEL else 0.0
+        alpha = np.arctan2(-turned[1], turned[2])
+        columns[:, i] = a, d, alpha, theta, beta
+        step = link_frames(_with_columns(like, columns), np.zeros(6))
+        before = step[i + 1]
+    columns[[0, 2, 4], 5] = like.a_m[5], like.alpha_rad[5], like.beta_rad[5]
+    behind = link_frames(_with_columns(like, columns), np.zeros(6))
+    last = np.linalg.inv(before) @ flange @ np.linalg.inv(np.linalg.inv(behind[5]) @ behind[6])
+    if max(np.abs(last[:2, 3]).max(), np.abs(last[:2, 2]).max()) > _ON_AXIS:
+        raise ValueError("the flange does not lie on the last axis")
+    if max(np.abs(point[0, :2]).max(), np.abs(direction[0, :2]).max()) > _ON_AXIS:
+        raise ValueError("the first axis is not the z axis of base")
+    columns[1, 5], columns[3, 5] = last[2, 3], np.arctan2(last[1, 0], last[0, 0])
+    return _with_columns(like, columns)
+
+
+_ON_AXIS = 1e-6
+"""Metres and radians by which a file's rounding may be off."""
+
+
+def _with_columns(like: RobotModel, columns: Array) -> RobotModel:
+    a, d, alpha, theta, beta = (tuple(column) for column in columns.tolist())
+    return replace(like, a_m=a, d_m=d, alpha_rad=alpha, theta_offset_rad=theta, beta_rad=beta)
 
 
 def _turn_z(angle: float) -> Array:

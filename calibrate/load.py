@@ -13,14 +13,17 @@ import numpy as np
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, MirroredImagesError, SquaresCountedError, TooFewViewsError
-from calibrate.kinematics import MODELS, RobotModel
+from calibrate.geometry import Array, pose, rotation_exp
+from calibrate.kinematics import MODELS, RobotModel, table_of_axes
 from calibrate.results import RejectedView
 from calibrate.views import BoardView, ViewSet
+from recordings import strict_yaml
 from recordings.errors import BadImageError
 from recordings.files import usable_cores
 from recordings.reader import Recording
 from recordings.schema.messages import (
     ARM_KINEMATICS_NAME,
+    UR_KINEMATICS_NAME,
     ArmKinematics,
     BoardSpec,
     CameraModel,
@@ -105,8 +108,17 @@ def load_views(
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:
     """Read the maker's calibration of the arm, where the recording states it."""
-    content = recording.attachments().get(ARM_KINEMATICS_NAME)
-    if content is None:
+    attached = recording.attachments()
+    if (content := attached.get(UR_KINEMATICS_NAME)) is not None:
+        try:
+            return arm_of_ros(content, recording.info.robot.model)
+        except ValueError as problem:
+            raise BadViewsError(
+                f"{recording.path}: {UR_KINEMATICS_NAME} is no kinematics file of a known arm ({problem}).",
+                code="arm-kinematics",
+                remedy="Name the robot in dataset.yaml, use the file of ur_calibration, or remove it.",
+            ) from None
+    if (content := attached.get(ARM_KINEMATICS_NAME)) is None:
         return None
     try:
         stated = msgspec.json.decode(content, type=ArmKinematics)
@@ -124,6 +136,53 @@ def _calibrated_arm(recording: Recording) -> RobotModel | None:
         alpha_rad=stated.alpha_rad,
         theta_offset_rad=stated.theta_rad,
     )
+
+
+class _Origin(msgspec.Struct):
+    """Of a link before its joint turns about z, as URDF has it: metres, and roll, pitch, yaw in radians."""
+
+    x: float
+    y: float
+    z: float
+    roll: float
+    pitch: float
+    yaw: float
+
+    @property
+    def matrix(self) -> Array:
+        turns = ((2, self.yaw), (1, self.pitch), (0, self.roll))
+        z, y, x = (rotation_exp(angle * np.eye(3)[axis]) for axis, angle in turns)
+        return pose(z @ y @ x, [self.x, self.y, self.z])
+
+
+class _RosArm(msgspec.Struct):
+    """`kinematics` of the file that `ur_calibration` writes for ROS 2's UR driver."""
+
+    shoulder: _Origin
+    upper_arm: _Origin
+    forearm: _Origin
+    wrist_1: _Origin
+    wrist_2: _Origin
+    wrist_3: _Origin
+
+
+class _RosFile(msgspec.Struct):
+    kinematics: _RosArm
+
+
+def arm_of_ros(content: bytes, robot: str) -> RobotModel:
+    """Read the file of `ur_calibration`. ValueError where it is none, or not of this robot."""
+    if robot not in MODELS:
+        raise ValueError(f"no robot {robot} is known")
+    try:
+        links = msgspec.convert(strict_yaml.load_plain(content), _RosFile, strict=False).kinematics
+    except msgspec.ValidationError as problem:
+        raise ValueError(str(problem)) from None
+    chain = [np.eye(4)]
+    for name in links.__struct_fields__:
+        chain.append(chain[-1] @ getattr(links, name).matrix)
+    frames = np.array(chain)
+    return table_of_axes(MODELS[robot], frames[1:, :3, 2], frames[1:, :3, 3], frames[6])
 
 
 def without_views(loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_VIEWS) -> LoadedViews:

@@ -86,7 +86,7 @@ class PoseRow:
 
 def read_dataset(path: Path) -> tuple[Dataset, bytes]:
     """(description, the file's bytes). Raises ImportSourceError with file and place."""
-    content = _read_small_file(path, strict_yaml.LIMIT_BYTES)
+    content = read_small_file(path, strict_yaml.LIMIT_BYTES)
     try:
         dataset = strict_yaml.load(content, Dataset)
     except strict_yaml.StrictYamlError as error:
@@ -151,7 +151,7 @@ def _camera_problem(camera: CameraModel | None) -> tuple[str, str] | None:
     return None
 
 
-def _read_small_file(path: Path, limit_bytes: int) -> bytes:
+def read_small_file(path: Path, limit_bytes: int) -> bytes:
     """The whole file. ImportSourceError when it is missing or too large to be right."""
     if not path.is_file():
         remedy = f"A folder to import has {DATASET_FILE}, {POSES_FILE} and images."
@@ -170,7 +170,7 @@ def _read_small_file(path: Path, limit_bytes: int) -> bytes:
 def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
     """(rows, the file's bytes). Raises ImportSourceError; values `line` and what is wrong there."""
     path = folder / POSES_FILE
-    content = _read_small_file(path, _CSV_LIMIT_BYTES)
+    content = read_small_file(path, _CSV_LIMIT_BYTES)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -6,6 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from recordings import strict_yaml
 from recordings.errors import ImportSourceError
 from recordings.images import (
     IMAGE_LIMIT_BYTES,
@@ -17,13 +18,32 @@ from recordings.images import (
     pixel_format_of,
     read_header,
 )
-from recordings.importers.dataset import DATASET_FILE, POSES_FILE, PoseRow, read_dataset, read_poses
+from recordings.importers.dataset import (
+    DATASET_FILE,
+    POSES_FILE,
+    PoseRow,
+    read_dataset,
+    read_poses,
+    read_small_file,
+)
 from recordings.importers.messages import Progress
-from recordings.schema.messages import CameraModel, CaptureEvent, Image, Stamps, View
+from recordings.schema.messages import (
+    ARM_KINEMATICS_NAME,
+    UR_KINEMATICS_NAME,
+    CameraModel,
+    CaptureEvent,
+    Image,
+    Stamps,
+    View,
+)
 from recordings.writer import RecordingWriter, derived_recording
 
 _HEADER_BYTES = 1024 * 1024
 """A JPEG's size may stand behind large comments."""
+
+
+_OF_ARM = {UR_KINEMATICS_NAME: "application/yaml", ARM_KINEMATICS_NAME: "application/json"}
+"""Optional files of a folder: the table of the arm as its maker calibrated it."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +71,11 @@ def import_folder(
             f"{folder / DATASET_FILE}: camera is missing", code="dataset-value", key="camera"
         )
     rows, poses_bytes = read_poses(folder)
+    arm = {
+        name: read_small_file(folder / name, strict_yaml.LIMIT_BYTES)
+        for name in _OF_ARM
+        if (folder / name).exists()
+    }
     for row in rows:
         _check_image(folder, row, camera)
     if output is None:
@@ -58,6 +83,8 @@ def import_folder(
     with derived_recording(output, dataset.session(folder, camera)) as writer:
         writer.attach(DATASET_FILE, "application/yaml", dataset_bytes)
         writer.attach(POSES_FILE, "text/csv", poses_bytes)
+        for name, content in arm.items():
+            writer.attach(name, _OF_ARM[name], content)
         for index, row in enumerate(rows):
             _write_view(writer, folder, index, row, camera)
             progress("importing", index + 1, len(rows))

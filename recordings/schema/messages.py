@@ -81,6 +81,8 @@ class RobotIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omi
 
 ARM_KINEMATICS_NAME = "arm-kinematics.json"
 """Attachment of a recording: `ArmKinematics`."""
+UR_KINEMATICS_NAME = "kinematics.yaml"
+"""Attachment of an imported recording: the arm's calibration as ROS 2's UR driver keeps it."""
 
 
 class ArmKinematics(msgspec.Struct, frozen=True):

@@ -8,9 +8,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import Rotation
 
 from calibrate.errors import BadViewsError, SquaresCountedError, TooFewViewsError
-from calibrate.load import load_views, without_views
+from calibrate.geometry import pose, rotation_exp
+from calibrate.kinematics import forward
+from calibrate.load import arm_of_ros, load_views, without_views
 from calibrate.pipeline import solve_recording
 from calibrate.report.page import report_page
 from recordings.errors import CorruptRecordingError, MissingSegmentError
@@ -18,6 +22,7 @@ from recordings.images import encode_png
 from recordings.manifest import enter_part
 from recordings.reader import Recording, open_recording
 from recordings.recover import recover_recording
+from recordings.schema.messages import RobotIdentity
 from recordings.writer import RecordingWriter
 from tests.calibrate.calling import raises_code
 
@@ -41,6 +46,47 @@ def copied(
 @pytest.fixture
 def source(real_session_file: Path) -> Recording:
     return open_recording(real_session_file)
+
+
+ORIGINS = (
+    (0.0, 0.0, 0.1273, 0.0, 0.0, 1e-5),
+    (1e-4, 0.0, 0.0, 1.5712, 0.0, 1e-5),
+    (-0.6121, 0.0, 0.0, 1e-3, -4e-4, 5e-6),
+    (-0.5722, -4e-4, 0.1638, 3e-3, -1e-3, -3e-6),
+    (-7e-6, -0.1157, 0.0, 1.5708, 0.0, 1e-6),
+    (1e-5, 0.0923, 1e-4, 1.5718, np.pi, 3.14159251),
+)
+"""x y z roll pitch yaw of each link, as `ur_calibration` states them of an arm."""
+LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+NAMES = ("x", "y", "z", "roll", "pitch", "yaw")
+KINEMATICS = yaml.safe_dump(
+    {"kinematics": {k: dict(zip(NAMES, link, strict=True)) for k, link in zip(LINKS, ORIGINS, strict=True)}}
+)
+
+
+def test_the_arm_s_calibration_beside_imported_images_is_its_table() -> None:
+    """ur_calibration's file; each link's origin, then its joint about z."""
+    arm = arm_of_ros(KINEMATICS.encode(), "UR10")
+    joints, T = [0.3, -1.2, 1.4, -0.8, 1.1, 0.2], np.eye(4)
+    for angle, link in zip(joints, ORIGINS, strict=True):
+        turn = Rotation.from_euler("xyz", link[3:]).as_matrix()
+        T = T @ pose(turn, link[:3]) @ pose(rotation_exp([0.0, 0.0, angle]), np.zeros(3))
+    np.testing.assert_allclose(forward(arm, joints), T, atol=1e-12)
+    assert not any(arm.d_m[1:3]) and arm.name == "UR10"
+
+
+@pytest.mark.parametrize("robot", ["UR10", "unknown"])
+def test_a_wrong_kinematics_file_is_named(source: Recording, tmp_path: Path, robot: str) -> None:
+    info = msgspec.structs.replace(source.info, robot=RobotIdentity(robot))
+    with RecordingWriter(tmp_path / "a.mcap", info) as writer:
+        content = KINEMATICS if robot == "unknown" else KINEMATICS.replace("x: 0.0\n", "x: 0.1\n")
+        writer.attach("kinematics.yaml", "application/yaml", content.encode())
+        for view, picture in source.images():
+            writer.image(picture)
+            writer.view(view)
+        path = writer.finish()
+    with raises_code(BadViewsError, "arm-kinematics"):
+        load_views(open_recording(path))
 
 
 def larger(data: bytes) -> bytes:

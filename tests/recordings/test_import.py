@@ -36,6 +36,7 @@ def edit(name: str, old: str, new: str) -> Change:
 
 
 def test_a_good_folder_becomes_a_recording(folder: Path, tmp_path: Path) -> None:
+    (folder / "kinematics.yaml").write_bytes(b"kinematics: {}\n")
     done = import_folder(folder, tmp_path / "out.mcap")
     recording = open_recording(done.path)
     info = recording.info
@@ -50,7 +51,7 @@ def test_a_good_folder_becomes_a_recording(folder: Path, tmp_path: Path) -> None
         np.testing.assert_array_equal(picture.pixels, make_image(view.index))
     stored = recording.segments[0].stored_image(0)
     assert stored == ("png", (folder / "images/0.png").read_bytes())
-    assert set(recording.attachments()) == {"dataset.yaml", "poses.csv"}
+    assert set(recording.attachments()) == {"dataset.yaml", "poses.csv", "kinematics.yaml"}
     assert done.images == 3
 
 

@@ -41,6 +41,7 @@ from calibrate.files.validity import Validity, ValidityReason, ValidityState, un
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_from_rotvec, rotation_exp
 from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
 from calibrate.kinematics import MODELS, base_from_flange, forward, with_near_axes
+from calibrate.load import arm_of_ros
 from calibrate.pipeline import SolvedRecording
 
 FOLLOWED = FrameNames(follow=("calibrate", "follow"))
@@ -131,6 +132,9 @@ def test_ur_kinematics_is_the_corrected_arm_by_the_driver_s_rule(
         assert abs(x) + abs(y) + abs(z) < 2.0
         origins.append(pose(Rotation.from_euler("xyz", rpy).as_matrix(), [x, y, z]))
     check_chain(origins, calibration)
+    back = arm_of_ros(export(calibration, "ur-kinematics"), "UR10e")
+    for joints in np.random.default_rng(1).uniform(-3, 3, (5, 6)):
+        assert np.abs(forward(back, joints) - flange_of_chain(origins, joints)).max() < 1e-9
 
 
 def test_arm_urdf_is_the_corrected_arm_with_its_own_camera(calibration: Calibration) -> None:

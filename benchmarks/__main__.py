@@ -117,7 +117,7 @@ def page() -> str:
 
 
 def _order(result: Path) -> tuple[int, str]:
-    """As in SHOWN, others behind."""
+    """Order results as in SHOWN, others behind."""
     names = list(SHOWN)
     return (names.index(result.stem) if result.stem in names else len(names), result.stem)
 

@@ -1,4 +1,4 @@
-"""Does `station accept` find what is wrong with an arm's stops, and leave a sound arm in peace?
+"""Weak stops that `station accept` finds, and sound arms that it refuses.
 
 Whole runs of the command against a simulated UR10 (125 Hz) with the real driver: daemon, control process,
 trace, judge. Clean runs go by both control paths. Moves that end before their stop is
@@ -51,7 +51,7 @@ def run() -> str:
 
 
 def accept(weakness: str, path: str) -> dict[str, Any]:
-    """What `station accept --json` says of one cell."""
+    """Run `station accept --json` on one cell and return what it says."""
     with tempfile.TemporaryDirectory(prefix="accept-") as place:
         folder = Path(place)
         truth, control = folder / "truth.json", folder / "s"

@@ -97,7 +97,7 @@ class _Kill:
 
 
 def worker_pids() -> list[int]:
-    """Of the pool: the fork server, a child of this process, started them."""
+    """List the pool's processes: the fork server, a child of this process, started them."""
     parents: dict[int, int] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:

@@ -1,4 +1,4 @@
-"""The blog's scene: how near can one come to its X at 0.1 px and an exact robot?"""
+"""The blog's scene: nearness to its X at 0.1 px with an exact robot."""
 
 from __future__ import annotations
 

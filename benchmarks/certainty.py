@@ -1,4 +1,4 @@
-"""Does the robust solver always end in the global minimum, and is that proven?
+"""Global minimum of the pair objective: how often the robust solver reaches and proves it.
 
 Each problem is solved by `calibrate.handeye.axxb.robust.solve_global`. The oracle is the lowest of 40 starts
 polished by Newton on the same objective; "worse" counts problems in which it found a lower value.

@@ -1,4 +1,4 @@
-"""Does the stated 95 % region hold the truth where board, lens, arm or bracket are not what they say?
+"""Coverage of the stated 95 % region where board, lens, arm or bracket are not as stated.
 
 The whole way of `calibrate solve` after detection: lens, board poses, estimate, cross-validation, gates.
 """

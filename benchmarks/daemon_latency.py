@@ -1,4 +1,4 @@
-"""How fast STOP passes through the daemon; how late its loop comes while 75 fps are recorded."""
+"""Latency of STOP through the daemon, and lateness of its loop while 75 fps are recorded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does the daemon keep every frame? Simulated GigE camera → `station serve` → disk, the arm in motion.
+"""Frames that the daemon keeps: simulated GigE camera → `station serve` → disk, the arm in motion.
 
 The real daemon, without a screen, in a network namespace with only `lo`: a simulated UR10e swings under a go
 given over the control socket, a free-running camera sends 1280×1024 mono8 in packets of 8996 bytes. A minute
@@ -48,12 +48,12 @@ SHARE = float(os.environ.get("BENCH_SHARE", "1"))
 
 @dataclass
 class Checked:
-    """Of one sealed session, or the sum of several."""
+    """Figures of one finished session, or the sum of several."""
 
     frames: int = 0
     """Sent by the camera between the first and the last one recorded, both included"""
     lost: int = 0
-    """Of them, not in the file"""
+    """Number of them that are not in the file"""
     reordered: int = 0
     wrong: int = 0
     """Pictures that are not what was sent under their number, or whose frame id does not fit it"""
@@ -84,7 +84,7 @@ class StreamOutcome:
     """Latest round of the daemon's loop: at 100 ms the arm stops"""
     sync_ms: float
     load: float
-    """Of the whole machine, with all that runs on it besides"""
+    """Load of the whole machine, with all that runs on it besides"""
 
     @property
     def clean(self) -> bool:
@@ -99,7 +99,7 @@ HEADER = (
 
 
 def row(o: StreamOutcome) -> str:
-    """Of the table under `HEADER`."""
+    """Write the row of the table under `HEADER`."""
     c = o.checked
     cells = (
         f"{o.asked_fps:g}|{o.sessions}|{c.seconds:.0f}|{c.frames}|{c.frames / c.seconds:.1f}|{c.lost}"

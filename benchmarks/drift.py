@@ -1,4 +1,4 @@
-"""How often does the drift check cry wolf, and how often does it notice 0.5 mm or 0.1°?
+"""False alarms of the drift check, and detections of 0.5 mm or 0.1°.
 
 Views are corners with noise on corners and robot, 0.45 m from the paper's board; the installed X has an error
 of its own, drawn from its covariance. Shifts and turns have random directions. Poses are random, as of an arm
@@ -33,13 +33,13 @@ TRIALS = 400
 SETS, POOL = 20, 200
 """So many choices of poses take turns; each out of a pool of its own."""
 _DEGREES_OF_FREEDOM = 69.0
-"""Of a calibration from 25 views."""
+"""Covariance of a calibration from 25 views."""
 _CAMERA = CameraModel(1280, 1024, ((1667.0, 0, 639.5), (0, 1667.0, 511.5), (0, 0, 1)), (0.0,) * 5)
 _BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=7, rows=6, square_m=0.025)
 _PLACE = pose(rotation_exp([np.pi - 0.2, 0.1, 0.4]), [0.6, 0.1, 0.0])
 _MOUNT = pose(rotation_exp([0.1, -0.2, 1.5]), [0.06, -0.07, 0.05])
 _OBJECTIVE = Objective("A", 0.45, prior_information(_CAMERA, True, BoardTolerance()), None)
-"""As the planner's own (`objective_for`), the lens known."""
+"""Objective as the planner's own (`objective_for`), the lens known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class _Set:
 
 @dataclass(frozen=True)
 class _Level:
-    """Of the simulated cell's noise levels."""
+    """One of the simulated cell's noise levels."""
 
     name: str
     noise: Noise

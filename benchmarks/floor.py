@@ -1,4 +1,4 @@
-"""What does the larger model cost where a smaller one would be right?
+"""Cost of the larger model where a smaller one would be right.
 
 The board is exact, the lens comes from the same pictures or is given and right, all noise is independent: the
 Cramér-Rao bound is that of a model which knows all this, and the true noise scales. The estimator is the

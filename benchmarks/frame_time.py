@@ -1,4 +1,4 @@
-"""Is a frame's time what it says, does a sweep find it when it is not, and are lost frames counted?
+"""Errors of frames' times, sweeps that find them, and lost frames that are counted.
 
 The first table: the plan of `station capture --sweep` with rendered pictures, detected and solved as in the
 product. Controller and camera have clocks of their own (offset at random, controller up to ± 30 ppm, camera

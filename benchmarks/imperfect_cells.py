@@ -50,16 +50,16 @@ _HOME = {"eye-in-hand": (-1.7, -1.7, 2.0, -1.9, -1.57, 0.0), "eye-to-hand": (0.1
 
 @dataclass(frozen=True)
 class Imperfection:
-    """What is not as stated; signs are drawn for each cell."""
+    """Deviations from what is stated; signs are drawn for each cell."""
 
     size: float = 0.0
-    """Of the squares, relative."""
+    """Error of the squares, relative."""
     unequal: float = 0.0
     """x against y of the print, relative."""
     bend_m: float = 0.0
     """Rise of the middle of a sheet that is bent like a piece of a tube, about any axis in its plane."""
     focal: float = 0.0
-    """Of the given lens, relative."""
+    """Error of the given lens, relative."""
     centre_px: float = 0.0
     """cx of the given lens."""
     table: float = 0.0
@@ -72,7 +72,7 @@ class Imperfection:
 
 @dataclass(frozen=True)
 class Known:
-    """What the solver is told."""
+    """Facts that the solver is told."""
 
     lens: bool = False
     """The lens, as given; else it comes from the same pictures."""
@@ -84,7 +84,7 @@ class Known:
 @dataclass(frozen=True, eq=False)
 class ImperfectCell:
     views: ViewSet
-    """As measured; `camera_from_board` by the stated board and the lens given or found."""
+    """Views as measured; `camera_from_board` by the stated board and the lens given or found."""
     X: Array
     """(4, 4); of a bracket that flexes: its mean over the views."""
     Y: Array

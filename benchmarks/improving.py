@@ -1,4 +1,4 @@
-"""Is it worth planning the poses that are left anew after eight pictures?
+"""Gain of replanning the remaining poses after eight images.
 
 Random cells of `random_cells` with guesses wrong by their sigmas; a plan of 25 is made from the guess, eight
 of its poses are visited with mid noise, and the rest is planned anew from what these pictures show

@@ -1,4 +1,4 @@
-"""Mistakes that users make, on other people's recordings: is the cause named? (STATION_DATASETS)"""
+"""Mistakes of users, on other people's recordings, and whether the cause is named. (STATION_DATASETS)"""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _BOARD_MOVED = pose(rotation_exp([0.0, 0.02, 0.05]), [0.03, -0.02, 0.01])
 
 @dataclass(frozen=True, eq=False)
 class MadeSession:
-    """What a user would hand to `recordings import`."""
+    """Session that a user would hand to `recordings import`."""
 
     description: dict[str, Any]
     """dataset.yaml"""
@@ -60,7 +60,7 @@ class MadeSession:
 
 @dataclass(frozen=True)
 class Said:
-    """What `calibrate solve` answers."""
+    """Answer of `calibrate solve`."""
 
     code: str
     """The hypothesis where one is named; else the error's code; else the verdict."""

@@ -1,4 +1,4 @@
-"""Mistakes that an operator makes while setting up and starting a cell: is the true cause named first?
+"""Mistakes while setting up and starting a cell, and whether the true cause is named first.
 
 Decided by codes; the sentence that is read first stands beside them. The cells are our own simulation.
 """
@@ -50,7 +50,7 @@ WAIT_S = 10.0
 
 
 class Said(NamedTuple):
-    """What the operator is told first."""
+    """First message to the operator."""
 
     code: str
     text: str

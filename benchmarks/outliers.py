@@ -1,4 +1,4 @@
-"""What do wrong views, and changes half-way, do to X? Ours against an oracle that knows which to use."""
+"""Effect of wrong views, and of changes half-way, on X. Ours against an oracle that knows which to use."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Spoilt:
 class OutlierTrial:
     passed: bool
     reading: str
-    """What was named; where nothing was solved, the error's own name."""
+    """Cause that was named; where nothing was solved, the error's own name."""
     oracle: tuple[float, float]
     """Error of the oracle, metres and radians."""
     truly: bool
@@ -267,7 +267,7 @@ def _move_board(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> S
 
 
 def _change_tcp(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
-    """What the flange holds seems to have moved on it: the camera, or the board."""
+    """Move what the flange holds, camera or board."""
     in_hand = cell.views.mount == "eye-in-hand"
     D = pose(np.eye(3), [0.0, 0.0, rng.uniform(0.02, 0.12)])
     return _move(cell, bad, D, False, Reading.CAMERA_MOVED if in_hand else Reading.BOARD_MOVED)

@@ -1,4 +1,4 @@
-"""Are planned poses worth it? Error of X, its prediction, safety, time, and plans from a bad first guess.
+"""Planned poses: error of X, its prediction, safety, time, and plans from a bad first guess.
 
 Cells come from `random_cells`, every check of a plan too. X is estimated by the product's own
 estimate with the lens free, from simulated corners and robot poses at mid noise (0.2 px,
@@ -57,7 +57,7 @@ AHEAD_M = 0.5
 _PRIORS = Priors(LensPrior.unknown(CAMERA))
 RANDOM_ORDERS = 3
 VISITS = 5
-"""How often each set of poses is visited, with new noise; random poses are drawn anew for each visit."""
+"""Visits of each set of poses, with new noise; random poses are drawn anew for each visit."""
 
 
 def run() -> str:

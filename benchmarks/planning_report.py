@@ -1,4 +1,4 @@
-"""What one cell of the planning benchmark gives, and the tables of all."""
+"""Figures of one cell of the planning benchmark, and the tables of all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the daemon and the simulators beside it use, read from /proc."""
+"""Load of the daemon and the simulators beside it, read from /proc."""
 
 from __future__ import annotations
 

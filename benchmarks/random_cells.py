@@ -122,7 +122,7 @@ def _taught(X: Array, Y: Array, rng: np.random.Generator) -> Array | None:
 
 
 def _free_views(X: Array, Y: Array, start: Array, rng: np.random.Generator) -> int:
-    """How many of the tried views some arm posture near the taught one can take."""
+    """Count the tried views that some arm posture near the taught one can take."""
     shown = np.array([C for C in _views(rng, _TRIED, (0.38, 0.60), np.deg2rad(35)) if shows_board(C)])
     view, q, _ = inverse_many(ARM, Y @ inverse(X @ shown))
     q = start + (q - start + np.pi) % (2 * np.pi) - np.pi

@@ -60,7 +60,7 @@ class SetResult:
     half_m: list[float]
     good: int
     full_weight: int
-    """Of the good ones; -1 where the whole set was refused."""
+    """Number of the good ones; -1 where the whole set was refused."""
     note: str
 
 
@@ -170,7 +170,7 @@ def split_halves(data: RealSet) -> tuple[list[float], list[float]]:
 
 
 def _whole_set(data: RealSet) -> tuple[int, str]:
-    """How many good views carry full weight when ours gets everything, and its error where truth is known."""
+    """Count good views of full weight when ours gets everything; its error where truth is known."""
     try:
         answer = ours(data.views, data.board)
     except FAILURES as error:

@@ -33,7 +33,7 @@ def _as_described(points: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a method learns from the training views."""
+    """Answer that a method learns from the training views."""
 
     X: Array
     """(4, 4) flange_from_camera or base_from_camera"""

@@ -1,4 +1,4 @@
-"""What does recording cost? Time per picture of the writer against plain `write()` of the same bytes.
+"""Cost of recording: time per image of the writer against plain `write()` of the same bytes.
 
 1280×1024 mono8 pictures of a noisy board, where said with 500 Hz robot states between them (6⅔ a picture at
 75 fps), all ways in one run, each time in another order, because the disk of a shared machine changes its
@@ -67,7 +67,7 @@ class Way:
     on_disk_ms: list[float] = field(default_factory=list)
     """Wall time until everything was on the disk."""
     cpu_ms: list[float] = field(default_factory=list)
-    """Of the process, until the last picture was handed over."""
+    """Processor time of the process, until the last picture was handed over."""
     megabytes: float = 0.0
 
 

@@ -57,7 +57,7 @@ BLOG_X = pose(rotation_exp([0, np.radians(-15), 0]), [0.1, 0, 0])
 @dataclass(frozen=True, eq=False)
 class SceneCell:
     views: ViewSet
-    """As measured: noisy corners and robot poses, PnP done with `views.camera`."""
+    """Views as measured: noisy corners and robot poses, PnP done with `views.camera`."""
     X: Array
     Y: Array
     camera: CameraModel

@@ -1,4 +1,4 @@
-"""How long from the STOP key to the daemon's stop call, and what does the screen cost while it watches?
+"""Time from the STOP key to the daemon's stop call, and the screen's cost while it watches.
 
 A real screen in a terminal of 160×48, attached to a daemon with a simulated cell whose previews it shows:
 once in half blocks, once on a terminal that says it draws sixels (letters of 8×17 pixels).
@@ -94,7 +94,7 @@ async def _measure(sixels: bool) -> tuple[list[float], float, float, int]:
 
 
 async def _cpu_share(operator: Client, screen: ScreenProcess) -> tuple[float, float]:
-    """Of one core, by the screen's process, from the first move to the last picture."""
+    """Measure the share of one core, by the screen's process, from the first move to the last picture."""
     summary = await operator.call(Prepare())
     await operator.call(Go(summary.token))
     await _until(operator, lambda s: s.state in RUNNING)

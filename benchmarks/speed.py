@@ -1,4 +1,4 @@
-"""What does the collapsed objective buy, is it the same search, and where does the time of a solve go?"""
+"""Gain of the collapsed objective, sameness of its search, and shares of a solve's time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does the state reader keep every sample at 500 Hz, how well does it know when each was taken, at what cost?
+"""Samples that the state reader keeps at 500 Hz, how well it knows their times, and its cost.
 
 A simulated UR10e in a process of its own, whose clock drifts by 50 ppm; the reader in another, alone, so that
 its processor time can be told. The truth of a sample's time is the controller's own grid. Both processes
@@ -31,7 +31,7 @@ SETTLE_S = 10.0
 
 
 class Read(msgspec.Struct):
-    """What the reader's process sends back."""
+    """Result that the reader's process sends back."""
 
     stamps: bytes
     """(n, 3) float64: controller time [s], arrival and fitted host time [ns since the first arrival]"""

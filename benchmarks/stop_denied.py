@@ -1,4 +1,4 @@
-"""Can anybody take STOP away? A user's STOP while others of the operators' group do their worst.
+"""STOP of a user while others of the operators' group do their worst.
 
 The real daemon on a simulated cell, in a folder as systemd makes it (0750, the operators' group). A process
 of one member (uid 52001) sends STOP's datagram and watches the page beside the socket; *heard* is the time
@@ -46,12 +46,12 @@ GIVE_UP_S = 3.0
 
 @dataclass
 class Found:
-    """Of one situation."""
+    """Figures of one situation."""
 
     name: str
     heard_ms: list[float] = field(default_factory=list)
     rest_ms: list[float] = field(default_factory=list)
-    """Of an arm that moved."""
+    """Times of an arm that moved."""
     commands: list[tuple[int, float, float]] = field(default_factory=list)
     """Exit code, seconds, processor seconds of `station stop`"""
 

@@ -1,4 +1,4 @@
-"""How long from the daemon's call of STOP until its bytes are out, and until the arm begins to slow down?
+"""Time from the daemon's call of STOP until its bytes are out, and until the arm begins to slow down.
 
 A simulated UR10e (500 Hz) cruises at 0.5 rad/s, driven by ur_rtde and by the station's own script; STOP
 comes at a random moment. Four ways: `stop()` as the daemon calls it (both paths at once), the control process

@@ -1,4 +1,4 @@
-"""How well is the arm's pose known at mid-exposure, at rest and while it moves?
+"""Error of the arm's pose at mid-exposure, at rest and while it moves.
 
 A simulated UR10 and a rendered camera, both with drifting clocks of their own, in processes of their own. The
 robot's pose is interpolated at the estimated middle of the exposure and compared with the joints that the
@@ -43,7 +43,7 @@ class Sync:
     position_error_mm: NDArray[np.float64]
     rotation_error_deg: NDArray[np.float64]
     speed_mm_s: NDArray[np.float64]
-    """Of the flange at that moment"""
+    """Speed of the flange at that moment"""
 
 
 def run() -> str:

@@ -1,4 +1,4 @@
-"""What the solver's benchmarks share: trial counts, spreads, markdown tables."""
+"""Common parts of the solver's benchmarks: trial counts, spreads, markdown tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How soon does `calibrate watch` notice that something moved, how often in vain, and does it name it right?
+"""Delay, false alarms and named causes of `calibrate watch`.
 
 The simulated cells know nothing of the test's own models: a UR10 whose table is wrong, a lens whose residual
 is a sum of waves, blur as noise and shift, a camera that creeps and swings with the day.
@@ -44,7 +44,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Happening:
-    """What happens after `_BEFORE` pictures."""
+    """Event after `_BEFORE` pictures."""
 
     part: str
     """camera, tag, joint-2 … joint-5, or noise"""
@@ -243,7 +243,7 @@ class _Still:
 
 
 def simulate(cell: Cell, count: int, what: Happening | None) -> tuple[CellModel, list[Picture]]:
-    """What the monitor is told of a cell, and its pictures; all are the same until something happens."""
+    """Simulate a cell's facts for the monitor, and its pictures; all are the same until something happens."""
     still = _still(cell, count)
     later = (np.arange(count) >= _BEFORE) & (what is not None)
     X, P, joints, noise_px = still.X.copy(), still.P.copy(), still.true_joints.copy(), still.noise_px.copy()

@@ -168,7 +168,7 @@ def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
 
 
 class CellIdentity(msgspec.Struct, frozen=True):
-    """What pictures say of the cell that they are of."""
+    """Facts of a cell that its images state."""
 
     mount: Mount
     source: Source
@@ -177,7 +177,7 @@ class CellIdentity(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, info: SessionInfo) -> CellIdentity:
-        """Of a recording's."""
+        """Read the facts of a recording."""
         return cls(info.mount, info.source, info.robot.serial, info.camera_identity.serial)
 
 

@@ -39,7 +39,7 @@ class Followed(msgspec.Struct, frozen=True):
 def follow(
     root: Root = None,
     camera: CameraName = MAIN_CAMERA,
-    poll_s: Annotated[float, typer.Option(min=0.01, help="How often it looks, s")] = 1.0,
+    poll_s: Annotated[float, typer.Option(min=0.01, help="Time between two looks, s")] = 1.0,
 ) -> None:
     """Print the installed calibration as JSON, and again after every change.
 

@@ -173,7 +173,7 @@ class HeldOutViews(msgspec.Struct, frozen=True):
     with_table_mm: float
     views: int
     recording: str = ""
-    """Of a verification: the recording that the views are in, none of which took part."""
+    """Recording of the views, none of which took part."""
 
 
 class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -186,7 +186,7 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     offered: bool
     model: str
     nominal: DhTable
-    """That the recorded flanges follow."""
+    """Table that the recorded flanges follow."""
     nominal_source: Literal["published", "factory"]
     errors: list[TableError]
     held: dict[str, str]

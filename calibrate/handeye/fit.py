@@ -114,7 +114,7 @@ _WORTH_SOLVING = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Sizes:
-    """What may be averaged over."""
+    """Sizes that are averaged over."""
 
     sigma: Array
     """(s, q) 1σ of each error, mm and mrad."""

@@ -72,7 +72,7 @@ def verdict(kind: Literal["good", "reason", "bad"], words: str, *lines: str) -> 
 
 
 def stamp(text: str) -> str:
-    """What must not be overlooked: where it may not be used."""
+    """Write what must not be overlooked: where it may not be used."""
     return f'<div class="stamp">{escape(text)}</div>'
 
 

@@ -45,7 +45,8 @@ def import_command(
     pair_within: Annotated[
         float, typer.Option(help="Largest time between an image and the nearest pose, seconds.")
     ] = PAIR_WITHIN_S,
-    still_mm: Annotated[float, typer.Option(help="What still counts as standing, mm.")] = POSITION_M * 1e3,
+    still_mm: Annotated[float, typer.Option(help="Largest motion of an arm at a stop, mm.")] = POSITION_M
+    * 1e3,
     still_deg: Annotated[
         float, typer.Option(help="The same in degrees.", show_default="0.003")
     ] = math.degrees(ROTATION_RAD),

@@ -52,7 +52,7 @@ def plan_command(
         str | None,
         typer.Option(help="Joints where the arm stands, degrees: 0,-90,90,…; without it the arm is asked"),
     ] = None,
-    poses: Annotated[int, typer.Option(min=3, max=200, help="How many")] = 25,
+    poses: Annotated[int, typer.Option(min=3, max=200, help="Poses to plan")] = 25,
     seed: Annotated[int, typer.Option(help="The same seed gives the same plan")] = 0,
     scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog")] = "paper",
     socket: Socket = None,

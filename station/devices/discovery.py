@@ -151,9 +151,9 @@ class UsbCamera(msgspec.Struct, frozen=True):
     serial: str
     firmware: str
     port: str
-    """As the kernel counts: bus, then the ports of the hubs on the way"""
+    """Place as the kernel counts: bus, then the ports of the hubs on the way"""
     speed_mbit_s: float
-    """Of the link as it came up"""
+    """Speed of the link as it came up"""
     permitted: bool
     """This program may open it."""
 

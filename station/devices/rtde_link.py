@@ -33,7 +33,7 @@ class RtdeLink:
         self._link = link
         self.packets = PacketReader()
         self.pending: deque[tuple[int, bytes]] = deque()
-        """What arrived and was not yet read: after `start`, the first data."""
+        """Data that arrived and was not yet read: after `start`, the first data."""
         accepted = self._ask(PacketType.PROTOCOL_VERSION, struct.pack(">H", PROTOCOL_VERSION))
         if accepted != b"\x01":
             raise RtdeError(f"the controller does not speak RTDE version {PROTOCOL_VERSION}")

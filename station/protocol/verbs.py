@@ -131,7 +131,7 @@ class Observation(msgspec.Struct, frozen=True, omit_defaults=True):
     camera_serial: str
     wall_ns: int
     rested_s: float
-    """How long the arm had rested by then."""
+    """Time that the arm had rested by then."""
     base_from_flange: Matrix4
     joints_rad: Vector6
     width: int

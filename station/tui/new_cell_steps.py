@@ -30,7 +30,7 @@ class StepPage:
     step: ClassVar[CellStep]
     title: ClassVar[str]
     words: ClassVar[str] = ""
-    """What it says, where that is always the same."""
+    """Its text, where that is always the same."""
     parts: ClassVar[Sequence[str]] = ()
     """Widgets it shows below its words."""
     placeholder: ClassVar[str] = ""
@@ -42,7 +42,7 @@ class StepPage:
 
     @property
     def about(self) -> str:
-        """What it says now."""
+        """Say what the step needs now."""
         return self.words
 
     @property

@@ -90,7 +90,7 @@ class StationScreen(Framed[None]):
     MODE: ClassVar[str] = ""
     """Its step of the task, or its name."""
     TIP: ClassVar[str] = ""
-    """What it is for, in a few words."""
+    """Purpose in a few words."""
 
     NAME: ClassVar[str] = ""
     """Its name, where that is not its mode."""

@@ -65,7 +65,7 @@ DRIVES = {
         ), _LARGE,
     ),
 }  # fmt: skip
-"""Of the arms whose controllers take torques."""
+"""Masses of the arms whose controllers take torques."""
 
 
 class Posture:
@@ -87,7 +87,7 @@ class Posture:
         self._axis_rates = [cross(turn, axis) for turn, axis in zip(turns, self._axes, strict=False)]
 
     def _columns(self, x: Six, link: int) -> list[Six]:
-        """How fast a point of a link moves per speed of each joint before it."""
+        """Compute how fast a point of a link moves per speed of each joint before it."""
         pairs = zip(self._axes[:link], self._points, strict=False)
         return [cross(z, plus(x, p, -1)) for z, p in pairs]
 

@@ -1,4 +1,4 @@
-"""What moves the arm in a script, and where it would go: kinematics, moves, streams and torques.
+"""Motion in a script: kinematics, moves, streams and torques.
 
 Arguments have the names of Universal Robots' manual, "The URScript Programming Language".
 """
@@ -278,7 +278,7 @@ class ArmMotions:
     # -- torques ----------------------------------------------------------------------------------------
 
     def _new(self) -> dict[str, Builtin]:
-        """What e-Series controllers have from 5.21 or 5.23 on; the scales of friction came with 5.25.1."""
+        """List functions that e-Series has from 5.21 or 5.23 on; the scales of friction came with 5.25.1."""
         robot, arm, settings = self._robot, self._robot.arm, self._robot.settings
         if not settings.is_e_series or settings.version < (5, 21):
             return {}

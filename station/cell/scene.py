@@ -77,7 +77,7 @@ class Scene:
 
 
 def camera_from_board(mount: Mount, base_from_flange: Array, X: Array, Y: Array) -> Array:
-    """Place the board in the camera, from flange poses (..., 4, 4), with camera and board at X and Y (`Scene`)."""
+    """Place the board in the camera from flange poses (..., 4, 4); camera and board at X and Y (`Scene`)."""
     if mount == "eye-in-hand":
         return np.asarray(inverse(base_from_flange @ X) @ Y)
     return np.asarray(inverse(X) @ base_from_flange @ Y)

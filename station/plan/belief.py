@@ -33,11 +33,17 @@ class BootstrapView:
 
 @dataclass(frozen=True, eq=False)
 class CameraPoseEstimate:
-    """The mount X and its uncertainty."""
+    """The mount X of a cell by some glimpses, and its uncertainty."""
 
+    config: StationConfig
+    glimpses: Sequence[BootstrapView]
     X: Array
     covariance: Array
     """(6, 6) of `geometry.perturb`'s delta."""
+
+    @property
+    def taught(self) -> BootstrapView:
+        return self.glimpses[0]
 
     @property
     def sigma_m(self) -> float:
@@ -55,6 +61,27 @@ class CameraPoseEstimate:
     @property
     def good(self) -> bool:
         return self.sigma_m <= GOOD_M and self.sigma_rad <= GOOD_RAD
+
+    def board(self, X: Array) -> Array:
+        """Place of the board as the taught glimpse shows it, if the mount is X."""
+        E = forward(arm_model(self.config.robot), self.taught.joints_rad)
+        return board_place(self.config.mount, E, X, self.taught.camera_from_board)
+
+    def seen_from(self, targets: Array, X: Array) -> Array:
+        """Board poses camera_from_board (n, 4, 4) at flange poses (n, 4, 4), if the mount is X."""
+        return camera_from_board(self.config.mount, targets, X, self.board(X))
+
+    def spread_after(self, target: Array) -> float:
+        """Squared error (m²) of X expected after one more glimpse from a flange pose (4, 4)."""
+        C = self.seen_from(target, self.X)
+        step = 1e-5
+        columns = []
+        for delta in np.eye(6) * step:
+            X = perturb(self.X, delta)
+            columns.append(_misfit(board_place(self.config.mount, target, X, C), self.board(X)) / step)
+        J = np.stack(columns, axis=1)
+        covariance = np.linalg.inv(np.linalg.inv(self.covariance) + J.T @ J)
+        return float(np.trace(covariance[:3, :3]) + _LEVER_M**2 * np.trace(covariance[3:, 3:]))
 
 
 def believe(config: StationConfig, glimpses: Sequence[BootstrapView]) -> CameraPoseEstimate:
@@ -76,55 +103,23 @@ def believe(config: StationConfig, glimpses: Sequence[BootstrapView]) -> CameraP
         return np.concatenate([delta / prior, *(_misfit(place, places[0]) for place in places[1:])])
 
     if len(glimpses) < 2:
-        return CameraPoseEstimate(guess, np.diag(prior**2))
+        return CameraPoseEstimate(config, glimpses, guess, np.diag(prior**2))
     fit = least_squares(residuals, np.zeros(6), x_scale=prior)
-    return CameraPoseEstimate(perturb(guess, fit.x), np.linalg.inv(fit.jac.T @ fit.jac))
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac)
+    return CameraPoseEstimate(config, glimpses, perturb(guess, fit.x), covariance)
 
 
 def improved_config(config: StationConfig, glimpses: Sequence[BootstrapView]) -> StationConfig:
     """The configuration with mount and board place as the glimpses show them: what the plan is made from."""
     belief = believe(config, glimpses)
-    taught = glimpses[0]
-    place = board_seen(config, taught, belief.X)
     # The board's place inherits the mount's doubt over the taught distance.
-    distance_m = float(np.linalg.norm(taught.camera_from_board[:3, 3]))
+    distance_m = float(np.linalg.norm(belief.taught.camera_from_board[:3, 3]))
     sigma_m = float(np.hypot(belief.sigma_m, distance_m * belief.sigma_rad))
     return msgspec.structs.replace(
         config,
         camera_guess=guess_from(belief.X, belief.sigma_m, belief.sigma_rad),
-        board_guess=guess_from(place, sigma_m, belief.sigma_rad),
+        board_guess=guess_from(belief.board(belief.X), sigma_m, belief.sigma_rad),
     )
-
-
-def expected_after(
-    config: StationConfig, glimpses: Sequence[BootstrapView], belief: CameraPoseEstimate, target: Array
-) -> Array:
-    """Covariance (6, 6) of X expected after one more glimpse from `target`."""
-    taught = glimpses[0]
-    C = seen_from(config, taught, belief.X, target[None])[0]
-    step = 1e-5
-    columns = []
-    for delta in np.eye(6) * step:
-        X = perturb(belief.X, delta)
-        place = board_seen(config, taught, X)
-        columns.append(_misfit(board_place(config.mount, target, X, C), place) / step)
-    J = np.stack(columns, axis=1)
-    return np.asarray(np.linalg.inv(np.linalg.inv(belief.covariance) + J.T @ J))
-
-
-def spread_of(covariance: Array) -> float:
-    return float(np.trace(covariance[:3, :3]) + _LEVER_M**2 * np.trace(covariance[3:, 3:]))
-
-
-def board_seen(config: StationConfig, glimpse: BootstrapView, X: Array) -> Array:
-    """The board's place as one glimpse shows it, if the mount is X."""
-    E = forward(arm_model(config.robot), glimpse.joints_rad)
-    return board_place(config.mount, E, X, glimpse.camera_from_board)
-
-
-def seen_from(config: StationConfig, taught: BootstrapView, X: Array, targets: Array) -> Array:
-    """camera_from_board (n, 4, 4) at the targets, if the mount is X."""
-    return camera_from_board(config.mount, targets, X, board_seen(config, taught, X))
 
 
 def _misfit(place: Array, reference: Array) -> Array:

@@ -30,10 +30,6 @@ from station.plan.belief import (
     BootstrapView,
     CameraPoseEstimate,
     believe,
-    board_seen,
-    expected_after,
-    seen_from,
-    spread_of,
 )
 from station.plan.order import move_times
 from station.plan.visibility import outline, planned_pose, visible
@@ -66,21 +62,21 @@ def next_move(config: StationConfig, glimpses: Sequence[BootstrapView]) -> Plann
     if moves >= MOVES_MAX or (moves >= MOVES_MIN and belief.good):
         return None
     rng = np.random.default_rng(moves)
-    samples, cells = _possible(config, glimpses, belief, rng)
+    samples, cells = _possible(belief, rng)
     if len(cells) < _FEWEST:
         raise _not_here(belief, len(cells))
     here = glimpses[-1].joints_rad
     allowed = geometry_from(config, here)  # what the daemon would refuse is no move
     in_view: list[Array] = []
-    for targets in (_targets(config, glimpses[0], belief), _any_direction(model, here, rng)):
-        targets = targets[_stays_in_view(config, glimpses[0], samples, targets)]
+    for targets in (_targets(belief), _any_direction(model, here, rng)):
+        targets = targets[_stays_in_view(belief, samples, targets)]
         in_view += list(targets)
         passed = _passing(allowed, here, targets)
-        gain = [spread_of(expected_after(config, glimpses, belief, forward(model, q))) for q in passed]
+        gain = [belief.spread_after(forward(model, q)) for q in passed]
         for place in np.argsort(gain, kind="stable"):
-            way_is_free = _free_in_all(cells, here, passed[place])
-            if way_is_free and _keeps_away(config, glimpses[0], samples, here, passed[place]):
-                return _described(config, glimpses[0], belief, moves, passed[place])
+            joints = passed[place]
+            if _free_in_all(cells, here, joints) and _keeps_away(belief, samples, here, joints):
+                return _described(belief, moves, joints)
     raise _no_move(belief, len(in_view), _in_the_way([allowed, *cells], here, in_view))
 
 
@@ -152,24 +148,19 @@ def _no_move(belief: CameraPoseEstimate, in_view: int, in_the_way: str) -> Limit
     )
 
 
-def _possible(
-    config: StationConfig,
-    glimpses: Sequence[BootstrapView],
-    belief: CameraPoseEstimate,
-    rng: np.random.Generator,
-) -> tuple[Array, list[CellGeometry]]:
+def _possible(belief: CameraPoseEstimate, rng: np.random.Generator) -> tuple[Array, list[CellGeometry]]:
     """Mounts (n, 4, 4) that are still possible, n at most 40, and the cells with them.
 
     Impossible is a mount with which camera or board would be in the arm's way where it has stood.
     """
-    taught, stood = glimpses[0], np.array([g.joints_rad for g in glimpses])
+    config, stood = belief.config, np.array([g.joints_rad for g in belief.glimpses])
     without = margins(geometry_of(config, None, None), stood)[1]
     draws = rng.multivariate_normal(np.zeros(6), belief.covariance, _DRAWS, method="eigh")
     draws[0] = 0.0
     mounts: list[Array] = []
     cells: list[CellGeometry] = []
     for X in perturb(belief.X, draws):
-        cell = as_taught(geometry_of(config, X, board_seen(config, taught, X)), taught.joints_rad)
+        cell = as_taught(geometry_of(config, X, belief.board(X)), belief.taught.joints_rad)
         gaps, contacts = margins(cell, stood)
         new = [column for column, contact in enumerate(contacts) if contact not in without]
         if gaps[:, new].min(initial=np.inf) >= SPACING_M / 2:
@@ -192,15 +183,14 @@ def as_taught(cell: CellGeometry, taught_rad: Array) -> CellGeometry:
     return replace(cell, obstacle_clearance_m=max(0.0, (near_m + cell.obstacle_clearance_m) / 2))
 
 
-def _targets(config: StationConfig, taught: BootstrapView, belief: CameraPoseEstimate) -> Array:
+def _targets(belief: CameraPoseEstimate) -> Array:
     """Flange poses (n, 4, 4) around the taught one: small turns about board, camera or wrists, and away."""
+    config, taught = belief.config, belief.taught
     model = arm_model(config.robot)
     E = forward(model, taught.joints_rad)
-    C = taught.camera_from_board
-    points = board_points(config.board)
     base_from_camera = E @ belief.X if config.mount == "eye-in-hand" else belief.X
-    base_from_board = base_from_camera @ C
-    centre = transform_points(base_from_board, points.mean(axis=0))
+    base_from_board = base_from_camera @ taught.camera_from_board
+    centre = transform_points(base_from_board, board_points(config.board).mean(axis=0))
     away = base_from_camera[:3, 3] - centre
     away /= np.linalg.norm(away)
     if config.mount == "eye-to-hand":
@@ -244,52 +234,41 @@ def _turned(E: Array, turn: Array, pivot: Array) -> Array:
     return pose(turn @ E[:3, :3], turn @ (E[:3, 3] - pivot) + pivot)
 
 
-def _stays_in_view(
-    config: StationConfig, taught: BootstrapView, samples: Array, targets: Array
-) -> NDArray[np.bool_]:
+def _stays_in_view(belief: CameraPoseEstimate, samples: Array, targets: Array) -> NDArray[np.bool_]:
     """(n,) whether for every possible mount the board is wholly seen and the camera no nearer than taught."""
-    camera = config.camera.model
+    camera, rim = belief.config.camera.model, outline(belief.config.board)
     assert camera is not None
-    rim = outline(config.board)
-    nearest_m = float(_away_m(config, taught.camera_from_board))
+    nearest_m = float(_away_m(rim, belief.taught.camera_from_board))
     good = np.ones(len(targets), dtype=bool)
     for X in samples:
-        seen = seen_from(config, taught, X, targets)
+        seen = belief.seen_from(targets, X)
         good &= visible(camera, transform_points(seen, rim), _BORDER_PX)
-        good &= _away_m(config, seen) >= nearest_m - _NEARER_M
+        good &= _away_m(rim, seen) >= nearest_m - _NEARER_M
     return good
 
 
-def _keeps_away(
-    config: StationConfig, taught: BootstrapView, samples: Array, here: Array, joints: Array
-) -> bool:
+def _keeps_away(belief: CameraPoseEstimate, samples: Array, here: Array, joints: Array) -> bool:
     """Tell whether every possible camera comes no nearer on the path than it was taught, or is."""
-    way = forward(arm_model(config.robot), here + np.linspace(0, 1, _ON_THE_WAY)[:, None] * (joints - here))
-    taught_m = float(_away_m(config, taught.camera_from_board))
+    rim, model = outline(belief.config.board), arm_model(belief.config.robot)
+    way = forward(model, here + np.linspace(0, 1, _ON_THE_WAY)[:, None] * (joints - here))
+    taught_m = float(_away_m(rim, belief.taught.camera_from_board))
     for X in samples:
-        away_m = _away_m(config, seen_from(config, taught, X, way))
+        away_m = _away_m(rim, belief.seen_from(way, X))
         if away_m.min() < min(taught_m, float(away_m[0])) - _NEARER_M:
             return False
     return True
 
 
-def _away_m(config: StationConfig, camera_from_board: Array) -> Array:
+def _away_m(rim: Array, camera_from_board: Array) -> Array:
     """(...) distance from the camera to the nearest point of the board's outline, for poses (..., 4, 4)."""
-    return np.asarray(
-        np.linalg.norm(transform_points(camera_from_board, outline(config.board)), axis=-1).min(axis=-1)
-    )
+    return np.asarray(np.linalg.norm(transform_points(camera_from_board, rim), axis=-1).min(axis=-1))
 
 
-def _described(
-    config: StationConfig, taught: BootstrapView, belief: CameraPoseEstimate, moves: int, joints: Array
-) -> PlannedPose:
-    place = board_seen(config, taught, belief.X)
+def _described(belief: CameraPoseEstimate, moves: int, joints: Array) -> PlannedPose:
+    config, X, Y = belief.config, belief.X, belief.board(belief.X)
     camera = config.camera.model
     assert camera is not None
-    scene = Scene(
-        config.mount, camera, config.board, belief.X, place, geometry_of(config, belief.X, place, 0.0)
-    )
+    scene = Scene(config.mount, camera, config.board, X, Y, geometry_of(config, X, Y))
     made = planned_pose(scene, moves, joints, forward(arm_model(config.robot), joints), None)
-    return msgspec.structs.replace(
-        made, name=f"bootstrap {moves + 1}", why=f"find the camera pose: {made.why}"
-    )
+    why = f"find the camera pose: {made.why}"
+    return msgspec.structs.replace(made, name=f"bootstrap {moves + 1}", why=why)

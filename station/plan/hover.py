@@ -58,6 +58,19 @@ class HoverPath:
     """(3,) unit normal in `board`, to the side that the camera sees."""
 
 
+@dataclass(frozen=True, eq=False)
+class HoverQuestion:
+    """The request, and where the arm stands: plain data that crosses into the worker."""
+
+    corner: int
+    standoff_m: float
+    pointer: PointerConfig
+    joints_rad: Vector6
+    """Where the arm stands."""
+    model_miss_m: float = 0.0
+    """Distance of the arm's own flange position from the configured kinematics, there."""
+
+
 def least_standoff_m(doubt_m: float) -> float:
     """Smallest standoff of the tip; `doubt_m`: how far board and tip may be off, all told."""
     return CLEARANCE_M + _PLATE_M + _CHECKED_M + doubt_m
@@ -99,19 +112,16 @@ def plan_hover(
     X: Array,
     base_from_board: Array,
     outward: Array,
-    corner: int,
-    standoff_m: float,
+    asked: HoverQuestion,
     doubt_m: float,
-    pointer: PointerConfig,
-    start_joints_rad: Vector6,
 ) -> HoverPath:
     """Plans the shortest free path over a corner, from where the arm stands. LimitError says what blocks it.
 
     X: flange_from_camera or base_from_camera of the calibration. Two moves: to a point `APPROACH_M` over the
     corner, then straight down the normal to the standoff.
     """
-    least_m = least_standoff_m(doubt_m)
-    if not standoff_m >= least_m:
+    corner, standoff_m = asked.corner, asked.standoff_m
+    if not standoff_m >= (least_m := least_standoff_m(doubt_m)):
         raise LimitError(
             f"{1000 * standoff_m:.0f} mm above the board is too near: {1000 * CLEARANCE_M:.0f} mm are kept "
             f"whatever is uncertain (limit {np.ceil(1000 * least_m):.0f} mm)",
@@ -120,14 +130,13 @@ def plan_hover(
             standoff_m=standoff_m,
             limit_m=least_m,
         )
-    geometry = hover_geometry(config, X, base_from_board, doubt_m, pointer)
-    point = board_points(config.board)[corner]
+    geometry = hover_geometry(config, X, base_from_board, doubt_m, asked.pointer)
     refused: PlanCheck | None = None
-    ways = _ways(geometry.model, base_from_board, point, outward, standoff_m, pointer, start_joints_rad)
+    ways = _ways(geometry.model, base_from_board, board_points(config.board)[corner], outward, asked)
     free = _free_ends(geometry, ways)
     for high, low in free[:_TRIED_WAYS] or ways[:1]:
         plan = _plan(config, geometry.model, corner, high, low)
-        check = check_plan(plan, start_joints_rad, geometry)
+        check = check_plan(plan, asked.joints_rad, geometry)
         if not check.problems:
             return HoverPath(plan, check, geometry, corner, standoff_m, base_from_board, outward)
         refused = refused or check
@@ -172,20 +181,16 @@ def hover_geometry(
 
 
 def _ways(
-    model: RobotModel,
-    base_from_board: Array,
-    point: Array,
-    outward: Array,
-    standoff_m: float,
-    pointer: PointerConfig,
-    start: Vector6,
+    model: RobotModel, base_from_board: Array, point: Array, outward: Array, asked: HoverQuestion
 ) -> list[tuple[Array, Array]]:
     """Joints over the corner, high (6,) and low (6,): every roll and arm posture, the shortest turn first."""
     found: list[tuple[float, Array, Array]] = []
-    high_m = max(standoff_m, APPROACH_M)
+    start = asked.joints_rad
     for roll in np.arange(_ROLLS) * 2 * np.pi / _ROLLS:
-        high = hover_target(base_from_board, point, outward, high_m, pointer, roll)
-        low = hover_target(base_from_board, point, outward, standoff_m, pointer, roll)
+        high, low = (
+            hover_target(base_from_board, point, outward, above_m, asked.pointer, roll)
+            for above_m in (max(asked.standoff_m, APPROACH_M), asked.standoff_m)
+        )
         lows = list(_postures(model, low, start))
         for joints in _postures(model, high, start):
             below = min(lows, key=lambda low: float(np.abs(low - joints).max()), default=None)
@@ -240,19 +245,6 @@ def _plan(config: StationConfig, model: RobotModel, corner: int, high: Array, lo
 
 
 @dataclass(frozen=True, eq=False)
-class HoverQuestion:
-    """The request: plain data that crosses into the worker."""
-
-    corner: int
-    standoff_m: float
-    pointer: PointerConfig
-    joints_rad: Vector6
-    """Where the arm stands."""
-    model_miss_m: float
-    """Distance of the arm's own flange position from the configured kinematics, there."""
-
-
-@dataclass(frozen=True, eq=False)
 class HoverAnswer:
     hover: HoverPath
     offset_covariance: Array
@@ -273,15 +265,6 @@ def answer_hover(
         for k in outer_corners(config.board)
     )
     doubt_m = _DOUBT_SIGMAS * float(np.sqrt(worst)) + question.model_miss_m
-    hover = plan_hover(
-        config,
-        calibration.transform.matrix,
-        now.base_from_board,
-        now.outward,
-        question.corner,
-        question.standoff_m,
-        doubt_m,
-        question.pointer,
-        question.joints_rad,
-    )
+    X = calibration.transform.matrix
+    hover = plan_hover(config, X, now.base_from_board, now.outward, question, doubt_m)
     return HoverAnswer(hover, covariance, now.moved_m)

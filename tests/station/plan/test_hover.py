@@ -51,6 +51,10 @@ def board_of(truth: CellTruth) -> Array:
     return pose(rotation_exp([np.pi, 0.0, 0.0]), [-0.62, 0.06, 0.01])
 
 
+def over(truth: CellTruth, standoff_m: float, corner: int = 0) -> HoverQuestion:
+    return HoverQuestion(corner, standoff_m, POINTER, truth.start_joints_rad)
+
+
 def asked(truth: CellTruth, corner: int, pointer: PointerConfig = POINTER, standoff_m: float = STANDOFF_M):  # type: ignore[no-untyped-def]
     start = truth.start_joints_rad
     E = forward(MODELS["UR10"], start)
@@ -100,7 +104,7 @@ def test_nearer_than_50_mm_is_impossible() -> None:
     # What is not known is kept away from, too.
     with raises("standoff-too-small"):
         X, place = np.array(truth.camera_mount), np.array(truth.board_place)
-        plan_hover(cell_config(truth), X, place, NORMAL, 0, 0.08, 0.03, POINTER, truth.start_joints_rad)
+        plan_hover(cell_config(truth), X, place, NORMAL, over(truth, 0.08), 0.03)
 
 
 def test_three_sigma_and_the_arms_own_miss_are_kept_away_from() -> None:
@@ -124,17 +128,7 @@ def test_an_unreachable_corner_is_said() -> None:
     truth = make_cell()
     X, place = np.array(truth.camera_mount), pose(np.eye(3), [0.0, 2.5, 0.0]) @ np.array(truth.board_place)
     with raises("corner-out-of-reach"):
-        plan_hover(
-            cell_config(truth),
-            X,
-            place,
-            NORMAL,
-            3,
-            0.08,
-            0.0,
-            POINTER,
-            truth.start_joints_rad,
-        )
+        plan_hover(cell_config(truth), X, place, NORMAL, over(truth, 0.08, corner=3), 0.0)
 
 
 def test_a_way_through_something_is_refused_with_its_name() -> None:
@@ -144,7 +138,7 @@ def test_a_way_through_something_is_refused_with_its_name() -> None:
     config = msgspec.structs.replace(config, limits=low)
     X, place = np.array(truth.camera_mount), np.array(truth.board_place)
     with raises("corner-path-blocked") as refused:
-        plan_hover(config, X, place, NORMAL, 0, 0.08, 0.0, POINTER, truth.start_joints_rad)
+        plan_hover(config, X, place, NORMAL, over(truth, 0.08), 0.0)
     assert (refused.value.code, refused.value.values) == ("corner-path-blocked", {"corner": 0})
 
 

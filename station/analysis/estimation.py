@@ -14,7 +14,7 @@ import numpy as np
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose
-from calibrate.handeye.information import MeasurementNoise, covariance_of, prior_information, view_information
+from calibrate.handeye.information import prior_information, view_information
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
@@ -25,6 +25,7 @@ from station.cell.config import StationConfig, matrix4
 from station.cell.errors import StationError
 from station.cell.scene import scene_of
 from station.cell.status import EstimateStatus
+from station.plan.choose import USUAL_NOISE, sigma_of
 from station.plan.predict import Advice, advise
 
 FEWEST_VIEWS = 4
@@ -33,14 +34,11 @@ COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
 
 
 def running_estimate(
-    mount: Mount,
-    camera: CameraModel,
-    lens_is_known: bool,
-    board: BoardSpec,
-    seen: Sequence[CapturedView],
-    goal_m: float,
+    config: StationConfig, lens_is_known: bool, seen: Sequence[CapturedView]
 ) -> EstimateStatus:
     """Few views or degenerate motion give an answer without numbers and with advice."""
+    camera, goal_m = config.camera.model, config.capture.goal_m
+    assert camera is not None
     shown = [image_coverage(camera, [view.pixels]) for view in seen]
     blank = EstimateStatus(
         len(seen),
@@ -51,11 +49,10 @@ def running_estimate(
     if len(seen) < FEWEST_VIEWS:
         return msgspec.structs.replace(blank, advice="too few views yet")
     try:
-        views, X, Y = solve_quickly(mount, camera, lens_is_known, board, seen)
+        views, X, Y = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return msgspec.structs.replace(blank, advice="the motion says too little yet")
-    free_lens = not lens_is_known
-    sigma_m, sigma_rad = quick_sigma(views, board, X, Y, free_lens)
+    sigma_m, sigma_rad = quick_sigma(views, config.board, X, Y, not lens_is_known)
     x, y, z = (float(v) for v in 1000 * X[:3, 3])
     return msgspec.structs.replace(
         blank,
@@ -118,13 +115,6 @@ def solve_quickly(
 
     CalibrationError, cv2.error or LinAlgError when the views are degenerate.
     """
-    views = _views(mount, camera, lens_is_known, board, seen)
-    return views, *_quick_solution(views)
-
-
-def _views(
-    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[CapturedView]
-) -> ViewSet:
     points = board_points(board)
     found = tuple(
         BoardView(v.index, f"p{v.index}", v.base_from_flange, points[v.indices], v.pixels) for v in seen
@@ -133,7 +123,8 @@ def _views(
     if not lens_is_known and len(found) >= FEWEST_FOR_LENS:
         with contextlib.suppress(CalibrationError):  # the rough lens will do
             views = replace(views, camera=calibrate_intrinsics(views).camera)
-    return solve_pnp(views, board)
+    views = solve_pnp(views, board)
+    return views, *_quick_solution(views)
 
 
 def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
@@ -157,7 +148,6 @@ def quick_sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens:
     """1σ of X: translation (m) and rotation (rad), roots of the summed variances."""
     points = board_points(board)
     flange = views.base_from_flange
-    each = view_information(views.mount, views.camera, flange, X, Y, points, MeasurementNoise())
+    each = view_information(views.mount, views.camera, flange, X, Y, points, USUAL_NOISE)
     prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
-    variances = np.diag(covariance_of(each.sum(axis=0), prior))
-    return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:6].sum()))
+    return sigma_of(each.sum(axis=0), prior)

@@ -147,7 +147,7 @@ def _worth(scene: Scene, seen: Sequence[CapturedView], left: Plan, free_lens: bo
     flange = flange_poses(scene, left)
     captured = np.array([view.base_from_flange for view in seen])
     everything = informations(scene, np.concatenate([captured, flange])).sum(axis=0)
-    sigma_m = sigma_of(everything, objective_for(scene, "A", free_lens))[0]
+    sigma_m = sigma_of(everything, objective_for(scene, "A", free_lens).prior)[0]
     whole = visible(scene.camera, scene.seen(flange, outline(scene.board)), 0.0)
     points = scene.seen(flange[whole], board_points(scene.board))
     pixels = np.concatenate(

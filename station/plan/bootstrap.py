@@ -269,6 +269,6 @@ def _described(belief: CameraPoseEstimate, moves: int, joints: Array) -> Planned
     camera = config.camera.model
     assert camera is not None
     scene = Scene(config.mount, camera, config.board, X, Y, geometry_of(config, X, Y))
-    made = planned_pose(scene, moves, joints, forward(arm_model(config.robot), joints), None)
+    made = planned_pose(scene, moves, joints, None)
     why = f"find the camera pose: {made.why}"
     return msgspec.structs.replace(made, name=f"bootstrap {moves + 1}", why=why)

@@ -169,7 +169,7 @@ def _best_addition(pool: Array, total: Array, taken: list[int], objective: Objec
     return int(open_places[best]), float(scores[best])
 
 
-def sigma_of(information: Array, objective: Objective) -> tuple[float, float]:
+def sigma_of(information: Array, prior: Array) -> tuple[float, float]:
     """1σ of X from a sum of informations: translation (m, root of the summed variances), rotation (rad)."""
-    diagonal = np.diag(covariance_of(information, objective.prior))
+    diagonal = np.diag(covariance_of(information, prior))
     return float(np.sqrt(diagonal[:3].sum())), float(np.sqrt(diagonal[3:6].sum()))

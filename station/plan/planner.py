@@ -326,11 +326,10 @@ def _describe(
     objective: Objective,
     before: Array | None,
 ) -> Plan:
-    flange = forward(scene.geometry.model, joints)
     known = gained.cumsum(axis=0) + (0.0 if before is None else before)
     poses = tuple(
-        planned_pose(scene, number, joints[number], flange[number], sigma_of(known[number], objective)[0])
-        for number in range(len(joints))
+        planned_pose(scene, number, q, sigma_of(total, objective.prior)[0])
+        for number, (q, total) in enumerate(zip(joints, known, strict=True))
     )
     limits = scene.geometry.limits
     return Plan(

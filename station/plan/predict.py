@@ -14,7 +14,6 @@ from calibrate.geometry import Array
 from calibrate.handeye.arm import PARAMETERS
 from calibrate.handeye.information import MeasurementNoise, covariance_of
 from calibrate.handeye.solution import MEASURED
-from calibrate.kinematics import forward
 from station.cell.limits import check_path
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import Scene, flange_poses
@@ -100,7 +99,7 @@ def forecast_views(
     objective = objective_for(scene, "A", free_intrinsics)
     gains = informations(scene, base_from_flange, noise=noise)
     gains[~_whole(scene, base_from_flange)] = 0.0
-    return [sigma_of(information, objective)[0] for information in gains.cumsum(axis=0)]
+    return [sigma_of(information, objective.prior)[0] for information in gains.cumsum(axis=0)]
 
 
 def _whole(scene: Scene, base_from_flange: Array) -> NDArray[np.bool_]:
@@ -123,7 +122,7 @@ def advise(
     flange = np.asarray(captured, dtype=float).reshape(-1, 4, 4)
     objective = objective_for(scene, "A", free_intrinsics=True)
     known = informations(scene, flange).sum(axis=0)
-    now = sigma_of(known, objective)[0]
+    now = sigma_of(known, objective.prior)[0]
     state = f"expected error {1000 * now:.2f} mm after {len(flange)} views"
     if now <= goal_m:
         return Advice(now, True, f"enough: {state}, the goal is {1000 * goal_m:.2f} mm")
@@ -139,9 +138,9 @@ def advise(
             now, False, f"{state}; no free path from here to a pose that helps: jog the arm and ask again"
         )
     missing = _missing(known, gains, goal_m, objective)
-    after = sigma_of(known + gains[best], objective)[0]
+    after = sigma_of(known + gains[best], objective.prior)[0]
     joints = pool.joints_rad[best]
-    pose = planned_pose(scene, len(flange), joints, forward(scene.geometry.model, joints), after)
+    pose = planned_pose(scene, len(flange), joints, after)
     more = (
         f"about {missing} more" if missing else f"more than {_FURTHER_POSES} more, or a better camera or arm"
     )
@@ -162,6 +161,6 @@ def _missing(known: Array, gains: Array, goal_m: float, objective: Objective) ->
     total = known
     for count in range(1, _FURTHER_POSES + 1):
         total = total + gains[int(np.argmin(objective(total + gains)))]
-        if sigma_of(total, objective)[0] <= goal_m:
+        if sigma_of(total, objective.prior)[0] <= goal_m:
             return count
     return None

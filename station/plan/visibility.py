@@ -168,10 +168,9 @@ def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
     )
 
 
-def planned_pose(
-    scene: Scene, number: int, joints_rad: Array, base_from_flange: Array, sigma_m: float | None
-) -> PlannedPose:
+def planned_pose(scene: Scene, number: int, joints_rad: Array, sigma_m: float | None) -> PlannedPose:
     """A pose of the plan with its expected view and the reason in a few words."""
+    base_from_flange = forward(scene.geometry.model, joints_rad)
     view = expected_view(scene, base_from_flange)
     return PlannedPose(
         name=f"p{number + 1:02d}",

@@ -15,7 +15,6 @@ import msgspec
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.schema.messages import CameraModel
 from station.analysis.estimation import next_best, next_best_text, running_estimate
 from station.analysis.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement, improve
 from station.analysis.pool import WorkerError
@@ -199,7 +198,7 @@ class Estimator:
             if camera is None or camera.matrix is None:
                 continue
             try:
-                estimate = await self._estimate(camera)
+                estimate = await self._estimate()
             except Exception as error:  # this task looks on; it must outlive every image and every defect
                 if not isinstance(error, WorkerError):
                     log.exception("the running estimate failed")
@@ -216,20 +215,12 @@ class Estimator:
                 with contextlib.suppress(RecordingError):  # a full disk ends the run, not this look
                     recording.show_frames(estimate.camera_pose, estimate.board_pose, stamps_now())
 
-    async def _estimate(self, camera: CameraModel) -> EstimateStatus:
+    async def _estimate(self) -> EstimateStatus:
         """Estimate with advice on the next pose, where one more would help."""
         context, config = self._context, self._context.cell.config
         seen = list(context.seen.values())
-        estimate = await context.workers.call(
-            running_estimate,
-            config.mount,
-            camera,
-            context.cell.camera_model is not None,
-            config.board,
-            seen,
-            config.capture.goal_m,
-            timeout_s=_ESTIMATE_S,
-        )
+        known = context.cell.camera_model is not None
+        estimate = await context.workers.call(running_estimate, config, known, seen, timeout_s=_ESTIMATE_S)
         joints = context.store.status.robot.joints_rad
         if joints is None or estimate.sigma_translation_mm is None or estimate.enough:
             return estimate

@@ -27,6 +27,7 @@ from station.cell.scene import scene_of
 from station.cell.status import EstimateStatus
 from station.plan.choose import USUAL_NOISE, sigma_of
 from station.plan.predict import Advice, advise
+from station.plan.visibility import count_in_parts
 
 FEWEST_VIEWS = 4
 FEWEST_FOR_LENS = 6
@@ -99,12 +100,7 @@ def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_ra
 def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[int, ...], ...]:
     """Corners in each part of the image, COVERAGE_ROWS × COVERAGE_COLUMNS."""
     points = np.concatenate([np.zeros((0, 2)), *pixels])
-    counts, _, _ = np.histogram2d(
-        points[:, 1],
-        points[:, 0],
-        bins=(COVERAGE_ROWS, COVERAGE_COLUMNS),
-        range=((0, camera.height), (0, camera.width)),
-    )
+    counts = count_in_parts(camera, points, COVERAGE_ROWS, COVERAGE_COLUMNS)
     return tuple(tuple(int(n) for n in row) for row in counts)
 
 

@@ -20,6 +20,7 @@ from calibrate.geometry import (
     transform_points,
 )
 from calibrate.kinematics import MODELS, RobotModel, forward
+from calibrate.projection import camera_matrix
 from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
 from station.cell.collision import CellGeometry, gap_to_arm, plate
 from station.cell.config import (
@@ -88,6 +89,13 @@ def board_place(mount: Mount, base_from_flange: Array, X: Array, camera_from_boa
     if mount == "eye-in-hand":
         return np.asarray(base_from_flange @ X @ camera_from_board)
     return np.asarray(inverse(base_from_flange) @ X @ camera_from_board)
+
+
+def frustum(camera: CameraModel, base_from_camera: Array, far_m: float) -> Array:
+    """Optical centre and, around it, the image's corners at this distance, (5, 3) in `base`."""
+    w, h = camera.width, camera.height
+    corners = np.array([(0, 0, 1), (w, 0, 1), (w, h, 1), (0, h, 1)]) @ np.linalg.inv(camera_matrix(camera)).T
+    return transform_points(base_from_camera, np.vstack([np.zeros(3), far_m * corners]))
 
 
 def pose_at(model: RobotModel, name: str, joints_rad: ArrayLike, why: str = "") -> PlannedPose:

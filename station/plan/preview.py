@@ -9,13 +9,14 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
-from calibrate.projection import camera_matrix, project
+from calibrate.projection import project
 from recordings.scene import Colour, Entity, Polyline, write_scene
 from station.cell.collision import body_segments
 from station.cell.errors import ConfigError
 from station.cell.limits import check_plan
 from station.cell.plan import Plan
-from station.cell.scene import Scene, flange_poses, printed_corners
+from station.cell.scene import Scene, flange_poses, frustum, printed_corners
+from station.plan.visibility import count_in_parts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,12 +90,8 @@ def _draw_space(axes: Axes3D, scene: Scene, plan: Plan) -> None:
 
 def camera_frustum(scene: Scene, base_from_camera: Array) -> list[Array]:
     """Edges of the image's pyramid, polylines (m, 3) in `base`."""
-    K = camera_matrix(scene.camera)
-    w, h = scene.camera.width, scene.camera.height
-    rays = np.array([[u, v, 1.0] for u, v in ((0, 0), (w, 0), (w, h), (0, h))]) @ np.linalg.inv(K).T
-    corners = transform_points(base_from_camera, _FRUSTUM_M * rays)
-    centre = base_from_camera[:3, 3]
-    return [np.vstack([corners, corners[:1]]), *(np.stack([centre, corner]) for corner in corners)]
+    points = frustum(scene.camera, base_from_camera, _FRUSTUM_M)
+    return [points[[1, 2, 3, 4, 1]], *(points[[0, corner]] for corner in range(1, 5))]
 
 
 def printed_outline(scene: Scene, base_from_board: Array) -> Array:
@@ -132,13 +129,7 @@ def expected_pixels(scene: Scene, plan: Plan) -> Array:
 def coverage_grid(scene: Scene, plan: Plan, columns: int, rows: int) -> Array:
     """Counts the board points in each cell of the image, (rows, columns)."""
     pixels = expected_pixels(scene, plan).reshape(-1, 2)
-    pixels = pixels[np.isfinite(pixels).all(axis=1)]
-    size = scene.camera.width, scene.camera.height
-    edges = [
-        np.linspace(-0.5, side - 0.5, cells + 1) for side, cells in zip(size, (columns, rows), strict=True)
-    ]
-    counts = np.histogram2d(pixels[:, 0], pixels[:, 1], bins=edges)[0]
-    return np.asarray(counts.T)
+    return count_in_parts(scene.camera, pixels[np.isfinite(pixels).all(axis=1)], rows, columns)
 
 
 def board_from_cameras(scene: Scene, plan: Plan) -> Array:

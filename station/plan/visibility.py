@@ -72,6 +72,12 @@ def visible(camera: CameraModel, points: Array, border_px: float) -> NDArray[np.
     return np.asarray((inside & in_front & (radius < lens_radius(camera))).all(axis=1))
 
 
+def count_in_parts(camera: CameraModel, pixels: Array, rows: int, columns: int) -> Array:
+    """Count points (n, 2) in each part of the image, (rows, columns) from the top left."""
+    sides = ((-0.5, camera.height - 0.5), (-0.5, camera.width - 0.5))
+    return np.histogram2d(pixels[:, 1], pixels[:, 0], bins=(rows, columns), range=sides)[0]
+
+
 def lens_radius(camera: CameraModel) -> float:
     """Largest normalised radius up to which the lens model grows, at most 1.3 times the image's corner."""
     K = camera_matrix(camera)

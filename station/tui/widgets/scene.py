@@ -14,7 +14,7 @@ from calibrate.geometry import Array, transform_points
 from station.cell.collision import body_segments
 from station.cell.config import StationConfig
 from station.cell.errors import StationError
-from station.cell.scene import Scene, board_extent, scene_of
+from station.cell.scene import Scene, board_extent, frustum, scene_of
 from station.cell.status import PoseStatus, StationStatus
 from station.tui.widgets.canvas import Canvas
 
@@ -131,11 +131,11 @@ def draw(
         rank = CHOSEN if i == chosen else SAVED if pose.counts else PLANNED
         if in_hand:
             far = scene.working_distance_m if i == chosen else _SHORT_M
-            edges(_frustum(scene, flange[i] @ scene.X, far), _FRUSTUM, rank)
+            edges(frustum(scene.camera, flange[i] @ scene.X, far), _FRUSTUM, rank)
         else:
             edges(transform_points(flange[i] @ scene.Y, board), _QUAD, rank)
     if not in_hand:
-        edges(_frustum(scene, scene.X, 2 * _SHORT_M), _FRUSTUM, BOARD)
+        edges(frustum(scene.camera, scene.X, 2 * _SHORT_M), _FRUSTUM, BOARD)
         canvas.text(place(scene.X[:3, 3]), "camera", BOARD)
     else:
         edges(still, [*_QUAD, (0, 3), (1, 2)], BOARD)
@@ -152,15 +152,7 @@ def draw(
 
 
 _QUAD = [(0, 1), (1, 3), (3, 2), (2, 0)]
-_FRUSTUM = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 4), (4, 3), (3, 1)]
-
-
-def _frustum(scene: Scene, base_from_camera: Array, far_m: float) -> Array:
-    """(5, 3) in `base`: the camera's centre and the picture's corners at this distance."""
-    lens = scene.camera
-    corners = np.array([[x, y, 1.0] for y in (0, lens.height) for x in (0, lens.width)])
-    rays = corners @ np.linalg.inv(np.array(lens.matrix)).T * far_m
-    return transform_points(base_from_camera, np.vstack([np.zeros(3), rays]))
+_FRUSTUM = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
 
 
 Edges = Callable[[Array, list[tuple[int, int]], int, int], None]

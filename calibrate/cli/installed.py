@@ -132,6 +132,9 @@ def export(
     camera: Annotated[
         str, typer.Option("--of", help="Name of the camera, in a cell with several")
     ] = MAIN_CAMERA,
+    with_table: Annotated[
+        bool, typer.Option("--with-table", help="The camera pose that belongs to the arm's corrected table")
+    ] = False,
     root: Root = None,
 ) -> None:
     """Write a calibration in another program's format.
@@ -141,7 +144,7 @@ def export(
     calibration, validity = named_or_installed(file, root, camera)
     names = FrameNames.of_camera(camera if file is None else calibration.camera_name)
     follow = () if file is not None else follow_command(root, camera)
-    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity, follow)
+    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity, follow, with_table)
     content = exports.export(calibration, str(to.value), frames)
     if validity is not None and validity.state is not ValidityState.VALID:
         err.print(f"Warning: the calibration is {validity_text(validity)}", style="yellow")

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from calibrate.files.calibration import Calibration
+import msgspec
+
+from calibrate.files.calibration import Calibration, FramePose
 from calibrate.files.exports import models, ros, vision
 from calibrate.files.exports.frames import ExportError as ExportError
 from calibrate.files.exports.frames import FrameNames as FrameNames
@@ -16,20 +18,22 @@ class Format(NamedTuple):
     suffix: str
     says: str
     make: Callable[[Calibration, FrameNames], str | bytes]
+    of_table: bool = False
+    """It may hold the camera pose that belongs to the arm's corrected table."""
 
 
 FORMATS: dict[str, Format] = {
     "ros-camera-info": Format(".yaml", "ROS camera_info YAML: the intrinsics", ros.ros_camera_info),
     "ros-static-transform": Format(
-        ".sh", "command line of ROS 2 static_transform_publisher", ros.ros_static_transform
+        ".sh", "command line of ROS 2 static_transform_publisher", ros.ros_static_transform, True
     ),
-    "ros-launch": Format(".launch.py", "ROS 2 launch file with the static transform", ros.ros_launch),
+    "ros-launch": Format(".launch.py", "ROS 2 launch file with the static transform", ros.ros_launch, True),
     "ros-launch-follow": Format(
         ".launch.py", "ROS 2 launch file that follows what is installed", ros.ros_launch_follow
     ),
-    "easy-handeye2": Format(".calib", "easy_handeye2 calibration", ros.easy_handeye2),
-    "urdf": Format(".urdf", "URDF: camera body and optical frame", models.urdf),
-    "xacro": Format(".xacro", "the same as a macro for a robot's xacro", models.xacro),
+    "easy-handeye2": Format(".calib", "easy_handeye2 calibration", ros.easy_handeye2, True),
+    "urdf": Format(".urdf", "URDF: camera body and optical frame", models.urdf, True),
+    "xacro": Format(".xacro", "the same as a macro for a robot's xacro", models.xacro, True),
     "mjcf": Format(".xml", "MuJoCo model with the camera", models.mjcf),
     "opencv": Format(".yml", "OpenCV FileStorage: transform and intrinsics", vision.opencv),
     "halcon": Format(".dat", "HALCON pose: tool_in_cam_pose or base_in_cam_pose", vision.halcon),
@@ -51,5 +55,21 @@ def export(calibration: Calibration, name: str, frames: FrameNames | None = None
         raise ExportError(
             f"There is no format {name!r}.", remedy=f"Choose one of {', '.join(FORMATS)}.", format=name
         )
-    made = FORMATS[name].make(calibration, frames or FrameNames())
+    frames = frames or FrameNames()
+    if frames.with_table:
+        calibration = _of_table(calibration, name)
+    made = FORMATS[name].make(calibration, frames)
     return made.encode() if isinstance(made, str) else made
+
+
+def _of_table(calibration: Calibration, name: str) -> Calibration:
+    """Put the X of the arm's table in place of that for the arm as it is. Raises as `installable`."""
+    if not FORMATS[name].of_table:
+        able = ", ".join(other for other, one in FORMATS.items() if one.of_table)
+        raise ExportError(
+            f"{name} is never for the corrected table alone.",
+            code="not-of-table",
+            remedy=f"Leave --with-table out, or choose one of {able}.",
+        )
+    _, X = models.table_of(calibration).installable()
+    return msgspec.structs.replace(calibration, result=FramePose.of(X))

@@ -46,6 +46,8 @@ class FrameNames:
     """Validity of the installed calibration, for the comment; None: of a file that may never be installed."""
     follow: tuple[str, ...] = ()
     """Command that prints every change of the installed calibration; empty: of a file."""
+    with_table: bool = False
+    """The camera pose that belongs to the arm's corrected table, not the one for the arm as it is."""
 
     @classmethod
     def of_camera(cls, name: str) -> FrameNames:
@@ -68,8 +70,8 @@ def follow_command(root: Path | None, camera: str) -> tuple[str, ...]:
     return (sys.executable, "-I", "-m", "calibrate.cli", "follow", *place)  # without the caller's PYTHONPATH
 
 
-def comment(calibration: Calibration, frames: FrameNames, with_table: bool = False) -> str:
-    """One line on where this comes from, stamped where it must be; `with_table`: of the corrected arm.
+def comment(calibration: Calibration, frames: FrameNames) -> str:
+    """One line on where this comes from, stamped where it must be.
 
     One line whatever the file says: the rest of a name must not become a line of a launch file or a script.
     """
@@ -77,10 +79,11 @@ def comment(calibration: Calibration, frames: FrameNames, with_table: bool = Fal
     origin = f"{calibration.provenance.session}, solved {calibration.created}"
     held = "" if frames.validity is None else validity_text(frames.validity)
     two = calibration.arm_table is not None and calibration.arm_table.offered
-    table = _AS_IT_IS if two and not with_table else ""
+    table = "" if not two else _WITH_TABLE if frames.with_table else _AS_IT_IS
     return " ".join(". ".join(filter(None, (stamp, origin, table, held))).split())
 
 
+_WITH_TABLE = "Camera pose for the corrected table (ur-kinematics) alone, not for the arm as it is"
 _AS_IT_IS = "Camera pose for the arm as it is, not for its corrected table"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -10,7 +11,7 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from calibrate.files.calibration import Calibration, DhTable
+from calibrate.files.calibration import Calibration, CorrectedArm, DhTable
 from calibrate.files.exports.frames import (
     BODY_FROM_OPTICAL,
     OPTICAL_FROM_OPENGL,
@@ -127,19 +128,25 @@ def link_origins(table: DhTable) -> Array:
     return np.array(found)
 
 
-def table_origins(calibration: Calibration, frames: FrameNames) -> tuple[Array, str]:
-    """The corrected arm's origins (6, 4, 4), and a comment with the one X that belongs to them."""
+def table_of(calibration: Calibration) -> CorrectedArm:
+    """Return the arm's table, offered or not. Raises ExportError where there is none."""
     if calibration.arm_table is None:
         raise ExportError(
             "This calibration holds no table of an arm.",
             code="no-arm-table",
             remedy="Solve a recording of a robot whose model is known.",
         )
-    table, X = calibration.arm_table.installable()
+    return calibration.arm_table
+
+
+def table_origins(calibration: Calibration, frames: FrameNames) -> tuple[Array, str]:
+    """The corrected arm's origins (6, 4, 4), and a comment with the one X that belongs to them."""
+    arm = table_of(calibration)
+    table, X = arm.installable()
     values = _numbers([*X.translation_m, *X.quaternion_xyzw])
     note = (
-        f"{comment(calibration, frames, with_table=True)}\n"
-        f"{calibration.arm_table.model}: use it only with this camera pose, and this one only with it:\n"
+        f"{comment(calibration, replace(frames, with_table=True))}\n"
+        f"{arm.model}: use it only with this camera pose, and this one only with it:\n"
         f"{frames.parent(calibration)} {frames.camera} (x y z, qx qy qz qw) {values}"
     )
     return link_origins(table), note
@@ -162,9 +169,9 @@ def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
 def arm_urdf(calibration: Calibration, frames: FrameNames) -> str:
     """A whole URDF: the arm with corrected origins (no shapes), and the camera of this table."""
     origins, note = table_origins(calibration, frames)
-    assert calibration.arm_table is not None
-    _, X = calibration.arm_table.installable()
-    limit = MODELS[calibration.arm_table.model].joint_limit_rad
+    arm = table_of(calibration)
+    _, X = arm.installable()
+    limit = MODELS[arm.model].joint_limit_rad
     links = [frames.base, *(f"{link}_link" for link in _LINKS), frames.flange]
     parts = [f"<link name={quoteattr(link)}/>" for link in links]
     for name, parent, child, T in zip(_JOINTS, links, links[1:], origins, strict=False):
@@ -177,5 +184,5 @@ def arm_urdf(calibration: Calibration, frames: FrameNames) -> str:
     parts.append(_joint("wrist_3_link", frames.flange, np.eye(4)))
     parent = frames.parent(calibration)
     parts.append(_camera(X.matrix, parent, frames))
-    name = quoteattr(f"{calibration.arm_table.model}_corrected")
+    name = quoteattr(f"{arm.model}_corrected")
     return f"{_commented(note)}<robot name={name}>\n" + "\n".join(parts) + "\n</robot>\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import cv2
 import msgspec
@@ -228,7 +229,7 @@ def arm_json(calibration: Calibration, frames: FrameNames) -> str:
     """Only the arm's table and the X that belongs to it."""
     table_origins(calibration, frames)  # refused where none is offered
     plain = {
-        "of": comment(calibration, frames, with_table=True),
+        "of": comment(calibration, replace(frames, with_table=True)),
         "mount": calibration.mount,
         "arm_table": calibration.arm_table,
     }

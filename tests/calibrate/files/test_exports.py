@@ -155,6 +155,22 @@ def test_arm_json_holds_table_and_camera_together(calibration: Calibration) -> N
     assert read["result"]["parent_frame"].startswith("corrected_")
 
 
+def test_a_ros_transform_is_of_the_arm_as_it_is_unless_asked_for_the_table(calibration: Calibration) -> None:
+    for frames, X in (
+        (FrameNames(), calibration.transform),
+        (FrameNames(with_table=True), calibration.arm_table.result.transform),
+    ):
+        read = yaml.safe_load(export(calibration, "easy-handeye2", frames))["transform"]
+        assert np.abs(np.array([read["translation"][k] for k in "xyz"]) - X.translation_m).max() < 1e-12
+    names = [name for name, one in FORMATS.items() if one.of_table]
+    for name in names:
+        own, other = (export(calibration, name, FrameNames(with_table=yes)) for yes in (True, False))
+        assert own.splitlines()[0] != other.splitlines()[0], "the first line says which"
+    with pytest.raises(ExportError) as refused:
+        export(calibration, "ros-launch-follow", FrameNames(with_table=True))
+    assert refused.value.code == "not-of-table"
+
+
 @pytest.mark.parametrize("name", ["ur-kinematics", "arm-urdf", "arm-json"])
 def test_a_table_that_is_not_offered_is_not_exported(calibration: Calibration, name: str) -> None:
     refused = msgspec.structs.replace(

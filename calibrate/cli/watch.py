@@ -387,7 +387,9 @@ def event_text(event: MovementEvent) -> str:
         EventKind.NOT_FIXED: f"These fit no fixed tag: misfit {values.get('median_misfit_px')} px (limit "
         f"{LARGEST_MISFIT_PX:g} px). Check that it is fixed, its size, and run `calibrate drift-check`.",
         EventKind.TESTING: f"Learned; from now on images of {values.get('postures')} postures are tested.",
-        EventKind.ALARM: f"Something moved {values.get('since_pictures')} images ago or less.",
+        EventKind.ALARM: "Something crept since the first images."
+        if values.get("crept")
+        else f"Something moved {values.get('since_pictures')} images ago or less.",
         EventKind.PICTURES_WORSE: "The last 20 images are worse, none moved: check focus and light.",
         EventKind.TAG_UNSEEN: f"No tag in the last {values.get('in_a_row')} images: nothing is watched.",
     }[event.kind]

@@ -88,10 +88,27 @@ def what_moved(M: Array, u: Array, mount: Mount) -> tuple[Moved, float]:
     return (name if first - second > np.log(ODDS) else Moved.CANNOT_TELL), first - second
 
 
-def move_size(M: Array, u: Array, moved: Moved) -> Array:
-    """Estimate the move (6,), metres and radians, of camera or tag, nothing else moving but the dead band."""
+def move_size(M: Array, u: Array, moved: Moved) -> tuple[Array, Array]:
+    """Estimate the move (6,), metres and radians, of camera or tag, nothing else moving but the dead band.
+
+    The second value is the largest standard deviation of its shift and of its turn, (2,).
+    """
     at = slice(6, 12) if moved in (Moved.TAG, Moved.TAG_GRIPPER) else slice(0, 6)
     variances = np.ones(12)
     variances[at] = _MOVES[1][:6]
-    estimate = np.linalg.solve(M[:12, :12] + np.diag(1 / variances), u[:12])
-    return np.asarray(estimate[at] * np.repeat([DEAD_BAND_M, DEAD_BAND_RAD], 3))
+    covariance = np.linalg.inv(M[:12, :12] + np.diag(1 / variances))
+    band = np.array([DEAD_BAND_M, DEAD_BAND_RAD])
+    blocks = covariance[at, at].reshape(2, 3, 2, 3)
+    sigma = [float(np.sqrt(np.linalg.eigvalsh(blocks[i, :, i])[-1])) for i in range(2)]
+    return np.asarray((covariance @ u[:12])[at] * np.repeat(band, 3)), np.array(sigma) * band
+
+
+def has_crept(M: Array, u: Array, tolerated: tuple[float, float]) -> bool:
+    """Whether camera or tag is surely (3σ) farther from where it was than is tolerated, metres and radians.
+
+    M (12, 12), u (12,); whichever of them explains more is taken to have moved.
+    """
+    log = log_marginal(M, u, _MOVES[1:])
+    move, sigma = move_size(M, u, Moved.CAMERA if log[0] > log[1] else Moved.TAG)
+    lengths = np.linalg.norm(move.reshape(2, 3), axis=1)
+    return bool((lengths - 3 * sigma > tolerated).any())

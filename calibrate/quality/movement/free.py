@@ -11,7 +11,9 @@ import numpy as np
 from calibrate.geometry import Array
 from calibrate.quality.movement.pictures import CAMERA, MOVES, SHARED, TAG, UNITS, Deviations
 from calibrate.quality.movement.window import (
+    LEARNING,
     LIMIT,
+    NOTHING,
     Counts,
     RunningSums,
     WindowFinding,
@@ -42,20 +44,30 @@ class FreePostures(WindowTest[Row]):
         camera = np.linalg.inv(X_covariance / np.outer(UNITS[CAMERA], UNITS[CAMERA]) + np.eye(6))
         prior = np.eye(16)
         prior[:6, :6], prior[6:12, 6:12] = camera, tag
-        J, y = learned.effects[..., _FITTED], learned.y
-        weights, noise = np.ones(len(y)), 1.0
-        for _ in range(_STEPS):
-            N = np.einsum("n,nia,nib->ab", weights, J, J) + prior * noise**2
-            theta = np.asarray(np.linalg.solve(N, np.einsum("n,nia,ni->a", weights, J, y)), dtype=float)
-            lengths = np.linalg.norm(y - J @ theta, axis=1)
-            noise = noise_of(np.asarray(lengths), 1 - 16 / (6 * len(y)))
-            weights = np.minimum(1.0, LIMIT * noise / np.maximum(lengths, 1e-12))
+        theta, lengths, noise = self._fit(learned.effects, learned.y, prior)
         super().__init__(noise)
         self._prior = prior * noise**2
         self._sums = RunningSums((16, 17))
-        self.log_likelihood = log_likelihood(learned, np.asarray(lengths), noise)
-        for row in zip(learned.effects, y, strict=True):
-            self._count(row, np.asarray(theta, dtype=float))
+        self._anew: list[Row] | None = None
+        """First pictures after some were missing."""
+        self.log_likelihood = log_likelihood(learned, lengths, noise)
+        for row in zip(learned.effects, learned.y, strict=True):
+            self._recent += (self._count(row, theta) > LIMIT, 1)
+        self._learn_far()
+        self._learned = self._sums.latest(len(lengths))
+
+    @staticmethod
+    def _fit(effects: Array, y: Array, prior: Array) -> tuple[Array, Array, float]:
+        """θ (16,) of pictures, the lengths (n,) of what it leaves, and the noise; far ones weighed down."""
+        J, noise = effects[..., _FITTED], 1.0
+        weights: Array = np.ones(len(y))
+        for _ in range(_STEPS):
+            N = np.einsum("n,nia,nib->ab", weights, J, J) + prior * noise**2
+            theta = np.asarray(np.linalg.solve(N, np.einsum("n,nia,ni->a", weights, J, y)), dtype=float)
+            lengths = np.asarray(np.linalg.norm(y - J @ theta, axis=1))
+            noise = noise_of(lengths, 1 - 16 / (6 * len(y)))
+            weights = np.asarray(np.minimum(1.0, LIMIT * noise / np.maximum(lengths, 1e-12)))
+        return theta, lengths, noise
 
     def _count(self, row: Row, theta: Array) -> float:
         effects, y = row
@@ -67,12 +79,29 @@ class FreePostures(WindowTest[Row]):
         return length / self.noise
 
     def add(self, entry: Row) -> WindowFinding:
+        if self._anew is not None:
+            self._anew.append(entry)
+            if len(self._anew) == LEARNING:
+                effects, y = (np.array(part) for part in zip(*self._anew, strict=True))
+                found = self._fit(effects, y, self._prior / self.noise**2)
+                for row in self._anew:
+                    self._count(row, found[0])
+                self._anew = None
+            return NOTHING
         sums = self._sums.latest(min(_LATEST, len(self._sums)))
         theta = np.linalg.solve(sums[:, :16] + self._prior, sums[:, 16])
         return self._judge(self._count(entry, np.asarray(theta, dtype=float)))
 
-    def contrasts(self, windows: Counts) -> tuple[Array, Array]:
-        after, before = self._sums.latest(windows), self._sums.before(windows)
+    def forget(self) -> None:
+        super().forget()
+        self._sums.clear()
+        self._anew = []
+
+    def _before(self, counts: Counts | int, learned: bool) -> Array:
+        return self._learned if learned else self._sums.before(counts)
+
+    def contrasts(self, windows: Counts, learned: bool = False) -> tuple[Array, Array]:
+        after, before = self._sums.latest(windows), self._before(windows, learned)
         return self._without_fit(after[:, :12, :12], after[:, :12], before + after)
 
     def _without_fit(self, moves: Array, crossed: Array, all_: Array) -> tuple[Array, Array]:
@@ -97,14 +126,14 @@ class FreePostures(WindowTest[Row]):
             np.einsum("n,nia,nib->ab", weights, moves, fitted),
         )
 
-    def contrast(self, count: int, weights: Array) -> tuple[Array, Array]:
+    def contrast(self, count: int, weights: Array, learned: bool = False) -> tuple[Array, Array]:
         _, fitted, moves, crossed = self._weighted(count, weights)
-        all_ = self._sums.before(count) + np.einsum("n,nia,nib->ab", weights, fitted[..., :16], fitted)
+        all_ = self._before(count, learned) + np.einsum("n,nia,nib->ab", weights, fitted[..., :16], fitted)
         return self._without_fit(moves, crossed, all_)
 
-    def rest(self, count: int, weights: Array, move: Array) -> Array:
+    def rest(self, count: int, weights: Array, move: Array, learned: bool = False) -> Array:
         J, fitted, _, crossed = self._weighted(count, weights)
-        all_ = self._sums.before(count) + np.einsum("n,nia,nib->ab", weights, fitted[..., :16], fitted)
+        all_ = self._before(count, learned) + np.einsum("n,nia,nib->ab", weights, fitted[..., :16], fitted)
         right = all_[:, 16] - crossed[:, :16].T @ move
         theta = np.linalg.solve(all_[:, :16] + self._prior, right)
         return np.asarray(fitted[..., 16] - fitted[..., :16] @ theta - J @ move)

@@ -2,7 +2,8 @@
 
     ROOT/calibrations/…/watch.jsonl     one line a picture, behind a line for the tag that is watched
 
-Lines are added and durable; beyond `_MOST` the file is replaced, in one step, by its latest part.
+Lines are added and durable; beyond `_MOST` the file is replaced, in one step, by what was learned from and
+its latest part.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class WatchedTag(msgspec.Struct, frozen=True):
 
 
 class WatchEntry(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A line of the file: a beginning (`begun`), or a picture; one without the tag has no pixels."""
+    """A line of the file: a beginning (`begun`), a `gap`, or a picture; one without the tag has no pixels."""
 
     begun: WatchedTag | None = None
     key: str = ""
@@ -45,6 +46,8 @@ class WatchEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     joints_rad: Vector6 | None = None
     corners: tuple[int, ...] = ()
     pixels: tuple[tuple[float, float], ...] = ()
+    gap: bool = False
+    """Pictures are missing here, between what was learned from and the latest."""
 
     def picture(self, tag: BoardSpec) -> Picture:
         """The picture that the monitor takes."""
@@ -83,6 +86,10 @@ class MonitorLog:
             self._remember(entry.key)
             if entry.pixels:
                 seen.append(entry.picture(watched.tag))
+            if entry.gap:
+                list(self.monitor.add(seen))
+                self.monitor.forget()
+                seen = []
         list(self.monitor.add(seen))
         self._lines = len(entries)
 
@@ -115,11 +122,22 @@ class MonitorLog:
         self._known.add(key)
 
     def _shorten(self, path: Path) -> None:
-        """Keep the latest pictures, and the tag's pose, which was learned from the first."""
+        """Keep what was learned from, with the tag's pose, and the latest pictures."""
         if self.monitor.P is None:
             return
         rows = tuple(tuple(row) for row in self.monitor.P.tolist())
         begun = WatchEntry(begun=msgspec.structs.replace(self._watched, pose=rows))
-        kept = [entry for entry in read_lines(path, WatchEntry) if entry.begun is None][-_LATEST:]
-        write_atomically(path, b"".join(msgspec.json.encode(entry) + b"\n" for entry in (begun, *kept)))
+        entries = [entry for entry in read_lines(path, WatchEntry) if entry.begun is None]
+        count = self._learned(entries)
+        latest = [entry for entry in entries[count:] if not entry.gap][-_LATEST:]
+        kept = [begun, *entries[:count], WatchEntry(gap=True), *latest]
+        write_atomically(path, b"".join(msgspec.json.encode(entry) + b"\n" for entry in kept))
         self._lines = len(kept)
+
+    def _learned(self, entries: list[WatchEntry]) -> int:
+        """How many of the entries were learned from."""
+        for place, entry in enumerate(entries):
+            if entry.gap:
+                return place
+        with_tag = [place for place, entry in enumerate(entries) if entry.pixels]
+        return min(with_tag[self.monitor.learned - 1] + 1 if self.monitor.learned else 0, _LATEST)

@@ -13,7 +13,8 @@ from scipy import special
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, inverse, project_to_rotation, rotation_log
 from calibrate.lens.pnp import candidate_poses
-from calibrate.quality.movement.evidence import Moved, move_size, what_moved
+from calibrate.quality.drift import SHIFT_M, TURN_RAD
+from calibrate.quality.movement.evidence import Moved, has_crept, move_size, what_moved
 from calibrate.quality.movement.free import FreePostures, Row
 from calibrate.quality.movement.pictures import (
     ArmErrors,
@@ -27,7 +28,7 @@ from calibrate.quality.movement.pictures import (
 )
 from calibrate.quality.movement.postures import PostureIndex
 from calibrate.quality.movement.repeated import FIRST_VISITS, RepeatedPostures
-from calibrate.quality.movement.window import KEPT, LEARNING, WindowFinding
+from calibrate.quality.movement.window import CREEP_WINDOW, KEPT, LEARNING, WindowFinding
 from calibrate.views import BoardView
 
 NAMED_AFTER = 30
@@ -100,6 +101,8 @@ class MovementMonitor:
         """(4, 4) base_from_tag (eye-in-hand) or flange_from_tag, once it is learned."""
         self.repeated: RepeatedPostures | None = None
         self.free: FreePostures | None = None
+        self.learned = 0
+        """Pictures until the latest test began."""
         self.alarmed = self.finished = False
         self._learning: list[Picture] = []
         self._index = PostureIndex()
@@ -120,6 +123,12 @@ class MovementMonitor:
         if self.repeated is not None or self.free is not None:
             return 0
         return LEARNING - max(len(self._learning), len(self._visits), len(self._others))
+
+    def forget(self) -> None:
+        """Forget all pictures but those that were learned from: some are missing from here on."""
+        for test in (self.repeated, self.free):
+            if test is not None:
+                test.forget()
 
     def miss(self, name: str) -> Iterator[MovementEvent]:
         """Take note of a picture without the tag."""
@@ -242,7 +251,7 @@ class MovementMonitor:
         yield self._testing(picture, self.free)
 
     def _testing(self, picture: Picture, test: Test) -> MovementEvent:
-        kind = "repeated" if test is self.repeated else "any"
+        kind, self.learned = "repeated" if test is self.repeated else "any", self.pictures
         values: dict[str, str | float | int | bool | None] = {"postures": kind, "noise": round(test.noise, 3)}
         return MovementEvent(EventKind.TESTING, picture.name, self.pictures, None, values)
 
@@ -251,6 +260,8 @@ class MovementMonitor:
             yield from self._name(picture, test, self._suspicion)
         elif finding.alarm:
             yield self._alarm(picture, test, finding.window, finding)
+        elif (crept := test.creep()) is not None and has_crept(*crept, (SHIFT_M, TURN_RAD)):
+            yield from self._creep(picture, test)
         elif 0 < finding.far <= _JUDGED_FOR:
             share, count = test.explained_share(finding.far)
             if share > self._share_of_noise(count):
@@ -273,16 +284,24 @@ class MovementMonitor:
         }
         return MovementEvent(EventKind.ALARM, picture.name, self.pictures, None, values)
 
+    def _creep(self, picture: Picture, test: Test) -> Iterator[MovementEvent]:
+        """Say that something crept since the learning, and what."""
+        self.alarmed = True
+        values: dict[str, str | float | int | bool | None] = {"crept": True, "since_pictures": self.pictures}
+        yield MovementEvent(EventKind.ALARM, picture.name, self.pictures, None, values)
+        yield self._named(picture, test, CREEP_WINDOW, learned=True)
+
     def _name(self, picture: Picture, test: Test, suspicion: _Suspicion) -> Iterator[MovementEvent]:
         """Say what moved, `NAMED_AFTER` pictures of the test that noticed it."""
         if test is not suspicion.test:
             return
         suspicion.after += 1
-        if suspicion.after < NAMED_AFTER:
-            return
+        if suspicion.after == NAMED_AFTER:
+            yield self._named(picture, test, suspicion.since + suspicion.after)
+
+    def _named(self, picture: Picture, test: Test, count: int, learned: bool = False) -> MovementEvent:
         self.finished = True
-        count = suspicion.since + suspicion.after
-        M, u = test.move_since(count)
+        M, u = test.move_since(count, learned)
         moved, log_odds = what_moved(M, u, self.cell.mount)
         postures, turn_rad = self._variety(test, count)
         if postures < _FEWEST_POSTURES or turn_rad < _LEAST_TURN_RAD:
@@ -293,10 +312,10 @@ class MovementMonitor:
             "turn_deg": round(float(np.degrees(turn_rad)), 2),
         }
         if moved in (Moved.CAMERA, Moved.CAMERA_BASE, Moved.TAG, Moved.TAG_GRIPPER):
-            size = move_size(M, u, moved)
+            size, _ = move_size(M, u, moved)
             values["moved_mm"] = round(float(np.linalg.norm(size[:3]) * 1e3), 3)
             values["moved_deg"] = round(float(np.degrees(np.linalg.norm(size[3:]))), 4)
-        yield MovementEvent(EventKind.NAMED, picture.name, self.pictures, moved, values)
+        return MovementEvent(EventKind.NAMED, picture.name, self.pictures, moved, values)
 
     def _variety(self, test: Test, count: int) -> tuple[int, float]:
         """Postures of the test's latest pictures, and 1σ of their turns about the second axis, radians."""

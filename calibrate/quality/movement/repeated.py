@@ -14,6 +14,7 @@ from calibrate.geometry import Array
 from calibrate.quality.movement.pictures import Deviations
 from calibrate.quality.movement.window import (
     LIMIT,
+    NOTHING,
     Counts,
     RunningSums,
     WindowFinding,
@@ -45,14 +46,18 @@ class RepeatedPostures(WindowTest[Visit]):
         lengths = np.linalg.norm(learned.y - medians[of], axis=1)
         super().__init__(noise_of(lengths))
         self.log_likelihood = log_likelihood(learned, lengths, self.noise)
-        self._sums = RunningSums((_ROOM, 7))
+        self._sums, self._learned = RunningSums((_ROOM, 7)), np.zeros((_ROOM, 7))
         self._effects = np.zeros((_ROOM, 6, 20))
         self._information = np.zeros((_ROOM, 144))
         self._visits: list[deque[Array]] = []
+        self._anew: dict[int, list[Array]] = {}
+        """First visits after pictures were missing."""
         for posture in effects:
             self._open(posture)
         for number, y in zip(postures, learned.y, strict=True):
-            self._count(number, y, medians[number])
+            self._recent += (self._count(number, y, medians[number]) > LIMIT, 1)
+        self._learn_far()
+        self._learned = self._sums.latest(len(postures))
 
     def __len__(self) -> int:
         return len(self._visits)
@@ -60,13 +65,13 @@ class RepeatedPostures(WindowTest[Visit]):
     def establish(self, visits: Deviations) -> None:
         """Add the next posture by its first visits."""
         self._open(visits.effects[0])
-        for y in visits.y:
-            self._count(len(self) - 1, y, np.median(visits.y, axis=0))
+        self._count_all(len(self) - 1, visits.y)
 
     def _open(self, effects: Array) -> None:
         number = len(self)
         if number == self._sums.places:
             self._sums.widen(2 * number)
+            self._learned = np.concatenate([self._learned, np.zeros_like(self._learned)])
             self._effects = np.concatenate([self._effects, np.zeros_like(self._effects)])
             self._information = np.concatenate([self._information, np.zeros_like(self._information)])
         self._visits.append(deque(maxlen=_LATEST_VISITS))
@@ -84,20 +89,39 @@ class RepeatedPostures(WindowTest[Visit]):
 
     def add(self, entry: Visit) -> WindowFinding:
         posture, y = entry
+        if posture in self._anew:
+            self._anew[posture].append(y)
+            if len(self._anew[posture]) == FIRST_VISITS:
+                self._count_all(posture, np.array(self._anew.pop(posture)))
+            return NOTHING
         return self._judge(self._count(posture, y, np.median(np.array(self._visits[posture]), axis=0)))
 
-    def contrasts(self, windows: Counts) -> tuple[Array, Array]:
-        h, apart = _apart(self._sums.latest(windows), self._sums.before(windows))
+    def forget(self) -> None:
+        super().forget()
+        self._sums.clear()
+        self._anew = {posture: [] for posture in range(len(self))}
+        for visits in self._visits:
+            visits.clear()
+
+    def _count_all(self, posture: int, visits: Array) -> None:
+        for y in visits:
+            self._count(posture, y, np.median(visits, axis=0))
+
+    def _before(self, counts: Counts | int, learned: bool) -> Array:
+        return self._learned if learned else self._sums.before(counts)
+
+    def contrasts(self, windows: Counts, learned: bool = False) -> tuple[Array, Array]:
+        h, apart = _apart(self._sums.latest(windows), self._before(windows, learned))
         u = (h[..., None] * apart).reshape(len(windows), -1) @ self._effects[..., :12].reshape(-1, 12)
         return (h @ self._information).reshape(-1, 12, 12), u
 
-    def contrast(self, count: int, weights: Array) -> tuple[Array, Array]:
-        h, apart = _apart(self._weighted(count, weights), self._sums.before(count))
+    def contrast(self, count: int, weights: Array, learned: bool = False) -> tuple[Array, Array]:
+        h, apart = _apart(self._weighted(count, weights), self._before(count, learned))
         J = self._effects[..., :16]
         return np.einsum("c,cia,cib->ab", h, J, J), np.einsum("c,ci,cia->a", h, apart, J)
 
-    def rest(self, count: int, weights: Array, move: Array) -> Array:
-        before = self._sums.before(count)
+    def rest(self, count: int, weights: Array, move: Array, learned: bool = False) -> Array:
+        before = self._before(count, learned)
         known = before[:, 6] >= _FEWEST_BEFORE
         means = before[:, :6] / np.maximum(before[:, 6:], 1)
         expected = means + self._effects[..., :16] @ move

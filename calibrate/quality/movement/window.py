@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -24,12 +24,14 @@ REFERENCE = 1000
 """Pictures before a window that it is compared with."""
 WINDOWS = 3 * 2 ** np.arange(8)
 """3, 6 … 384 pictures."""
+CREEP_WINDOW = int(WINDOWS[-1])
+"""Pictures that are compared with those that were learned from."""
 KEPT = REFERENCE + int(WINDOWS[-1])
 CHI2_6_MEDIAN, _CHI2_6_99 = 5.348, 16.81
 LIMIT = float(np.sqrt(_CHI2_6_99))
 """Whitened length to which a deviation is shortened; 1 % of good pictures are longer."""
-_STEP, _FAST_LIMIT = float(np.log(9)), 13.8
-"""Log-odds of a shortened picture, and the sum (CUSUM) that is an alarm: seven in a row."""
+_FAR_AFTER_MOVE, _FAST_LIMIT = 0.9, 13.8
+"""Share of pictures that a large move shortens, and the sum of log-odds (CUSUM) that is an alarm."""
 _ROBUST_STEPS = 6
 _FAINT = 0.01
 """Information beforehand on moves, per `UNITS` squared: only so that what nothing shows stays finite."""
@@ -46,6 +48,11 @@ class RunningSums:
 
     def __len__(self) -> int:
         return min(self._at, KEPT)
+
+    def clear(self) -> None:
+        """Forget every entry."""
+        self._at = 0
+        self._rows[0] = 0
 
     def append(self, value: Array, place: int | None = None) -> None:
         """Add an entry: a whole row, or what is at `place` of it."""
@@ -91,6 +98,9 @@ class WindowFinding:
     alarm: bool
 
 
+NOTHING = WindowFinding(0.0, 0, 0, False)
+
+
 class WindowTest(ABC, Generic[Entry]):
     """A sequential test of one kind of pictures."""
 
@@ -104,47 +114,72 @@ class WindowTest(ABC, Generic[Entry]):
         """Standard deviation of whitened deviations, by the learning pictures."""
         self.latest: deque[Entry] = deque(maxlen=KEPT)
         self._cusum, self._since = 0.0, 0
+        self._usual, self._recent = np.zeros(2), np.zeros(2)
+        """Shortened pictures and all of them: before the fast lane began to count, and since."""
 
     @abstractmethod
     def add(self, entry: Entry) -> WindowFinding:
         """Judge the next picture."""
 
     @abstractmethod
-    def contrasts(self, windows: Counts) -> tuple[Array, Array]:
-        """M (w, 12, 12) and u (w, 12) of these latest windows against what was before, unit noise."""
+    def contrasts(self, windows: Counts, learned: bool = False) -> tuple[Array, Array]:
+        """M (w, 12, 12) and u (w, 12) of these latest windows against what was before, unit noise.
+
+        `learned`, here and below: against the pictures that were learned from instead.
+        """
 
     @abstractmethod
-    def contrast(self, count: int, weights: Array) -> tuple[Array, Array]:
+    def contrast(self, count: int, weights: Array, learned: bool = False) -> tuple[Array, Array]:
         """M (16, 16) and u (16,) of the latest `count` pictures, not shortened, against what was before."""
 
     @abstractmethod
-    def rest(self, count: int, weights: Array, move: Array) -> Array:
+    def rest(self, count: int, weights: Array, move: Array, learned: bool = False) -> Array:
         """Deviations (m, 6) of the latest `count` pictures that a move (16,) leaves, whitened, not shortened.
 
         `count` pictures, or fewer where some have nothing to be compared with.
         """
 
+    def forget(self) -> None:
+        """Forget everything but what was learned: pictures are missing from here on."""
+        self.latest.clear()
+        self._cusum, self._since = 0.0, 0
+
     def _judge(self, length: float) -> WindowFinding:
         """Finding after the picture whose deviation has this whitened length."""
-        step = _STEP if length > LIMIT else -_STEP
-        self._cusum = min(max(0.0, self._cusum + step), 1.5 * _FAST_LIMIT)
+        usual = (self._usual[0] + 1) / (self._usual[1] + 2)  # Laplace's rule of succession
+        odds = _FAR_AFTER_MOVE / usual if length > LIMIT else (1 - _FAR_AFTER_MOVE) / (1 - usual)
+        self._cusum = min(max(0.0, self._cusum + float(np.log(odds))), 1.5 * _FAST_LIMIT)
         self._since = self._since + 1 if self._cusum > 0 else 0
+        self._recent += (length > LIMIT, 1)
+        if not self._since:
+            self._learn_far()
         far = self._since if self._cusum > _FAST_LIMIT else 0
         windows = WINDOWS[: int(np.searchsorted(WINDOWS, len(self.latest) // 2, side="right"))]
         if not len(windows):
-            return WindowFinding(0.0, 0, far, False)
+            return replace(NOTHING, far=far)
         M, u = self.contrasts(windows)
         scores = move_score(M / self.noise**2, u / self.noise**2) + np.log(windows) / 2
         best = int(scores.argmax())
         return WindowFinding(float(scores[best]), int(windows[best]), far, bool(scores[best] > self.limit))
 
-    def move_since(self, count: int) -> tuple[Array, Array]:
+    def _learn_far(self) -> None:
+        self._usual += self._recent
+        self._recent[:] = 0
+
+    def creep(self) -> tuple[Array, Array] | None:
+        """M (12, 12) and u (12,) of a whole window against what was learned; None before there is one."""
+        if len(self.latest) < LEARNING + CREEP_WINDOW:
+            return None
+        M, u = self.contrasts(np.array([CREEP_WINDOW]), learned=True)
+        return M[0] / self.noise**2, u[0] / self.noise**2
+
+    def move_since(self, count: int, learned: bool = False) -> tuple[Array, Array]:
         """M (16, 16) and u (16,) of the latest `count` pictures over the noise, far ones weighed down."""
         weights: Array = np.ones(count)
         for _ in range(_ROBUST_STEPS):
-            M, u = self.contrast(count, weights)
+            M, u = self.contrast(count, weights, learned)
             move = np.asarray(np.linalg.solve(M + _FAINT * self.noise**2 * np.eye(16), u), dtype=float)
-            lengths = np.linalg.norm(self.rest(count, weights, move), axis=1) / self.noise
+            lengths = np.linalg.norm(self.rest(count, weights, move, learned), axis=1) / self.noise
             weights = np.asarray(np.minimum(1.0, LIMIT / np.maximum(lengths, 1e-12)))
         return M / self.noise**2, u / self.noise**2
 

@@ -192,7 +192,7 @@ def test_a_restart_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_a_long_log_is_shortened_and_still_notices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(movement_log, "_MOST", 250)
-    monkeypatch.setattr(movement_log, "_LATEST", 170)
+    monkeypatch.setattr(movement_log, "_LATEST", 90)
     monkeypatch.setattr("os.fsync", lambda descriptor: None)
     model, pictures = simulate(Cell(9, "eye-to-hand", True), 660, Happening("camera", 1.0))
     path = tmp_path / FILE
@@ -203,6 +203,28 @@ def test_a_long_log_is_shortened_and_still_notices(tmp_path: Path, monkeypatch: 
     again = MonitorLog(path, WATCHED, model)
     assert not again.monitor.alarmed
     assert any(again.add(entry(picture)) for picture in pictures[600:]) and again.monitor.alarmed
+
+
+@pytest.mark.parametrize("repeated", [True, False])
+def test_a_shortened_log_remembers_what_was_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, repeated: bool
+) -> None:
+    monkeypatch.setattr(movement_log, "_MOST", 800)
+    monkeypatch.setattr(movement_log, "_LATEST", 500)
+    monkeypatch.setattr(monitor, "SHIFT_M", 0.25e-3)
+    monkeypatch.setattr("os.fsync", lambda descriptor: None)
+    model, pictures = simulate(Cell(11, "eye-in-hand", repeated, creep_mm=0.2), 3000, None)
+    wanted = next(e for e in MovementMonitor(model).add(pictures) if e.kind is monitor.EventKind.ALARM)
+    path = tmp_path / FILE
+    log = MonitorLog(path, WATCHED, model)
+    for picture in pictures[:1100]:
+        log.add(entry(picture))
+    assert sum(line.gap for line in read_lines(path, WatchEntry)) == 1
+    again = MonitorLog(path, WATCHED, model)
+    assert not again.monitor.alarmed
+    told = [event for picture in pictures[1100:] for event in again.add(entry(picture))]
+    assert told[0].values["crept"] is True
+    assert abs(int(told[0].picture) - int(wanted.picture)) < 100
 
 
 def test_another_version_or_tag_begins_anew(tmp_path: Path) -> None:

@@ -135,6 +135,34 @@ def test_one_at_a_time_or_all_at_once_is_the_same() -> None:
     assert list(together.add(pictures)) == [event for p in pictures for event in single.add([p])]
 
 
+@pytest.mark.parametrize("repeated", [True, False])
+def test_creep_that_began_with_the_learning_is_not_learned_away(
+    repeated: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 0.2 mm a day every window lies within the dead band of what was before it."""
+    cell = Cell(11, "eye-in-hand", repeated, creep_mm=0.2)
+    monkeypatch.setattr("calibrate.quality.movement.monitor.SHIFT_M", 0.25e-3)
+    model, pictures = simulate(cell, 3000, None)
+    monitor = MovementMonitor(model)
+    events = list(monitor.add(pictures))
+    (alarm,) = (event for event in events if event.kind is EventKind.ALARM)
+    assert alarm.values["crept"] is True and 0.25 < alarm.pictures / 1000 * cell.creep_mm < 0.6
+    assert events[-1].kind is EventKind.NAMED and events[-1].moved in (Moved.CAMERA, Moved.CANNOT_TELL)
+
+
+def test_a_cell_without_blurred_pictures_needs_fewer_of_a_knock() -> None:
+    model, pictures = simulate(Cell(12, "eye-in-hand", True), BEFORE + 20, Happening("camera", 3.0))
+    needed = []
+    for far in (None, 0.0):
+        monitor = MovementMonitor(model)
+        list(monitor.add(pictures[:BEFORE]))
+        assert monitor.repeated is not None
+        if far is not None:
+            monitor.repeated._usual[0] = far
+        needed.append(next(iter(monitor.add(pictures[BEFORE:]))).pictures - BEFORE)
+    assert needed[1] < needed[0]
+
+
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_effects_are_the_derivatives_of_the_picture(mount: Mount) -> None:
     """What small moves of X, P and a joint do to the corners, against the effects, by projecting anew."""

@@ -33,15 +33,13 @@ def watch_command(
         Path | None, typer.Option(help="YAML of the tag (default: the configuration's board)")
     ] = None,
     every: Annotated[float, typer.Option(min=0.2, help="Seconds between two looks")] = 60.0,
-    pictures: Annotated[
-        int | None, typer.Option(min=1, help="End after so many (default: at Ctrl-C)")
-    ] = None,
+    images: Annotated[int | None, typer.Option(min=1, help="End after so many (default: at Ctrl-C)")] = None,
     socket: Socket = None,
     as_json: AsLines = False,
 ) -> None:
     """Notice through the station's own camera that camera, tag or arm moved.
 
-    As `calibrate watch`, with pictures of the daemon's camera: every minute, one of each stop of the arm,
+    As `calibrate watch`, with images of the daemon's camera: every minute, one of each stop of the arm,
     whatever program moves it, while no session runs. The station adds no motion, and no control is needed.
     What is tested, and put in doubt, is what is installed in the daemon's state folder.
 
@@ -51,7 +49,7 @@ def watch_command(
     root, camera, own_board = asyncio.run(_cell(path))
     watched = Watched.find(None, root, camera)
     tag = own_board if board is None else read_board(board)
-    taking = _Taking(path, watched.calibration, every, pictures)
+    taking = _Taking(path, watched.calibration, every, images)
     watch_pictures([WatchSource(tag, taking.entries)], tag, watched, as_json)
 
 
@@ -62,7 +60,7 @@ async def _cell(path: Path) -> tuple[Path | None, str, BoardSpec]:
 
 
 class _Taking:
-    """Pictures of the daemon's camera, one every so many seconds."""
+    """Images of the daemon's camera, one every so many seconds."""
 
     def __init__(self, path: Path, calibration: Calibration, every_s: float, most: int | None) -> None:
         self._path, self._calibration, self._every_s, self._most = path, calibration, every_s, most
@@ -91,7 +89,7 @@ class _Taking:
                     if not number:
                         raise
                     told = problem.code
-                    err.print(f"No picture: {problem}", style="yellow")
+                    err.print(f"No image: {problem}", style="yellow")
                 continue
             told = ""
             if seen.wall_ns - round(1e9 * seen.rested_s) > latest_ns:

@@ -49,7 +49,7 @@ async def test_the_corners_belong_to_the_pose_that_is_told_with_them(rig: System
 
 async def watch(socket: Path, pictures: int) -> tuple[int, list[dict[str, object]]]:
     command = [sys.executable, "-m", "station.cli", "watch", "--socket", str(socket), "--json"]
-    command += ["--every", "0.2", "--pictures", str(pictures)]
+    command += ["--every", "0.2", "--images", str(pictures)]
     done = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
     assert done.stdout is not None
     lines = [json.loads(line) async for line in done.stdout]

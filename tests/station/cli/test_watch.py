@@ -109,7 +109,7 @@ def test_a_camera_that_moves_is_noticed_in_the_stations_own_pictures(
     hook.write_text(f"#!/bin/sh\necho $1 >> {root}/told\n")
     hook.chmod(0o700)
     daemon = FakeDaemon(MOVED_AT - 200)
-    code, lines = watch(daemon, root, monkeypatch, "--pictures", 190)
+    code, lines = watch(daemon, root, monkeypatch, "--images", 190)
     assert code == 0 and lines[-1]["values"]["state"] == "watching" and lines[-1]["pictures"] == 190
     code, lines = watch(daemon, root, monkeypatch)
     assert code == 4 and [line["event"] for line in lines] == ["alarm", "named", "summary"]
@@ -130,7 +130,7 @@ def test_pictures_of_another_cell_are_no_pictures(
 
 
 def test_a_stop_of_the_arm_counts_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    code, lines = watch(FakeDaemon(0, rested_s=2.5), root, monkeypatch, "--pictures", 10)
+    code, lines = watch(FakeDaemon(0, rested_s=2.5), root, monkeypatch, "--images", 10)
     assert code == 0 and lines[-1]["pictures"] == 10
     kept = [entry for entry in read_lines(root / "calibrations" / FILE, WatchEntry) if entry.key]
     assert np.diff([entry.wall_s for entry in kept]).tolist() == [3.0] * 9

@@ -158,7 +158,7 @@ _REFUSED = {
     "30001 of the controller, which states the factory calibration",
     "not-better": "it does not help on poses elsewhere",
 }
-_WORTH_SAYING = 0.85
+WORTH_SAYING = 0.85
 """A limiting cause of the table is named where knowing it leaves less than this share of the error."""
 
 
@@ -191,7 +191,7 @@ def arm_sentences(calibration: Calibration) -> Iterator[str]:
     else:
         yield f"The arm's table is not offered: {_REFUSED.get(arm.refused, arm.refused)}."
     limits = sorted(arm.if_measured_mm.items(), key=lambda item: item[1])
-    if limits and limits[0][1] < _WORTH_SAYING * arm.with_table_mm:
+    if limits and limits[0][1] < WORTH_SAYING * arm.with_table_mm:
         what, left_mm = limits[0]
         stated = calibration.board.square_tolerance or BoardTolerance().square
         known = f"The board's length is known to {stated:.2%}" if what == "board" else "The lens is the limit"

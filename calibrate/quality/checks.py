@@ -17,7 +17,8 @@ from calibrate.quality.drift import DriftCheck
 from recordings.files import MAIN_CAMERA
 
 FILE = "checks.jsonl"
-_FEWEST_FOR_TREND = 5
+FEWEST_FOR_TREND = 5
+"""Drift checks from which on a trend may be told."""
 _TREND_P = 0.01
 
 
@@ -94,7 +95,7 @@ def find_trend(history: Sequence[CheckEntry], generation: int) -> Trend | None:
     of freedom at 1 %.
     """
     entries = [entry for entry in history if entry.generation == generation]
-    if len(entries) < _FEWEST_FOR_TREND:
+    if len(entries) < FEWEST_FOR_TREND:
         return None
     days = np.array([entry.wall_s for entry in entries]) / 86400
     if np.ptp(days) <= 0:

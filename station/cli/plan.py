@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from calibrate.files.formatting import WORTH_SAYING
 from calibrate.handeye.solution import MEASURED
 from recordings.plain_text import printed
 from recordings.schema.messages import Mount, Vector6
@@ -126,16 +127,13 @@ def _show_arm(arm: ArmForecast) -> None:
         f"with the arm's table from these poses a point is placed to about {1000 * arm.with_table_m:.2f} mm "
         "(1σ) over the workspace, if corners, board and arm are as good as assumed"
     )
-    if arm.if_measured_m < _WORTH * arm.with_table_m:
+    if arm.if_measured_m < WORTH_SAYING * arm.with_table_m:
         out.print(
             f"a board measured to {MEASURED:.2%} (board: square_tolerance) makes that "
             f"{1000 * arm.if_measured_m:.2f} mm"
         )
     if arm.open:
         out.print(f"these poses tell little of {', '.join(arm.open)}: take more poses, or tilt them more")
-
-
-_WORTH = 0.85
 
 
 def _require_replaceable(output: Path) -> None:

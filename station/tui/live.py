@@ -12,6 +12,7 @@ from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.widgets import ProgressBar, RichLog, Static
 
+from station.cell.config import CaptureConfig
 from station.cell.scene import Scene
 from station.cell.status import Event, PoseStatus, SessionStatus, StationState, StationStatus
 from station.protocol.states import LATCHED, RUNNING
@@ -22,8 +23,8 @@ from station.tui.widgets.preview import PreviewPane
 from station.tui.widgets.scene import cell_scene, fields_of
 from station.tui.words import UNKNOWN, clock, degrees, duration, facts, mark, mm
 
-CLOCKS_POOR_MS = 20.0
-"""The default of `capture.time_bound_s`: poses known worse than that are refused."""
+CLOCKS_POOR_MS = 1000 * CaptureConfig().time_bound_s
+"""Poses known worse than that are refused by default."""
 BURNT = 0.01
 """Share of saturated pixels from which on a person should look."""
 _STEPS = {"moving": "move", "settling": "settle", "capturing": "capture", "writing": "save"}

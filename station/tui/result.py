@@ -21,7 +21,7 @@ from calibrate.files.validity import ValidityState, validity_text
 from calibrate.files.verification import agrees, touch_sigmas
 from calibrate.files.versions import LogEntry, read_log
 from calibrate.geometry import difference
-from calibrate.quality.checks import CheckEntry, find_trend
+from calibrate.quality.checks import FEWEST_FOR_TREND, CheckEntry, find_trend
 from station.operate.ending import Way, after_drift_check, after_solve
 from station.tui.installed import Result, drift_history, local, state_root
 from station.tui.screen import Box, Panel, Rows, StationScreen
@@ -34,8 +34,6 @@ NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter sho
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
 SIGNS: dict[str, str] = {"PASS": "✓", "PASS WITH A REASON": "▲", "FAIL": "✗"}
 BAR_CELLS, NAME_CELLS = 14, 25
-FEWEST_CHECKS = 5
-"""Drift checks from which on a trend may be told (`quality.checks`)."""
 
 
 def verdict_lines(result: Result) -> Content:
@@ -410,7 +408,7 @@ def drift_lines(entries: Sequence[CheckEntry], width: int, height: int) -> Conte
         if e.statistic > 0
     ]
     limit = float(np.median(limits)) if limits else None
-    if len(entries) < FEWEST_CHECKS:
+    if len(entries) < FEWEST_FOR_TREND:
         said = f"{many(len(entries), 'check')}: too few to say whether it drifts."
     elif trend is None:
         said = f"No trend in {len(entries)} checks."

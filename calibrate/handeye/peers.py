@@ -81,7 +81,7 @@ def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[Pee
             samples_e_t_m=np.array(ours.holdout.samples_e_t_m),
             samples_e_R=np.array(ours.holdout.samples_e_R),
         )
-    return [*rows, replace(final, time_ms=ours_ms, note="hold-out, outliers and proof included in the time")]
+    return [*rows, replace(final, time_ms=ours_ms, note="time with held-out scores, outliers and proof")]
 
 
 def _methods(options: SolveOptions) -> dict[str, Method]:

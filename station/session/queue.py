@@ -16,9 +16,9 @@ from station.protocol.verbs import Purpose
 OPEN: frozenset[PoseState] = frozenset({"planned"})
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
 POSE_LIMIT = 2000
-TAKE_AGAIN = "to be taken again"
-STILL_COUNTS = "; the image it has counts until then"
-NOT_AGAIN = "not taken again: the image it has counts"
+TAKE_AGAIN = "to be captured again"
+STILL_COUNTS = "; its image counts until then"
+NOT_AGAIN = "not captured again: its image counts"
 
 
 @dataclass(frozen=True, eq=False)

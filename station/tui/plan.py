@@ -11,13 +11,13 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
-from textual.widgets import Static
 
 from station.cell.plan import PlannedPose
 from station.cell.scene import Scene
 from station.cell.status import PoseStatus, StationStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
+from station.tui.frame import Line
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.scene import LEGEND, cell_scene, draw, view_of
@@ -135,7 +135,7 @@ class PlanScreen(StationScreen):
         self._turn_deg, self._zoom = -60.0, 1.0
 
     def body(self) -> ComposeResult:
-        yield Static(NO_PLAN, id="plan-facts")
+        yield Line(lambda known, _: facts_line(known.status or StationStatus()), id="plan-facts")
         with Horizontal(id="plan"):
             with Vertical(id="plan-left"):
                 with Box("Poses", id="plan-poses"):
@@ -159,7 +159,7 @@ class PlanScreen(StationScreen):
             return  # what was known last stands there
         poses, goal_mm = status.session.poses, status.estimate.goal_mm or 0.5
         scene = cell_scene(self.desk.configuration, status)
-        self.query_one("#plan-facts", Static).update(facts_line(status), layout=False)
+        self.query_one("#plan-facts", Line).show(known)
         self.table.show([row_of(pose, goal_mm, scene) for pose in poses])
         self.draw_panels(known)
 

@@ -96,12 +96,12 @@ def recording_info(recording: Recording) -> RecordingInfoJson:
     steps = Steps()
     for segment in recording.segments:
         steps.begin()
-        for table in stamps_tables(segment.parsed(Topic.ROBOT_STATE)):
+        for table in stamps_tables(segment, Topic.ROBOT_STATE):
             steps.add(table["controller_s"])
             arrivals[segment].add(table["controller_s"], table["host_monotonic_ns"])
     longest = max(recording.segments, key=lambda segment: len(segment.messages(Topic.ROBOT_STATE)))
     camera_clock = Arrivals()
-    for table in stamps_tables(longest.parsed(Topic.PICTURE_FACTS)):
+    for table in stamps_tables(longest, Topic.PICTURE_FACTS):
         camera_clock.add(table["device_ns"] / 1e9, table["host_monotonic_ns"])
     attempts = sum(len(segment.views) for segment in recording.segments)
     views = recording.views()

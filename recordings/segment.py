@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
 
 from recordings.errors import BadImageError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name
@@ -141,7 +142,7 @@ class RecordingSegment:
         return Image(pixels=image, **told)
 
     def _decoded_image(self, topic: Topic, address: int, width: int, height: int) -> Pixels:
-        message = self._parsed(topic, address)
+        message = self.parsed_at(topic, address)
         data = message.data
         if topic is Topic.COMPRESSED_IMAGE:
             del message  # it holds a second copy of the bytes
@@ -154,7 +155,7 @@ class RecordingSegment:
         """(format, file bytes) of an image that is kept compressed; None when it is kept raw."""
         if sequence not in self._compressed:
             return None
-        message = self._parsed(Topic.COMPRESSED_IMAGE, self._compressed[sequence])
+        message = self.parsed_at(Topic.COMPRESSED_IMAGE, self._compressed[sequence])
         return str(message.format), bytes(message.data)
 
     def _corrupt(self, topic: Topic, address: int, reason: str) -> CorruptRecordingError:
@@ -167,9 +168,13 @@ class RecordingSegment:
 
     def parsed(self, topic: Topic) -> Iterator[Any]:
         """A topic's protobuf messages, in file order; their values are not checked."""
-        return (self._parsed(topic, address) for address in self.messages(topic).addresses)
+        return (self.parsed_at(topic, address) for address in self.messages(topic).addresses)
 
-    def _parsed(self, topic: Topic, address: int) -> Any:
+    def beginnings(self, topic: Topic, length: int) -> Iterator[tuple[list[int], NDArray[np.uint8]]]:
+        """(addresses, first bytes (n, length)) of messages, until one lies in a compressed chunk."""
+        return self._source.beginnings(self.messages(topic).addresses, length)
+
+    def parsed_at(self, topic: Topic, address: int) -> Any:
         try:
             return parse(topic, self._read(topic, address).data)
         except DecodeError as error:

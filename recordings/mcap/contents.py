@@ -27,8 +27,8 @@ from recordings.mcap.records import (
 
 ATTACHMENTS_LIMIT_BYTES = 32 * 1024 * 1024
 METADATA_LIMIT_BYTES = 1024 * 1024
-MESSAGES_LIMIT = 3_000_000
-"""More than an hour and a half of 500 Hz."""
+MESSAGES_LIMIT = 12_000_000
+"""Six hours of 500 Hz: a session that was left alone. Their places take 100 MB."""
 CHANNELS_LIMIT = 1024
 SCHEMAS_LIMIT_BYTES = 16 * 1024 * 1024
 _CHANNEL_LIMIT_BYTES = 64 * 1024

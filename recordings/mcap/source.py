@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import io
 import os
+from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import lz4.frame
+import numpy as np
 import zstandard
+from numpy.typing import NDArray
 
 from recordings.mcap.records import MESSAGE_HEAD, RECORD_HEAD, BadRecordError
 
 UNPACKED_START = 1 << 60
 _WINDOW_BYTES = 64 * 1024
+_BLOCK_RECORDS, _BLOCK_BYTES = 1024, 512 * 1024
 _HEAD_BYTES = RECORD_HEAD.size + MESSAGE_HEAD.size
 _ZSTD_WINDOW_LIMIT_BYTES = 64 * 1024 * 1024
 """Look-back that packed data may ask for."""
@@ -96,6 +100,23 @@ class Source:
         """Like `message`, with at most the first `length` bytes of its data."""
         size, time_ns, sequence = self.head(address)
         return Message(time_ns, sequence, self.read(address + _HEAD_BYTES, min(size, length)))
+
+    def beginnings(self, addresses: array[int], length: int) -> Iterator[tuple[list[int], NDArray[np.uint8]]]:
+        """Blocks of (addresses, (n, length) bytes that follow each record head); what lies outside is 0.
+
+        Only of records in the file: it ends at the first that lies in a compressed chunk.
+        """
+        places = np.frombuffer(addresses, np.int64)
+        while len(places) and places[0] < UNPACKED_START:
+            block = places[:_BLOCK_RECORDS] - places[0]
+            inside = (block >= 0) & (block < _BLOCK_BYTES)
+            block = block[: len(block) if inside.all() else int(inside.argmin())]
+            first = int(places[0]) + _HEAD_BYTES
+            data = np.zeros(int(block[-1]) + length, np.uint8)
+            raw = os.pread(self.descriptor, len(data), first)
+            data[: len(raw)] = np.frombuffer(raw, np.uint8)
+            yield places[: len(block)].tolist(), data[block[:, None] + np.arange(length)]
+            places = places[len(block) :]
 
     def messages(self, addresses: Iterable[int]) -> Iterator[Message]:
         return map(self.message, addresses)

@@ -13,6 +13,13 @@ class CalibrationError(CodedError):
     """The cause as a word for programs, where it is known."""
 
 
+class UsageError(CalibrationError):
+    """A file, a target or an option of the command line cannot be used as asked."""
+
+    code = "output"
+    exit_code = 2
+
+
 class TooFewViewsError(CalibrationError):
     """Fewer usable views than the method needs."""
 

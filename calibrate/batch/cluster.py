@@ -16,16 +16,9 @@ import msgspec
 
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, R, T
 from calibrate.document import software_versions
+from calibrate.errors import UsageError
 
 _CONNECT_S = 30
-
-
-class ClusterError(BatchError):
-    """The cluster cannot be used as asked."""
-
-    code = "cluster-options"
-
-    exit_code = 2
 
 
 @dataclass(frozen=True)
@@ -46,11 +39,11 @@ class Cluster:
         tls_cert: Path | None = None,
         tls_key: Path | None = None,
     ) -> Cluster:
-        """Read `dask scheduler --scheduler-file`'s JSON. Raises ClusterError."""
+        """Read `dask scheduler --scheduler-file`'s JSON. Raises UsageError."""
         try:
             address = msgspec.json.decode(path.read_bytes(), type=_SchedulerFile).address
         except (OSError, msgspec.DecodeError, UnicodeDecodeError) as problem:
-            raise ClusterError(
+            raise UsageError(
                 f"{path} is no scheduler file ({problem}).",
                 code="cluster-file",
                 remedy="Start the scheduler with: dask scheduler --scheduler-file FILE",
@@ -58,24 +51,24 @@ class Cluster:
         return cls(address, tls_ca, tls_cert, tls_key)
 
     def check(self) -> None:
-        """Raises ClusterError where address and files do not belong together."""
+        """Raises UsageError where address and files do not belong together."""
         scheme, _, place = self.address.partition("://")
         if scheme not in ("tcp", "tls") or ":" not in place:
-            raise ClusterError(
+            raise UsageError(
                 f"{self.address!r} is no address of a scheduler.",
                 code="cluster-address",
                 remedy="Write tcp://HOST:PORT or tls://HOST:PORT, as `dask scheduler` prints it.",
             )
         given = [path for path in (self.tls_ca, self.tls_cert, self.tls_key) if path is not None]
         if (scheme == "tls") != (len(given) == 3) or (scheme == "tcp" and given):
-            raise ClusterError(
+            raise UsageError(
                 f"{self.address}: a tls:// address needs --tls-ca, --tls-cert and --tls-key; a "
                 "tcp:// address takes none of them.",
                 code="cluster-tls",
             )
         for path in given:
             if not path.is_file():
-                raise ClusterError(
+                raise UsageError(
                     f"{path} does not exist or is no file.", code="cluster-file", remedy="Check the name."
                 )
 
@@ -87,13 +80,13 @@ class _SchedulerFile(msgspec.Struct):
 def cluster_workers(cluster: Cluster) -> BatchWorkers:
     """Check at once that `distributed` is installed and the address makes sense; connect when there is work.
 
-    Raises ClusterError.
+    Raises UsageError.
     """
     cluster.check()
     try:
         dask: Any = importlib.import_module("distributed")
     except ImportError:
-        raise ClusterError(
+        raise UsageError(
             "A cluster needs the package `distributed`.",
             code="package-missing",
             remedy="pip install 'calibration-station[cluster]', the same version as on the workers.",

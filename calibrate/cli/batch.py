@@ -23,7 +23,8 @@ from calibrate.batch.workers import BatchWorkers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.contracts import FleetCameraJson, FleetJson
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit, takes
-from calibrate.cli.output import AsJson, OutputError, err, out, print_json, progress_bar
+from calibrate.cli.output import AsJson, err, out, print_json, progress_bar
+from calibrate.errors import UsageError
 from calibrate.load import Progress as LoadProgress
 from calibrate.pipeline import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
@@ -53,14 +54,14 @@ def chosen_workers(
     tls = (tls_ca, tls_cert, tls_key)
     if scheduler is None and scheduler_file is None:
         if any(tls):
-            raise OutputError("--tls-ca, --tls-cert and --tls-key need --scheduler.", code="options")
+            raise UsageError("--tls-ca, --tls-cert and --tls-key need --scheduler.", code="options")
         return pool(workers)
     if workers is not None:
-        raise OutputError("--workers counts processes here, not on a cluster.", code="options")
+        raise UsageError("--workers counts processes here, not on a cluster.", code="options")
     if scheduler_file is None:
         return cluster_workers(Cluster(scheduler or "", *tls))
     if scheduler is not None:
-        raise OutputError("Give --scheduler or --scheduler-file, not both.", code="options")
+        raise UsageError("Give --scheduler or --scheduler-file, not both.", code="options")
     return cluster_workers(Cluster.from_file(scheduler_file, *tls))
 
 
@@ -158,7 +159,7 @@ def _tell(results: list[BatchResult], found: tuple[CellHistory, ...], output: st
 
 def _results(output: str) -> Results:
     if Path(output).is_file():
-        raise OutputError(f"{output} is a file; the results need a folder.", code="target-exists")
+        raise UsageError(f"{output} is a file; the results need a folder.", code="target-exists")
     return Results(output)
 
 

@@ -10,7 +10,8 @@ import typer
 from calibrate.boards.model import ambiguity_text, describe_board, usual_markers
 from calibrate.boards.printing import PAPER_MM, board_sheet
 from calibrate.cli.files import read_board
-from calibrate.cli.output import OutputError, check_target, err, out
+from calibrate.cli.output import check_target, err, out
+from calibrate.errors import UsageError
 from calibrate.files.calibration import write_output
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
@@ -47,7 +48,7 @@ def board(
     station's configuration.
     """
     if output.suffix.lower() not in (".pdf", ".svg"):
-        raise OutputError(f"{output}: the name must end in .pdf or .svg.", code="board-format")
+        raise UsageError(f"{output}: the name must end in .pdf or .svg.", code="board-format")
     check_target(output, "export")
     usual_m, usual = usual_markers(kind, square_mm / 1000)
     marker_m = usual_m if marker_mm is None else marker_mm / 1000

@@ -13,8 +13,8 @@ import typer
 from calibrate.cli.contracts import DriftCheckJson, DriftPowerJson
 from calibrate.cli.installed import Root, named_or_installed
 from calibrate.cli.job import Threads
-from calibrate.cli.output import AsJson, OutputError, detection_progress, out, print_json
-from calibrate.errors import BadViewsError
+from calibrate.cli.output import AsJson, detection_progress, out, print_json
+from calibrate.errors import BadViewsError, UsageError
 from calibrate.files.calibration import Calibration, Provenance
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
@@ -31,7 +31,7 @@ DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
 
 
-class OtherCellError(OutputError):
+class OtherCellError(UsageError):
     """The views are of another cell, robot or camera than the calibration."""
 
     code = "other-cell"

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.model import check_board
-from calibrate.errors import CalibrationError
+from calibrate.errors import UsageError
 from calibrate.files.calibration import FORMAT, read_calibration
 from calibrate.lens.intrinsics import LensModel
 from calibrate.lens.model import distortion
@@ -19,14 +19,6 @@ from recordings.schema.messages import BoardSpec, CameraModel, TimeCorrection
 
 _LIMIT_BYTES = strict_yaml.LIMIT_BYTES
 T = TypeVar("T")
-
-
-class InputFileError(CalibrationError):
-    """A file named on the command line cannot be used."""
-
-    code = "input-file"
-
-    exit_code = 2
 
 
 def read_board(path: Path) -> BoardSpec:
@@ -46,7 +38,7 @@ def read_camera(path: Path) -> CameraModel:
     else:
         camera = _strictly(path, CameraModel, "camera")
     if camera.width < 1 or camera.height < 1:
-        raise InputFileError(f"{path}: {camera.width}×{camera.height} is no image size.")
+        raise UsageError(f"{path}: {camera.width}×{camera.height} is no image size.", code="input-file")
     camera_matrix(camera)
     distortion(camera)
     return camera
@@ -73,14 +65,16 @@ class CellFacts(NamedTuple):
 
 
 def read_cell(path: Path) -> CellFacts:
-    """Read them from a station's configuration. Raises InputFileError."""
+    """Read them from a station's configuration. Raises UsageError."""
     plain = _read(path, "a station's configuration")
     robot, camera, rule = plain.get("robot"), plain.get("camera"), plain.get("validity") or {}
     if not isinstance(robot, dict) or not isinstance(camera, dict) or not isinstance(rule, dict):
-        raise InputFileError(f"{path}: no station configuration, robot and camera are missing.")
+        raise UsageError(
+            f"{path}: no station configuration, robot and camera are missing.", code="input-file"
+        )
     days = rule.get("max_age_days")
     if not isinstance(days, int | float | None):
-        raise InputFileError(f"{path}: validity.max_age_days {days!r} is no number of days.")
+        raise UsageError(f"{path}: validity.max_age_days {days!r} is no number of days.", code="input-file")
     robot_serial, camera_serial = (str(device.get("serial") or "") for device in (robot, camera))
     return CellFacts(robot_serial, camera_serial, str(camera.get("name") or ""), days)
 
@@ -89,7 +83,9 @@ def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
     model = plain.get("distortion_model", "plumb_bob")
     if model not in get_args(LensModel):
         known = ", ".join(get_args(LensModel))
-        raise InputFileError(f"{path}: distortion_model {model!r} is not known here; known are {known}.")
+        raise UsageError(
+            f"{path}: distortion_model {model!r} is not known here; known are {known}.", code="input-file"
+        )
     try:
         fields = {
             "width": plain["image_width"],
@@ -101,14 +97,14 @@ def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
         }
         return msgspec.convert(fields, CameraModel)
     except (KeyError, TypeError, ValueError) as problem:
-        raise InputFileError(f"{path}: not a whole camera_info file ({problem!r}).") from None
+        raise UsageError(f"{path}: not a whole camera_info file ({problem!r}).", code="input-file") from None
 
 
 def _strictly(path: Path, kind: type[T], under: str) -> T:
     try:
         return strict_yaml.load(_content(path), kind, under)
     except strict_yaml.StrictYamlError as error:
-        raise InputFileError(f"{path}: {'; '.join(map(str, error.problems))}.") from None
+        raise UsageError(f"{path}: {'; '.join(map(str, error.problems))}.", code="input-file") from None
 
 
 def _content(path: Path) -> bytes:
@@ -116,10 +112,11 @@ def _content(path: Path) -> bytes:
         with path.open("rb") as file:
             content = file.read(_LIMIT_BYTES + 1)
     except OSError as problem:
-        raise InputFileError(f"{path}: {problem.strerror or problem}.") from None
+        raise UsageError(f"{path}: {problem.strerror or problem}.", code="input-file") from None
     if len(content) > _LIMIT_BYTES:
-        raise InputFileError(
+        raise UsageError(
             f"{path}: larger than {_LIMIT_BYTES // 1024} kB.",
+            code="input-file",
             remedy="Check that it is the right file.",
             limit_bytes=_LIMIT_BYTES,
         )
@@ -130,7 +127,7 @@ def _read(path: Path, wanted: str) -> dict[str, Any]:
     try:
         plain = strict_yaml.load_plain(_content(path))
     except strict_yaml.StrictYamlError as problem:
-        raise InputFileError(f"{path}: {problem}.") from None
+        raise UsageError(f"{path}: {problem}.", code="input-file") from None
     if not isinstance(plain, dict):
-        raise InputFileError(f"{path}: {wanted} is needed, and no fields are in it.")
+        raise UsageError(f"{path}: {wanted} is needed, and no fields are in it.", code="input-file")
     return plain

@@ -14,7 +14,8 @@ from rich.table import Column, Table
 
 from calibrate.cli.contracts import DiffJson, InstalledJson, ListedJson
 from calibrate.cli.files import CellFacts, read_cell
-from calibrate.cli.output import AsJson, OutputError, check_target, err, out, print_json
+from calibrate.cli.output import AsJson, check_target, err, out, print_json
+from calibrate.errors import UsageError
 from calibrate.files import exports
 from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, Lens, read_calibration, write_output
@@ -81,7 +82,7 @@ def diff(
     """Compare two calibrations with their uncertainty."""
     a, (b, validity) = read_calibration(first), named_or_installed(second, root, camera)
     if a.mount != b.mount:
-        raise OutputError(
+        raise UsageError(
             f"{first} is {a.mount}, the other is {b.mount}: there is nothing to compare.", code="other-mount"
         )
     millimetres, degrees, sigmas = pose_difference(a, b)
@@ -150,7 +151,7 @@ def export(
         err.print(f"Warning: the calibration is {validity_text(validity)}", style="yellow")
     if output is None:
         if b"\0" in content:
-            raise OutputError(f"{to.value} is no text.", remedy="Name a file with -o.")
+            raise UsageError(f"{to.value} is no text.", remedy="Name a file with -o.")
         typer.echo(content.decode(), nl=False)
         return
     check_target(output, "export")
@@ -186,7 +187,7 @@ def install(
     Exit codes: 0 installed, 4 a gate failed, 1 refused for another reason; then nothing was changed.
     """
     if root is None and cell is not CellKind.real:
-        raise OutputError(f"{cell} needs its own folder.", code="root-missing", remedy="Name it with --root.")
+        raise UsageError(f"{cell} needs its own folder.", code="root-missing", remedy="Name it with --root.")
     facts = CellFacts("", "", "", None) if cell_config is None else read_cell(cell_config)
     made = installing.install(
         file,
@@ -228,7 +229,7 @@ def withdraw(
     check does.
     """
     if problem := installing.reason_problem(reason):
-        raise OutputError(problem, code="reason-too-short")
+        raise UsageError(problem, code="reason-too-short")
     cause = ValidityReason("withdrawn", reason.strip())
     validity = installing.set_validity(root, ValidityState.WITHDRAWN, cause, camera=camera)
     if as_json:

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from calibrate.cli.files import read_board, read_camera, read_lens_sigma, read_time_offset
-from calibrate.cli.output import OutputError
+from calibrate.errors import UsageError
 from calibrate.pipeline import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
 
@@ -107,7 +107,7 @@ def picture_options(
 ) -> JobOptions:
     """Options of reading images."""
     if camera is not None and find_intrinsics:
-        raise OutputError(
+        raise UsageError(
             "--camera fixes the intrinsics, --estimate-intrinsics estimates them.",
             code="options",
             remedy="Choose one of them.",

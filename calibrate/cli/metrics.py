@@ -11,8 +11,8 @@ import numpy as np
 import typer
 
 from calibrate.cli.installed import Root
-from calibrate.cli.output import OutputError, check_target
-from calibrate.errors import CalibrationFileError
+from calibrate.cli.output import check_target
+from calibrate.errors import CalibrationFileError, UsageError
 from calibrate.files.calibration import read_calibration, write_output
 from calibrate.files.loader import cameras, current_validity, current_version, readable_folder
 from calibrate.files.validity import ValidityState, parse_time
@@ -49,7 +49,7 @@ def metrics(
         typer.echo(text, nl=False)
         return
     if output.suffix != ".prom":
-        raise OutputError(f"{output} is no .prom file.", remedy="The collector reads *.prom only.")
+        raise UsageError(f"{output} is no .prom file.", remedy="The collector reads *.prom only.")
     check_target(output, "export")
     write_output(output, text.encode())
 

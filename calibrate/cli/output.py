@@ -11,7 +11,7 @@ from typing import Literal
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from calibrate.errors import CalibrationError, CalibrationFileError
+from calibrate.errors import CalibrationFileError, UsageError
 from calibrate.files.calibration import FORMAT, read_calibration
 from calibrate.load import Progress as LoadProgress
 from recordings.cli.console import AsJson as AsJson
@@ -24,29 +24,22 @@ out = plain_console(width=None if _told_width else 150)
 err = plain_console(stderr=True)
 
 
-class OutputError(CalibrationError):
-    """A target or an option of the command line is wrong."""
-
-    code = "output"
-    exit_code = 2
-
-
 def check_target(target: Path, kind: Literal["calibration", "report", "export"]) -> None:
-    """Raise OutputError, before the work, where no file can be written or another thing would be lost.
+    """Raise UsageError, before the work, where no file can be written or another thing would be lost.
 
     A calibration replaces a whole calibration file only, a report a report only; an export replaces neither a
     recording nor a calibration.
     """
     try:
         if not target.parent.is_dir():
-            raise OutputError(
+            raise UsageError(
                 f"{target}: the folder {target.parent} does not exist.", remedy="Create it, or name another."
             )
         if target.exists() and not target.is_file():
-            raise OutputError(f"{target} is a folder, a device or a pipe.", remedy="Name a file.")
+            raise UsageError(f"{target} is a folder, a device or a pipe.", remedy="Name a file.")
         start = _beginning(target) if target.exists() else b""
     except OSError as problem:
-        raise OutputError(f"{target}: {problem.strerror}.", remedy="Name another place.") from None
+        raise UsageError(f"{target}: {problem.strerror}.", remedy="Name another place.") from None
     if not target.exists():
         return
     if kind == "calibration":
@@ -56,7 +49,7 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
     else:
         spared = start.startswith((MAGIC, f"format: {FORMAT}".encode()))
     if spared:
-        raise OutputError(
+        raise UsageError(
             f"{target} exists and is not replaced by this {kind}.",
             code="target-exists",
             remedy="Give another name with -o or --report.",

@@ -24,13 +24,12 @@ from calibrate.cli.installed import Root, history_rows
 from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.cli.output import (
     AsJson,
-    OutputError,
     check_target,
     detection_progress,
     out,
     print_json,
 )
-from calibrate.errors import CalibrationError
+from calibrate.errors import CalibrationError, UsageError
 from calibrate.files.calibration import Touch, ViewWeight, write_calibration, write_output
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
 from calibrate.files.install import install_line, installed_calibration
@@ -70,7 +69,7 @@ def solve(
     if report is not None:
         check_target(report, "report")
         if report.resolve() == target.resolve():
-            raise OutputError(
+            raise UsageError(
                 f"{target} cannot be calibration and report.",
                 code="target-exists",
                 remedy="Give --report another name.",

@@ -11,7 +11,8 @@ import msgspec
 import typer
 
 from calibrate.cli.contracts import SweepJson
-from calibrate.cli.output import AsJson, OutputError, check_target, err, out, print_json
+from calibrate.cli.output import AsJson, check_target, err, out, print_json
+from calibrate.errors import UsageError
 from calibrate.files.calibration import read_calibration
 from calibrate.quality.sweep import TimeOffset, sweep_time_offset
 from recordings import strict_yaml
@@ -64,7 +65,7 @@ def sweep(
 
 def _correction(recording: Recording, found: TimeOffset) -> TimeCorrection:
     if found.source is None:
-        raise OutputError(
+        raise UsageError(
             f"{recording.path} has no frame times: its offset corrects none.",
             code="no-frame-times",
             remedy="Capture the sweep again with this version.",

@@ -24,8 +24,8 @@ from calibrate.cli.drift_check import CellIdentity, require_same_cell
 from calibrate.cli.files import read_board
 from calibrate.cli.installed import CameraName, Root, named_or_installed
 from calibrate.cli.job import BoardFile, Threads
-from calibrate.cli.output import OutputError, err, out, print_json, progress_bar
-from calibrate.errors import InstallError
+from calibrate.cli.output import err, out, print_json, progress_bar
+from calibrate.errors import InstallError, UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
@@ -52,7 +52,7 @@ _POLL_S = 2.0
 AsLines = Annotated[bool, typer.Option("--json", help="Print a JSON object for each event, one a line")]
 
 
-class WatchSourceError(OutputError):
+class WatchSourceError(UsageError):
     """A source of `calibrate watch` cannot be used with this calibration."""
 
     code = "watch-source"
@@ -124,7 +124,7 @@ def watch(
     watched = Watched.find(calibration_file, root, camera)
     opened = [_open(path, watched.calibration) for path in sources]
     if follow and not (sources[-1] / DATASET_FILE).is_file():
-        raise OutputError(
+        raise UsageError(
             f"--follow: {sources[-1]} does not grow.",
             code="options",
             remedy=f"Give a folder with {DATASET_FILE} and poses.csv last.",

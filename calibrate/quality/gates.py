@@ -10,17 +10,10 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from calibrate.errors import CalibrationError
+from calibrate.errors import UsageError
 from calibrate.files.gate import Gate, Sense
 from calibrate.handeye.solution import Reading, Solution
 from recordings import strict_yaml
-
-
-class GatesError(CalibrationError):
-    """The file of limits is wrong."""
-
-    code = "gate-limits"
-    exit_code = 2
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -72,13 +65,15 @@ class GateInputs:
 
 
 def read_limits(path: Path) -> GateLimits:
-    """Read YAML with some of GateLimits' fields. Raises GatesError naming file and field."""
+    """Read YAML with some of GateLimits' fields. Raises UsageError naming file and field."""
     try:
         with path.open("rb") as file:
             return strict_yaml.load(file.read(strict_yaml.LIMIT_BYTES + 1), GateLimits)
     except (OSError, strict_yaml.StrictYamlError) as problem:
         names = ", ".join(GateLimits.__struct_fields__)
-        raise GatesError(f"{path}: {problem}.", remedy=f"Allowed: {names}.", path=str(path)) from None
+        raise UsageError(
+            f"{path}: {problem}.", code="gate-limits", remedy=f"Allowed: {names}.", path=str(path)
+        ) from None
 
 
 def judge(solution: Solution, inputs: GateInputs, limits: GateLimits | None = None) -> tuple[Gate, ...]:

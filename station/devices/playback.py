@@ -356,8 +356,7 @@ class PlaybackRobot:
         if not self.control:
             raise RobotError("playback cannot move: motion is not approved", code="no-control")
         if off[nearest] > _SAME_JOINTS_RAD:
-            text = "playback cannot move to these joints: the recorded arm never stood there"
-            raise RobotError(text, code="not-recorded")
+            raise RobotError("playback moves only to where the recorded arm stood", code="not-recorded")
         with self._lock:
             self._from, self._to, self._halted_at = self._to, self.views[nearest], None
             self._move_start_s = time.monotonic()

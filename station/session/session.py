@@ -206,8 +206,9 @@ class Session:
     def _offer(self, voids: int, asked: MotionApproval) -> None:
         self.permit(verbs.Prepare, asked.client_id)
         if self.approvals.voids != voids:
-            text = "Conditions changed during the preflight check."
-            raise RefusedError(text, code="changed", remedy="Retry.")
+            raise RefusedError(
+                "Conditions changed during the preflight check.", code="changed", remedy="Retry."
+            )
         self.approvals.offer(asked)
         # To every watcher, without the token that is for the one who asked.
         self.store.update(go=msgspec.structs.replace(asked.summary, token=""))

@@ -82,13 +82,20 @@ async def prepare_stop_test(
 
 def _require_slider(way: StopWay, fraction: float) -> None:
     if way is StopWay.SLIDER:
-        good, wanted, code, remedy = fraction <= _SLIDER_ZERO, 0, "slider-not-zero", "Draw it down to 0."
-    else:
-        good, wanted, code = fraction >= _SLIDER_FULL, 100, "slider-low"
-        remedy = "Raise it to 100 %: the test itself is slow."
-    if not good:
-        text = f"The speed slider stands at {100 * fraction:.0f} % (wanted: {wanted} %)."
-        raise RefusedError(text, code=code, remedy=remedy, fraction=fraction)
+        if fraction > _SLIDER_ZERO:
+            raise RefusedError(
+                f"The speed slider stands at {100 * fraction:.0f} % (wanted: 0 %).",
+                code="slider-not-zero",
+                remedy="Draw it down to 0 on the pendant.",
+                fraction=fraction,
+            )
+    elif fraction < _SLIDER_FULL:
+        raise RefusedError(
+            f"The speed slider stands at {100 * fraction:.0f} % (wanted: 100 %).",
+            code="slider-low",
+            remedy="Raise it to 100 %: the test itself is slow.",
+            fraction=fraction,
+        )
 
 
 def _free_move(

@@ -16,10 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.batch.cluster import Cluster, ClusterError, cluster_workers, dask_workers
+from calibrate.batch.cluster import Cluster, cluster_workers, dask_workers
 from calibrate.batch.fleet import collect_fleet
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import BatchError, pool
+from calibrate.errors import UsageError
 from tests.calibrate.batch.test_run import Counted, in_this_process, read_results, wait_until
 from tests.calibrate.calling import raises_code
 
@@ -165,25 +166,25 @@ def test_a_client_that_is_there_is_used_and_stays_open(recordings: list[Path], t
 def test_a_scheduler_file_that_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text("[]")
     for name in ("other.json", "missing.json"):
-        with raises_code(ClusterError, "cluster-file"):
+        with raises_code(UsageError, "cluster-file"):
             Cluster.from_file(tmp_path / name)
 
 
 def test_what_cannot_be_meant_is_refused_with_the_next_step(tmp_path: Path) -> None:
     for address in ("somewhere", "http://a:1", "tcp://host"):
-        with raises_code(ClusterError, "cluster-address"):
+        with raises_code(UsageError, "cluster-address"):
             Cluster(address).check()
-    with raises_code(ClusterError, "cluster-tls"):
+    with raises_code(UsageError, "cluster-tls"):
         Cluster("tls://host:8786", tls_ca=tmp_path).check()
-    with raises_code(ClusterError, "cluster-tls"):
+    with raises_code(UsageError, "cluster-tls"):
         Cluster("tcp://host:8786", tmp_path, tmp_path, tmp_path).check()
-    with raises_code(ClusterError, "cluster-file"):
+    with raises_code(UsageError, "cluster-file"):
         Cluster("tls://host:8786", *[tmp_path / "no.pem"] * 3).check()
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with raises_code(ClusterError, "package-missing"):
+    with raises_code(UsageError, "package-missing"):
         cluster_workers(Cluster("tcp://127.0.0.1:8786"))
 
 

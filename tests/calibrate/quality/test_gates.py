@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.errors import UsageError
 from calibrate.files.gate import Gate
 from calibrate.handeye.solution import (
     CrossValidation,
@@ -21,7 +22,7 @@ from calibrate.handeye.solution import (
     Solution,
 )
 from calibrate.pipeline import SolvedRecording
-from calibrate.quality.gates import GateInputs, GateLimits, GatesError, judge, read_limits
+from calibrate.quality.gates import GateInputs, GateLimits, judge, read_limits
 from calibrate.results import HoldoutScore
 from tests.calibrate.calling import raises_code
 
@@ -163,9 +164,9 @@ def test_limits_come_from_a_file_and_null_switches_a_gate_off(solution: Solution
 def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) -> None:
     path = tmp_path / "gates.yaml"
     path.write_text(content)
-    with raises_code(GatesError, "gate-limits", path=str(path)):
+    with raises_code(UsageError, "gate-limits", path=str(path)):
         read_limits(path)
-    with raises_code(GatesError, "gate-limits"):
+    with raises_code(UsageError, "gate-limits"):
         read_limits(tmp_path / "none.yaml")
 
 

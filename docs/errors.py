@@ -84,7 +84,7 @@ def _sites(path: Path, tree: ast.Module, classes: dict[str, ErrorClass]) -> Iter
     module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
     for function in [None, *(node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))]:
         for node in ast.walk(function or tree):
-            site = _site(node, module, classes)
+            site = _site(node, module, classes, tree)
             if site is None or (function is None and "{" in site.code):
                 continue
             if function is None:
@@ -93,22 +93,51 @@ def _sites(path: Path, tree: ast.Module, classes: dict[str, ErrorClass]) -> Iter
                 yield from _through(function, site, tree)
 
 
-def _site(node: ast.AST, module: str, classes: dict[str, ErrorClass]) -> Site | None:
+def _site(node: ast.AST, module: str, classes: dict[str, ErrorClass], tree: ast.Module) -> Site | None:
     if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args):
         return None
     inherited = _inherited(node.func.id, classes)
     if inherited is None:
         return None
     said = {word.arg: word.value for word in node.keywords if word.arg}
-    code, remedy = said.pop("code", None), said.pop("remedy", None)
+    code, remedy, given = said.pop("code", None), said.pop("remedy", None), _texts(tree, node.lineno)
     return Site(
         _template(code) if code else inherited[0],
         inherited[1],
-        _template(node.args[0]),
-        _template(remedy) if remedy else "",
+        _filled(_template(node.args[0]), given),
+        _filled(_template(remedy), given) if remedy else "",
         tuple(said),
         module,
     )
+
+
+def _texts(tree: ast.Module, line: int) -> dict[str, str]:
+    """Names of texts that hold at this line: the module's, and those set before it in the same function.
+
+    A name that was set twice since the last `raise` may hold either text: it stays a name.
+    """
+    functions = [node for node in ast.walk(tree) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
+    around = [node for node in functions if node.lineno <= line <= (node.end_lineno or 0)][-1:]
+    inside = [node for function in around for node in ast.walk(function)]
+    raised = max(
+        (node.lineno for node in inside if isinstance(node, ast.Raise) and node.lineno < line), default=0
+    )
+    found: dict[str, list[tuple[int, str]]] = {}
+    for node in (*tree.body, *inside):
+        if isinstance(node, ast.Assign) and (node in tree.body or node.lineno < line):
+            is_text = isinstance(node.value, ast.JoinedStr) or _is_string(node.value)
+            for name in (target.id for target in node.targets if isinstance(target, ast.Name)):
+                found.setdefault(name, []).append((node.lineno, _template(node.value) if is_text else ""))
+    latest = {name: sorted(said) for name, said in found.items()}
+    return {
+        name: said[-1][1]
+        for name, said in latest.items()
+        if said[-1][1] and (len(said) == 1 or said[-2][0] <= raised < said[-1][0])
+    }
+
+
+def _is_string(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
 
 
 def _through(function: ast.FunctionDef, site: Site, tree: ast.Module) -> Iterator[Site]:

@@ -197,7 +197,7 @@ def _alone(folder: Path) -> Iterator[None]:
             raise InstallError(
                 f"{folder} is being watched by another program.",
                 code="watched-already",
-                remedy="Let one watch take all pictures of a camera; several sources can be given to it.",
+                remedy="Let one watch take all images of a camera; several sources can be given to it.",
             ) from None
         yield
 

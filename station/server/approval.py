@@ -111,4 +111,4 @@ class ApprovalRule:
     def _require_permitted(self, asks: Applicant) -> None:
         if self._config.persons and asks.user not in self._config.persons:
             text = f"{asks.user} is not in approval.persons."
-            raise RefusedError(text, code="not-permitted", remedy="Ask a person who is to approve.")
+            raise RefusedError(text, code="not-permitted", remedy="Ask one of approval.persons to approve.")

@@ -390,4 +390,4 @@ def _require_between_sessions(context: SessionContext) -> None:
     if (refusal := Observe.refusal(context.store.state)) is not None:
         raise refusal
     if context.cell.source == "playback":
-        raise RefusedError("Played images are no new ones.", code="played", remedy="Use `calibrate watch`.")
+        raise RefusedError("Played-back images are not new.", code="played", remedy="Use `calibrate watch`.")

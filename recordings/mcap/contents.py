@@ -19,6 +19,7 @@ from recordings.mcap.records import (
     Channel,
     Schema,
     Statistics,
+    TooLargeError,
     parse_attachment,
     parse_channel,
     parse_metadata,
@@ -103,7 +104,7 @@ class Contents:
         """
         self.message_count += len(places)
         if self.message_count > MESSAGES_LIMIT:
-            raise BadRecordError(f"more than {MESSAGES_LIMIT} messages")
+            raise TooLargeError(f"over {MESSAGES_LIMIT} messages")
         for first in range(0, len(places), _BATCH):
             self._add_batch(buffer, np.array(places[first : first + _BATCH], np.int64), base)
 
@@ -126,7 +127,9 @@ class Contents:
         if known is None:
             self._schema_bytes += len(content)
             if self._schema_bytes > SCHEMAS_LIMIT_BYTES or len(self.schemas) >= CHANNELS_LIMIT:
-                raise BadRecordError("the schemas are more than any recording needs")
+                raise TooLargeError(
+                    f"over {CHANNELS_LIMIT} schemas, or {SCHEMAS_LIMIT_BYTES >> 20} MiB of them"
+                )
             self.schemas[schema.id] = schema
         elif known != schema:
             raise BadRecordError(f"schema {schema.id} is declared twice, differently")
@@ -139,7 +142,7 @@ class Contents:
         if known is not None:
             return
         if len(content) > _CHANNEL_LIMIT_BYTES or len(self.channels) >= CHANNELS_LIMIT:
-            raise BadRecordError(f"a channel of {len(content)} bytes, or more than {CHANNELS_LIMIT} channels")
+            raise TooLargeError(f"a channel of {len(content)} bytes, or over {CHANNELS_LIMIT} channels")
         if channel.schema_id and channel.schema_id not in self.schemas:
             raise BadRecordError(f"channel {channel.id} names schema {channel.schema_id}, which is unknown")
         self.channels[channel.id] = channel
@@ -148,7 +151,7 @@ class Contents:
     def add_attachment(self, content: memoryview) -> None:
         self._attachment_bytes += len(content)
         if self._attachment_bytes > ATTACHMENTS_LIMIT_BYTES:
-            raise BadRecordError("the attachments are larger than any recording needs")
+            raise TooLargeError(f"over {ATTACHMENTS_LIMIT_BYTES >> 20} MiB of attachments")
         record = parse_attachment(content, self.exact)
         if record.crc and checksum.crc32(content[: record.crc_covers]) != record.crc:
             raise BadRecordError(f"the checksum of attachment '{record.name[:40]}' does not fit")
@@ -159,7 +162,7 @@ class Contents:
     def add_metadata(self, content: memoryview) -> None:
         self._metadata_bytes += len(content)
         if self._metadata_bytes > METADATA_LIMIT_BYTES:
-            raise BadRecordError("the metadata are larger than any recording needs")
+            raise TooLargeError(f"over {METADATA_LIMIT_BYTES >> 20} MiB of metadata")
         record = parse_metadata(content, self.exact)
         self.metadata_count += 1
         self.metadata.setdefault(record.name, record.content)

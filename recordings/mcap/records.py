@@ -43,6 +43,10 @@ class BadRecordError(ValueError):
     """A record that breaks the format; the message says how, the caller knows where."""
 
 
+class TooLargeError(BadRecordError):
+    """More than is read here, which bounds memory; the file may be whole."""
+
+
 class Schema(NamedTuple):
     id: int
     name: str

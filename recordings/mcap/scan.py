@@ -33,6 +33,7 @@ from recordings.mcap.records import (
     BadRecordError,
     Opcode,
     Statistics,
+    TooLargeError,
     parse_chunk_head,
     parse_header,
     parse_statistics,
@@ -110,6 +111,10 @@ class _Scan:
             while (end := self._data_record(position)) != position:
                 position = end
             self._take(position)
+        except TooLargeError as error:
+            raise RecordingError(
+                f"{self._path} has {error}, more than is read", code="too-large", remedy="Split it first."
+            ) from error
         except BadRecordError as error:
             raise self._corrupt(position, str(error)) from error
         stored_crc, end = self._data_end(position)

@@ -193,7 +193,7 @@ def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) 
         if not same:
             raise OtherCellError(
                 f"{where} has {name} {new}, the calibration {known}: that is no drift.",
-                remedy="Calibrate the new one.",
+                remedy="Check with images of the calibrated cell, or calibrate this one.",
                 differs=name,
                 found=str(new),
                 calibrated=str(known),

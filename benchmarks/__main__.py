@@ -34,7 +34,7 @@ SHOWN: dict[str, str] = {
     "coverage": r"^\| (clean|size 0.5 %|bent 0.5 mm|arm 0.4 mm, arm unknown) \| eye-to",
     "outliers": r"^\| (far|shuffled) \| 40 % \| eye-in|moved \| 35 % \| eye-in",
     "kinematics": r"^\| (0|0.5) \|",
-    "arm_table": r"^\| 0.3 mm, (measured|usual), 50 planned \| 100 \|",
+    "arm_table": r"^\| 0.3 mm, (measured|usual), 50 planned \| \d+ \|",
     "mistakes": r"^\*\*",
     "constants": r"FULL` × 0|SIZES|CLEARLY` × 0|STUDENT|ROBOT_PRIOR_M|ASPECT",
     "detection": r"^\| (good|20°) ",

@@ -45,6 +45,7 @@ SHOWN: dict[str, str] = {
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves, plan|predicted)",
     "improving": "improved",
     "watch": r"^\| (repeated|any) .* of ",
+    "watch_real": "",
     "drift": r"planned \| [38] \|",
     "stop_latency": r"^\| both \| (first|bytes).* 200 \||no heartbeat \| rest",
     "stop_denied": "busy|fake",

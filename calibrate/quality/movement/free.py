@@ -94,11 +94,7 @@ class FreePostures(WindowTest[Row]):
 
     def forget(self) -> None:
         super().forget()
-        self._sums.clear()
         self._anew = []
-
-    def _before(self, counts: Counts | int, learned: bool) -> Array:
-        return self._learned if learned else self._sums.before(counts)
 
     def contrasts(self, windows: Counts, learned: bool = False) -> tuple[Array, Array]:
         after, before = self._sums.latest(windows), self._before(windows, learned)

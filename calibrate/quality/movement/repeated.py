@@ -98,7 +98,6 @@ class RepeatedPostures(WindowTest[Visit]):
 
     def forget(self) -> None:
         super().forget()
-        self._sums.clear()
         self._anew = {posture: [] for posture in range(len(self))}
         for visits in self._visits:
             visits.clear()
@@ -106,9 +105,6 @@ class RepeatedPostures(WindowTest[Visit]):
     def _count_all(self, posture: int, visits: Array) -> None:
         for y in visits:
             self._count(posture, y, np.median(visits, axis=0))
-
-    def _before(self, counts: Counts | int, learned: bool) -> Array:
-        return self._learned if learned else self._sums.before(counts)
 
     def contrasts(self, windows: Counts, learned: bool = False) -> tuple[Array, Array]:
         h, apart = _apart(self._sums.latest(windows), self._before(windows, learned))

@@ -108,6 +108,9 @@ class WindowTest(ABC, Generic[Entry]):
     """Log likelihood of the pictures learned from."""
     limit: float
     """Score that is an alarm."""
+    _sums: RunningSums
+    _learned: Array
+    """Sums of the pictures learned from."""
 
     def __init__(self, noise: float) -> None:
         self.noise = noise
@@ -139,8 +142,12 @@ class WindowTest(ABC, Generic[Entry]):
         `count` pictures, or fewer where some have nothing to be compared with.
         """
 
+    def _before(self, counts: Counts | int, learned: bool) -> Array:
+        return self._learned if learned else self._sums.before(counts)
+
     def forget(self) -> None:
         """Forget everything but what was learned: pictures are missing from here on."""
+        self._sums.clear()
         self.latest.clear()
         self._cusum, self._since = 0.0, 0
 

@@ -1,4 +1,4 @@
-"""Does `calibrate watch` stay quiet on real repeated postures, and notice a camera moved by calculation?
+"""False alarms of `calibrate watch` on real repeated postures, and delays of calculated moves.
 
 A Motoman arm came back some 20 times to each of six postures, seen by two fixed cameras (K. Stepanova et al.,
 Robotics and Computer-Integrated Manufacturing 73, 2022; github.com/ctu-vras/multirobot-calibration, commit

@@ -217,6 +217,8 @@ def _read(source: WatchSource, tag: BoardSpec, log: MonitorLog, teller: _Teller,
 def _open(path: Path, calibration: Calibration) -> WatchSource:
     if (path / DATASET_FILE).is_file():
         return _open_folder(path, calibration)
+    if path.is_socket():
+        raise WatchSourceError(f"{path} is a station.", remedy=f"Use `station watch --socket {path}`.")
     recording = open_recording(path)
     info, lens = recording.info, calibration.intrinsics.model
     require_same_cell(str(path), calibration, CellIdentity.of(info))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -150,6 +151,17 @@ def test_what_is_wrong_with_a_source_is_said_with_a_code(root: Path, tmp_path: P
     (production.folder / "dataset.yaml").write_text(yaml.safe_dump(stated))
     code, lines = watch(root, production.folder)
     assert code == 1 and lines[-1]["error"]["code"] == "watch-source"
+
+
+def test_a_station_is_watched_by_its_own_command(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # Unix sockets have short names
+    with socket.socket(socket.AF_UNIX) as station:
+        station.bind("here")
+        code, lines = watch(root, Path("here"))
+    assert code == 1 and lines[-1]["error"]["code"] == "watch-source"
+    assert "station watch --socket" in lines[-1]["error"]["remedy"]
 
 
 def test_a_recording_does_not_grow(root: Path, session_file: Path) -> None:

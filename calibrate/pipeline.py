@@ -17,10 +17,10 @@ from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration
 from calibrate.files.gate import Gate
+from calibrate.handeye.arm_result import Verification, verify_elsewhere
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Profile, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.handeye.workspace import Verification, verify_elsewhere
 from calibrate.lens.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty

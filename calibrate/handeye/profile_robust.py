@@ -9,6 +9,7 @@ import numpy as np
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.arm import FLEX, PARAMETERS, RELATIVE_SIGMA
+from calibrate.handeye.arm_result import table_result
 from calibrate.handeye.axxb.objective import pair_covariance
 from calibrate.handeye.axxb.pairs import all_pairs, mount_poses
 from calibrate.handeye.corners import boards_by_corners, corner_distance, corner_residuals
@@ -45,7 +46,6 @@ from calibrate.handeye.solution import (
     board_frames,
     camera_frames,
 )
-from calibrate.handeye.workspace import table_result
 from calibrate.results import BoardShape, HoldoutScore
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet

@@ -1,4 +1,4 @@
-"""The table of an arm as a result: what may be installed, how good each way is, what another recording says."""
+"""The table of an arm as a result: what may be installed, how good it is, what another recording says."""
 
 from __future__ import annotations
 

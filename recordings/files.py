@@ -151,10 +151,10 @@ def usable_cores() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
-def state_root(root: Path | None = None) -> Path:
+def state_root(root: Path | str | None = None) -> Path:
     """State folder of the station: `root`, $STATE_DIRECTORY (systemd), or the XDG state folder."""
     if root is not None:
-        return root
+        return Path(root)
     if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
         return Path(state)
     base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")

@@ -43,7 +43,7 @@ _NOT_REAL = ("simulated", "playback")
 
 
 # --- where calibrations lie ---
-def calibrations_folder(root: Path | None, camera: str = MAIN_CAMERA) -> Path:
+def calibrations_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
     """Folder of one camera's installed calibrations. InstallError for what is no name of a camera."""
     if not is_session_name(camera):
         raise InstallError(
@@ -53,7 +53,7 @@ def calibrations_folder(root: Path | None, camera: str = MAIN_CAMERA) -> Path:
     return folder if camera == MAIN_CAMERA else folder / "cameras" / camera
 
 
-def readable_folder(root: Path | None, camera: str = MAIN_CAMERA) -> Path:
+def readable_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
     """Folder of the calibrations; InstallError where it may not be looked into."""
     folder = calibrations_folder(root, camera)
     try:
@@ -67,7 +67,7 @@ def readable_folder(root: Path | None, camera: str = MAIN_CAMERA) -> Path:
     return folder
 
 
-def cameras(root: Path | None = None) -> list[str]:
+def cameras(root: Path | str | None = None) -> list[str]:
     """Names of the cameras for which something was ever installed below `root`, `main` first."""
     folder = readable_folder(root)
     others = sorted(path.parent.name for path in (folder / "cameras").glob("*/gen"))
@@ -243,7 +243,7 @@ class InstalledCalibration:
 
 
 def load_installed(
-    root: Path | None = None,
+    root: Path | str | None = None,
     allow_simulated: bool = False,
     *,
     camera: str = MAIN_CAMERA,
@@ -288,7 +288,7 @@ def load_installed(
     return found
 
 
-def _read(root: Path | None, camera: str) -> InstalledCalibration:
+def _read(root: Path | str | None, camera: str) -> InstalledCalibration:
     folder = readable_folder(root, camera)
     number, path = current_version(folder)
     plain = proven_plain(read_bounded(path), str(path))
@@ -332,7 +332,7 @@ class InstallationChange:
 
 
 def watch(
-    root: Path | None = None,
+    root: Path | str | None = None,
     *,
     camera: str = MAIN_CAMERA,
     poll_s: float = 1.0,
@@ -380,7 +380,7 @@ def _aged(installed: InstalledCalibration) -> bool:
     return installed.validity.at(datetime.now(UTC)).state is not installed.validity.state
 
 
-def _look(root: Path | None, camera: str, before: InstallationChange | None) -> InstallationChange:
+def _look(root: Path | str | None, camera: str, before: InstallationChange | None) -> InstallationChange:
     try:
         now = _read(root, camera)
     except CalibrationError as problem:

@@ -271,7 +271,7 @@ def _touching_calls(program: str, new: Path, template: Path, tmp_path: Path) -> 
 
 def test_consumers_get_frames_in_the_name(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     install(make_file(), tmp_path)
-    calibration = load_installed(tmp_path)
+    calibration = load_installed(str(tmp_path))  # as text, too
     assert (calibration.transform.parent, calibration.transform.child) == ("flange", "camera")
     assert calibration.intrinsics.model.width == 480
     assert (tmp_path / "calibrations/current").readlink().parts[0] == "gen"

@@ -179,6 +179,8 @@ class StatusStore:
 
     def __init__(self, status: StationStatus) -> None:
         self.status = status
+        self.entered = 0
+        """States entered so far: one that was left and entered again is another."""
         self._watchers: list[Callable[[], None]] = []
         self._listeners: list[Callable[[Event], None]] = []
 
@@ -217,6 +219,7 @@ class StatusStore:
         """`reason` for people, `cause` for programs. TransitionError for a step not in the table."""
         if state is not self.state:
             check_transition(self.state, state)
+            self.entered += 1
         if isinstance(reason, CodedError):
             cause = reason.code
         self.update(state=state, reason=str(reason), cause=cause)

@@ -47,7 +47,8 @@ class SessionSupervisor:
         self._monitor = Monitor(context)
         self._jogged, self._ticked, self._lost, self._first = jogged, ticked, lost, first
         self._failure = ""
-        self._rest_joints: Vector6 | None = None
+        self._rest: tuple[int, Vector6] | None = None
+        """Which pause it is, of `store.entered`, and the joints at rest in it."""
         self._stale_rounds = 0
         self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
         """Delay of each round."""
@@ -112,17 +113,16 @@ class SessionSupervisor:
         """Tells when somebody moves the arm while the session rests; any approval is void then."""
         context = self._context
         if context.store.state is not StationState.PAUSED:
-            self._rest_joints = None
             return
         try:
             state = context.cell.robot.latest()
         except RobotError:
             return
-        joints = state.joints_rad
-        if self._rest_joints is None:
+        pause, joints = context.store.entered, state.joints_rad
+        if self._rest is None or self._rest[0] != pause:
             if max(map(abs, state.joint_speeds_rad_s)) < RESTING_RAD_S:  # not while a halt still brakes
-                self._rest_joints = joints
+                self._rest = pause, joints
             return
-        if np.abs(np.subtract(joints, self._rest_joints)).max() > JOGGED_RAD:
-            self._jogged(displacement(context, self._rest_joints, joints))
-            self._rest_joints = joints
+        if np.abs(np.subtract(joints, self._rest[1])).max() > JOGGED_RAD:
+            self._jogged(displacement(context, self._rest[1], joints))
+            self._rest = pause, joints

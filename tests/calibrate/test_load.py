@@ -137,7 +137,7 @@ def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recordi
     original = encode_png(next(source.images())[1].pixels)
     recording = open_recording(path)
     part = recording.segments[0]
-    stored = part._parsed
+    stored = part.parsed_at
 
     def lying(*place: object) -> object:
         message = stored(*place)  # type: ignore[arg-type]
@@ -145,7 +145,7 @@ def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recordi
             message.data = larger(message.data)
         return message
 
-    part._parsed = lying  # type: ignore[method-assign]
+    part.parsed_at = lying  # type: ignore[method-assign]
     with raises_code(TooFewViewsError, "too-few-views", views=2, images=3):
         load_views(recording)
 

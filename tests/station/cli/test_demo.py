@@ -20,7 +20,7 @@ from station.cli.demo import DemoError, DemoJson, _solve
 @pytest.mark.timeout(900)
 def test_the_demo_finds_the_truth(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "station.cli", "demo", "--headless", "--json", "--seed", "4"]
-    command += ["--out", str(tmp_path), "--poses", "12", "--time-scale", "4"]
+    command += ["--out", str(tmp_path), "--poses", "12", "--time-scale", "2"]
     done = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     assert done.returncode in (0, 4), done.stderr  # 12 poses may be too few for a gate
     result = json.loads(done.stdout)

@@ -74,10 +74,7 @@ def make_calibration(
         source=info.source,
         mount=solution.mount,
         result=FramePose.of(X),
-        sigma=Sigma(
-            1e3 * float(np.sqrt(np.trace(covariance[:3, :3]))),
-            _DEG * float(np.sqrt(np.trace(covariance[3:, 3:]))),
-        ),
+        sigma=Sigma.of(covariance),
         covariance=tuple(tuple(row) for row in covariance.tolist()),
         confidence_threshold=float(solution.confidence_threshold),
         board_place=FramePose.of(solution.board_place),

@@ -6,6 +6,7 @@ otherwise; covariances are of `geometry.perturb`'s delta.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, Literal
 
@@ -72,6 +73,12 @@ class Sigma(msgspec.Struct, frozen=True):
     translation_mm: float
     """Root mean squared length of the translation's error."""
     rotation_deg: float
+
+    @classmethod
+    def of(cls, covariance: ArrayLike) -> Sigma:
+        """Take it from a covariance that begins with those of δt (m) and δφ (rad)."""
+        shift, turn = np.sqrt(np.diag(np.asarray(covariance))[:6].reshape(2, 3).sum(axis=1)).tolist()
+        return cls(1e3 * shift, math.degrees(turn))
 
 
 class ViewWeight(msgspec.Struct, frozen=True):

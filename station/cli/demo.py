@@ -129,9 +129,10 @@ def _show_demo(result: DemoJson, duration_s: float) -> None:
     table = Table(title=f"SIMULATED cell, seed {result.seed}: {result.mount}, {result.scene} scene")
     for heading in ("", "translation", "rotation"):
         table.add_column(heading, justify="left" if not heading else "right")
+    on_table = ", with the arm's table" if result.arm.offered else ""
     for name, value in (
-        ("error against the truth", result.truth_error),
-        ("standard uncertainty", result.sigma),
+        (f"error against the truth{on_table}", result.truth_error),
+        (f"standard uncertainty{on_table}", result.sigma),
     ):
         table.add_row(name, f"{value.translation_mm:.3f} mm", f"{value.rotation_deg:.4f}°")
     out.print(table)
@@ -161,11 +162,13 @@ def _run(
     solved = _solve(recording, calibration, report)
     arm = solved.arm_table
     # The camera's true pose is that on the true arm: the X of the corrected one is to be compared with it.
-    own = solved.result if arm is None or arm.result is None else arm.result
+    own, sigma = solved.result, solved.sigma
+    if arm is not None and arm.result is not None:
+        own, sigma = arm.result, Sigma.of(arm.covariance)
     return DemoJson(
         **cell,
         truth_error=ErrorJson(*truth_error(recording, own.matrix)),
-        sigma=solved.sigma,
+        sigma=sigma,
         poses=PosesJson(outcome.planned, outcome.captured),
         recording=str(recording),
         calibration=str(calibration),

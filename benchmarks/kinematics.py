@@ -14,7 +14,7 @@ from benchmarks.imperfect_cells import table_errors
 from benchmarks.scene import LOW, PAPER_X, CellNoise, grid, make_cell, pose_arrays, view_set
 from benchmarks.trials import rms, share_spread, table, trials
 from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp
-from calibrate.handeye.arm import by_parameters
+from calibrate.handeye.arm import PARAMETERS, by_parameters
 from calibrate.handeye.axxb.peer_methods import HAND_EYE, opencv_hand_eye
 from calibrate.handeye.metrics import board_spread
 from calibrate.handeye.solve import SolveOptions, solve_views
@@ -71,7 +71,7 @@ def _row(size_mm: float, count: int) -> list[str]:
         assert arm is not None
         detected += arm.detected
         park = opencv_hand_eye(*pose_arrays(worn.views), HAND_EYE["Park-Martin"])
-        found = np.array([value for value, _ in arm.errors.values()])
+        found = np.array([arm.errors[name][0] for name in PARAMETERS])
         reported = forward(_MODEL, worn.new_joints)
         corrected = perturb(reported, by_parameters(_MODEL, worn.new_joints) @ found)
         for j, (poses, X) in enumerate(((reported, park), (corrected, solution.matrix))):

@@ -21,7 +21,7 @@ from calibrate.geometry import difference
 
 CONSTANTS = {
     "calibrate.handeye.estimate": ("FULL", "REJECTED", "_SETTLED"),
-    "calibrate.handeye.fit": ("_SIZES", "_NARROW", "_CLEARLY"),
+    "calibrate.handeye.fit": ("_SIZES", "_BENDS", "_NARROW", "_CLEARLY"),
     "calibrate.handeye.linear": (
         "GARBAGE_M",
         "GARBAGE_RAD",

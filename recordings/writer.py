@@ -23,6 +23,7 @@ from recordings.errors import RecordingError, disk_error, exists_error, recover_
 from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, rename_new, sync_folder
 from recordings.images import ImageError, encode_png, read_header
 from recordings.mcap.records import with_crc
+from recordings.mcap.source import Message
 from recordings.mcap.writer import McapFile, Piece
 from recordings.scene import Entity, scene_update
 from recordings.schema import viewing
@@ -184,6 +185,10 @@ class RecordingWriter:
         time_ns = self._start_ns if stamps is None else self._time_ns(stamps)
         message = viewing.frame_transform(parent, child, parent_from_child, time_ns)
         self._show(Topic.BOARD_TRANSFORM if child == "board" else Topic.FIXED_TRANSFORM, message, time_ns)
+
+    def shown(self, topic: Topic, message: Message) -> None:
+        """What another recording of the session shows viewers, as it stands there."""
+        self._add(topic, [message.data], message.time_ns)
 
     def _show(self, topic: Topic, message: Any, time_ns: int) -> None:
         self._add(topic, [message.SerializeToString()], time_ns)

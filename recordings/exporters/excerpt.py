@@ -9,9 +9,12 @@ import msgspec
 
 from recordings.reader import Recording
 from recordings.schema.messages import RobotState
+from recordings.schema.topics import Topic
 from recordings.writer import derived_recording
 
 _NS = 1_000_000_000
+_SHOWN = (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM, Topic.ANNOTATIONS)
+"""For viewers only, small, and made by nothing else that is kept."""
 
 
 def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> Path:
@@ -34,6 +37,9 @@ def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> 
         for segment in recording.segments:
             for reading in segment.clock_readings():
                 writer.clock_reading(reading)
+            for topic in _SHOWN:
+                for message in segment.stored(topic):
+                    writer.shown(topic, message)
         for sequence, (view, image) in enumerate(recording.images()):
             writer.image(msgspec.structs.replace(image, sequence=sequence))
             writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))

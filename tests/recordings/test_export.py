@@ -22,7 +22,8 @@ from recordings.exporters.folder import Target, export_recording
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel, FrameTime, Stamps
-from recordings.schema.viewing import quaternion_xyzw
+from recordings.schema.topics import Topic
+from recordings.schema.viewing import DETECTED, Marks, quaternion_xyzw
 from recordings.writer import RecordingWriter
 from tests.command_line import call
 from tests.recordings.small_recording import (
@@ -106,10 +107,12 @@ def test_an_export_that_fails_halfway_leaves_nothing(small: Path, tmp_path: Path
 def test_an_excerpt_keeps_the_views_and_the_states_around_them(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.attach("plan.yaml", "application/yaml", b"poses: 2\n")
+        writer.frame("base", "board", TURNED)
         for count in range(1000):  # 2 s at 500 Hz
             writer.robot_state(make_state(count))
         for sequence, (index, attempt, at_s) in enumerate([(0, 1, 0.2), (0, 2, 0.5), (1, 1, 1.5)]):
             writer.image(make_picture(sequence))
+            writer.marks(sequence, [Marks(np.array([[3.0, 4.0]]), DETECTED)])
             stamps = Stamps(host_monotonic_ns=round(at_s * 1e9), host_wall_ns=START_NS)
             writer.view(msgspec.structs.replace(make_view(index, sequence, attempt), stamps=stamps))
         original = open_recording(writer.finish())
@@ -121,6 +124,9 @@ def test_an_excerpt_keeps_the_views_and_the_states_around_them(tmp_path: Path) -
         [0.4 + 0.002 * i for i in range(101)] + [1.4 + 0.002 * i for i in range(101)]
     )
     assert excerpt.attachments() == original.attachments()
+    (whole,), (part,) = original.segments, excerpt.segments
+    assert part.fixed_frames == whole.fixed_frames != {}
+    assert [*part.stored(Topic.ANNOTATIONS)] == [*whole.stored(Topic.ANNOTATIONS)] != []
 
 
 @pytest.mark.parametrize("make", ["import", "excerpt"])

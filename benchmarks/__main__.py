@@ -36,7 +36,7 @@ SHOWN: dict[str, str] = {
     "kinematics": r"^\| (0|0.5) \|",
     "arm_table": r"^\| 0.3 mm, (measured|usual), 50 planned \| \d+ \|",
     "mistakes": r"^\*\*",
-    "constants": r"FULL` × 0|SIZES|CLEARLY` × 0|STUDENT|ROBOT_PRIOR_M|ASPECT",
+    "constants": r"FULL` × 0|BENDS|CLEARLY` × 0|STUDENT|ROBOT_PRIOR_M|ASPECT",
     "detection": r"^\| (good|20°) ",
     "speed": r"^\| (18|4950) \|",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",

@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.imperfect_cells import BOARD, LENSES, _look
 from benchmarks.real_sets import real_sets
 from benchmarks.scene import grid
-from benchmarks.trials import rms, share_spread, table, trials
+from benchmarks.trials import in_processes, rms, share_spread, table, trials
 from calibrate.geometry import (
     Array,
     difference,
@@ -309,14 +309,16 @@ ROWS = (
 
 
 def run() -> str:
-    found = {
-        row.name: [
-            measure(seed, row.mount, row.size, row.told, row.views, row.planned)
-            for seed in range(trials(row.cells))
-        ]
-        for row in ROWS
-    }
+    tasks = [(row, seed) for row in ROWS for seed in range(trials(row.cells))]
+    found: dict[str, list[dict[str, float]]] = {row.name: [] for row in ROWS}
+    for (row, _), cell in zip(tasks, in_processes(_measured, tasks), strict=True):
+        found[row.name].append(cell)
     return described(found) + "\n\n" + of_real_arms()
+
+
+def _measured(task: tuple[Row, int]) -> dict[str, float]:
+    row, seed = task
+    return measure(seed, row.mount, row.size, row.told, row.views, row.planned)
 
 
 REAL = {"ur3a-two-swapped": "UR3", "ur5-chessboard": "UR5"}

@@ -6,7 +6,7 @@ most MAX_STEPS linearisations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,18 @@ FULL = 0.35
 """A view whose chance to be an ordinary one is larger than this counts fully."""
 _SETTLED = 0.01
 """Length of a step, in sigmas of all unknowns together."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeanParts:
+    """Estimates that one is the mean of: tails of a mean of normal distributions are heavier than one's."""
+
+    chances: Array = field(default_factory=lambda: np.ones(1))
+    """(s,)"""
+    camera_ratio: Array = field(default_factory=lambda: np.ones(1))
+    """(s,) variance of X over the mean's."""
+    table_ratio: Array = field(default_factory=lambda: np.ones(1))
+    """(s,) the same for the errors of the arm's table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +61,7 @@ class Estimate:
     log_evidence: float
     steps: int
     converged: bool
-    averaged: tuple[Array, Array, Array] = (np.ones(1), np.ones(1), np.ones(1))
-    """(s,) chances of the estimates that this one is the mean of; the variance of each over the mean's, of X
-    and of the arm's table: the tails of a mean of normal distributions are heavier than one's."""
+    mean_of: MeanParts = field(default_factory=MeanParts)
 
     @property
     def weight(self) -> Array:
@@ -66,16 +76,16 @@ class Estimate:
     @property
     def threshold(self) -> float:
         """95 % region δᵀ C⁻¹ δ of X: 6·F(6, ν), ν = 3n - 6 of the n views that count."""
-        return self._region(1)
+        return self._region(self.mean_of.camera_ratio)
 
     @property
     def table_threshold(self) -> float:
         """The same for the six errors of a flange, by those of the arm's table."""
-        return self._region(2)
+        return self._region(self.mean_of.table_ratio)
 
-    def _region(self, part: int) -> float:
+    def _region(self, ratio: Array) -> float:
         freedom = max(3.0 * float(self.chances[:, 0].sum()) - 6.0 + ROBOT_PRIOR_COUNT, 1.0)
-        chances, ratio = self.averaged[0], self.averaged[part]
+        chances = self.mean_of.chances
         one = float(6 * special.fdtri(6, freedom, 0.95))
         if len(chances) == 1:
             return one

@@ -18,7 +18,7 @@ from calibrate.handeye.arm import (
 )
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
-from calibrate.handeye.estimate import Estimate, corner_weights, estimate
+from calibrate.handeye.estimate import Estimate, MeanParts, corner_weights, estimate
 from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.observations import (
@@ -182,7 +182,9 @@ def allow_for_table(
         board_poses=linear.seen_boards(before.C),
         corner_weights=weights,
         log_evidence=float(log_all),
-        averaged=(chances, _against(spread, covariance, at.X), _against(spread, covariance, by_table)),
+        mean_of=MeanParts(
+            chances, _against(spread, covariance, at.X), _against(spread, covariance, by_table)
+        ),
     )
     return with_table, log_bayes
 

@@ -11,6 +11,7 @@ from scipy import stats
 from benchmarks.kinematics import worn_cell
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye.arm import PARAMETERS, arm_postures, by_parameters
+from calibrate.handeye.estimate import MeanParts
 from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import SolveOptions, solve_views
@@ -79,7 +80,7 @@ def test_the_region_of_an_average_holds_95_percent_of_it():
     found = fit_cell(views, Priors(LensPrior.given(views.camera)), 0)
     assert found.estimate.scales.table[0] > 0.2 > found.estimate.scales.table[-1], "the bracket is rigid"
     chances, widths = np.array([0.5, 0.3, 0.2]), np.array([0.2, 0.8, 3.3])
-    average = replace(found.estimate, averaged=(chances, widths, np.ones(3)))
+    average = replace(found.estimate, mean_of=MeanParts(chances, widths, np.ones(3)))
     rng, n = np.random.default_rng(0), 200_000
     freedom = 3 * average.chances[:, 0].sum() - 5
     drawn = rng.choice(widths, n, p=chances) * 6 * rng.f(6, freedom, n)

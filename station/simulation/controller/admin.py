@@ -13,7 +13,7 @@ from math import inf, isfinite
 
 from station.simulation.controller.arm import Vibration
 from station.simulation.controller.interpreted import InterpretedProgram
-from station.simulation.controller.kinematics import ArmGeometry, Six
+from station.simulation.controller.kinematics import ArmGeometry, Vector
 from station.simulation.controller.machine import Machine
 from station.simulation.controller.network import Cut
 from station.simulation.controller.paths import JointPath, Path, UnreachableError
@@ -36,7 +36,7 @@ def number(name: str, value: float, low: float = -inf, high: float = inf) -> flo
     return checked
 
 
-def numbers(name: str, values: Sequence[float] | None, count: int) -> Six:
+def numbers(name: str, values: Sequence[float] | None, count: int) -> Vector:
     """Exactly so many finite numbers; zeros for None."""
     if values is None:
         return (0.0,) * count
@@ -252,7 +252,7 @@ def hand_move(machine: Machine, path: list[list[float]], speed_rad_s: float = 0.
     corners = [numbers("path", corner, 6) for corner in path]
     speed_rad_s = number("speed_rad_s", speed_rad_s, 1e-3, 100.0)
 
-    def make_path(start: Six) -> Path:
+    def make_path(start: Vector) -> Path:
         return JointPath(start, *corners)
 
     length_rad = JointPath(robot.arm.command, *corners).length

@@ -10,7 +10,7 @@ from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
     ArmGeometry,
     Rigid,
-    Six,
+    Vector,
     between,
     compose,
     forward,
@@ -31,14 +31,14 @@ SCALE_PER_S = 5.0
 """Rate at which the speed scaling follows the slider or a pause."""
 PROGRAM_END_RAD_S2 = 4.0
 """Deceleration when the program ends under a motion."""
-ZERO: Six = (0.0,) * 6
+ZERO: Vector = (0.0,) * 6
 
 JOINT_SPEED_RAD_S = pi
 """No joint goes faster, whatever a script asks for."""
 
-MakePath = Callable[[Six], Path]
+MakePath = Callable[[Vector], Path]
 """Joints where the motion begins → its path."""
-Speeds = Callable[[Six, float], Six]
+Speeds = Callable[[Vector, float], Vector]
 """Commanded joints and the cycle's length [s] → the joint speeds wanted now. Raises UnreachableError."""
 SPAN_S = 15.0
 
@@ -60,12 +60,12 @@ class JointMotion:
 class Stream(JointMotion):
     """A motion without an end, whose speeds are asked for in every cycle: servoj, speedj and their kin."""
 
-    def __init__(self, wanted: Speeds, acceleration: float, speeds: Six) -> None:
+    def __init__(self, wanted: Speeds, acceleration: float, speeds: Vector) -> None:
         super().__init__(JointPath, 0.0, acceleration)
         self.wanted = wanted
         self.speeds = speeds
 
-    def step(self, joints: Six, dt_s: float, scale: float) -> Six:
+    def step(self, joints: Vector, dt_s: float, scale: float) -> Vector:
         """The next joints: all speeds change together, the leading one by at most the acceleration."""
         wanted = ZERO if self.braking else self.wanted(joints, dt_s)
         fastest = max(map(abs, wanted))
@@ -98,7 +98,7 @@ class Vibration:
 class SimulatedArm:
     """Joints that move in time. Speeds in rad/s of simulated time; `scale` is slider × pause."""
 
-    def __init__(self, table: ArmGeometry, joints_rad: Six, draw_miss: Callable[[], Six]) -> None:
+    def __init__(self, table: ArmGeometry, joints_rad: Vector, draw_miss: Callable[[], Vector]) -> None:
         self.table = table
         self.flange_from_tcp: Rigid = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
         self.command = joints_rad
@@ -113,9 +113,9 @@ class SimulatedArm:
         self.miss = draw_miss()
         """(6,) [δt (m), δφ (rad)] by which the true flange misses its pose now."""
         self._misses = (self.miss, self.miss)
-        self.offset: Six = ZERO
+        self.offset: Vector = ZERO
         """Joints where the arm rests short of its command; takes effect with the next motion."""
-        self._offset_now: Six = ZERO
+        self._offset_now: Vector = ZERO
         self.vibration: Vibration | None = None
 
     @property
@@ -145,7 +145,7 @@ class SimulatedArm:
         return isinstance(self.motion, Stream) and not self.motion.braking
 
     @property
-    def stream_speeds(self) -> Six:
+    def stream_speeds(self) -> Vector:
         """Joint speeds a stream goes on from: those of the running one, before the slider scales them."""
         return self.motion.speeds if self.streams else self.command_speed  # type: ignore[union-attr]
 
@@ -285,10 +285,10 @@ class History:
 
     def __init__(self, dt_s: float) -> None:
         self._size = int(SPAN_S / dt_s)
-        self._ring: list[tuple[int, Six, Six]] = [(0, (), ())] * self._size
+        self._ring: list[tuple[int, Vector, Vector]] = [(0, (), ())] * self._size
         self._count = 0
 
-    def add(self, monotonic_ns: int, joints: Six, miss: Six) -> None:
+    def add(self, monotonic_ns: int, joints: Vector, miss: Vector) -> None:
         self._ring[self._count % self._size] = (monotonic_ns, joints, miss)
         self._count += 1
 
@@ -296,7 +296,7 @@ class History:
     def newest_ns(self) -> int:
         return self._ring[(self._count - 1) % self._size][0] if self._count else 0
 
-    def at(self, monotonic_ns: int) -> tuple[Six, Six]:
+    def at(self, monotonic_ns: int) -> tuple[Vector, Vector]:
         """Joints and miss at that time. LookupError when it is older than the ring or not yet reached."""
         low, high = max(0, self._count - self._size), self._count - 1
         if high < 0 or not self._time(low) <= monotonic_ns <= self._time(high):
@@ -312,7 +312,7 @@ class History:
         u = (monotonic_ns - t0) / (t1 - t0) if t1 > t0 else 0.0
         return between(q0, q1, u), between(m0, m1, u)
 
-    def before(self, cycles: int) -> Six:
+    def before(self, cycles: int) -> Vector:
         """Joints so many cycles ago, or as long ago as is known."""
         return self._ring[(self._count - 1 - min(cycles, self._count - 1, self._size - 1)) % self._size][1]
 

@@ -10,7 +10,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from station.simulation.controller.kinematics import ArmGeometry, Rigid, Six, cross, dot, frames, place, plus
+from station.simulation.controller.kinematics import (
+    ArmGeometry,
+    Rigid,
+    Vector,
+    cross,
+    dot,
+    frames,
+    place,
+    plus,
+)
 
 Matrix = list[list[float]]
 
@@ -24,17 +33,17 @@ class Body(NamedTuple):
     link: int
     """1…6: behind which joint."""
     mass_kg: float
-    place_m: Six
+    place_m: Vector
     """In the frame of its link."""
 
 
 class Drives(NamedTuple):
     bodies: tuple[Body, ...]
-    most_nm: Six
+    most_nm: Vector
     """No joint gives more torque."""
 
 
-def _links(*masses: tuple[float, Six]) -> tuple[Body, ...]:
+def _links(*masses: tuple[float, Vector]) -> tuple[Body, ...]:
     return tuple(Body(i, *mass) for i, mass in enumerate(masses, 1))
 
 
@@ -75,26 +84,26 @@ class Posture:
     point on it), so M is the sum of m JᵀJ over the bodies, and C that of m Jᵀ J̇ q̇.
     """
 
-    def __init__(self, table: ArmGeometry, joints_rad: Six, speeds_rad_s: Six) -> None:
+    def __init__(self, table: ArmGeometry, joints_rad: Vector, speeds_rad_s: Vector) -> None:
         self._frames = frames(table, joints_rad)
         self._speeds = speeds_rad_s
-        self._axes: list[Six] = [(T[2], T[6], T[10]) for T in self._frames[:-1]]
-        self._points: list[Six] = [place(T) for T in self._frames[:-1]]
+        self._axes: list[Vector] = [(T[2], T[6], T[10]) for T in self._frames[:-1]]
+        self._points: list[Vector] = [place(T) for T in self._frames[:-1]]
         self._velocities = [self._velocity(p, j) for j, p in enumerate(self._points)]
-        turns: list[Six] = [(0.0, 0.0, 0.0)]
+        turns: list[Vector] = [(0.0, 0.0, 0.0)]
         for axis, speed in zip(self._axes, speeds_rad_s, strict=True):
             turns.append(plus(turns[-1], axis, speed))
         self._axis_rates = [cross(turn, axis) for turn, axis in zip(turns, self._axes, strict=False)]
 
-    def _columns(self, x: Six, link: int) -> list[Six]:
+    def _columns(self, x: Vector, link: int) -> list[Vector]:
         """Compute how fast a point of a link moves per speed of each joint before it."""
         pairs = zip(self._axes[:link], self._points, strict=False)
         return [cross(z, plus(x, p, -1)) for z, p in pairs]
 
-    def _velocity(self, x: Six, link: int) -> Six:
+    def _velocity(self, x: Vector, link: int) -> Vector:
         return _combined(self._columns(x, link), self._speeds)
 
-    def _column_rates(self, x: Six, link: int) -> list[Six]:
+    def _column_rates(self, x: Vector, link: int) -> list[Vector]:
         v = self._velocity(x, link)
         return [
             plus(
@@ -104,7 +113,7 @@ class Posture:
             for j in range(link)
         ]
 
-    def _placed(self, body: Body) -> Six:
+    def _placed(self, body: Body) -> Vector:
         T, (x, y, z) = self._frames[body.link], body.place_m
         return (
             T[0] * x + T[1] * y + T[2] * z + T[3],
@@ -132,7 +141,7 @@ class Posture:
                 torques[j] += body.mass_kg * dot(column, acceleration)
         return torques
 
-    def accelerations(self, bodies: Sequence[Body], most_nm: Six, torques_nm: Six) -> list[float]:
+    def accelerations(self, bodies: Sequence[Body], most_nm: Vector, torques_nm: Vector) -> list[float]:
         """(6,) [rad/s²] that torques give beside those against gravity; none is larger than most_nm."""
         left = [
             max(-most, min(most, torque)) - c - FRICTION_S * most * speed
@@ -166,12 +175,12 @@ def solved(M: Matrix, right: Sequence[float]) -> list[float]:
     return found
 
 
-def _rows(linear: Sequence[Six], angular: Sequence[Six]) -> Matrix:
+def _rows(linear: Sequence[Vector], angular: Sequence[Vector]) -> Matrix:
     return [list(row) for columns in (linear, angular) for row in zip(*columns, strict=True)]
 
 
-def _combined(vectors: Sequence[Six], shares: Sequence[float]) -> Six:
-    total: Six = (0.0, 0.0, 0.0)
+def _combined(vectors: Sequence[Vector], shares: Sequence[float]) -> Vector:
+    total: Vector = (0.0, 0.0, 0.0)
     for vector, share in zip(vectors, shares, strict=False):
         total = plus(total, vector, share)
     return total

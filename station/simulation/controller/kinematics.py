@@ -13,7 +13,8 @@ from math import acos, atan2, cos, hypot, pi, sin, sqrt
 
 Rigid = tuple[float, ...]
 """(12,) r00 r01 r02 tx r10 r11 r12 ty r20 r21 r22 tz"""
-Six = tuple[float, ...]
+Vector = tuple[float, ...]
+"""(6,) one number a joint, or (3,) x, y, z."""
 
 IDENTITY: Rigid = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 JOINT_LIMIT_RAD = 2 * pi
@@ -21,15 +22,15 @@ JOINT_LIMIT_RAD = 2 * pi
 
 @dataclass(frozen=True)
 class ArmGeometry:
-    a_m: Six
-    d_m: Six
-    alpha_rad: Six = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
-    theta_rad: Six = (0.0,) * 6
+    a_m: Vector
+    d_m: Vector
+    alpha_rad: Vector = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
+    theta_rad: Vector = (0.0,) * 6
     published: ArmGeometry | None = field(default=None, compare=False)
     """The table it was made from; None: it is one itself."""
 
-    def plus(self, a_m: Six, d_m: Six, alpha_rad: Six, theta_rad: Six) -> ArmGeometry:
-        def add(x: Six, y: Six) -> Six:
+    def plus(self, a_m: Vector, d_m: Vector, alpha_rad: Vector, theta_rad: Vector) -> ArmGeometry:
+        def add(x: Vector, y: Vector) -> Vector:
             return tuple(i + j for i, j in zip(x, y, strict=True))
 
         return ArmGeometry(
@@ -56,24 +57,24 @@ TABLES = {
 }
 
 
-def place(T: Rigid) -> Six:
+def place(T: Rigid) -> Vector:
     """(3,) where its origin is."""
     return (T[3], T[7], T[11])
 
 
-def between(first: Six, second: Six, share: float) -> Six:
+def between(first: Vector, second: Vector, share: float) -> Vector:
     return tuple(a + share * (b - a) for a, b in zip(first, second, strict=True))
 
 
-def plus(a: Six, b: Six, times: float = 1.0) -> Six:
+def plus(a: Vector, b: Vector, times: float = 1.0) -> Vector:
     return (a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2])
 
 
-def dot(a: Six, b: Six) -> float:
+def dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a: Six, b: Six) -> Six:
+def cross(a: Vector, b: Vector) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
@@ -143,17 +144,17 @@ def to_rotvec(A: Rigid) -> tuple[float, float, float]:
     return x * scale, y * scale, z * scale
 
 
-def from_pose(pose: Six) -> Rigid:
+def from_pose(pose: Vector) -> Rigid:
     """UR pose: x y z [m], rotation vector [rad]."""
     x, y, z, rx, ry, rz = pose
     return from_rotvec(rx, ry, rz, x, y, z)
 
 
-def to_pose(A: Rigid) -> Six:
+def to_pose(A: Rigid) -> Vector:
     return (A[3], A[7], A[11], *to_rotvec(A))
 
 
-def frames(table: ArmGeometry, joints_rad: Six) -> list[Rigid]:
+def frames(table: ArmGeometry, joints_rad: Vector) -> list[Rigid]:
     """The base's own frame, then that of every link, in base; the last is the flange's."""
     found = [IDENTITY]
     for q, theta, a, d, alpha in zip(
@@ -165,12 +166,12 @@ def frames(table: ArmGeometry, joints_rad: Six) -> list[Rigid]:
     return found
 
 
-def forward(table: ArmGeometry, joints_rad: Six) -> Rigid:
+def forward(table: ArmGeometry, joints_rad: Vector) -> Rigid:
     """base_from_flange."""
     return frames(table, joints_rad)[-1]
 
 
-def inverse_all(table: ArmGeometry, base_from_flange: Rigid) -> list[Six]:
+def inverse_all(table: ArmGeometry, base_from_flange: Rigid) -> list[Vector]:
     """Every solution of the nominal geometry, at most 8. At a wrist singularity: those with wrist 3 = 0.
 
     Derived from the geometry: the wrist's centre lies d4 beside the plane of the arm (2 × q1); the angle
@@ -183,7 +184,7 @@ def inverse_all(table: ArmGeometry, base_from_flange: Rigid) -> list[Six]:
     radius = hypot(wx, wy)
     if radius < d4:
         return []
-    solutions: list[Six] = []
+    solutions: list[Vector] = []
     beside = acos(d4 / radius)
     for side in (beside, -beside):
         q1 = atan2(wy, wx) + pi / 2 + side
@@ -214,7 +215,7 @@ def _wrap(angle: float) -> float:
     return (angle + pi) % (2 * pi) - pi
 
 
-def inverse_nearest(table: ArmGeometry, base_from_flange: Rigid, near_rad: Six) -> Six | None:
+def inverse_nearest(table: ArmGeometry, base_from_flange: Rigid, near_rad: Vector) -> Vector | None:
     """The solution nearest to `near_rad` (largest joint difference), turns chosen within ±2π; or None."""
     published = table.published
     if published is None:
@@ -230,7 +231,7 @@ def inverse_nearest(table: ArmGeometry, base_from_flange: Rigid, near_rad: Six) 
     return joints
 
 
-def _nearest(table: ArmGeometry, base_from_flange: Rigid, near_rad: Six) -> Six | None:
+def _nearest(table: ArmGeometry, base_from_flange: Rigid, near_rad: Vector) -> Vector | None:
     best, best_distance = None, float("inf")
     for solution in inverse_all(table, base_from_flange):
         turned = tuple(_nearest_turn(q, near) for q, near in zip(solution, near_rad, strict=True))

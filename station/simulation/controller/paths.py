@@ -15,7 +15,7 @@ from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
     ArmGeometry,
     Rigid,
-    Six,
+    Vector,
     between,
     compose,
     cross,
@@ -38,14 +38,14 @@ class Path(Protocol):
     @property
     def length(self) -> float: ...
 
-    def at(self, s: float) -> Six:
+    def at(self, s: float) -> Vector:
         """Joints at s. Asked for in increasing order. Raises UnreachableError."""
 
 
 class JointPath:
     """Through given joints one after the other, all joints together, each in proportion to its own way."""
 
-    def __init__(self, start: Six, *goals: Six) -> None:
+    def __init__(self, start: Vector, *goals: Vector) -> None:
         if any(not abs(q) <= JOINT_LIMIT_RAD for goal in goals for q in goal):
             raise UnreachableError(f"joints {goals} are outside ±2π")
         self._corners = (start, *goals)
@@ -55,7 +55,7 @@ class JointPath:
             self._ends.append(self._ends[-1] + step)
         self.length = self._ends[-1]
 
-    def at(self, s: float) -> Six:
+    def at(self, s: float) -> Vector:
         for i, end in enumerate(self._ends[1:]):
             if s < end:
                 begin = self._ends[i]
@@ -66,7 +66,9 @@ class JointPath:
 class LinePath:
     """The tool's point on a straight line, the tool turning about one fixed axis; the nearest inverse."""
 
-    def __init__(self, table: ArmGeometry, flange_from_tcp: Rigid, start: Six, base_from_goal: Rigid) -> None:
+    def __init__(
+        self, table: ArmGeometry, flange_from_tcp: Rigid, start: Vector, base_from_goal: Rigid
+    ) -> None:
         self._table = table
         self._tcp_from_flange = invert(flange_from_tcp)
         self._first = compose(forward(table, start), flange_from_tcp)
@@ -80,11 +82,11 @@ class LinePath:
         if goal is None:
             raise UnreachableError(f"no joints reach {base_from_goal}")
 
-    def _place(self, u: float) -> Six:
+    def _place(self, u: float) -> Vector:
         """The tool's point at this share of the way."""
         return plus(place(self._first), self._way, u)
 
-    def at(self, s: float) -> Six:
+    def at(self, s: float) -> Vector:
         u = min(s / self.length, 1.0) if self.length > 0 else 1.0
         x, y, z = self._turn
         turned = compose(self._first, from_rotvec(u * x, u * y, u * z))
@@ -104,7 +106,7 @@ class ArcPath(LinePath):
         self,
         table: ArmGeometry,
         flange_from_tcp: Rigid,
-        start: Six,
+        start: Vector,
         base_from_via: Rigid,
         base_from_goal: Rigid,
     ) -> None:
@@ -124,7 +126,7 @@ class ArcPath(LinePath):
         self._angle = atan2(dot(last, self._v), dot(last, self._u)) % (2 * pi)
         self.length = sqrt(dot(self._u, self._u)) * self._angle
 
-    def _place(self, u: float) -> Six:
+    def _place(self, u: float) -> Vector:
         c, s = cos(u * self._angle), sin(u * self._angle)
         return tuple(m + c * x + s * y for m, x, y in zip(self._centre, self._u, self._v, strict=True))
 

@@ -14,7 +14,7 @@ from station.simulation.controller.arm import PROGRAM_END_RAD_S2, JointMotion, M
 from station.simulation.controller.interpreted import InterpretedProgram
 from station.simulation.controller.kinematics import (
     Rigid,
-    Six,
+    Vector,
     compose,
     forward,
     from_rotvec,
@@ -307,7 +307,7 @@ class SimulatedRobot(ControllerState):
             self._safety_since_s = self.time_s
         self.safety_mode = mode
 
-    def true_flange(self, joints: Six, miss: Six) -> Rigid:
+    def true_flange(self, joints: Vector, miss: Vector) -> Rigid:
         """base_from_flange with the arm's real lengths and its repeatability error."""
         T = forward(self.true_table, joints)
         turned = compose(from_rotvec(*miss[3:]), T)

@@ -13,7 +13,7 @@ from station.simulation.controller.dynamics import DRIVES, Body, Posture
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
     Rigid,
-    Six,
+    Vector,
     between,
     compose,
     forward,
@@ -81,7 +81,7 @@ class ArmMotions:
 
     # -- kinematics -------------------------------------------------------------------------------------
 
-    def _tool(self, joints: Six) -> Rigid:
+    def _tool(self, joints: Vector) -> Rigid:
         return compose(forward(self._robot.table, joints), from_pose(self._robot.tcp))
 
     def _forward(self, q: list[float] | None = None, tcp: Pose | None = None) -> Pose:
@@ -89,7 +89,7 @@ class ArmMotions:
         offset = self._robot.tcp if tcp is None else six(tcp)
         return pose_of(compose(forward(self._robot.table, joints), from_pose(offset)))
 
-    def _solved(self, pose: Rigid, near: Six, tcp: list[float] | None = None) -> Six | None:
+    def _solved(self, pose: Rigid, near: Vector, tcp: list[float] | None = None) -> Vector | None:
         offset = from_pose(self._robot.tcp if tcp is None else six(tcp))
         return inverse_nearest(self._robot.table, compose(pose, invert(offset)), near)
 
@@ -120,7 +120,7 @@ class ArmMotions:
 
     # -- motion -----------------------------------------------------------------------------------------
 
-    def _joints(self, target: list[float]) -> Six:
+    def _joints(self, target: list[float]) -> Vector:
         return tuple(self._inverse(target)) if isinstance(target, Pose) else six(target)
 
     def _pose(self, target: list[float]) -> Rigid:
@@ -158,7 +158,7 @@ class ArmMotions:
         yield from self._move(name, to_pose(goal), make_path, a, v, t)
 
     def _move(
-        self, name: str, goal: Six, make_path: Callable[[Six], Path], a: float, v: float, t: float
+        self, name: str, goal: Vector, make_path: Callable[[Vector], Path], a: float, v: float, t: float
     ) -> Wait:
         """Move until the arm rests at the goal. The thread that moves controls the arm as long."""
         arm = self._robot.arm
@@ -183,7 +183,7 @@ class ArmMotions:
         """Follows the goal with the lookahead as its time constant; `gain` has no effect."""
         goal, lag_s = six(q), max(0.03, min(0.2, lookahead_time))
 
-        def wanted(joints: Six, dt_s: float) -> Six:
+        def wanted(joints: Vector, dt_s: float) -> Vector:
             return tuple((g - c) / max(lag_s, dt_s) for g, c in zip(goal, joints, strict=True))
 
         yield from self._flow("servoj", wanted, inf, t, lambda: True)
@@ -201,13 +201,13 @@ class ArmMotions:
         """Straight towards the pose, until it is reached or as near as the blend radius."""
         goal, robot = rigid(pose), self._robot
 
-        def way(tool: Rigid) -> tuple[Six, float]:
+        def way(tool: Rigid) -> tuple[Vector, float]:
             """Return what is left: a twist that would do it in 1 s, and its length [m]."""
             move = plus(place(goal), place(tool), -1)
             turn = to_rotvec(compose(goal, invert(tool)))
             return (*move, *turn), max(hypot(*move), ROTATION_WEIGHT_M * hypot(*turn))
 
-        def towards(tool: Rigid) -> Six:
+        def towards(tool: Rigid) -> Vector:
             twist, distance_m = way(tool)
             speed = min(v, sqrt(2 * a * distance_m), distance_m / (4 * robot.dt_s))
             return tuple(x * speed / distance_m for x in twist) if distance_m > 0 else twist
@@ -297,7 +297,7 @@ class ArmMotions:
         def turn(torque: Sequence[float]) -> Wait:
             asked, load = six(torque), bodies()
 
-            def wanted(joints: Six, dt_s: float) -> Six:
+            def wanted(joints: Vector, dt_s: float) -> Vector:
                 speeds = arm.stream_speeds
                 rates = Posture(robot.table, joints, speeds).accelerations(load, drives.most_nm, asked)
                 faster = tuple(v + dt_s * r for v, r in zip(speeds, rates, strict=True))
@@ -333,7 +333,9 @@ class ArmMotions:
 class _ToolSpeed:
     """Joint speeds for a tool speed that changes by at most the acceleration (m/s² and rad/s²)."""
 
-    def __init__(self, robot: ControllerState, wanted: Callable[[Rigid], Six], acceleration: float) -> None:
+    def __init__(
+        self, robot: ControllerState, wanted: Callable[[Rigid], Vector], acceleration: float
+    ) -> None:
         if not (isfinite(acceleration) and acceleration > 0):
             raise ScriptRuntimeError(f"an acceleration of {acceleration}")
         self._robot, self._wanted, self._acceleration = robot, wanted, acceleration
@@ -345,10 +347,10 @@ class _ToolSpeed:
         self.twist = twist_between(self.place, self._at(ahead), 1 / step_s)
         """m/s and rad/s, in base"""
 
-    def _at(self, joints: Six) -> Rigid:
+    def _at(self, joints: Vector) -> Rigid:
         return compose(forward(self._robot.table, joints), self._flange_from_tcp)
 
-    def joint_speeds(self, joints: Six, dt_s: float) -> Six:
+    def joint_speeds(self, joints: Vector, dt_s: float) -> Vector:
         """Raises UnreachableError."""
         self.place = place = self._at(joints)
         goal = self._wanted(place)

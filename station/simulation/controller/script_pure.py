@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from station.simulation.controller.kinematics import (
     Rigid,
-    Six,
+    Vector,
     between,
     compose,
     from_pose,
@@ -24,7 +24,7 @@ from station.simulation.controller.kinematics import (
 from station.simulation.controller.urscript import Builtin, Pose, ScriptRuntimeError, Value
 
 
-def six(values: Sequence[float]) -> Six:
+def six(values: Sequence[float]) -> Vector:
     """Raises ScriptRuntimeError unless these are six finite numbers."""
     if not isinstance(values, list) or len(values) != 6 or not all(map(math.isfinite, values)):
         raise ScriptRuntimeError(f"{values!r} is not six numbers")

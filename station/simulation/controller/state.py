@@ -30,7 +30,7 @@ from station.simulation.controller.kinematics import (
     TABLES,
     ArmGeometry,
     Rigid,
-    Six,
+    Vector,
     compose,
     forward,
     from_pose,
@@ -57,16 +57,16 @@ _JOINT_MODE = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255}
 @dataclass(frozen=True)
 class Settings:
     model: str = "UR10"
-    start_joints_rad: Six = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
+    start_joints_rad: Vector = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
     serial: str = "20263000001"
     time_scale: float = 1.0
     """The arm moves this many times faster than it says; clocks stay real. For tests."""
     sigma_m: float = 0.0
     sigma_rad: float = 0.0
     seed: int = 0
-    dh_delta: tuple[Six, Six, Six, Six] = ((0.0,) * 6,) * 4
+    dh_delta: tuple[Vector, Vector, Vector, Vector] = ((0.0,) * 6,) * 4
     """a_m, d_m, alpha_rad, theta_rad of the true arm against the table that the controller uses."""
-    factory: tuple[Six, Six, Six, Six] = ((0.0,) * 6,) * 4
+    factory: tuple[Vector, Vector, Vector, Vector] = ((0.0,) * 6,) * 4
     """The same of the controller's table, its maker's calibration, against the published one."""
     states_factory: bool = True
     """Port 30001 states the table in use; else the published one, which is then not true."""
@@ -203,14 +203,14 @@ class ControllerState(ABC):
         self.true_table: ArmGeometry = self.table.plus(*settings.dh_delta)
         self._random = random.Random(settings.seed)
         self.arm = SimulatedArm(self.table, settings.start_joints_rad, self._draw_miss)
-        self.tcp: Six = (0.0,) * 6
+        self.tcp: Vector = (0.0,) * 6
         self.payload_kg = 0.0
-        self.payload_cog: Six = (0.0,) * 3
+        self.payload_cog: Vector = (0.0,) * 3
         self.robot_mode = RobotMode.RUNNING
         self.safety_mode = SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.remote = settings.remote
-        self.payload_inertia: Six = (0.0,) * 6
+        self.payload_inertia: Vector = (0.0,) * 6
         self.freedrive = self.force_mode = False
         self.popup: str | None = None
         self.loaded = ""
@@ -230,7 +230,7 @@ class ControllerState(ABC):
         """Time 0, empty registers; installation and the arm's place survive."""
         self.ticks, self.time_s, self.slider = 0, 0.0, 1.0
         self.history = History(self.dt_s)
-        self._seen: dict[str, tuple[Six, Six, Rigid]] = {}
+        self._seen: dict[str, tuple[Vector, Vector, Rigid]] = {}
         """Per tool pose: joints, TCP and pose it was last computed for."""
         self.inputs, self.outputs = (
             VariableStore(VARIABLES[side], self.settings.is_e_series, self.settings.version)
@@ -257,7 +257,7 @@ class ControllerState(ABC):
         volts = int(self.outputs.get("analog_io_types")) >> 2 + int(n) & 1
         self.outputs.set(f"standard_analog_output{int(n)}", 10 * share if volts else 0.004 + 0.016 * share)
 
-    def _draw_miss(self) -> Six:
+    def _draw_miss(self) -> Vector:
         m, rad = self.settings.sigma_m, self.settings.sigma_rad
         return tuple(self._random.gauss(0.0, sigma) for sigma in (m, m, m, rad, rad, rad))
 
@@ -290,7 +290,7 @@ class ControllerState(ABC):
         out.set("robot_status_bits", bits)
         out.set("joint_mode", *(_JOINT_MODE.get(self.robot_mode, 239),) * 6)
 
-    def _publish_tool(self, name: str, joints: Six) -> None:
+    def _publish_tool(self, name: str, joints: Vector) -> None:
         """Pose and speed of the tool; computed only when joints or TCP changed."""
         before = self._seen.get(name)
         if before is not None and before[0] is joints and before[1] is self.tcp:
@@ -305,7 +305,7 @@ class ControllerState(ABC):
             self.outputs.set(f"{name}_speed", *twist_between(before[2], T, per_s))
 
 
-def twist_between(last: Rigid, now: Rigid, per_s: float) -> Six:
+def twist_between(last: Rigid, now: Rigid, per_s: float) -> Vector:
     """Velocity (6,) between two neighbouring poses: m/s, then rad/s, both in base."""
     l0, l1, l2, lx, l4, l5, l6, ly, l8, l9, l10, lz = last
     turn = compose(now, (l0, l4, l8, 0.0, l1, l5, l9, 0.0, l2, l6, l10, 0.0))

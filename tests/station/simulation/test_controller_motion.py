@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from station.simulation.controller.arm import SimulatedArm, Vibration
-from station.simulation.controller.kinematics import TABLES, Six, compose, forward, from_pose
+from station.simulation.controller.kinematics import TABLES, Vector, compose, forward, from_pose
 from station.simulation.controller.paths import JointPath, LinePath, Trapezoid, UnreachableError
 
 UR10 = TABLES["UR10"]
@@ -30,7 +30,7 @@ def run(arm: SimulatedArm, seconds: float, scale: float = 1.0) -> None:
         arm.step(DT, scale)
 
 
-def go(arm: SimulatedArm, goal: Six, speed: float = 1.0, acceleration: float = 2.0) -> None:
+def go(arm: SimulatedArm, goal: Vector, speed: float = 1.0, acceleration: float = 2.0) -> None:
     arm.start(lambda start: JointPath(start, goal), speed, acceleration)
 
 
@@ -254,7 +254,7 @@ def test_an_offset_leaves_the_arm_short_of_its_next_goal() -> None:
 def test_every_stop_misses_differently_and_never_jumps() -> None:
     draws = iter(float(i) for i in range(1, 100))
 
-    def draw() -> Six:
+    def draw() -> Vector:
         return (next(draws), *(0.0,) * 5)
 
     arm = SimulatedArm(UR10, HOME, draw)

@@ -279,11 +279,22 @@ class JobScreen(Question[int]):
             self.dismiss(-1 if self._exit_code is None else self._exit_code)
             return
         self._cancelled = True
-        self._process.terminate()
+        await self._end()
+
+    async def on_unmount(self) -> None:
+        await self._end()  # the program may be left before its work is done
+
+    async def _end(self) -> None:
+        """End the process, by force if it takes too long."""
+        process = self._process
+        if process is None or process.returncode is not None:
+            return
+        process.terminate()
         try:
-            await asyncio.wait_for(self._process.wait(), TERMINATE_S)
+            await asyncio.wait_for(process.wait(), TERMINATE_S)
         except TimeoutError:
-            self._process.kill()
+            process.kill()
+            await process.wait()
 
     async def on_button_pressed(self) -> None:
         await self.action_cancel()

@@ -87,6 +87,15 @@ async def test_cancelling_ends_the_process(link: FakeLink, job: Path, tmp_path: 
             os.kill(int(pid_file.read_text()), 0)
 
 
+async def test_leaving_the_program_ends_the_process(link: FakeLink, job: Path, tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    job.write_text(f"import os, time; open({str(pid_file)!r}, 'w').write(str(os.getpid())); time.sleep(600)")
+    async with running(link) as (pilot, _screen, _codes):
+        await until(pilot, lambda: pid_file.exists() and pid_file.read_text())
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid_file.read_text()), 0)
+
+
 async def test_enter_by_mistake_cancels_nothing(link: FakeLink, job: Path) -> None:
     """A second Enter after the question that began it."""
     job.write_text("import time; time.sleep(600)")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol, TypeVar, runtime_checkable
@@ -27,7 +28,7 @@ class DeviceThread:
         """Begin a job behind those that were begun before."""
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, self._name)
-        return asyncio.get_running_loop().run_in_executor(self._pool, job)
+        return asyncio.get_running_loop().run_in_executor(self._pool, _letting_go, job)
 
     async def close(self, last: Callable[[], object]) -> None:
         """Run a last job and end the thread; nothing where it never ran."""
@@ -35,6 +36,21 @@ class DeviceThread:
             self._pool = None
             await asyncio.get_running_loop().run_in_executor(pool, last)
             pool.shutdown(wait=False)
+
+
+def _letting_go(job: Callable[[], T]) -> T:
+    """Does it. What a failed job held is let go here: an error may be kept, and by its traceback the device.
+
+    The end of a camera that is gone takes seconds; in the loop's thread, the arm would be without heartbeat.
+    """
+    try:
+        return job()
+    except BaseException as error:
+        held: BaseException | None = error
+        while held is not None:
+            traceback.clear_frames(held.__traceback__)
+            held = held.__cause__ or held.__context__
+        raise
 
 
 class Robot(Protocol):

@@ -18,6 +18,7 @@ from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 
+from recordings.schema.messages import RobotState
 from station.cell.acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
@@ -50,6 +51,7 @@ OUTLIVED_S: dict[ControlPath, float] = {"ur_rtde": 0.3, "script": 0.6}
 rests: at its fastest it brakes for 0.26 s."""
 PROGRAM_START_NS = 200_000_000
 LEFTOVER_WAIT_NS = 2_000_000_000
+NEWS_WAIT_NS = 250_000_000
 CLOSE_WAIT_S = 0.5
 KEPT = 64
 
@@ -150,7 +152,7 @@ class UrRobot(UrLink):
         try:
             await child.heard()
         except RobotError as error:
-            raise await self._ask_remote(self._program_trouble() or error) from None
+            raise await self._look_again(self._program_trouble() or error) from None
 
     async def _may_start(self) -> None:
         """Raises RobotError, with the remedy, while starting control would disturb somebody or must fail."""
@@ -213,7 +215,7 @@ class UrRobot(UrLink):
                 await self._one_way_ends()
             finally:
                 await asyncio.shield(self.stop(str(cause) or type(cause).__name__))
-            raise await self._ask_remote(cause) from None
+            raise await self._look_again(cause) from None
         finally:
             self._moving = False
             self.notice, self._one_way_s = "", None
@@ -266,10 +268,14 @@ class UrRobot(UrLink):
             return trouble
         return error
 
-    async def _ask_remote(self, error: BaseException) -> BaseException:
-        """A program that just stopped may have been stopped by the switch to local control."""
+    async def _look_again(self, error: BaseException) -> BaseException:
+        """A program that just stopped was stopped by something that state and dashboard may tell only now:
+        a safety stop, the arm's power, the switch to local control."""
         if not isinstance(error, RobotError) or isinstance(error, SafetyStopError):
             return error
+        now_ns = time.monotonic_ns()
+        if error.code == "program-ended" and (state := await self._state_after(now_ns, NEWS_WAIT_NS)):
+            error = safety_stop(state) or not_powered(state) or error
         if self.remote and self.dashboard is not None:
             with contextlib.suppress(RobotError, TimeoutError):
                 async with asyncio.timeout(0.3):
@@ -343,16 +349,18 @@ class UrRobot(UrLink):
     async def _stop_leftover_program(self) -> None:
         """A killed child may have left its program playing, or one that it had just sent starts only now:
         it moves nothing, but it would look like somebody else's. Waits for news that is newer than this."""
-        asked_ns = time.monotonic_ns()
-        give_up_ns = asked_ns + LEFTOVER_WAIT_NS
-        while time.monotonic_ns() < give_up_ns and self._child is None:
-            await asyncio.sleep(0.05)
+        state = await self._state_after(time.monotonic_ns() + PROGRAM_START_NS, LEFTOVER_WAIT_NS)
+        if state is not None and state.runtime_state == RuntimeState.PLAYING and self._child is None:
+            await self._dashboard_stop_anew()
+
+    async def _state_after(self, moment_ns: int, wait_ns: int) -> RobotState | None:
+        """The first news that came after the moment (monotonic clock); None: none within `wait_ns` of it."""
+        while time.monotonic_ns() < moment_ns + wait_ns:
             sample = self.reader.newest if self.reader is not None else None
-            if sample is None or sample.state.stamps.host_monotonic_ns < asked_ns + PROGRAM_START_NS:
-                continue
-            if sample.state.runtime_state == RuntimeState.PLAYING:
-                await self._dashboard_stop_anew()
-            return
+            if sample is not None and sample.state.stamps.host_monotonic_ns > moment_ns:
+                return sample.state
+            await asyncio.sleep(POLL_S)
+        return None
 
     async def _dashboard_stop_anew(self) -> None:
         try:

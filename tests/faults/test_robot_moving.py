@@ -66,6 +66,30 @@ async def test_a_refused_kick_is_told_as_the_stopped_program_that_it_means(strik
     await c.stays_at_rest()
 
 
+async def test_a_refused_kick_is_told_as_the_safety_stop_behind_it(strike: Strike) -> None:
+    """The control process may hear of the stopped program before the state stream tells what stopped it."""
+    cells: list[Any] = []
+
+    class RefusedAsItIsPressed(ControlChild):
+        @property
+        def kicks_refused(self) -> bool:
+            if cells:
+                cells.pop().admin.ask("estop")
+            return True
+
+        @kicks_refused.setter
+        def kicks_refused(self, _: bool) -> None:
+            pass
+
+    def press(c: Any) -> None:
+        cells.append(c)
+        c.robot._child.__class__ = RefusedAsItIsPressed
+
+    c, outcome = await strike(press)
+    assert outcome.error.code == "emergency-stop"
+    await c.stays_at_rest()
+
+
 async def test_the_switch_to_local_is_named_although_the_supervision_saw_it_first(strike: Strike) -> None:
     def go_local(c: Any) -> None:
         c.admin.ask(cmd="remote", on=False)

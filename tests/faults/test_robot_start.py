@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from station.cell.errors import RobotError
-from station.devices.ur import LEFTOVER_WAIT_NS, STOP_WAIT_S, UrRobot
+from station.devices.ur import LEFTOVER_WAIT_NS, PROGRAM_START_NS, STOP_WAIT_S, UrRobot
 from station.devices.ur_child import END_S, HEARD_S
 from tests.codes import raises
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.process
 
 Make = Callable[..., Awaitable[Any]]
 Start = Callable[..., Awaitable[tuple[Any, asyncio.Task[None]]]]
-SOON_S = HEARD_S + END_S + LEFTOVER_WAIT_NS / 1e9 + 1.0
+SOON_S = HEARD_S + END_S + (PROGRAM_START_NS + LEFTOVER_WAIT_NS) / 1e9 + 1.0
 """The wait, the end of a child that hangs, news of what it left behind, and this computer's share."""
 
 

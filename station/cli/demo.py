@@ -33,7 +33,7 @@ from station.cli.console import AsJson, Headless, err, out, print_json
 from station.cli.daemon import own_daemon
 from station.cli.progress import SessionProgress
 from station.cli.session import PosesJson
-from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
+from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
 from station.operate.motion import SessionOutcome, carry_out, wait_until_idle
 from station.plan.choose import Aim
 from station.protocol.client import Client
@@ -101,7 +101,6 @@ def demo_command(
 
     Exit codes: 0 done, 1 failed, 3 poses missing, 4 a gate failed.
     """
-    require_choices(scene=scene, noise=noise, mount=mount, control=control)
     if output is not None and output.exists() and not output.is_dir():
         raise ConfigError(f"--out {output} is a file.", code="not-a-folder", remedy="Name a folder.")
     if gige and not is_isolated():

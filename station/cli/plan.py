@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -27,12 +27,14 @@ from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
 from station.cell.socket_folder import default_socket
 from station.cli.console import AsJson, Socket, err, out, print_json
 from station.operate.motion import status_now
-from station.plan.choose import CRITERIA, WITH_TABLE, Criterion
+from station.plan.choose import CRITERIA, WITH_TABLE, Aim, Criterion
 from station.plan.files import import_list, load_plan, save_plan, taught_plan
 from station.plan.planner import make_plan
 from station.plan.predict import ArmForecast, forecast_arm, with_forecast
 from station.plan.preview import save_picture, save_scene, sketch
 
+SceneName = Literal["paper", "blog", "paper-binned"]
+"""Of `station.simulation.cell`, which is loaded only where it is wanted."""
 _ASK_S = 3.0
 """A daemon that serves answers within milliseconds, on a busy computer within a second."""
 _NOTHING_KNOWN_M = 0.05
@@ -55,11 +57,10 @@ def plan_command(
     ] = None,
     poses: Annotated[int, typer.Option(min=3, max=200, help="Poses to plan")] = 25,
     seed: Annotated[int, typer.Option(help="The same seed gives the same plan")] = 0,
-    scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog")] = "paper",
+    scene: Annotated[SceneName, typer.Option(help="Simulated cell")] = "paper",
     socket: Socket = None,
     purpose: Annotated[
-        str,
-        typer.Option("--for", help="camera, arm (its table too) or both (board and lens too)"),
+        Aim, typer.Option("--for", help="arm: its table too; both: board and lens too")
     ] = "camera",
     d_optimal: Annotated[
         bool, typer.Option("--d-optimal", help="Minimize the error ellipsoid instead of the error")
@@ -109,12 +110,8 @@ def plan_command(
         raise typer.Exit(LimitError.exit_code)
 
 
-def _criterion(purpose: str, d_optimal: bool) -> Criterion:
-    criterion = CRITERIA.get(purpose)  # type: ignore[call-overload]
-    if criterion is None:
-        raise ConfigError(
-            f"--for {purpose} is no aim of a plan.", code="usage", remedy="Give camera, arm or both."
-        )
+def _criterion(purpose: Aim, d_optimal: bool) -> Criterion:
+    criterion = CRITERIA[purpose]
     if d_optimal and criterion != "A":
         raise ConfigError(
             f"--d-optimal is for the camera, not for --for {purpose}.", code="usage", remedy="Leave it out."
@@ -147,7 +144,9 @@ def _require_replaceable(output: Path) -> None:
             ) from None
 
 
-def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationConfig, list[float] | None]:
+def _cell(
+    config: Path | None, scene: SceneName, start: str | None
+) -> tuple[StationConfig, list[float] | None]:
     """The cell to plan for, and where its arm stands."""
     standing = _joints(start) if start is not None else None
     if config is not None:
@@ -155,7 +154,7 @@ def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationCo
     # Simulation is loaded only where it is wanted.
     from station.simulation.scenes import cell_config, make_cell
 
-    truth = make_cell(scene, 0, "low", "eye-in-hand")  # type: ignore[arg-type]
+    truth = make_cell(scene, 0, "low", "eye-in-hand")
     return cell_config(truth), standing or list(truth.start_joints_rad)
 
 

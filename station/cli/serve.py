@@ -17,7 +17,7 @@ from recordings.files import state_root
 from station.cell.errors import ConfigError
 from station.cell.process import DAEMON_NICENESS, go_before_others
 from station.cell.socket_folder import default_socket
-from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
+from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
 from station.devices.cell import Cell
 
 
@@ -64,7 +64,6 @@ def serve_command(
         raise ConfigError(
             "--rehearse needs the cell to rehearse.", code="usage", remedy="Give --config FILE too."
         )
-    require_choices(scene=scene, noise=noise, mount=mount, control=control)
     log_to_stderr()
     place = state_root(root)
     # What only one kind of cell needs is loaded only for it.
@@ -84,16 +83,7 @@ def serve_command(
         from station.simulation.launch_cell import SimulationOptions, simulated_cell
 
         options = SimulationOptions(
-            scene,  # type: ignore[arg-type]
-            seed,
-            noise,  # type: ignore[arg-type]
-            mount,  # type: ignore[arg-type]
-            time_scale,
-            gige,
-            hardware_trigger,
-            frame_rate_hz,
-            control,  # type: ignore[arg-type]
-            robot,
+            scene, seed, noise, mount, time_scale, gige, hardware_trigger, frame_rate_hz, control, robot
         )
         cell = simulated_cell(options, place / "simulation")
     asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))

@@ -244,7 +244,6 @@ class AcceptanceTest:
         )
 
     async def _connected(self) -> bool:
-        self.link.outdate()
         async for status in self.link.statuses():
             return status.state is StationState.IDLE and status.robot.connected
         return False

@@ -46,10 +46,7 @@ class Link(Protocol):
         """The verb's result. RefusedError with the daemon's code; StationError when it is gone."""
 
     def statuses(self) -> AsyncIterator[StationStatus]:
-        """The full status now and at every change; ends when the daemon is gone."""
-
-    def outdate(self) -> None:
-        """Forget the known status, which is older than the last call: `statuses` begins with the next one."""
+        """The full status, never older than the last call, and at every change; ends with the daemon."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +138,6 @@ async def approved_motion(
     if not await approve(preview):
         return False
     await link.call(Go(preview.token, preview.plan_sha256, headless))
-    link.outdate()  # it would show the session before, finished and at rest
     return True
 
 
@@ -185,7 +181,6 @@ async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) ->
     status = await _until_rest(link, watch)
     if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
         await link.call(Finish())
-        link.outdate()
         status = await _until_rest(link, watch)
     return SessionOutcome(status)
 

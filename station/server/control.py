@@ -172,7 +172,7 @@ class ControlServer:
         protocol = asyncio.StreamReaderProtocol(reader)
         transport, _ = await loop.connect_accepted_socket(lambda: protocol, link)
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
-        connection = _Connection(peer, reader, writer, self._handler, self._full_status)
+        connection = _Connection(peer, reader, writer, self._handler, self._publish_newest)
         self._connections.add(connection)
         try:
             await connection.run()
@@ -180,10 +180,9 @@ class ControlServer:
             self._connections.discard(connection)
             self._handler.gone(peer)
 
-    def _full_status(self) -> bytes:
-        # Published first, so that the next changes start from exactly what this watcher was told.
+    def _publish_newest(self) -> StationStatus:
         self.publish(self._newest())
-        return msgspec.json.encode(Notice(status=self._status)) + b"\n"
+        return self._status
 
 
 class _Connection:
@@ -195,12 +194,13 @@ class _Connection:
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
         handler: Handler,
-        full_status: Callable[[], bytes],
+        publish: Callable[[], StationStatus],
     ) -> None:
+        """`publish`: tells every watcher what changed; returns the newest status."""
         self.peer = peer
         self.watching = False
         self._reader, self._writer, self._handler = reader, writer, handler
-        self._full_status = full_status
+        self._publish = publish
         self._tasks: set[asyncio.Task[None]] = set()
         self._pieces = bytearray()
         """Pieces of a request that is longer than a line."""
@@ -266,14 +266,16 @@ class _Connection:
     async def _answer_stop(self, request_id: int, stopping: Awaitable[object] | None) -> None:
         if stopping is not None:
             await stopping
+        self._publish()
         self.reply(Reply(request_id, True, {}))
 
     async def _answer(self, request: Request) -> None:
         try:
             result = await self._handler.handle(self.peer, request.verb, request.args)
+            status = self._publish()  # who was answered knows what came of it, and nothing older
             self.reply(Reply(request.id, True, result))
             if request.verb == "watch" and not self.watching:
-                self.send(self._full_status())
+                self.send(msgspec.json.encode(Notice(status=status)) + b"\n")
                 self.watching = True
         except CodedError as error:
             self.refuse(request.id, error)

@@ -160,10 +160,6 @@ class Desk(ThemedApp[None]):
         self._news.set()
         self._news = asyncio.Event()
 
-    def outdate(self) -> None:
-        if self.link is not None:
-            self.link.outdate()
-
     async def attempt(self, work: Awaitable[R]) -> R | None:
         """Its result, or None after a notice that says why not."""
         try:

@@ -92,9 +92,6 @@ class ReplayLink:
             remedy="Nothing can be commanded.",
         )
 
-    def outdate(self) -> None:
-        """Do nothing: a recording is never outdated."""
-
     async def statuses(self) -> AsyncIterator[StationStatus]:
         """Yield statuses until the end, which stays on the screen."""
         seen_s = time.monotonic()

@@ -120,7 +120,6 @@ async def test_the_tip_truly_stands_over_the_corner_slowly_and_the_offset_is_kep
             arrived = asyncio.Event()
             watch = asyncio.create_task(fastest_m_s(rig, told, arrived))
             await anna.request("go", token=offer.go.token)
-            anna.outdate()
             done = await status_when(anna, lambda s: s.state in (S.IDLE, S.FAULT, S.STOPPED))
             arrived.set()
             assert 0.02 < await watch <= SPEED_M_S

@@ -113,9 +113,6 @@ class FakeLink:
             return msgspec.structs.replace(self.answers["preview"], sequence=self._images)
         return self.answers.get(verb.verb(), Done())
 
-    def outdate(self) -> None:
-        """Every status of a test is a new one."""
-
     async def statuses(self) -> AsyncIterator[StationStatus]:
         while (status := await self._statuses.get()) is not None:
             yield status

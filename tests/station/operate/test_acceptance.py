@@ -50,8 +50,6 @@ class Daemon:
         state = StationState.STOPPED if end == HELD else StationState.IDLE
         yield StationStatus(state=state, events=events)
 
-    def outdate(self) -> None: ...
-
 
 class Hands:
     def __init__(self) -> None:

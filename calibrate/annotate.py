@@ -20,6 +20,7 @@ from calibrate.files.calibration import Calibration, encode_calibration
 from calibrate.geometry import Array, inverse
 from calibrate.load import Progress, load_views
 from calibrate.projection import project_pixels
+from recordings.images import viewable
 from recordings.reader import Recording
 from recordings.scene import Entity, Polyline
 from recordings.schema.messages import CameraModel, Matrix4, View
@@ -89,7 +90,8 @@ def annotate(
             writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
             text = _text(found[sequence])
             writer.marks(sequence, marks[sequence], text)
-            writer.drawn_image(sequence, drawn(picture.viewable(), marks[sequence], text))
+            image = viewable(picture.pixels, picture.pixel_format)
+            writer.drawn_image(sequence, drawn(image, marks[sequence], text))
         pairs = zip(recording.views(), found, strict=True)
         cameras = [_camera_entity(calibration, camera, view, residual) for view, residual in pairs]
         writer.scene(0, [_board_entity(calibration), *cameras])

@@ -20,6 +20,7 @@ from calibrate.views import BoardView, ViewSet
 from recordings import strict_yaml
 from recordings.errors import BadImageError
 from recordings.files import usable_cores
+from recordings.images import viewable
 from recordings.reader import Recording
 from recordings.schema.messages import (
     ARM_KINEMATICS_NAME,
@@ -258,7 +259,7 @@ def detect_all(
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
     picture = recording.image(view)
     _check_size(view, picture.pixels.shape[1], picture.pixels.shape[0], camera)
-    return detect(picture.viewable(), spec, with_quality=False)
+    return detect(viewable(picture.pixels, picture.pixel_format), spec, with_quality=False)
 
 
 def _check_size(view: View, width: int, height: int, camera: CameraModel) -> None:

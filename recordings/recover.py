@@ -15,11 +15,18 @@ from recordings.errors import (
     disk_error,
     exists_error,
 )
-from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, discard_leftover, lock, rename_new, sync_folder
+from recordings.files import (
+    EMPTY_SUFFIX,
+    PART_SUFFIX,
+    discard_leftover,
+    lock,
+    open_file,
+    rename_new,
+    sync_folder,
+)
 from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
 from recordings.mcap.records import MESSAGE_HEAD, Opcode, with_crc
 from recordings.mcap.salvage import Salvage, salvage
-from recordings.mcap.scan import open_file
 from recordings.mcap.writer import McapFile
 from recordings.schema.definitions import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
 from recordings.schema.messages import SessionInfo, View

@@ -30,6 +30,7 @@ from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import SolvedRecording
 from calibrate.report import html, plots
 from calibrate.results import PeerResult
+from recordings.images import viewable
 
 _PICTURES_LIMIT = 60
 _WIDTHS_PX = ((12, 480), (30, 320), (_PICTURES_LIMIT, 240))
@@ -351,7 +352,8 @@ def _views(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
             continue
         found = detection.pixels
         ours = modelled.get(view.index, (found, None))[1]
-        jpeg = drawn_view(job.recording.image(view).viewable(), found, ours, width_px)
+        image = job.recording.image(view)
+        jpeg = drawn_view(viewable(image.pixels, image.pixel_format), found, ours, width_px)
         px = job.solution.residual_px.get(view.index)
         name = "" if view.name == str(view.index) else f": {view.name}"
         caption = f"pose {view.index + 1}{name}" + (f", {px:.2f} px" if px is not None else "")

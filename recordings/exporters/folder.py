@@ -14,7 +14,7 @@ import msgspec
 from recordings.errors import disk_error, exists_error
 from recordings.exporters import Target
 from recordings.files import sync_folder
-from recordings.images import encode_png, mosaic_encoding
+from recordings.images import encode_png, mosaic_encoding, viewable
 from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE
 from recordings.reader import Recording
 from recordings.schema.messages import ClockReading, Stamps, View
@@ -81,7 +81,7 @@ def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
     image = recording.image(view)
     stored = recording.stored_image(view)
     if stored is None or mosaic_encoding(image.pixel_format):
-        stored = "png", encode_png(image.viewable())
+        stored = "png", encode_png(viewable(image.pixels, image.pixel_format))
     extension, data = stored
     name = f"images/{view.index:03d}.{_EXTENSIONS.get(extension, extension)}"
     (folder / name).write_bytes(data)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from recordings.errors import ImportSourceError
+from recordings.files import open_file
 from recordings.importers.messages import (
     CDR,
     STAMP_BYTES,
@@ -23,7 +24,7 @@ from recordings.importers.messages import (
     ros_types,
 )
 from recordings.mcap.contents import Contents
-from recordings.mcap.scan import open_file, scan_file
+from recordings.mcap.scan import scan_file
 from recordings.mcap.source import Source
 from recordings.schema.definitions import SESSION_RECORDS
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import stat
 from array import array
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +18,6 @@ from recordings.errors import (
     CorruptRecordingError,
     RecordingError,
     UnfinishedRecordingError,
-    disk_error,
     recover_line,
 )
 from recordings.mcap import checksum
@@ -69,18 +67,6 @@ def scan_file(
         raise CorruptRecordingError(
             text, code="changed-while-read", remedy="Try again afterwards."
         ) from error
-
-
-def open_file(path: Path) -> int:
-    """Descriptor for reading. RecordingError when it is no readable file."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    except OSError as error:
-        raise disk_error("open", path, error) from error
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise RecordingError(f"{path} is not a file", code="no-file")
-    return descriptor
 
 
 class _Scan:

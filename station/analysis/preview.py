@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from calibrate.geometry import Array
-from recordings.images import eight_bits
+from recordings.images import eight_bits, viewable
 from recordings.schema.messages import Image
 from station.protocol.verbs import PreviewImage
 
@@ -22,7 +22,7 @@ def preview_image(taken: Image, corners: Array, width: int, height: int, sequenc
 
     `corners`: (n, 2) of the image, px. `sequence`: another number for another image.
     """
-    image = eight_bits(taken.viewable(), taken.pixel_format)
+    image = eight_bits(viewable(taken.pixels, taken.pixel_format), taken.pixel_format)
     sides = image.shape[1::-1]
     scale = min(width / sides[0], height / sides[1], 1.0)
     size = max(1, round(sides[0] * scale)), max(1, round(sides[1] * scale))

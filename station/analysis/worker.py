@@ -22,7 +22,7 @@ from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
 from recordings.errors import RecordingError
-from recordings.images import Pixels
+from recordings.images import Pixels, viewable
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec, CameraModel, Vector6
 from station.cell.config import StationConfig
@@ -126,7 +126,8 @@ def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:
     recording, seen = open_recording(path), []
     for view in recording.views():
         with contextlib.suppress(RecordingError):
-            found = detect(recording.image(view).viewable(), board)
+            image = recording.image(view)
+            found = detect(viewable(image.pixels, image.pixel_format), board)
             if found.found:
                 flange = np.array(view.base_from_flange)
                 seen.append(CapturedView(view.index, flange, found.indices, found.pixels))

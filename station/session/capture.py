@@ -11,7 +11,7 @@ from collections import deque
 import msgspec
 import numpy as np
 
-from recordings.images import Pixels
+from recordings.images import Pixels, viewable
 from recordings.schema.messages import Image, RobotState, Stamps, Stillness, View
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion
@@ -286,7 +286,7 @@ class ImageWatch:
                     raise
                 continue
             if image is not None:
-                self._images.append((asked_ns, image.viewable()))
+                self._images.append((asked_ns, viewable(image.pixels, image.pixel_format)))
             return image is not None
         return False
 

@@ -15,6 +15,7 @@ import numpy as np
 from calibrate.geometry import difference
 from calibrate.kinematics import forward
 from recordings.errors import CodedError, RecordingError, Value
+from recordings.images import viewable
 from recordings.recorder import Recorder
 from recordings.recover import recover_recording
 from recordings.schema.messages import CameraModel, Image, RobotState, Vector6
@@ -133,8 +134,9 @@ class SessionContext:
     async def look_at(self, image: Image, lens: CameraModel | None = None) -> BoardDetection:
         """The board in an image, by the configured lens where no other is given. Raises WorkerError."""
         config = self.cell.config
+        pixels = viewable(image.pixels, image.pixel_format)
         return await self.workers.call(
-            sight, image.viewable(), config.board, lens or config.camera.model, timeout_s=_LOOK_S
+            sight, pixels, config.board, lens or config.camera.model, timeout_s=_LOOK_S
         )
 
     def forget_session(self, check: bool = False) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from calibrate.boards.detect import detect
 from calibrate.boards.model import check_board
+from recordings.images import viewable
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import BoardSpec, Image, RobotState
 from station.analysis.pool import WorkerError
@@ -344,7 +345,7 @@ class Previewer:
             state, _ = await at_exposure(context, resting, image)
             _require_between_sessions(context)
             found = await context.workers.call(
-                detect, image.viewable(), tag, False, False, timeout_s=_OBSERVE_S
+                detect, viewable(image.pixels, image.pixel_format), tag, False, False, timeout_s=_OBSERVE_S
             )
         return Observation(
             mount=context.cell.config.mount,
@@ -375,8 +376,9 @@ class Previewer:
         config = context.cell.config
         try:
             exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None
+            pixels = viewable(image.pixels, image.pixel_format)
             sighting = await context.workers.call(
-                sight, image.viewable(), config.board, config.camera.model, False, exposure, timeout_s=5.0
+                sight, pixels, config.board, config.camera.model, False, exposure, timeout_s=5.0
             )
         except WorkerError:
             sighting = None

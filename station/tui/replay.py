@@ -13,6 +13,7 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.files import MAIN_CAMERA
+from recordings.images import viewable
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.schema.messages import CaptureEvent, RobotState, View
@@ -144,7 +145,8 @@ class ReplayLink:
         except RecordingError as error:
             self._seen = DetectionStatus(reason=str(error))
             return PreviewImage()
-        seen = sight(taken.viewable(), self._timeline.recording.info.board, None, thorough=False)
+        pixels = viewable(taken.pixels, taken.pixel_format)
+        seen = sight(pixels, self._timeline.recording.info.board, None, thorough=False)
         self._seen = seen.status
         corners = seen.pixels if seen.status.found else np.zeros((0, 2))
         return preview_image(taken, corners, width, height, view.picture_sequence)

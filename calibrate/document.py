@@ -36,8 +36,7 @@ from calibrate.files.calibration import (
 from calibrate.files.gate import Gate
 from calibrate.geometry import Transform
 from calibrate.handeye.arm import HELD, PARAMETERS
-from calibrate.handeye.arm_result import Verification
-from calibrate.handeye.solution import Remark, Solution, TableResult
+from calibrate.handeye.solution import Remark, Solution, TableResult, Verification
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty

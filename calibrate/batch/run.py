@@ -15,46 +15,17 @@ from typing import Any
 import cv2
 import msgspec
 
-from calibrate.batch.storage import Results, facts, is_url, local_copy
+from calibrate.batch.storage import BatchResult, Results, facts, is_url, local_copy, whole
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.bounds import Limits, bounded
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import encode_calibration
 from calibrate.files.proof import content_sha256
-from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
+from calibrate.job import JobOptions, SolvedRecording
+from calibrate.pipeline import solve_recording
 from recordings.errors import RecordingError
 
 RESULTS = "results.jsonl"
-
-
-class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One recording of a batch: its camera pose and how good it is, or why it could not be solved."""
-
-    recording: str
-    key: str
-    """Key of recording and options: a finished one is not solved again."""
-    solved: bool
-    passed: bool = False
-    error: str = ""
-    session: str = ""
-    robot: str = ""
-    camera: str = ""
-    recorded_wall_ns: int = 0
-    mount: str = ""
-    translation_m: tuple[float, ...] = ()
-    rotation_xyzw: tuple[float, ...] = ()
-    covariance: tuple[tuple[float, ...], ...] = ()
-    sigma_mm: float | None = None
-    sigma_deg: float | None = None
-    e_t_mm: float | None = None
-    rms_px: float | None = None
-    views: int = 0
-    rejected: int = 0
-    failed_gates: tuple[str, ...] = ()
-    calibration: str = ""
-    """File name in the output folder."""
-    content_sha256: str = ""
-    """Hash of the calibration: equal for equal results, whoever computed them."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +78,6 @@ def run_batch(
     except OSError as problem:
         raise BatchError(f"{output}: {problem.strerror or problem}.", code="batch-folder") from None
     return results
-
-
-def whole(place: Path | str) -> str:
-    """An absolute path, or the URL as it is."""
-    return str(place) if is_url(str(place)) else str(Path(place).resolve())
 
 
 def batch_key(place: Path | str, options: JobOptions) -> str:

@@ -16,8 +16,8 @@ import typer
 
 from calibrate.batch.cluster import Cluster, cluster_workers
 from calibrate.batch.fleet import UNREADABLE, collect_fleet, fleet_table
-from calibrate.batch.run import BatchResult, run_batch
-from calibrate.batch.storage import Results, expand
+from calibrate.batch.run import run_batch
+from calibrate.batch.storage import BatchResult, Results, expand
 from calibrate.batch.trends import CellHistory, cells, trends_text
 from calibrate.batch.workers import BatchWorkers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
@@ -25,8 +25,8 @@ from calibrate.cli.contracts import FleetCameraJson, FleetJson
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit, takes
 from calibrate.cli.output import AsJson, err, out, print_json, progress_bar
 from calibrate.errors import UsageError
+from calibrate.job import JobOptions
 from calibrate.load import Progress as LoadProgress
-from calibrate.pipeline import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
 
 DONE_WITH_LOSS = 3

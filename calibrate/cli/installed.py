@@ -20,9 +20,9 @@ from calibrate.files import exports
 from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, Lens, read_calibration, write_output
 from calibrate.files.exports import FORMATS, FrameNames, follow_command
+from calibrate.files.folders import cameras, current_validity, readable_folder
 from calibrate.files.formatting import override_text, pose_difference, pose_text, summary, verdict_text
 from calibrate.files.lines import read_lines
-from calibrate.files.loader import cameras, current_validity, readable_folder
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
 from calibrate.files.versions import LOG, InstalledVersion, LogEntry, installed_versions, read_log
 from recordings.files import MAIN_CAMERA, state_root

@@ -14,7 +14,7 @@ import typer
 
 from calibrate.cli.files import read_board, read_camera, read_lens_sigma, read_time_offset
 from calibrate.errors import UsageError
-from calibrate.pipeline import JobOptions
+from calibrate.job import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
 
 

@@ -30,12 +30,14 @@ from calibrate.cli.output import (
     print_json,
 )
 from calibrate.errors import CalibrationError, UsageError
-from calibrate.files.calibration import Touch, ViewWeight, write_calibration, write_output
+from calibrate.files.calibration import ViewWeight, write_calibration, write_output
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
 from calibrate.files.install import install_line, installed_calibration
+from calibrate.files.touch import Touch
 from calibrate.geometry import rotation_log
 from calibrate.handeye.solution import camera_frames
-from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
+from calibrate.job import JobOptions, SolvedRecording
+from calibrate.pipeline import prepare_views, solve_recording, solver_options
 from calibrate.results import PeerResult
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]

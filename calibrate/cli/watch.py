@@ -20,21 +20,21 @@ import typer
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import check_board, describe_board
 from calibrate.cli.contracts import WatchEventJson
-from calibrate.cli.drift_check import CellIdentity, require_same_cell
 from calibrate.cli.files import read_board
 from calibrate.cli.installed import CameraName, Root, named_or_installed
 from calibrate.cli.job import BoardFile, Threads
 from calibrate.cli.output import err, out, print_json, progress_bar
 from calibrate.errors import InstallError, UsageError
 from calibrate.files.calibration import Calibration
+from calibrate.files.folders import current_version, readable_folder
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
 from calibrate.files.lines import share
-from calibrate.files.loader import current_version, readable_folder
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
 from calibrate.kinematics import MODELS
 from calibrate.load import detect_all
 from calibrate.pipeline import single_threaded_opencv
+from calibrate.quality.drift import CellIdentity, require_same_cell
 from calibrate.quality.movement.evidence import Moved
 from calibrate.quality.movement.log import FILE, MonitorLog, WatchedTag, WatchEntry
 from calibrate.quality.movement.monitor import LARGEST_MISFIT_PX, NAMED_AFTER, EventKind, MovementEvent

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override, source_stamp
+from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
-from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import MEASURED
@@ -58,8 +58,8 @@ def summary(calibration: Calibration, validity: Validity | None = None) -> Rende
     if validity is not None:
         shown = f"Installed: {validity_text(validity)}"
         parts.append(Text(shown, style=VALIDITY_STYLES[validity.state]))
-    if source_stamp(calibration):
-        parts.append(Text(source_stamp(calibration), style="bold yellow"))
+    if source_stamp(calibration.source):
+        parts.append(Text(source_stamp(calibration.source), style="bold yellow"))
     if calibration.override is not None:
         parts.append(Text(override_text(calibration.override), style="bold yellow"))
     parts += [_result_table(calibration), _gate_table(calibration)]

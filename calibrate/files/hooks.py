@@ -22,8 +22,8 @@ from typing import Literal
 
 import msgspec
 
+from calibrate.files.folders import calibrations_folder
 from calibrate.files.lines import append_line
-from calibrate.files.loader import calibrations_folder
 from calibrate.files.validity import Validity, ValidityState, time_text
 from recordings.files import state_root
 

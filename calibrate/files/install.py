@@ -15,15 +15,11 @@ import numpy as np
 
 from calibrate.errors import GateFailedError, InstallError
 from calibrate.files.calibration import Calibration, Override, read_calibration
+from calibrate.files.folders import calibrations_folder, current_validity, current_version, readable_folder
 from calibrate.files.gate import Gate
 from calibrate.files.hooks import HookEvent, announce
 from calibrate.files.lines import append_line
-from calibrate.files.loader import (
-    calibrations_folder,
-    current_validity,
-    current_version,
-    readable_folder,
-)
+from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import (
     CheckKind,
@@ -34,7 +30,6 @@ from calibrate.files.validity import (
     time_text,
     unrecorded,
 )
-from calibrate.files.verification import agrees, touch_text
 from calibrate.files.versions import (
     InstalledVersion,
     add_version,

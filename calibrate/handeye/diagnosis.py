@@ -9,8 +9,7 @@ from scipy import special
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, skew
-from calibrate.handeye.estimate import FULL, estimate
-from calibrate.handeye.fit import CellFit
+from calibrate.handeye.estimate import FULL, CellFit, estimate
 from calibrate.handeye.linear import Linear, inverse_of
 from calibrate.handeye.observations import Layout, Places, implied_flange
 from calibrate.handeye.solution import CrossValidation, Finding

@@ -37,12 +37,12 @@ from calibrate.handeye.metrics import (
     mean_pose,
     motion_errors,
     placed_boards,
+    require_solvable,
 )
 from calibrate.handeye.observations import SHAPE, CellState, observe_views
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
-from calibrate.handeye.profile_robust import solve_robust_profile
 from calibrate.handeye.solution import Solution, SolveOptions
-from calibrate.handeye.solve import require_solvable
+from calibrate.handeye.solve import solve_robust_profile
 from calibrate.projection import intrinsics_vector
 from calibrate.results import PeerResult
 from calibrate.views import ViewSet

@@ -142,6 +142,26 @@ class TableResult:
         return self.refused is None
 
 
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """The arm without and with its table at poses that took no part in the fit, n of them."""
+
+    recording: str
+    flange_m: Array
+    """(n, 3) where the flange stood."""
+    missed_m: Array
+    """(2, n) distance of the board's middle from its mean place: without, with the table."""
+
+    @property
+    def rms_m(self) -> tuple[float, float]:
+        without, with_table = np.sqrt(np.mean(self.missed_m**2, axis=1)).tolist()
+        return without, with_table
+
+    @property
+    def better(self) -> bool:
+        return self.rms_m[1] < self.rms_m[0]
+
+
 TableRefusal = Literal["no-evidence", "no-joints", "not-nominal", "not-better"]
 """No clear evidence; joints by inverse kinematics; recorded flanges do not follow the nominal table; the
 table does not help on poses elsewhere."""

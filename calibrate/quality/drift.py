@@ -11,18 +11,19 @@ from bisect import bisect_left
 from dataclasses import dataclass, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy import special
 
 from calibrate.boards.model import board_points
-from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.errors import BadViewsError, TooFewViewsError, UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, inverse, perturb
 from calibrate.handeye.corners import bent_points, boards_by_corners
 from calibrate.handeye.observations import extent_of, observe_views
 from calibrate.lens.model import project
 from calibrate.views import ViewSet, require_no_copies
-from recordings.schema.messages import CameraModel
+from recordings.schema.messages import CameraModel, Mount, SessionInfo, Source
 
 FEWEST_VIEWS = 3
 FALSE_ALARM = 0.05
@@ -254,3 +255,52 @@ def pnp_covariance(points: Array, camera: CameraModel, camera_from_board: Array)
     moved = perturb(camera_from_board, _STEP * np.eye(6))
     J = np.stack([(project(camera, m, points) - base).ravel() / _STEP for m in moved], axis=1)
     return np.asarray(np.linalg.inv(J.T @ J))
+
+
+class OtherCellError(UsageError):
+    """The views are of another cell, robot or camera than the calibration."""
+
+    code = "other-cell"
+
+    @property
+    def device(self) -> str:
+        """robot or camera; empty when more than that differs."""
+        differs = str(self.values.get("differs", ""))
+        return differs if differs in ("robot", "camera") else ""
+
+
+class CellIdentity(msgspec.Struct, frozen=True):
+    """Facts of a cell that its images state."""
+
+    mount: Mount
+    source: Source
+    robot_serial: str
+    camera_serial: str
+
+    @classmethod
+    def of(cls, info: SessionInfo) -> CellIdentity:
+        """Read the facts of a recording."""
+        return cls(info.mount, info.source, info.robot.serial, info.camera_identity.serial)
+
+
+def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) -> None:
+    """Raise OtherCellError for pictures of another mounting, source, robot or camera."""
+    simulated = calibration.source == "simulated"
+    for name, new, known, same in (
+        ("mounting", seen.mount, calibration.mount, seen.mount == calibration.mount),
+        ("source", seen.source, calibration.source, (seen.source == "simulated") == simulated),
+        ("robot", *_serials(seen.robot_serial, calibration.robot.serial)),
+        ("camera", *_serials(seen.camera_serial, calibration.camera.serial)),
+    ):
+        if not same:
+            raise OtherCellError(
+                f"{where} has {name} {new}, the calibration {known}: that is no drift.",
+                remedy="Check with images of the calibrated cell, or calibrate this one.",
+                differs=name,
+                found=str(new),
+                calibrated=str(known),
+            )
+
+
+def _serials(new: str, known: str) -> tuple[str, str, bool]:
+    return new, known, not new or not known or new == known

@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.boards.corners import to_grey
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import Touch, source_stamp
+from calibrate.files.calibration import source_stamp
 from calibrate.files.formatting import (
     PEER_HEAD,
     arm_sentences,
@@ -21,13 +21,13 @@ from calibrate.files.formatting import (
     pose_text,
     verdict_text,
 )
-from calibrate.files.verification import agrees, touch_text
+from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.geometry import Array, difference
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.observations import SHAPE, observe_views
+from calibrate.job import SolvedRecording
 from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
-from calibrate.pipeline import SolvedRecording
 from calibrate.report import html, plots
 from calibrate.results import PeerResult
 from recordings.images import viewable
@@ -88,7 +88,7 @@ def _verdict(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[str]:
     """All that one screen holds: the verdict, and the figures it stands on."""
     calibration = job.calibration
     good, quality = calibration.verdict != "FAIL", calibration.quality
-    if stamp := source_stamp(calibration):
+    if stamp := source_stamp(calibration.source):
         yield html.stamp(f"{stamp}. It is not installed on a real cell.")
     yield html.paragraph(rehearsal_text(job))
     expected = " ".join(gate.text for gate in quality.failed)

@@ -13,9 +13,9 @@ from rich.text import Text
 
 from calibrate.boards.model import outer_corners
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Touch, read_calibration
+from calibrate.files.calibration import read_calibration
 from calibrate.files.install import installed_calibration
-from calibrate.files.verification import touch_text
+from calibrate.files.touch import Touch, touch_text
 from recordings.schema.messages import BoardSpec
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview

@@ -15,10 +15,9 @@ import numpy as np
 
 from calibrate.boards.model import outer_corners
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Touch
 from calibrate.files.install import installed_calibration
-from calibrate.files.verification import note_in_file, note_installed
-from calibrate.files.versions import same_solve
+from calibrate.files.touch import Touch
+from calibrate.files.versions import note_in_file, note_installed, same_solve
 from calibrate.geometry import Array, inverse, transform_points
 from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec, Matrix4

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, Verdict, read_calibration
+from calibrate.files.folders import calibrations_folder, current_validity
 from calibrate.files.install import installed_calibration, objections_beside
-from calibrate.files.loader import calibrations_folder, current_validity
+from calibrate.files.touch import agrees
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
-from calibrate.files.verification import agrees
 from calibrate.files.versions import LogEntry, read_log, same_solve
 from calibrate.quality.checks import CheckEntry, read_checks
 from recordings.files import MAIN_CAMERA

@@ -17,8 +17,8 @@ from textual.widgets import DataTable, Static
 from calibrate.files.calibration import Calibration
 from calibrate.files.formatting import arm_sentences
 from calibrate.files.gate import Gate
+from calibrate.files.touch import agrees, touch_sigmas
 from calibrate.files.validity import ValidityState, validity_text
-from calibrate.files.verification import agrees, touch_sigmas
 from calibrate.files.versions import LogEntry, read_log
 from calibrate.geometry import difference
 from calibrate.quality.checks import FEWEST_FOR_TREND, CheckEntry, find_trend

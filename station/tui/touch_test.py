@@ -15,8 +15,8 @@ from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
 from calibrate.boards.model import board_points, outer_corners
-from calibrate.files.calibration import Touch, read_calibration
-from calibrate.files.verification import touch_text
+from calibrate.files.calibration import read_calibration
+from calibrate.files.touch import Touch, touch_text
 from recordings.schema.messages import BoardSpec
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import view_rms_px
-from calibrate.pipeline import SolvedRecording
 
 
 def test_result_and_sigmas(solved_real: SolvedRecording) -> None:

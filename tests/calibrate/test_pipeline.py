@@ -18,9 +18,10 @@ from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
+from calibrate.job import JobOptions, SolvedRecording
 from calibrate.kinematics import MODELS, forward, inverse_nearest
 from calibrate.load import load_views
-from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording
+from calibrate.pipeline import prepare_views, solve_recording
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Image, Stamps, View

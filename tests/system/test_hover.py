@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.files.calibration import Touch, read_calibration, write_calibration
-from calibrate.files.verification import agrees, note_in_file
+from calibrate.files.calibration import read_calibration, write_calibration
+from calibrate.files.touch import Touch, agrees
+from calibrate.files.versions import note_in_file
 from calibrate.geometry import Array, inverse, pose
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import CameraIdentity, Matrix4, RobotIdentity

@@ -11,8 +11,7 @@ from textual.widgets import DataTable
 
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install, rollback
-from calibrate.files.verification import note_installed
-from calibrate.files.versions import who
+from calibrate.files.versions import note_installed, who
 from station.cell.errors import StationError
 from station.tui import app as app_module
 from station.tui.app import StationApp

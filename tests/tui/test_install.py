@@ -10,12 +10,12 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input, OptionList, Static
 
-from calibrate.files.calibration import Override, Touch, write_calibration
+from calibrate.files.calibration import Override, write_calibration
 from calibrate.files.exports import FORMATS
 from calibrate.files.install import install, installed_calibration
+from calibrate.files.touch import Touch
 from calibrate.files.validity import Validity, ValidityReason, ValidityState
-from calibrate.files.verification import note_installed
-from calibrate.files.versions import installed_versions
+from calibrate.files.versions import installed_versions, note_installed
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.tui.dialogs import ChooseFormat, Confirm, Reason
 from station.tui.installed import Installed, Result, local

@@ -17,7 +17,7 @@ from calibrate.files.install import change_text, install, installed_calibration,
 from calibrate.files.lines import append_line
 from calibrate.files.versions import installed_versions, read_log
 from calibrate.geometry import Transform, perturb
-from calibrate.pipeline import SolvedRecording
+from calibrate.job import SolvedRecording
 from recordings.files import write_atomically
 from tests.calibrate.calling import raises_code
 from tests.durability import disk_order

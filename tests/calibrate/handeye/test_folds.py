@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import perturb
-from calibrate.handeye import diagnosis, profile_robust
+from calibrate.handeye import diagnosis
+from calibrate.handeye import solve as profile_robust
 from calibrate.handeye.diagnosis import cross_validate
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.fit import fit_cell

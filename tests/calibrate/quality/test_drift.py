@@ -15,10 +15,10 @@ from calibrate.cli.drift_check import check_text
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.files.calibration import FramePose
 from calibrate.geometry import Array, Transform, inverse, perturb, pose, rotation_exp
+from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, forward
 from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
-from calibrate.pipeline import SolvedRecording
 from calibrate.quality.checks import CheckEntry, append_check, earlier_results, find_trend, read_checks
 from calibrate.quality.drift import POWER, DriftCheck, Noise, check_drift, judge_shift, pnp_covariance, powers
 from calibrate.views import BoardView, ViewSet

@@ -21,7 +21,7 @@ from calibrate.handeye.solution import (
     Remark,
     Solution,
 )
-from calibrate.pipeline import SolvedRecording
+from calibrate.job import SolvedRecording
 from calibrate.quality.gates import GateInputs, GateLimits, judge, read_limits
 from calibrate.results import HoldoutScore
 from tests.calibrate.calling import raises_code

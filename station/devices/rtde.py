@@ -18,8 +18,6 @@ PORT = 30004
 PROTOCOL_VERSION = 2
 HEADER = struct.Struct(">HB")
 
-Value = bool | int | float | tuple[float, ...] | tuple[int, ...]
-
 
 class RtdeError(RobotError):
     """The bytes on the connection are not RTDE, or a variable was refused."""
@@ -180,17 +178,6 @@ class Recipe:
                 expected_bytes=self.packer.size - HEADER.size,
             )
         return self.packer.unpack(HEADER.pack(self.packer.size, PacketType.DATA) + payload)[3:]
-
-    def unpack(self, payload: bytes) -> dict[str, Value]:
-        """Elements by name; vectors as tuples."""
-        elements = self.unpack_elements(payload)
-        values: dict[str, Value] = {}
-        start = 0
-        for name, type_name in zip(self.names, self.types, strict=True):
-            count = DATA_TYPES[type_name].count
-            values[name] = elements[start] if count == 1 else elements[start : start + count]
-            start += count
-        return values
 
 
 def join_names(names: Iterable[str]) -> bytes:

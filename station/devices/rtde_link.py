@@ -55,7 +55,7 @@ class RtdeLink:
         answer = self._ask(PacketType.INPUT_SETUP, join_names(names))
         if IN_USE in split_names(answer[1:]):
             raise RtdeError(
-                "another client owns the RTDE input registers",
+                "another program controls the robot (its RTDE registers are in use)",
                 code="registers-in-use",
                 remedy="Close that program, or the field bus on the pendant, then try again.",
             )

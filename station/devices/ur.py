@@ -23,7 +23,7 @@ from station.cell.acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.rtde import RuntimeState
-from station.devices.ur_child import REFUSALS, ControlChild
+from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import (
     APPROVE_AGAIN,
     STALE_S,
@@ -34,6 +34,7 @@ from station.devices.ur_condition import (
     safety_stop,
     watchdog_cause,
 )
+from station.devices.ur_control import LIBRARY_REMEDY
 from station.devices.ur_dashboard import STOP, Dashboard, came
 from station.devices.ur_link import UrLink, link_lost
 from station.devices.ur_moves import MoveWatch, check_goal
@@ -86,7 +87,7 @@ def library_installed() -> bool:
 def control_trouble(path: str) -> tuple[str, str]:
     """Say what speaks against driving an arm that way, and what to do; empty: nothing."""
     if path == "ur_rtde" and not library_installed():
-        return "ur_rtde is not installed", REFUSALS["ur-rtde-missing"][1]
+        return "ur_rtde is not installed", LIBRARY_REMEDY
     return "", ""
 
 

@@ -241,7 +241,7 @@ class ScriptControl:
             raise RtdeError(f"no robot state came within {HANDSHAKE_S:g} s", code="no-state")
         if self._told.program not in (RuntimeState.STOPPED, RuntimeState.STOPPING):
             raise RobotError(
-                "a program is playing on the robot",
+                "another program is playing on the robot",
                 code="program-playing",
                 remedy="Stop it on the pendant, then try again.",
             )
@@ -250,7 +250,7 @@ class ScriptControl:
             # Open until the script answers: closed with unread data, it could take the text with it.
             if not self._wait(lambda: self._plays() and self._told.answer == sequence, START_S):
                 raise RobotError(
-                    "the control script did not start",
+                    "the control program did not start",
                     code="script-not-started",
                     remedy="Power on, release the brakes, clear the pendant's messages.",
                 )

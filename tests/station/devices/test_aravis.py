@@ -167,7 +167,7 @@ class Box:
         self.count += 1
         if self.wired:
             self.server.inject("pulse")
-        return TriggerPulse(self.count, 0, time.monotonic_ns())
+        return TriggerPulse(self.count, time.monotonic_ns())
 
     async def light(self, level: float) -> None: ...
 

@@ -107,7 +107,7 @@ class Box:
 
     async def fire(self) -> TriggerPulse:
         self.fired += 1
-        return TriggerPulse(self.fired, 0, 0)
+        return TriggerPulse(self.fired, 0)
 
 
 def opened(device: Device, config: CameraConfig, trigger: Any = None) -> AravisCamera:

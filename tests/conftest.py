@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ from tests.isolated_network import isolated_thread
 
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
 
+# Hundreds of programs are started: without its byte code each of them compiles the source first.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 for _size in ("COLUMNS", "LINES"):  # a shell may export them: what is printed would break elsewhere
     os.environ.pop(_size, None)
 

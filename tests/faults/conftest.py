@@ -244,7 +244,7 @@ async def camera(
     controller: Callable[..., SimulatedController], tmp_path: Path
 ) -> AsyncIterator[RenderedCamera]:
     """Opened, before the published cell's arm."""
-    cell = make_cell()
+    cell = make_cell("paper-binned")
     write_truth(cell, tmp_path / "truth.json")
     rendered = RenderedCamera(cell, controller(truth=tmp_path / "truth.json").host)
     await rendered.open()

@@ -52,6 +52,11 @@ class BoardShape(msgspec.Struct, frozen=True):
     bend_m: tuple[float, float, float]
     sigma: tuple[float, float, float, float, float]
 
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """(5,) in the order of `SHAPE`."""
+        return np.array([self.scale, self.anisotropy, *self.bend_m])
+
 
 @dataclass(frozen=True, eq=False)
 class PeerResult:

@@ -145,11 +145,16 @@ def _apply(H: Array, points: Array) -> Array:
 
 
 @lru_cache(maxsize=8)
-def marker_detector(dictionary: str, border_bits: int, smallest: float = _SMALLEST_PERIMETER) -> Any:
+def marker_detector(
+    dictionary: str,
+    border_bits: int,
+    smallest: float = _SMALLEST_PERIMETER,
+    refinement: int = cv2.aruco.CORNER_REFINE_SUBPIX,
+) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = smallest
     parameters.markerBorderBits = border_bits
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.cornerRefinementMethod = refinement
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)), parameters)
 
 
@@ -202,7 +207,10 @@ def find_tag(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indice
 
     `thorough`: where it is not seen, the dark parts of the image are brightened.
     """
-    quick, other = (marker_detector(tag_dictionary(spec), 1), _quad_detector(tag_dictionary(spec)))
+    quick = marker_detector(tag_dictionary(spec), 1)
+    # AprilTag's search for quadrilaterals: slower, finds what OpenCV's leaves out (8 of 55 rendered). Its
+    # corners are half a pixel off; the fit of the sides mends that.
+    other = marker_detector(tag_dictionary(spec), 1, refinement=cv2.aruco.CORNER_REFINE_APRILTAG)
     attempts = [(quick, grey), (other, grey)]
     if thorough:
         attempts.append((other, equalise(grey)))
@@ -210,17 +218,6 @@ def find_tag(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indice
     if corners is None:
         return NOTHING
     return np.arange(4), fit_sides(grey, corners)[_ROW_BY_ROW]
-
-
-@lru_cache(maxsize=8)
-def _quad_detector(dictionary: str) -> Any:
-    """AprilTag's search for quadrilaterals: slower, finds what OpenCV's leaves out (8 of 55 rendered).
-
-    Its corners are half a pixel off; the fit of the sides mends that.
-    """
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
-    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)), parameters)
 
 
 def _seen(detector: Any, grey: Grey, spec: BoardSpec) -> Array | None:

@@ -23,11 +23,12 @@ from calibrate.batch.workers import BatchWorkers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.contracts import FleetCameraJson, FleetJson
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit, takes
-from calibrate.cli.output import AsJson, err, out, print_json, progress_bar
+from calibrate.cli.output import AsJson, err, out, print_json
 from calibrate.errors import UsageError
 from calibrate.job import JobOptions
 from calibrate.load import Progress as LoadProgress
 from calibrate.quality.gates import GateLimits, read_limits
+from recordings.cli.console import progress_bar
 
 DONE_WITH_LOSS = 3
 OutputFolder = Annotated[str, typer.Option("-o", "--output", help="Folder of the results, or a URL")]
@@ -168,7 +169,7 @@ def _stoppable(label: str) -> Iterator[LoadProgress | None]:
     """A bar on a terminal. SIGTERM ends the command as Ctrl-C does, with everything it started."""
     before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
-        with progress_bar(label) if err.is_terminal else nullcontext() as bar:
+        with progress_bar(label, err) if err.is_terminal else nullcontext() as bar:
             yield bar
     finally:
         signal.signal(signal.SIGTERM, before)

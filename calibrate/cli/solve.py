@@ -13,7 +13,6 @@ from rich.table import Table
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.cli.contracts import (
     CompareJson,
-    HoldoutJson,
     MethodJson,
     RejectedJson,
     SolveJson,
@@ -97,7 +96,6 @@ def solve(
 def solve_json(job: SolvedRecording) -> SolveJson:
     """Build the object that `calibrate solve --json` prints."""
     found, quality = job.calibration, job.calibration.quality
-    score = quality.holdout
     return SolveJson(
         mount=found.mount,
         result=found.result,
@@ -109,7 +107,7 @@ def solve_json(job: SolvedRecording) -> SolveJson:
             [ViewWeight(index, weight) for index, weight in job.solution.weights.items()],
         ),
         intrinsics=found.intrinsics,
-        holdout=None if score is None else HoldoutJson(score.e_t_m, score.e_R),
+        holdout=quality.holdout,
         certificate=quality.certificate,
         gates=quality.gates,
         verdict="pass" if job.passed else "fail",
@@ -196,7 +194,8 @@ def compare(
         results = compare_all(prepared.views, solver_options(options, prepared))
     if as_json:
         views = [view.index for view in prepared.views]
-        print_json(CompareJson(prepared.views.mount, views, [_method(peer) for peer in results]))
+        plain = msgspec.to_builtins(results, enc_hook=lambda array: array.tolist())
+        print_json(CompareJson(prepared.views.mount, views, msgspec.convert(plain, list[MethodJson])))
         return
     table = Table(*PEER_HEAD, box=None)
     for peer in results:
@@ -216,12 +215,3 @@ def _table_of_X(results: list[PeerResult]) -> Table:
         turn = [f"{v:.4f}" for v in np.degrees(rotation_log(peer.matrix[:3, :3]))] if peer.rigid else ["-"]
         table.add_row(peer.name, *(f"{1e3 * v:.3f}" for v in peer.matrix[:3, 3]), *turn)
     return table
-
-
-def _method(peer: PeerResult) -> MethodJson:
-    plain = {name: getattr(peer, name) for name in MethodJson.__struct_fields__}
-    plain = {
-        name: value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-        for name, value in plain.items()
-    }
-    return msgspec.convert(plain, MethodJson)

@@ -91,9 +91,7 @@ def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") ->
         )
     views, shape = views.select(far), solution.board
     observed = observe_views(views)
-    numbers = (
-        np.zeros(len(SHAPE)) if shape is None else np.array([shape.scale, shape.anisotropy, *shape.bend_m])
-    )
+    numbers = np.zeros(len(SHAPE)) if shape is None else shape.numbers
     C = boards_by_corners(observed, solution.camera, views.camera_from_board, numbers)
     joints = np.array([view.joints_rad for view in views], dtype=float)
     middle = np.array([*observed.extent[0], 0.0, 1.0])

@@ -14,10 +14,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, inverse
+from calibrate.geometry import Array
 from calibrate.handeye.arm import PARAMETERS
 from calibrate.handeye.linear import Linear
-from calibrate.handeye.observations import SHAPE, CellState, Layout, Observations, extent_of
+from calibrate.handeye.observations import (
+    SHAPE,
+    CellState,
+    Layout,
+    Observations,
+    board_in_camera,
+    extent_of,
+)
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.projection import camera_matrix
 from recordings.schema.messages import CameraModel, Mount
@@ -53,10 +60,7 @@ def view_information(
     by each error of the arm's table.
     """
     n, k = len(base_from_flange), len(board_points)
-    if mount == "eye-in-hand":
-        C = inverse(base_from_flange @ X) @ Y
-    else:
-        C = inverse(X) @ base_from_flange @ Y
+    C = board_in_camera(mount, base_from_flange, X, Y)
     observed = Observations(
         mount,
         base_from_flange,

@@ -167,6 +167,11 @@ def implied_flange(mount: Mount, X: Array, Y: Array, C: Array) -> Array:
     return np.asarray(X @ C @ inverse(Y))
 
 
+def board_in_camera(mount: Mount, flange: Array, X: Array, Y: Array) -> Array:
+    """Predict camera_from_board (..., 4, 4) of base_from_flange (..., 4, 4): (F X)⁻¹ Y, or X⁻¹ F Y."""
+    return np.asarray(inverse(flange @ X) @ Y if mount == "eye-in-hand" else inverse(X) @ flange @ Y)
+
+
 def flange_residuals(observed: Observations, state: CellState) -> Array:
     """Compute [δt, δφ] (n, 6) in base, implied minus recorded flange, without errors of the arm's table."""
     X, Y = state.poses(observed)

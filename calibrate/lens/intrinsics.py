@@ -17,6 +17,7 @@ import numpy as np
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.corners import CornerBlocks, corner_residuals, linearise_corners
+from calibrate.handeye.linear import inverse_of
 from calibrate.handeye.observations import Observations, observe_views
 from calibrate.handeye.priors import LensPrior
 from calibrate.lens.pnp import planar_tilts
@@ -238,15 +239,10 @@ def _judged(
     information, *_ = _reduced(blocks, 0.0)
     freedom = max(2 * float(corners.sum()) - len(information) - 6 * len(corners), 1.0)
     total = information * freedom / max(float(square.sum()), 1e-12) + np.diag(prior.sigma**-2.0)
-    scale = 1 / np.sqrt(np.maximum(np.diag(total), 1e-300))
-    values, vectors = np.linalg.eigh(total * np.outer(scale, scale))
-    # What is not determined at all has a huge sigma, not an infinite one.
-    basis = vectors * scale[:, None]
-    covariance = (basis / np.maximum(values, 1e-16)) @ basis.T
     return LensFit(
         camera,
         C,
-        covariance,
+        inverse_of(total),
         float(np.sqrt(square.sum() / corners.sum())),
         np.sqrt(square.sum(axis=1) / corners),
     )

@@ -38,7 +38,6 @@ class BoardNow:
     """(3,) unit normal in `board`, towards the camera."""
     moved_m: float
     """Distance of the board's origin from its pose in the calibration; eye-in-hand only, else 0."""
-    moved_rad: float
 
 
 def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) -> BoardNow:
@@ -71,7 +70,6 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
         seen,
         np.array([0.0, 0.0, towards_camera]),
         float(np.linalg.norm(misses[best][:3])) if in_hand else 0.0,
-        float(np.linalg.norm(misses[best][3:])) if in_hand else 0.0,
     )
 
 
@@ -90,8 +88,7 @@ def found_points(calibration: Calibration, board: BoardSpec) -> Array:
         return points
     whole = BoardView(0, "", np.eye(4), points, np.zeros((len(points), 2)))
     observed = observe_views(ViewSet(calibration.mount, (whole,), calibration.intrinsics.model))
-    shape = np.array([found.scale, found.anisotropy, *found.bend_m])
-    return np.asarray(bent_points(observed, shape)[0])
+    return np.asarray(bent_points(observed, found.numbers)[0])
 
 
 def _is_small(miss: Array) -> bool:

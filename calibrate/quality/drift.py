@@ -18,9 +18,10 @@ from scipy import special
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError, UsageError
 from calibrate.files.calibration import Calibration
-from calibrate.geometry import Array, difference, inverse, perturb
+from calibrate.geometry import Array, difference, perturb
+from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.corners import bent_points, boards_by_corners
-from calibrate.handeye.observations import extent_of, observe_views
+from calibrate.handeye.observations import board_in_camera, extent_of, observe_views
 from calibrate.lens.model import project
 from calibrate.views import ViewSet, require_no_copies
 from recordings.schema.messages import CameraModel, Mount, SessionInfo, Source
@@ -121,9 +122,8 @@ def with_found_shape(views: ViewSet, calibration: Calibration) -> ViewSet:
     if found is None:
         return views
     observed = replace(observe_views(views), extent=extent_of(board_points(calibration.board)))
-    shape = np.array([found.scale, found.anisotropy, *found.bend_m])
-    C = boards_by_corners(observed, views.camera, views.camera_from_board, shape)
-    points = bent_points(observed, shape)
+    C = boards_by_corners(observed, views.camera, views.camera_from_board, found.numbers)
+    points = bent_points(observed, found.numbers)
     shaped = [
         replace(view, board_points=points[i, : len(view.pixels)], camera_from_board=C[i])
         for i, view in enumerate(views)
@@ -144,22 +144,21 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
             views=len(views),
             needed=FEWEST_VIEWS,
         )
-    flanges, in_hand = views.base_from_flange, views.mount == "eye-in-hand"
-    seen = views.camera_from_board
+    flanges, seen = views.base_from_flange, views.camera_from_board
     pnp = np.array(
         [pnp_covariance(v.board_points, views.camera, c) for v, c in zip(views, seen, strict=True)]
     )
     pnp *= noise.corner_px**2
     robot = np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
     X = installed.copy()
-    P = (flanges[0] if in_hand else inverse(flanges[0])) @ installed @ seen[0]
+    P = mount_poses(flanges[0], views.mount) @ installed @ seen[0]
     for _ in range(_ITERATIONS):
-        information, gradient, misfit = _normal_equations(flanges, in_hand, seen, X, P, robot, pnp)
+        information, gradient, misfit = _normal_equations(views.mount, flanges, seen, X, P, robot, pnp)
         fitted_all = _inverse(information)
         step = -fitted_all @ gradient
         fitted = fitted_all[:6, :6]
         X, P = perturb(X, step[:6]), perturb(P, step[6:])
-    _, _, misfit = _normal_equations(flanges, in_hand, seen, X, P, robot, pnp)
+    _, _, misfit = _normal_equations(views.mount, flanges, seen, X, P, robot, pnp)
     shift = difference(X, installed)
     total = fitted + covariance
     statistic = float(shift @ np.linalg.solve(total, shift))
@@ -221,7 +220,7 @@ def _views_needed(fitted: Array, installed: Array, views: int, nu: float) -> int
 
 
 def _normal_equations(
-    flanges: Array, in_hand: bool, seen: Array, X: Array, P: Array, robot: Array, pnp: Array
+    mount: Mount, flanges: Array, seen: Array, X: Array, P: Array, robot: Array, pnp: Array
 ) -> tuple[Array, Array, float]:
     """(12, 12) information of [δX, δP], (12,) gradient, and the misfit r'Wr.
 
@@ -231,8 +230,7 @@ def _normal_equations(
     steps = _STEP * np.eye(6)[:, None]
 
     def miss(F: Array, X: Array, P: Array) -> Array:
-        H = F if in_hand else inverse(F)
-        return difference(seen, inverse(H @ X) @ P)
+        return difference(seen, board_in_camera(mount, F, X, P))
 
     def slope(moved: Array, r: Array) -> Array:
         """(6, n, 6) misses after each step → (n, 6, 6) Jacobians."""

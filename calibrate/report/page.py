@@ -206,9 +206,7 @@ def _modelled_pixels(job: SolvedRecording) -> ModelledPixels:
     refitted = solve_pnp(replace(job.views, camera=camera))
     kept = {view.index: view for view in job.solution.kept}
     views = replace(refitted, views=tuple(kept.get(view.index, view) for view in refitted))
-    shape = (
-        np.zeros(len(SHAPE)) if board is None else np.array([board.scale, board.anisotropy, *board.bend_m])
-    )
+    shape = np.zeros(len(SHAPE)) if board is None else board.numbers
     points = bent_points(observe_views(views), shape)
     return {
         view.index: (view.pixels, project(camera, view.camera_from_board, points[i, : len(view.pixels)]))

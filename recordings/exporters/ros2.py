@@ -15,6 +15,7 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.images import mosaic_encoding, raw_encoding
+from recordings.importers.messages import ros_types
 from recordings.reader import Recording
 from recordings.schema.definitions import PictureFacts
 from recordings.schema.messages import CameraModel, Matrix4, View
@@ -38,12 +39,9 @@ class _Entry(NamedTuple):
 
 def write_ros2(recording: Recording, folder: Path) -> None:
     """Fills the folder with `NAME.mcap` and `metadata.yaml`. Wall time is the bag's time. RecordingError."""
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-    except ImportError as error:
-        text, remedy = "ROS 2 bags need the package rosbags", "pip install 'calibration-station[ros]'"
-        raise RecordingError(text, code="missing-package", remedy=remedy) from error
     messages = _Messages()
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
     inner = folder / recording.info.name
     with Writer(inner, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
@@ -160,9 +158,7 @@ class _Messages:
     """ROS 2's messages, made by the names of their types."""
 
     def __init__(self) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self.store = get_typestore(Stores.ROS2_HUMBLE)
+        self.store = ros_types()
 
     def make(self, kind: str, *fields: Any) -> Any:
         return self.store.types[kind](*fields)

@@ -72,7 +72,7 @@ def import_bag(
     wanted: Wanted = Wanted(),  # noqa: B008 - frozen
     limits: StandstillLimits = StandstillLimits(),  # noqa: B008 - frozen
     pair_within_s: float = PAIR_WITHIN_S,
-    progress: Progress = lambda text, done, total: None,
+    progress: Progress = lambda done, total, text: None,
 ) -> BagPlan:
     """`output` None: says what would be taken and writes nothing. Raises ImportSourceError or RecordingError.
 
@@ -177,7 +177,7 @@ def _write(
                 last, waiting = waiting, next(states, None)
             joints_rad = _joints_at(stop.stamp_ns, last, waiting, pair_within_s)
             _write_view(writer, index[stop.place], stop, image, joints_rad)
-            progress("importing", done + 1, len(stops))
+            progress(done + 1, len(stops), "importing")
         while waiting is not None:
             writer.robot_state(waiting)
             waiting = next(states, None)

@@ -90,7 +90,7 @@ class Bag:
             yield message
             self._done += 1
             if self._done <= self._total and self._done % _SHOWN_EVERY == 0:
-                self._progress("reading the bag", self._done, self._total)
+                self._progress(self._done, self._total, "reading the bag")
 
     def values(self, topic: str) -> Iterator[Value]:
         """Yield the values in the order of the file. Raises ImportSourceError."""
@@ -115,7 +115,7 @@ class Bag:
             yield image
 
 
-def open_bag(path: Path, progress: Progress = lambda text, done, total: None) -> Bag:
+def open_bag(path: Path, progress: Progress = lambda done, total, text: None) -> Bag:
     """A bag's folder, or one file; MCAP is proven first. Raises ImportSourceError or RecordingError."""
     if path.suffix == ".bag":
         remedy = f"Convert it first: rosbags-convert --src {path} --dst BAG"
@@ -146,7 +146,7 @@ class _McapBag:
                 self._files.append((Contents(), Source(open_file(path))))
 
                 def scanned(bytes_done: int, before: int = done) -> None:
-                    progress("checking the bag", before + bytes_done, total)
+                    progress(before + bytes_done, total, "checking the bag")
 
                 contents, source, _ = scan_file(self._files[-1][1].descriptor, path, _RESCUE, scanned)
                 self._files[-1] = (contents, source)

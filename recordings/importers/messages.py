@@ -30,8 +30,8 @@ from recordings.schema.messages import CameraModel
 from recordings.schema.viewing import camera_model_of, intrinsics
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
-"""Is told what is being done, how much of it is, and of how much."""
+Progress = Callable[[int, int, str], None]
+"""Is told how much is done, of how much, and what is being done."""
 
 
 class Kind(Enum):

@@ -18,10 +18,11 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from calibrate.cli.contracts import HoldoutJson, SolveJson
+from calibrate.cli.contracts import SolveJson
 from calibrate.files.calibration import Sigma, read_calibration
 from calibrate.files.formatting import arm_sentences
 from calibrate.geometry import difference
+from calibrate.results import HoldoutScore
 from recordings.errors import ErrorReport
 from recordings.files import state_root
 from recordings.reader import open_recording
@@ -70,7 +71,7 @@ class DemoJson(msgspec.Struct, frozen=True):
     recording: str
     calibration: str
     report: str
-    holdout: HoldoutJson | None
+    holdout: HoldoutScore | None
     gates_passed: bool
     arm: DemoArmJson
 

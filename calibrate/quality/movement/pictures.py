@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, inverse, perturb, skew, transform_points
+from calibrate.handeye.observations import board_in_camera
 from calibrate.kinematics import RobotModel, jacobian
 from calibrate.projection import camera_matrix, project
 from recordings.schema.messages import CameraModel, Mount
@@ -91,20 +92,13 @@ class Deviations:
         return len(self.y)
 
 
-def predicted_board(cell: CellModel, flange: Array, P: Array) -> Array:
-    """Predict camera_from_tag (n, 4, 4); P: base_from_tag (eye-in-hand) or flange_from_tag, (4, 4)."""
-    if cell.mount == "eye-in-hand":
-        return np.asarray(inverse(flange @ cell.X) @ P)
-    return np.asarray(inverse(cell.X) @ flange @ P)
-
-
 def deviations(
     cell: CellModel, P: Array, pictures: list[Picture], arm: ArmErrors
 ) -> tuple[Deviations, Deviations]:
     """Whiten pictures of equally many corners for the two tests: repeated postures, and any postures."""
     flange = np.array([picture.base_from_flange for picture in pictures])
     points = np.array([picture.points for picture in pictures])
-    C = predicted_board(cell, flange, P)
+    C = board_in_camera(cell.mount, flange, cell.X, P)
     turned = points @ np.swapaxes(C[:, :3, :3], 1, 2)
     projected = project(cell.camera, turned + C[:, None, :3, 3], with_intrinsics=True)
     r = np.array([picture.pixels for picture in pictures]) - projected.pixels
@@ -232,7 +226,7 @@ def same_corners(pictures: list[Picture]) -> list[list[Picture]]:
 def _median_px(cell: CellModel, P: Array, pictures: list[Picture]) -> float:
     found = []
     for group in same_corners(pictures):
-        C = predicted_board(cell, np.array([p.base_from_flange for p in group]), P)
+        C = board_in_camera(cell.mount, np.array([p.base_from_flange for p in group]), cell.X, P)
         seen = project(cell.camera, transform_points(C, np.array([p.points for p in group]))).pixels
         found.append(np.sqrt(np.mean((np.array([p.pixels for p in group]) - seen) ** 2, axis=(1, 2))))
     rms_px = np.concatenate(found)

@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.watch import Cell, Happening, simulate
 from calibrate.geometry import Array, perturb, transform_points
+from calibrate.handeye.observations import board_in_camera
 from calibrate.projection import project_pixels
 from calibrate.quality.movement.evidence import Moved
 from calibrate.quality.movement.monitor import (
@@ -25,7 +26,6 @@ from calibrate.quality.movement.pictures import (
     CellModel,
     Picture,
     deviations,
-    predicted_board,
 )
 from calibrate.quality.movement.window import KEPT, LEARNING, RunningSums
 from recordings.schema.messages import Mount
@@ -172,7 +172,7 @@ def test_effects_are_the_derivatives_of_the_picture(mount: Mount) -> None:
     P[:3, 3] += [0.1, 0.0, 0.6] if mount == "eye-in-hand" else [0.0, 0.0, 0.1]
 
     def seen(cell: CellModel, tag: Array) -> list[Picture]:
-        C = predicted_board(cell, np.array([p.base_from_flange for p in pictures]), tag)
+        C = board_in_camera(cell.mount, np.array([p.base_from_flange for p in pictures]), cell.X, tag)
         points = np.array([p.points for p in pictures])
         pixels = project_pixels(cell.camera, transform_points(C, points))
         return [replace(p, pixels=pixels[k]) for k, p in enumerate(pictures)]

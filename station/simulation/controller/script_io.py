@@ -8,7 +8,8 @@ import socket
 from collections.abc import Generator
 
 from station.simulation.controller.state import DIGITAL_BANKS, ControllerState
-from station.simulation.controller.urscript import Builtin, ScriptRuntimeError, Value
+from station.simulation.controller.urscript import ScriptRuntimeError, Value
+from station.simulation.controller.urscript_parser import Builtin
 
 Wait = Generator[None, None, Value]
 OPEN_S = 2.0

@@ -30,7 +30,8 @@ from station.simulation.controller.paths import ArcPath, JointPath, LinePath, Pa
 from station.simulation.controller.script_io import Wait
 from station.simulation.controller.script_pure import pose_of, rigid, six, text_of
 from station.simulation.controller.state import ControllerState, twist_between
-from station.simulation.controller.urscript import Builtin, Pose, ScriptRuntimeError, Thread
+from station.simulation.controller.urscript import Pose, ScriptRuntimeError, Thread
+from station.simulation.controller.urscript_parser import Builtin
 
 KILLED_RAD_S2 = 40.0
 """Deceleration of an arm whose moving thread was killed and that nobody stops: very sudden."""

@@ -31,13 +31,15 @@ from benchmarks.random_cells import (
 from benchmarks.scene import MID
 from benchmarks.trials import trials
 from calibrate.geometry import Array, difference, perturb, pose, rotation_exp
+from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.information import MeasurementNoise
-from calibrate.handeye.observations import SHAPE, CellState, Observations, extent_of
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.kinematics import forward
 from calibrate.projection import project
+from calibrate.results import SHAPE
+from calibrate.views import Observations, extent_of
 from station.analysis.worker import check_run
 from station.cell.errors import LimitError
 from station.cell.limits import allowed_speed, check_plan, sample_path

@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb
 from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA, ArmPostures, corrected_model
+from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corners import boards_by_corners
 from calibrate.handeye.estimate import CellFit
-from calibrate.handeye.observations import SHAPE, Layout, observe_views
 from calibrate.handeye.solution import MEASURED, Solution, TableRefusal, TableResult, Verification
 from calibrate.handeye.workspace import MIDDLE, SPREAD, Workspace, sample_workspace
 from calibrate.kinematics import forward
 from calibrate.projection import intrinsics_vector
-from calibrate.views import BoardView, ViewSet
+from calibrate.results import SHAPE
+from calibrate.views import BoardView, ViewSet, observe_views
 
 _NOMINAL_M = 1e-4
 """Recorded flanges farther than this from the nominal table, rms, are another table's."""

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, perturb, skew
-from calibrate.handeye.observations import SHAPE, Observations
 from calibrate.projection import intrinsics_names, project, project_pixels
+from calibrate.results import SHAPE
+from calibrate.views import Observations
 from recordings.schema.messages import CameraModel
 
 _CHUNK_POINTS = 40_000

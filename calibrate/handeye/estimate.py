@@ -17,11 +17,11 @@ from calibrate.geometry import Array
 from calibrate.handeye.arm import ArmPostures
 from calibrate.handeye.axxb.pairs import Pairs
 from calibrate.handeye.axxb.robust import GlobalResult
+from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corners import corner_distance, corner_residuals
 from calibrate.handeye.linear import GAIN, ROBOT_PRIOR_COUNT, STUDENT, WIDE, Fit, Linear, Scales, first_scales
-from calibrate.handeye.observations import CellState, Observations
 from calibrate.handeye.priors import Priors
-from calibrate.views import ViewSet
+from calibrate.views import Observations, ViewSet
 
 MAX_STEPS = 15
 REJECTED = 0.05

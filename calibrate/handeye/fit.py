@@ -17,21 +17,14 @@ from calibrate.handeye.arm import (
 )
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
+from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.estimate import CellFit, Estimate, MeanParts, corner_weights, estimate
 from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.metrics import require_motion
-from calibrate.handeye.observations import (
-    SHAPE,
-    CellState,
-    Layout,
-    Moved,
-    Observations,
-    Places,
-    observe_views,
-)
 from calibrate.handeye.poses import BoardPoses, PoseViews, agreed_start, fit_poses
 from calibrate.handeye.priors import Priors
-from calibrate.views import BoardView, ViewSet
+from calibrate.results import SHAPE
+from calibrate.views import BoardView, Moved, Observations, Places, ViewSet, observe_views
 
 FEWEST_FOR_TABLE = 8
 """Fewer views cannot tell 18 errors of a table from noise."""

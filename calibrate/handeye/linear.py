@@ -16,15 +16,9 @@ import numpy as np
 from scipy import linalg
 
 from calibrate.geometry import Array, perturb
+from calibrate.handeye.cell_state import CellState, Layout, Quadratic, flange_derivatives, flange_residuals
 from calibrate.handeye.corners import CornerBlocks, linearise_corners
-from calibrate.handeye.observations import (
-    CellState,
-    Layout,
-    Observations,
-    flange_derivatives,
-    flange_residuals,
-)
-from calibrate.handeye.priors import Quadratic
+from calibrate.views import Observations
 
 ROUNDS = 8
 GAIN = np.array([1.0, 3.0, 10.0])

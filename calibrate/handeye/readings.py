@@ -23,10 +23,9 @@ from calibrate.geometry import (
     rotation_log,
 )
 from calibrate.handeye.estimate import FULL
-from calibrate.handeye.observations import Moved
 from calibrate.handeye.poses import BoardPoses, PoseFit, PoseViews, fit_poses
 from calibrate.handeye.solution import Explanation, Reading
-from calibrate.views import ViewSet
+from calibrate.views import Moved, ViewSet
 
 _CLEAR = 10.0
 """Log evidence beyond chance by which another reading has to win."""

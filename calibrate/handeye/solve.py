@@ -12,6 +12,7 @@ from calibrate.handeye.arm import FLEX, PARAMETERS, RELATIVE_SIGMA
 from calibrate.handeye.arm_result import table_result
 from calibrate.handeye.axxb.objective import pair_covariance
 from calibrate.handeye.axxb.pairs import all_pairs, mount_poses
+from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corners import boards_by_corners, corner_distance, corner_residuals
 from calibrate.handeye.diagnosis import (
     cross_validate,
@@ -33,7 +34,6 @@ from calibrate.handeye.metrics import (
     require_solvable,
     score_holdout,
 )
-from calibrate.handeye.observations import Layout, Moved
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.profile_paper import solve_paper_profile
@@ -51,7 +51,7 @@ from calibrate.handeye.solution import (
 )
 from calibrate.results import BoardShape, HoldoutScore
 from calibrate.stopwatch import Stopwatch
-from calibrate.views import ViewSet
+from calibrate.views import Moved, ViewSet
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
 

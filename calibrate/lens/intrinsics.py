@@ -18,11 +18,10 @@ from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.corners import CornerBlocks, corner_residuals, linearise_corners
 from calibrate.handeye.linear import inverse_of
-from calibrate.handeye.observations import Observations, observe_views
 from calibrate.handeye.priors import LensPrior
 from calibrate.lens.pnp import planar_tilts
 from calibrate.projection import camera_matrix, intrinsics_names, intrinsics_vector, with_intrinsics_vector
-from calibrate.views import ViewSet
+from calibrate.views import Observations, ViewSet, observe_views
 from recordings.schema.messages import CameraModel
 
 LensModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]

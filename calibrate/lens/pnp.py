@@ -16,10 +16,9 @@ from calibrate.boards.model import board_from_turned, looks_same_turns
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, rotation_log, transform_points
 from calibrate.handeye.corners import corner_residuals, linearise_corners
-from calibrate.handeye.observations import Observations, observe_views
 from calibrate.lens.model import project, undistort
 from calibrate.projection import camera_matrix
-from calibrate.views import BoardView, ViewSet
+from calibrate.views import BoardView, Observations, ViewSet, observe_views
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 
 _STEPS = 20

@@ -16,10 +16,9 @@ from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, inverse, perturb, transform_points
 from calibrate.handeye.corners import bent_points
-from calibrate.handeye.observations import observe_views
 from calibrate.lens.pnp import Candidate, candidate_poses
 from calibrate.quality.drift import Noise, pnp_covariance, with_found_shape
-from calibrate.views import BoardView, ViewSet
+from calibrate.views import BoardView, ViewSet, observe_views
 from recordings.schema.messages import BoardSpec
 
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.01, 0.03

@@ -24,12 +24,12 @@ from calibrate.files.formatting import (
 from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.geometry import Array, difference
 from calibrate.handeye.corners import bent_points
-from calibrate.handeye.observations import SHAPE, observe_views
 from calibrate.job import SolvedRecording
 from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
 from calibrate.report import html, plots
-from calibrate.results import PeerResult
+from calibrate.results import SHAPE, PeerResult
+from calibrate.views import observe_views
 from recordings.images import viewable
 
 _PICTURES_LIMIT = 60

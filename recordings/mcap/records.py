@@ -20,6 +20,8 @@ FOOTER = struct.Struct("<QQI")
 _CHUNK_HEAD = struct.Struct("<QQQI")
 FOOTER_BYTES = RECORD_HEAD.size + FOOTER.size
 
+Piece = bytes | bytearray | memoryview
+
 
 class Opcode(IntEnum):
     HEADER = 0x01

@@ -21,7 +21,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
 
 from recordings.images import Pixels, raw_encoding
-from recordings.mcap.writer import Piece
+from recordings.mcap.records import Piece
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,

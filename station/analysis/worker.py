@@ -12,7 +12,6 @@ import multiprocessing
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,9 +20,7 @@ from numpy.typing import NDArray
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from recordings.errors import RecordingError
-from recordings.images import Pixels, viewable
-from recordings.reader import open_recording
+from recordings.images import Pixels
 from recordings.schema.messages import BoardSpec, CameraModel, Vector6
 from station.cell.config import StationConfig
 from station.cell.limits import PlanCheck, check_plan
@@ -116,22 +113,6 @@ def sight(
         advice=advice,
     )
     return BoardDetection(status, found.indices, found.pixels)
-
-
-def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:
-    """The views of a recording that show the board; an image that cannot be read shows none.
-
-    RecordingError for a recording that cannot be read.
-    """
-    recording, seen = open_recording(path), []
-    for view in recording.views():
-        with contextlib.suppress(RecordingError):
-            image = recording.image(view)
-            found = detect(viewable(image.pixels, image.pixel_format), board)
-            if found.found:
-                flange = np.array(view.base_from_flange)
-                seen.append(CapturedView(view.index, flange, found.indices, found.pixels))
-    return seen
 
 
 def _distance_and_tilt(

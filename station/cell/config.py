@@ -146,6 +146,10 @@ class Plane(Section, frozen=True):
     normal: Vector3
 
 
+SPEED_CAP_M_S = 0.25
+"""Of any modelled point, in code: no configuration raises it."""
+
+
 class LimitsConfig(Section, frozen=True):
     speed_m_s: float = 0.25
     """Speed of any modelled point of arm, tool or camera; code caps it at 0.25."""

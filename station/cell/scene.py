@@ -22,7 +22,7 @@ from calibrate.geometry import (
 from calibrate.kinematics import MODELS, RobotModel, forward
 from calibrate.projection import camera_matrix
 from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
-from station.cell.collision import CellGeometry, gap_to_arm, plate
+from station.cell.collision import SPACING_M, CellGeometry, gap_to_arm, plate
 from station.cell.config import (
     Capsule,
     PoseGuess,
@@ -34,7 +34,6 @@ from station.cell.config import (
     vector6,
 )
 from station.cell.errors import ConfigError, LimitError
-from station.cell.limits import SPACING_M
 from station.cell.plan import Plan, PlannedPose
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035

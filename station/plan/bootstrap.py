@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, perturb, pose, rotation_exp, transform_points
 from calibrate.kinematics import RobotModel, forward, inverse_nearest
-from station.cell.collision import CellGeometry, margins
+from station.cell.collision import SPACING_M, CellGeometry, margins
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
-from station.cell.limits import SPACING_M, check_path, joint_bounds
+from station.cell.limits import check_path, joint_bounds
 from station.cell.plan import PlannedPose
 from station.cell.scene import Scene, arm_model, geometry_from, geometry_of
 from station.plan.belief import (

@@ -21,9 +21,9 @@ from recordings.schema.messages import BoardSpec, Image, RobotState
 from station.analysis.pool import WorkerError
 from station.analysis.preview import preview_image
 from station.analysis.worker import BoardDetection, sight
-from station.cell.config import matrix4
+from station.cell.config import SPEED_CAP_M_S, matrix4
 from station.cell.errors import CameraError, RefusedError, RobotError, StationError
-from station.cell.limits import SPEED_CAP_M_S, point_speed_m_s
+from station.cell.limits import point_speed_m_s
 from station.cell.scene import flange_pose
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import (

@@ -20,7 +20,8 @@ from calibrate.geometry import (
     rotation_exp,
 )
 from calibrate.kinematics import MODELS, forward
-from station.cell.limits import SPEED_CAP_M_S, check_plan
+from station.cell.config import SPEED_CAP_M_S
+from station.cell.limits import check_plan
 from station.cell.scene import cell_geometry, scene_of
 from station.plan import planner
 from station.plan.candidates import NOT_IN_PICTURE, find_candidates

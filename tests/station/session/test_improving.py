@@ -15,14 +15,15 @@ from calibrate.geometry import inverse, transform_points
 from calibrate.kinematics import MODELS, forward
 from calibrate.projection import project
 from recordings.reader import open_recording
-from station.analysis.estimation import next_best
-from station.analysis.worker import BoardDetection, seen_before, sight
+from station.analysis.estimation import seen_before
+from station.analysis.worker import BoardDetection, sight
 from station.cell.errors import LimitError
 from station.cell.limits import check_plan
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import cell_geometry
 from station.cell.status import StationState as S
 from station.plan.planner import make_plan
+from station.plan.predict import next_best
 from station.protocol.verbs import Purpose, Skip
 from station.session.queue import PoseQueue
 from tests.codes import raises

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate.geometry import difference, perturb, pose, random_rotation
-from calibrate.handeye.observations import (
+from calibrate.handeye.cell_state import (
     flange_derivatives,
     implied_flange,
 )

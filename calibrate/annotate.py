@@ -17,7 +17,7 @@ from calibrate.boards.model import board_from_turned, board_points, looks_same_t
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, encode_calibration
 from calibrate.geometry import Array
-from calibrate.handeye.observations import board_in_camera
+from calibrate.handeye.cell_state import board_in_camera
 from calibrate.load import Progress, load_views
 from calibrate.projection import project_pixels
 from recordings.exporters.excerpt import copied

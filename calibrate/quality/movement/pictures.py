@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, inverse, perturb, skew, transform_points
-from calibrate.handeye.observations import board_in_camera
+from calibrate.handeye.cell_state import board_in_camera
 from calibrate.kinematics import RobotModel, jacobian
 from calibrate.projection import camera_matrix, project
 from recordings.schema.messages import CameraModel, Mount

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibrate.handeye.observations import board_in_camera
 
 from benchmarks.watch import Cell, Happening, simulate
 from calibrate.geometry import Array, perturb, transform_points
+from calibrate.handeye.cell_state import board_in_camera
 from calibrate.projection import project_pixels
 from calibrate.quality.movement.evidence import Moved
 from calibrate.quality.movement.monitor import (

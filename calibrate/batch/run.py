@@ -7,7 +7,7 @@ import hashlib
 import io
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,15 +26,6 @@ from calibrate.pipeline import solve_recording
 from recordings.errors import RecordingError
 
 RESULTS = "results.jsonl"
-
-
-@dataclass(frozen=True)
-class Solved:
-    """Answer of a worker; workers write no file."""
-
-    result: BatchResult
-    content: bytes = b""
-    """Bytes of the calibration file."""
 
 
 Progress = Callable[[int, int, BatchResult], None]
@@ -65,10 +56,10 @@ def run_batch(
         with closing((workers or pool())(work, todo)) as answers:
             for count, ((recording, key), answer) in enumerate(answers, 1):
                 if isinstance(answer, Lost):
-                    answer = Solved(BatchResult(recording, key, False, error=answer.reason))
-                result = answer.result
-                if answer.content:
-                    store.write(result.calibration, answer.content)
+                    answer = BatchResult(recording, key, False, error=answer.reason), b""
+                result, content = answer
+                if content:
+                    store.write(result.calibration, content)
                 done[key] = result
                 store.add(RESULTS, key, result)
                 if progress:
@@ -93,8 +84,11 @@ def batch_key(place: Path | str, options: JobOptions) -> str:
     return hashlib.sha256(msgspec.json.encode([found, chosen], order="deterministic")).hexdigest()[:24]
 
 
-def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> Solved:
-    """Solve (recording, key) in a worker, here or on a cluster. Any failure is a result."""
+def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> tuple[BatchResult, bytes]:
+    """Solve (recording, key) in a worker, here or on a cluster. Any failure is a result.
+
+    The second value is the calibration file, which workers do not write; empty where there is none.
+    """
     recording, key = task
     cv2.setNumThreads(1)
     try:
@@ -102,11 +96,11 @@ def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> Sol
             job = solve_recording(path, replace(options, threads=1))
         content = encode_calibration(job.calibration)
     except (CalibrationError, RecordingError) as problem:
-        return Solved(BatchResult(recording, key, False, error=str(problem)))
+        return BatchResult(recording, key, False, error=str(problem)), b""
     except Exception as problem:  # a defect in one recording must not stop the other 199
         error = f"internal error: {type(problem).__name__}: {problem}"
-        return Solved(BatchResult(recording, key, False, error=error))
-    return Solved(_result(recording, key, job, f"{path.stem}-{key[:8]}.calibration.yaml"), content)
+        return BatchResult(recording, key, False, error=error), b""
+    return _result(recording, key, job, f"{path.stem}-{key[:8]}.calibration.yaml"), content
 
 
 def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchResult:

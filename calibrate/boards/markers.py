@@ -96,14 +96,8 @@ def _snap_to_corners(
     miss = (weight @ (pixels - shown)) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
     predicted += miss
     spacing = local_spacing(predicted.reshape(spec.rows - 1, spec.columns - 1, 2)).ravel()
-    height, width = grey.shape
-    margin = np.maximum(spacing * 0.4, 4.0)
-    inside = (
-        (predicted[:, 0] > margin)
-        & (predicted[:, 0] < width - 1 - margin)
-        & (predicted[:, 1] > margin)
-        & (predicted[:, 1] < height - 1 - margin)
-    )
+    margin, last = np.maximum(spacing * 0.4, 4.0)[:, None], np.array(grey.shape[::-1]) - 1
+    inside = ((predicted > margin) & (predicted < last - margin)).all(axis=1)
     chosen = np.flatnonzero(known & inside & (spacing > 5.0))
     if len(chosen) == 0:
         return NOTHING

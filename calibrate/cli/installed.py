@@ -291,12 +291,8 @@ def _lines(version: InstalledVersion) -> list[str]:
     made = f"{calibration.provenance.session}, solved {calibration.created}"
     told = version.current or (validity is not None and validity.state in _TOLD_OF_OLD)
     held = [validity_text(validity)] if validity is not None and told else []
-    return [made, pose_text(calibration), _verdict_text(calibration), *held]
-
-
-def _verdict_text(calibration: Calibration) -> str:
-    text = verdict_text(calibration)
-    return text if calibration.override is None else f"{text}; {override_text(calibration.override)}"
+    override = "" if calibration.override is None else f"; {override_text(calibration.override)}"
+    return [made, pose_text(calibration), verdict_text(calibration) + override, *held]
 
 
 def history_rows(root: Path | None, camera: str) -> list[tuple[str, str, str, str]]:

@@ -16,7 +16,6 @@ import subprocess
 import tempfile
 import time
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
@@ -82,7 +81,7 @@ def _runs(folder: Path, event: HookEvent, fields: dict[str, str]) -> list[HookRu
     if not folder.is_dir():
         return []
     if problem := _distrusted(folder):
-        return [HookRun(time_text(datetime.now(UTC)), event, str(folder), problem=problem)]
+        return [HookRun(time_text(), event, str(folder), problem=problem)]
     programs = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     return [_run(path, event, fields) for path in programs if not path.is_dir()]
 
@@ -100,7 +99,7 @@ def _distrusted(path: Path) -> str:
 
 
 def _run(path: Path, event: HookEvent, fields: dict[str, str]) -> HookRun:
-    wall, begun_s = time_text(datetime.now(UTC)), time.monotonic()
+    wall, begun_s = time_text(), time.monotonic()
     problem = _distrusted(path)
     if not problem and not os.access(path, os.X_OK):
         problem = f"{path} is not executable."

@@ -196,9 +196,7 @@ def load_installed(
             if found.validity.state is not ValidityState.WITHDRAWN:
                 found = replace(
                     found,
-                    validity=replace(
-                        found.validity, state=doubt, since=time_text(datetime.now(UTC)), reason=reason
-                    ),
+                    validity=replace(found.validity, state=doubt, since=time_text(), reason=reason),
                 )
     _require(found, require_valid)
     return found

@@ -136,7 +136,8 @@ def add_version(
     It is on the disk, whole, and read back before anything points to it. InstallError, CalibrationFileError.
     """
     content = encode_calibration(calibration)
-    number = _next_number(folder)
+    numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := VERSION_NAME.fullmatch(p.name))]
+    number = max(numbers, default=0) + 1
     path = folder / "gen" / f"{number:04d}-{content_name(content)}.yaml"
     write_atomically(path, content)
     decode_calibration(path.read_bytes(), str(path))
@@ -151,7 +152,7 @@ def make_current(
     validity = replace(validity, version=version.number)
     append_line(folder / VALIDITY_FILE, validity)  # before anybody can ask for it
     _switch(folder, version.path.name, version.path.read_bytes())
-    entry = LogEntry(_now_text(), action, version.number, who(), change, reason)
+    entry = LogEntry(time_text(), action, version.number, who(), change, reason)
     append_line(folder / LOG, entry)
     return replace(version, current=True, validity=validity)
 
@@ -169,11 +170,6 @@ def _current_name(folder: Path) -> str:
         return (folder / "current").readlink().name
     except OSError:
         return ""
-
-
-def _next_number(folder: Path) -> int:
-    numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := VERSION_NAME.fullmatch(p.name))]
-    return max(numbers, default=0) + 1
 
 
 def _switch(folder: Path, name: str, content: bytes) -> None:
@@ -231,10 +227,6 @@ def no_such_version(folder: Path, number: int, known: list[InstalledVersion]) ->
         code="no-such-version",
         generation=number,
     )
-
-
-def _now_text() -> str:
-    return time_text(datetime.now(UTC))
 
 
 def who() -> str:

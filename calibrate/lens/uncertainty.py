@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, skew
-from calibrate.lens.model import undistort
-from calibrate.projection import camera_matrix, project
+from calibrate.projection import camera_matrix, project, undistort
 from recordings.schema.messages import CameraModel
 
 _COLUMNS, _ROWS = 33, 25

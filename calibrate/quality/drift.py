@@ -22,7 +22,7 @@ from calibrate.geometry import Array, difference, perturb
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.cell_state import board_in_camera
 from calibrate.handeye.corners import bent_points, boards_by_corners
-from calibrate.lens.model import project
+from calibrate.projection import project_at
 from calibrate.views import ViewSet, extent_of, observe_views, require_no_copies
 from recordings.schema.messages import CameraModel, Mount, SessionInfo, Source
 
@@ -249,9 +249,9 @@ def _normal_equations(
 
 def pnp_covariance(points: Array, camera: CameraModel, camera_from_board: Array) -> Array:
     """(6, 6) of the board's pose in `camera`, of its points (n, 3): (JᵀJ)⁻¹, for noise of 1 px per axis."""
-    base = project(camera, camera_from_board, points)
+    base = project_at(camera, camera_from_board, points)
     moved = perturb(camera_from_board, _STEP * np.eye(6))
-    J = np.stack([(project(camera, m, points) - base).ravel() / _STEP for m in moved], axis=1)
+    J = np.stack([(project_at(camera, m, points) - base).ravel() / _STEP for m in moved], axis=1)
     return np.asarray(np.linalg.inv(J.T @ J))
 
 

@@ -25,8 +25,8 @@ from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.geometry import Array, difference
 from calibrate.handeye.corners import bent_points
 from calibrate.job import SolvedRecording
-from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
+from calibrate.projection import project_at
 from calibrate.report import html, plots
 from calibrate.results import SHAPE, PeerResult
 from calibrate.views import observe_views
@@ -209,7 +209,10 @@ def _modelled_pixels(job: SolvedRecording) -> ModelledPixels:
     shape = np.zeros(len(SHAPE)) if board is None else board.numbers
     points = bent_points(observe_views(views), shape)
     return {
-        view.index: (view.pixels, project(camera, view.camera_from_board, points[i, : len(view.pixels)]))
+        view.index: (
+            view.pixels,
+            project_at(camera, view.camera_from_board, points[i, : len(view.pixels)]),
+        )
         for i, view in enumerate(views)
         if view.camera_from_board is not None
     }

@@ -18,8 +18,7 @@ from calibrate.files.exports.frames import (
     roll_pitch_yaw,
 )
 from calibrate.geometry import Array, inverse, rotation_log
-from calibrate.lens.model import distortion
-from calibrate.projection import camera_matrix, project_pixels
+from calibrate.projection import camera_matrix, distortion, project_pixels
 from recordings.schema.messages import CameraModel
 
 LENS_MISFIT_PX = 0.5

@@ -11,7 +11,7 @@ from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
-from calibrate.lens.model import project, undistort
+from calibrate.projection import project_at, undistort
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel
 from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking
@@ -30,7 +30,7 @@ def views_of(camera: CameraModel, poses: list[Array], noise_px: float = 0.1, see
             f"view-{k}",
             np.eye(4),
             points,
-            project(camera, p, points) + rng.normal(size=(42, 2)) * noise_px,
+            project_at(camera, p, points) + rng.normal(size=(42, 2)) * noise_px,
         )
         for k, p in enumerate(poses)
     )
@@ -125,7 +125,7 @@ def test_undistort_is_the_inverse_of_project(camera: CameraModel) -> None:
     points = board_points(PAPER_BOARD)
     straight = replace_distortion(camera)
     assert (
-        np.abs(undistort(camera, project(camera, seen, points)) - project(straight, seen, points)).max()
+        np.abs(undistort(camera, project_at(camera, seen, points)) - project_at(straight, seen, points)).max()
         < 1e-5
     )
 

@@ -7,9 +7,8 @@ import numpy as np
 from benchmarks.scene import CellNoise, make_cell, zhang
 from calibrate.geometry import Array, rotation_exp
 from calibrate.lens.intrinsics import fit_lens
-from calibrate.lens.model import undistort
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
-from calibrate.projection import camera_matrix, project_pixels
+from calibrate.projection import camera_matrix, project_pixels, undistort
 from recordings.schema.messages import CameraModel
 
 PLACES = np.array([[640.0, 512.0], [0.0, 0.0], [1279.0, 0.0], [1279.0, 1023.0], [320.0, 768.0]])

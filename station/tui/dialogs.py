@@ -7,8 +7,8 @@ import os
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Sequence
-from typing import ClassVar, cast
+from collections.abc import Sequence
+from typing import ClassVar
 
 from rich.console import Group
 from rich.table import Table
@@ -25,8 +25,9 @@ from calibrate.files.exports import FORMATS
 from calibrate.files.install import reason_problem
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
-from station.tui.frame import Frame, Knowing, Question
+from station.tui.frame import Frame, Question
 from station.tui.task import Action, Known
+from station.tui.widgets.scene import cell_scene, draw
 from station.tui.words import duration, limit_bar
 
 TERMINATE_S = 5.0
@@ -77,10 +78,9 @@ class ConfirmMotion(Confirm):
 
     BOX = "motion"
 
-    def __init__(self, preview: MotionPreview, scene: Callable[[int, int], Content] | None = None) -> None:
-        """`scene`: the cell in so many cells and rows."""
+    def __init__(self, preview: MotionPreview) -> None:
         super().__init__("The arm will move", "", yes="Start motion", no="Do not move")
-        self._preview, self._scene = preview, scene
+        self._preview = preview
         self._until_s = time.monotonic() + APPROVAL_LIFETIME_S
 
     def body(self) -> ComposeResult:
@@ -98,13 +98,16 @@ class ConfirmMotion(Confirm):
 
     def show(self, known: Known) -> None:
         super().show(known)
-        if known.status is not None and known.status.simulated:
+        if known.shown.simulated:
             self.titled("The arm will move", SIMULATED)
 
     def _draw(self) -> None:
-        scene = self.query_one("#motion-scene", Static)
-        if self._scene is not None and scene.display and scene.size.width > 20:
-            scene.update(self._scene(scene.size.width, scene.size.height))
+        pane, status = self.query_one("#motion-scene", Static), self.known.shown
+        scene = cell_scene(self.known.configuration, status)
+        if scene is not None and pane.display and pane.size.width > 20:
+            poses = status.session.poses
+            first = next((place for place, pose in enumerate(poses) if pose.state == "planned"), None)
+            pane.update(draw(scene, status, first, *pane.size))
 
     def _count_down(self) -> None:
         left_s = max(0.0, self._until_s - time.monotonic())
@@ -272,7 +275,7 @@ class JobScreen(Question[int]):
             close.label = "Close"
             close.focus()
             self.query_one(Frame).question = READ
-            self.show(cast(Knowing, self.app).known())
+            self.show(self.known)
 
     async def action_cancel(self) -> None:
         if self._process is None or self._exit_code is not None:

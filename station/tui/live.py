@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 from rich.text import Text
+from textual import work
 from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.widgets import ProgressBar, RichLog, Static
@@ -16,6 +19,7 @@ from station.cell.config import CaptureConfig
 from station.cell.scene import Scene
 from station.cell.status import Event, PoseStatus, SessionStatus, StationState, StationStatus
 from station.protocol.states import LATCHED, RUNNING
+from station.tui.replay import ReplayLink
 from station.tui.screen import Box, Panel, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
@@ -124,7 +128,7 @@ def counted_line(session: SessionStatus) -> Content:
 
 def progress_lines(known: Known, width: int, height: int) -> Content:
     """Draw how many are saved, the steps of this pose, a chip a pose."""
-    status = known.status or StationStatus()
+    status = known.shown
     session, pose = status.session, _under_way(status)
     saved = sum(pose.counts for pose in session.poses)
     left = (
@@ -164,7 +168,7 @@ def _chip(pose: PoseStatus, current: bool, cells: int) -> Content:
 
 def error_lines(known: Known, width: int, height: int) -> Content:
     """The expected error as it falls towards its goal: measured solid, planned dotted."""
-    status = known.status or StationStatus()
+    status = known.shown
     estimate, poses = status.estimate, status.session.poses
     goal = estimate.goal_mm
     now = estimate.sigma_translation_mm
@@ -208,7 +212,7 @@ _HEAT = ("$dim on $h0", "$foreground on $h1", "$strong on $h2", "$onaccent on $h
 
 def coverage_lines(known: Known, width: int, height: int, scene: Scene | None = None) -> Content:
     """The picture as a grid: in how many images each part showed the board, and which poses fill the rest."""
-    status = known.status or StationStatus()
+    status = known.shown
     views = status.estimate.image_views
     if not views:
         return Content.styled("no image of the board yet", "$dim")
@@ -250,7 +254,7 @@ def _empty_words(status: StationStatus, scene: Scene | None) -> Content:
 
 def device_lines(known: Known, width: int, height: int) -> Content:
     """Each device with its rate; two a line."""
-    status = known.status or StationStatus()
+    status = known.shown
     robot, camera, recorder, bounds = status.robot, status.camera, status.recorder, status.clock
     if status.playback:
         return Content.styled("robot not live   camera not live", "$dim")
@@ -300,7 +304,7 @@ class Events(Panel):
 
 
 def _newest(known: Known, width: int, height: int) -> Content:
-    status = known.status or StationStatus()
+    status = known.shown
     return lines(*(event_text(event, width) for event in reversed(status.events[-max(1, height) :])))
 
 
@@ -308,8 +312,8 @@ class Stopped(Static):
     """Over the capture while STOP or a fault is latched: what happened, and the way on in three steps."""
 
     def show(self, known: Known) -> None:
-        status = known.status
-        latched = status is not None and status.state in LATCHED and known.silent_s is None
+        status = known.live
+        latched = status is not None and status.state in LATCHED and not known.old
         self.display = latched
         if status is None or not latched:
             return
@@ -383,8 +387,8 @@ class LiveScreen(StationScreen):
         yield Stopped(id="stopped")
 
     def _coverage(self, known: Known, width: int, height: int) -> Content:
-        status = known.status or StationStatus()
-        return coverage_lines(known, width, height, cell_scene(self.desk.configuration, status))
+        status = known.shown
+        return coverage_lines(known, width, height, cell_scene(known.configuration, status))
 
     def show(self, known: Known) -> None:
         super().show(known)
@@ -411,6 +415,79 @@ class LiveScreen(StationScreen):
             self._quality = quality
             self.query_one("#quality", Static).update(quality, layout=False)
         self.query_one("#live").set_class(status.state in LATCHED, "-dimmed")
+
+
+WATCHABLE = (StationState.IDLE, StationState.DISCONNECTED)
+"""A cell at rest: nobody looks at an old recording while the arm works or waits for an answer."""
+
+
+JUMP_S = 10.0
+
+
+class Player:
+    """The keys of a playback; for a screen of its own beside a cell, and for a whole app without one."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("space", "play", "Play/Pause", tooltip="Stop the playback here, or go on"),
+        Binding("left", "step(-1)", "Image back", tooltip="To the image before this one"),
+        Binding("right", "step(1)", "Image on", tooltip="To the next image"),
+        Binding("pageup", f"seek({-JUMP_S})", "10 s back", show=False, tooltip="Ten seconds back"),
+        Binding("pagedown", f"seek({JUMP_S})", "10 s on", show=False, tooltip="Ten seconds on"),
+        Binding("home", f"seek({-1e9})", "Start", show=False, tooltip="To the start of the recording"),
+    ]
+    player: ReplayLink
+
+    def action_play(self) -> None:
+        self.player.toggle()
+
+    def action_step(self, by: int) -> None:
+        self.player.step(by)
+
+    def action_seek(self, by_s: float) -> None:
+        self.player.seek(by_s)
+
+
+class ReplayScreen(Player, LiveScreen):
+    """Shows `link`'s statuses in place of the daemon's. STOP still goes to the daemon."""
+
+    NAME = "Playback"
+    HELP = (
+        "PLAYBACK of a recording. Nothing can be commanded; F12 still stops this cell's arm. Escape leaves."
+    )
+    BINDINGS: ClassVar[list[BindingType]] = [
+        *Player.BINDINGS,
+        Binding("escape", "close", "Back", tooltip="Leave the playback"),
+    ]
+
+    def __init__(self, link: ReplayLink) -> None:
+        super().__init__()
+        self.player = link
+        self._played: StationStatus | None = None
+
+    def on_mount(self) -> None:
+        self.play()
+
+    def show(self, known: Known) -> None:
+        """The cell's own status shows nothing here, but its work ends the playback."""
+        status = known.status
+        if status is not None and status.state not in WATCHABLE:
+            self.notify(f"The playback was closed: the cell is {status.state.value}.", severity="warning")
+            self.action_close()
+            return
+        super().show(Known(self._played))
+
+    @work(exclusive=True, exit_on_error=False)
+    async def play(self) -> None:
+        async for status in self.player.statuses():
+            self._played = status
+            super().show(Known(status))
+
+    async def on_unmount(self) -> None:
+        await self.player.close()
+
+    def action_close(self) -> None:
+        if self.is_attached:
+            self.dismiss()
 
 
 class LogScreen(StationScreen):

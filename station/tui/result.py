@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -19,15 +17,13 @@ from calibrate.files.formatting import arm_sentences
 from calibrate.files.gate import Gate
 from calibrate.files.touch import agrees, touch_sigmas
 from calibrate.files.validity import ValidityState, validity_text
-from calibrate.files.versions import LogEntry, read_log
+from calibrate.files.versions import LogEntry
 from calibrate.geometry import difference
-from calibrate.quality.checks import FEWEST_FOR_TREND, CheckEntry, find_trend
-from station.operate.ending import Way, after_drift_check, after_solve
-from station.tui.installed import Result, drift_history, local, state_root
+from station.operate.ending import Way, after_solve
+from station.tui.drift import drift_lines
+from station.tui.installed import Result, local
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.touch_test import run_touch_test
-from station.tui.widgets.canvas import Series, curve
 from station.tui.words import UNKNOWN, Mark, facts, limit_bar, many, mark, shortened, signed
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter shows older ones."
@@ -202,17 +198,39 @@ def residual_lines(calibration: Calibration, width: int, height: int) -> Content
 class ResultScreen(StationScreen):
     """Common base of the three: the verdict on top, and what may be done with a calibration."""
 
+    LOOK = "look_at_results"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("i", "act('install')", "Install", tooltip="Make this the cell's calibration; b undoes it"),
-        Binding("h", "act('test')", "Touch test", tooltip="Bring the tip onto corners of the board"),
         Binding(
-            "e", "act('export')", "Export", tooltip="Write it for ROS, OpenCV, URDF … beside the recording"
+            "i",
+            "app.on_result('install')",
+            "Install",
+            tooltip="Make this the cell's calibration; b undoes it",
         ),
         Binding(
-            "b", "act('roll back')", "Roll back", tooltip="Back to the calibration that was installed before"
+            "h",
+            "app.on_result('touch test')",
+            "Touch test",
+            tooltip="Bring the tip onto corners of the board",
         ),
-        Binding("x", "act('discard')", "Discard", tooltip="Delete this result; the recording stays"),
+        Binding(
+            "e",
+            "app.on_result('export')",
+            "Export",
+            tooltip="Write it for ROS, OpenCV, URDF … beside the recording",
+        ),
+        Binding(
+            "b",
+            "app.on_result('roll back')",
+            "Roll back",
+            tooltip="Back to the calibration that was installed before",
+        ),
+        Binding(
+            "x", "app.on_result('discard')", "Discard", tooltip="Delete this result; the recording stays"
+        ),
     ]
+
+    _drawn: object = ()
+    """The result that it shows; before the first, nothing is."""
 
     def body(self) -> ComposeResult:
         yield Static(NO_RESULT, id="verdict")
@@ -222,20 +240,10 @@ class ResultScreen(StationScreen):
     def evidence(self) -> ComposeResult:
         yield from ()
 
-    def on_mount(self) -> None:
-        self.watch(self.desk, "result", self._changed, init=False)
-
-    def _changed(self) -> None:
-        self.show(self.desk.known())
-
-    def on_screen_resume(self) -> None:
-        super().on_screen_resume()
-        self.desk.look_at_results()
-
     def show(self, known: Known) -> None:
         super().show(known)
         result = known.result
-        if result is getattr(self, "_drawn", ()):
+        if result is self._drawn:
             return
         self._drawn = result
         verdict = self.query_one("#verdict", Static)
@@ -248,29 +256,6 @@ class ResultScreen(StationScreen):
 
     def tell(self, calibration: Calibration) -> None:
         """Fill what is no panel."""
-
-    def action_act(self, what: str) -> None:
-        result = self.desk.result
-        if result is None or result.calibration is None:
-            self.notify(f"There is no result to {what}: F9 on 7 makes one.")
-            return
-        desk, path = self.desk, Path(result.path)
-        match what:
-            case "install":
-                desk.install(path, result.state.end_of(result.calibration))
-            case "roll back":
-                desk.roll_back(path, result.calibration.camera_name)
-            case "export":
-                desk.export(path)
-            case "discard":
-                desk.discard(path)
-            case "test":
-                work = self._touch_test(path)
-                desk.run_worker(work, group="job", exclusive=True, exit_on_error=False)
-
-    async def _touch_test(self, path: Path) -> None:
-        if await run_touch_test(self.desk, path):
-            await self.desk.show_result(str(path))
 
 
 def _panel(
@@ -314,7 +299,6 @@ class SolveScreen(ResultScreen):
             )
 
     def on_mount(self) -> None:
-        super().on_mount()
         self.query_one(Rows).focus()
 
     def tell(self, calibration: Calibration) -> None:
@@ -339,7 +323,7 @@ class VerifyScreen(ResultScreen):
             yield _panel("Held-out views", lambda r, c, w, h: held_out_lines(c), id="held-out")
         yield _panel(
             "Drift checks of the installed calibration",
-            lambda r, c, w, h: drift_lines(drift_history(state_root(r.path), c.camera_name), w, h),
+            lambda r, c, w, h: drift_lines(r.drift, w, h),
             id="drift",
             below="d on 7 captures one",
         )
@@ -392,50 +376,6 @@ def held_out_lines(calibration: Calibration) -> Content:
     return Content("\n").join(rows)
 
 
-def drift_lines(entries: Sequence[CheckEntry], width: int, height: int) -> Content:
-    """The camera's shift over time against what would be found, and a sentence; from five checks on."""
-    if not entries:
-        return Content.styled("No drift check yet. d on 7 captures one: eight poses, two minutes.", "$dim")
-    trend = find_trend(entries, entries[-1].generation)
-    end = after_drift_check(entries[-1], "" if trend is None else trend.text)
-    shifts = [1000 * float(np.linalg.norm(entry.shift[:3])) for entry in entries]
-    kind: Mark = "done" if end.way is Way.KEEP else "look" if entries[-1].passed else "failed"
-    head = facts(("", f"{shifts[-1]:.2f}", "mm")) + Content("  ") + mark(kind, str(end))
-    days = [(entry.wall_s - entries[0].wall_s) / 86400 for entry in entries]
-    limits = [
-        s * np.sqrt(e.threshold / e.statistic)
-        for s, e in zip(shifts, entries, strict=True)
-        if e.statistic > 0
-    ]
-    limit = float(np.median(limits)) if limits else None
-    if len(entries) < FEWEST_FOR_TREND:
-        said = f"{many(len(entries), 'check')}: too few to say whether it drifts."
-    elif trend is None:
-        said = f"No trend in {len(entries)} checks."
-    else:
-        rate = trend.shift_mm / max(trend.days, 1e-9)
-        left = (limit - shifts[-1]) / rate if limit is not None and rate > 0 else 0.0
-        soon = f" The limit is reached in about {_span(left)}." if left > 0 else " The limit is reached."
-        said = f"Rising by {7 * rate:.2f} mm a week.{soon}"
-    drawn = curve(
-        [Series(list(zip(days, shifts, strict=True)), "$accent")],
-        limit,
-        width,
-        height - 2,
-        log=False,
-        ends=f"{_day(entries[0])}|{_day(entries[-1])}",
-    )
-    return Content("\n").join([head, Content.styled(said, "$foreground"), drawn])
-
-
-def _day(entry: CheckEntry) -> str:
-    return time.strftime("%d %b", time.localtime(entry.wall_s))
-
-
-def _span(days: float) -> str:
-    return many(round(days / 7), "week") if days >= 14 else many(max(1, round(days)), "day")
-
-
 class InstallScreen(ResultScreen):
     """Comparison with the installed one, what speaks against this one, and every version before."""
 
@@ -451,9 +391,7 @@ class InstallScreen(ResultScreen):
                 id="change",
                 below="i installs  b rolls back",
             )
-        yield _panel(
-            "Installed so far", lambda r, c, w, h: log_lines(_log(r.path, c.camera_name), h), id="versions"
-        )
+        yield _panel("Installed so far", lambda r, c, w, h: log_lines(r.log, h), id="versions")
 
 
 def install_lines(result: Result, calibration: Calibration) -> Content:
@@ -465,13 +403,6 @@ def install_lines(result: Result, calibration: Calibration) -> Content:
         )
     rows.append(Content.styled("Every program that reads this cell's calibration gets it at once.", "$dim"))
     return Content("\n").join(rows)
-
-
-def _log(path: str, camera: str) -> Sequence[LogEntry]:
-    try:
-        return read_log(state_root(path), camera)
-    except OSError:
-        return ()
 
 
 def log_lines(entries: Sequence[LogEntry], height: int) -> Content:

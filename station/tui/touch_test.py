@@ -20,6 +20,7 @@ from calibrate.files.touch import Touch, touch_text
 from recordings.schema.messages import BoardSpec
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview
+from station.operate.motion import Approve
 from station.operate.touch_test import Hovering, note_touches, touch_test, touch_told
 from station.tui.desk import Desk, told
 from station.tui.frame import Question
@@ -115,7 +116,7 @@ class Touching(Question[Touch | None]):
         if self._hovering is None:
             return
         try:
-            now = None if self._desk.silent_s is not None else self._desk.status
+            now = None if self.known.old else self.known.status
             self.dismiss(touch_told(self._hovering, event.value.strip(), now))
         except RefusedError as problem:
             self.query_one("#dialog-problem", Label).update(told(problem))
@@ -130,43 +131,43 @@ class Touching(Question[Touch | None]):
 class _ScreenToucher:
     """The person in front of this screen, who guides the tip."""
 
-    def __init__(self, desk: Desk, board: BoardSpec) -> None:
+    def __init__(self, desk: Desk, board: BoardSpec, approves: Approve) -> None:
         self._desk, self._board, self._pointer_mm = desk, board, ""
+        self._approves = approves
         self.found: dict[int, Touch] = {}
 
     async def next_corner(self) -> int | None:
         choice = ChooseCorner(self._board, self.found, self._pointer_mm)
-        corner: int | None = await self._desk.push_screen_wait(choice)
+        corner = await self._desk.question(choice)
         self._pointer_mm = choice.pointer_mm
         return corner
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        return await self._approves(preview)
 
     def pointer_m(self) -> float | None:
         return float(self._pointer_mm) / 1000 if self._pointer_mm else None
 
-    async def approves(self, preview: MotionPreview) -> bool:
-        return await self._desk.approves(preview)
-
     def refused(self, corner: int, problem: StationError) -> None:
-        self._desk.notify(told(problem), severity="warning", timeout=10, markup=False)
+        self._desk.app.notify(told(problem), severity="warning", timeout=10, markup=False)
 
     async def touch(self, offer: HoverOffer, arrival: Awaitable[Hovering]) -> None:
         screen = Touching(self._desk, offer.corner, self._board, arrival)
-        if (touch := await self._desk.push_screen_wait(screen)) is not None:
+        if (touch := await self._desk.question(screen)) is not None:
             self.found[offer.corner] = touch
 
 
-async def run_touch_test(desk: Desk, path: Path) -> bool:
+async def run_touch_test(desk: Desk, approves: Approve, path: Path) -> bool:
     """Visit corners until the person ends it. True when something was written into the file."""
-
     calibration = await desk.attempt(asyncio.to_thread(read_calibration, path))
     if calibration is None:
         return False
-    person = _ScreenToucher(desk, calibration.board)
+    person = _ScreenToucher(desk, calibration.board, approves)
     await desk.attempt(touch_test(desk, person, path))
     if not person.found:
         return False
     found = list(person.found.values())
     words = await desk.attempt(asyncio.to_thread(note_touches, state_root(str(path)), path, found))
     if words:
-        desk.notify(words, markup=False)
+        desk.app.notify(words, markup=False)
     return bool(words)

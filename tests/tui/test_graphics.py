@@ -61,9 +61,14 @@ def _cell_size() -> object:
 
 
 def sharp_app(link: FakeLink, graphics: Graphics) -> StationApp:
-    app = app_on(link)
-    app.graphics = graphics
-    return app
+    PreviewPane.graphics = graphics
+    return app_on(link)
+
+
+@pytest.fixture(autouse=True)
+def blocks_again() -> Iterator[None]:
+    yield
+    PreviewPane.graphics = None
 
 
 def lines_of(pilot: Pilot[None]) -> list[str]:

@@ -7,7 +7,7 @@ import base64
 import time
 from functools import lru_cache
 from itertools import groupby
-from typing import cast
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -20,8 +20,8 @@ from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
+from station.operate.motion import Link
 from station.protocol import verbs
-from station.tui.desk import Desk, ScreenLink
 from station.tui.widgets.graphics import PERIOD_S, SHARE, Graphics, SharpPicture
 
 Grey = NDArray[np.uint8]
@@ -45,6 +45,8 @@ class PreviewPane(Widget):
 
     DEFAULT_CSS = "PreviewPane { width: 1fr; height: 1fr; }"
 
+    graphics: ClassVar[Graphics | None] = None
+    """The terminal's own graphics; None: half blocks only."""
     old: reactive[bool] = reactive(False)
     """The camera may see something else by now; written across the picture."""
 
@@ -59,7 +61,7 @@ class PreviewPane(Widget):
         self._next_s = 0.0
         """Not before: drawing takes no more than its share of the computer."""
 
-    async def fetch(self, link: ScreenLink) -> None:
+    async def fetch(self, link: Link) -> None:
         """Ask for an image and show it. What the daemon sees in it stands in the status, shown or not.
 
         Until the next one may be drawn the smallest will do: a large one is dear to send and to read.
@@ -93,7 +95,7 @@ class PreviewPane(Widget):
 
     def _graphics(self) -> Graphics | None:
         """The terminal's own graphics; None while half blocks are due."""
-        graphics = cast(Desk, self.app).graphics
+        graphics = self.graphics
         if graphics is None or self.old or not self.screen.is_active or not graphics.ready():
             return None
         return (

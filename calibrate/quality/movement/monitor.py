@@ -26,8 +26,7 @@ from calibrate.quality.movement.pictures import (
     fitted_tag,
     same_corners,
 )
-from calibrate.quality.movement.postures import PostureIndex
-from calibrate.quality.movement.repeated import FIRST_VISITS, RepeatedPostures
+from calibrate.quality.movement.repeated import FIRST_VISITS, PostureIndex, RepeatedPostures
 from calibrate.quality.movement.window import CREEP_WINDOW, KEPT, LEARNING, WindowFinding
 from calibrate.views import BoardView
 

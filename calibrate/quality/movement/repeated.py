@@ -11,7 +11,7 @@ from collections import deque
 import numpy as np
 
 from calibrate.geometry import Array
-from calibrate.quality.movement.pictures import Deviations
+from calibrate.quality.movement.pictures import Deviations, Picture
 from calibrate.quality.movement.window import (
     LIMIT,
     NOTHING,
@@ -24,6 +24,10 @@ from calibrate.quality.movement.window import (
     shortened,
 )
 
+_SAME = float(np.radians(0.2))
+"""Joints that differ by less are one posture; without joints, the twelve numbers of the flange's pose."""
+_MOST_REPEATED, _MOST_NEW = 128, 256
+"""Postures remembered; of new ones the oldest are forgotten."""
 FIRST_VISITS = 5
 """Visits that make a posture a repeated one."""
 _FEWEST_BEFORE = 3
@@ -140,3 +144,39 @@ def _apart(after: Array, before: Array) -> tuple[Array, Array]:
     h = np.where(n1 >= _FEWEST_BEFORE, n1 * n2 / np.maximum(n1 + n2, 1e-12), 0.0)
     means = (sums[..., :6] / np.maximum(sums[..., 6:], 1e-12) for sums in (after, before))
     return h, np.subtract(*means) * (h > 0)[..., None]
+
+
+class PostureIndex:
+    """Numbers of postures, in bounded memory. The same corners must be seen: others have other errors."""
+
+    def __init__(self) -> None:
+        self._places = np.full((_MOST_REPEATED + _MOST_NEW, 12), np.inf)
+        self._corners: list[tuple[int, ...]] = [()] * len(self._places)
+        self._repeated, self._new = 0, 0
+
+    def find(self, picture: Picture) -> tuple[int, bool]:
+        """Slot of the picture's posture, and whether it was there; a new one replaces the oldest new one."""
+        place = _place(picture)
+        for slot in np.flatnonzero((np.abs(self._places - place) < _SAME).all(axis=1)):
+            if self._corners[slot] == picture.corners:
+                return int(slot), True
+        fresh = _MOST_REPEATED + self._new % _MOST_NEW
+        self._new += 1
+        self._places[fresh], self._corners[fresh] = place, picture.corners
+        return fresh, False
+
+    def keep(self, slot: int) -> int | None:
+        """Move a new posture to the ones that are kept: its slot there; None where there is no room."""
+        if self._repeated == _MOST_REPEATED:
+            return None
+        kept = self._repeated
+        self._repeated += 1
+        self._places[kept], self._corners[kept] = self._places[slot], self._corners[slot]
+        self._places[slot], self._corners[slot] = np.inf, ()
+        return kept
+
+
+def _place(picture: Picture) -> Array:
+    if picture.joints_rad is not None:
+        return np.concatenate([picture.joints_rad, np.zeros(6)])
+    return np.asarray(picture.base_from_flange[:3].ravel())

@@ -1,8 +1,9 @@
 """A GigE Vision camera in a process of its own: Aravis's fake camera, fed with rendered images.
 
-It speaks the real control and stream protocols over loopback. Run it only in a network namespace that has
-nothing but `lo`, for discovery broadcasts. Faults are JSON lines on standard input, as for the rendered
-camera, with `packet-loss` (share of packets) besides. It ends with its input.
+Its features are those of `genicam.xml`. It speaks the real control and stream protocols over loopback: run it
+only in a network namespace that has nothing but `lo`, for discovery broadcasts. Faults are JSON lines on
+standard input, as for the rendered camera, with `packet-loss` (share of packets) besides. It ends with its
+input.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ import json
 import os
 import socket
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -28,7 +29,6 @@ from numpy.typing import NDArray
 from calibrate.kinematics import MODELS, forward
 from station.cell.errors import CameraError, RobotError
 from station.devices.pixels import encode
-from station.simulation import genicam
 from station.simulation.camera_process import CameraProcess
 from station.simulation.cell import CellTruth, read_truth
 from station.simulation.renderer import render
@@ -36,6 +36,23 @@ from station.simulation.scenes import make_cell
 
 LIBRARY = "libaravis-0.8.so.0"
 CONTROL_PORT = 3956
+DESCRIPTION = Path(__file__).with_name("genicam.xml")
+_GENICAM = {"": "http://www.genicam.org/GenApi/Version_1_1"}
+_ROOT = ElementTree.parse(DESCRIPTION).getroot()
+ADDRESSES = {
+    node.attrib["Name"].removesuffix("Register"): int(node.findtext("Address", "", _GENICAM), 16)
+    for node in _ROOT.iterfind("*[Address]", _GENICAM)
+}
+"""Of each feature's register."""
+PIXEL_FORMATS = {
+    entry.attrib["Name"]: int(entry.findtext("Value", "", _GENICAM))
+    for entry in _ROOT.iterfind("Enumeration[@Name='PixelFormat']/EnumEntry", _GENICAM)
+}
+OWN_MEMORY = 0xA000
+"""Registers from here on mean nothing to Aravis."""
+FAKE_TRIGGER_SOURCE, FAKE_TRIGGER_SOFTWARE = 0x304, 1
+"""The only source Aravis's fake camera reacts to: pulses on a line are written to TriggerSoftware, too."""
+GAIN_STEPS_PER_DB = 10
 _LATCH_POLL_S = 0.001
 _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
@@ -51,12 +68,9 @@ class GigeCamera:
         self._source = source
         self._lib = _library()
         _require_free(address)
-        with tempfile.NamedTemporaryFile("w", suffix=".xml", encoding="utf-8") as description:
-            description.write(genicam.genicam_xml())
-            description.flush()
-            self._server = self._lib.arv_gv_fake_camera_new_full(
-                address.encode(), serial.encode(), description.name.encode()
-            )
+        self._server = self._lib.arv_gv_fake_camera_new_full(
+            address.encode(), serial.encode(), str(DESCRIPTION).encode()
+        )
         if not self._server or not self._lib.arv_gv_fake_camera_is_running(self._server):
             raise CameraError(f"the GigE simulator did not start on {address}", code="simulation-not-started")
         self._camera = self._lib.arv_gv_fake_camera_get_fake_camera(self._server)
@@ -65,9 +79,9 @@ class GigeCamera:
         self._fill = _FILL(self._fill_buffer)  # must outlive the camera: C keeps only the pointer
         self._lib.arv_fake_camera_set_fill_pattern(self._camera, self._fill, None)
 
-    def register(self, address: int) -> int:
+    def register(self, name: str) -> int:
         value = ctypes.c_uint32()
-        self._lib.arv_fake_camera_read_register(self._camera, address, ctypes.byref(value))
+        self._lib.arv_fake_camera_read_register(self._camera, ADDRESSES[name], ctypes.byref(value))
         return value.value
 
     def set_register(self, address: int, value: int) -> None:
@@ -85,42 +99,37 @@ class GigeCamera:
 
         def watch() -> None:
             while True:
-                if self.register(genicam.TIMESTAMP_LATCH):
-                    self._write(genicam.TIMESTAMP_VALUE, device_ns().to_bytes(8, "big"))
-                    self.set_register(genicam.TIMESTAMP_LATCH, 0)
+                if self.register("GevTimestampControlLatch"):
+                    self._write("GevTimestampValue", device_ns().to_bytes(8, "big"))
+                    self.set_register(ADDRESSES["GevTimestampControlLatch"], 0)
                 time.sleep(_LATCH_POLL_S)
 
         threading.Thread(target=watch, name="timestamp latch", daemon=True).start()
 
     def _describe(self, width: int, height: int, serial: str) -> None:
-        for address, text in (
-            (genicam.VENDOR_ADDRESS, genicam.VENDOR),
-            (genicam.MODEL_ADDRESS, genicam.MODEL),
-            (genicam.VERSION_ADDRESS, "simulated"),
-            (genicam.INFO_ADDRESS, "simulated by the calibration station"),
-            (genicam.SERIAL_ADDRESS, serial),
+        for name, text in (
+            ("DeviceVendorName", _ROOT.attrib["VendorName"]),
+            ("DeviceModelName", _ROOT.attrib["ModelName"]),
+            ("DeviceVersion", "simulated"),
+            ("DeviceManufacturerInfo", "simulated by the calibration station"),
+            ("DeviceID", serial),
+            ("GevTimestampValue", "\0" * 7),
         ):
-            self._write(address, text.encode() + b"\0")
-        for address, value in (
-            (genicam.SENSOR_WIDTH, width),
-            (genicam.SENSOR_HEIGHT, height),
-            (genicam.WIDTH, width),
-            (genicam.HEIGHT, height),
-            (genicam.PIXEL_FORMAT, genicam.PIXEL_FORMATS["Mono8"]),
-            (genicam.EXPOSURE, 10_000),
-            (genicam.GAIN, 0),
-            (genicam.FAKE_TRIGGER_SOURCE, genicam.FAKE_TRIGGER_SOFTWARE),
-            *((address, 0) for address in range(genicam.TIMESTAMP_LATCH, genicam.FIRST_FREE, 4)),
-        ):
-            self.set_register(address, value)
+            self._write(name, text.encode() + b"\0")
+        values = {"SensorWidth": width, "SensorHeight": height, "Width": width, "Height": height}
+        values |= {"PixelFormat": PIXEL_FORMATS["Mono8"], "ExposureTime": 10_000, "Gain": 0}
+        for name, address in ADDRESSES.items():
+            if name in values or address >= OWN_MEMORY:
+                self.set_register(address, values.get(name, 0))
+        self.set_register(FAKE_TRIGGER_SOURCE, FAKE_TRIGGER_SOFTWARE)
 
-    def _write(self, address: int, data: bytes) -> None:
-        self._lib.arv_fake_camera_write_memory(self._camera, address, len(data), data)
+    def _write(self, name: str, data: bytes) -> None:
+        self._lib.arv_fake_camera_write_memory(self._camera, ADDRESSES[name], len(data), data)
 
     def _fill_buffer(self, buffer: int, _: int, exposure_us: int, gain: int, pixel_format: int) -> None:
-        names = {value: name for name, value in genicam.PIXEL_FORMATS.items()}
-        width, height = self.register(genicam.WIDTH), self.register(genicam.HEIGHT)
-        grey, device_ns = self._source(width, height, float(exposure_us), gain / genicam.GAIN_STEPS_PER_DB)
+        names = {value: name for name, value in PIXEL_FORMATS.items()}
+        width, height = self.register("Width"), self.register("Height")
+        grey, device_ns = self._source(width, height, float(exposure_us), gain / GAIN_STEPS_PER_DB)
         # The size it reports is not set yet; the buffer holds width × height pixels of this format.
         target = self._lib.arv_buffer_get_data(buffer, ctypes.byref(ctypes.c_size_t()))
         if names[pixel_format] == "Mono8":
@@ -280,7 +289,7 @@ def _carry_out(
         case "sent":
             pass  # every answer says it
         case "pulse":
-            camera.set_register(genicam.TRIGGER_PULSE, 1)
+            camera.set_register(ADDRESSES["TriggerSoftware"], 1)
         case "register":
             camera.set_register(*value)
         case _:

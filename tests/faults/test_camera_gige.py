@@ -17,7 +17,7 @@ from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
-from station.simulation import genicam
+from station.simulation.gige import ADDRESSES
 from station.simulation.launch import SimulatedGige, start_gige
 from tests.codes import raises
 
@@ -69,8 +69,8 @@ async def test_23_settings_changed_behind_our_back_are_refused(server: Simulated
     camera = AravisCamera(CONFIG)
     await camera.open()
     try:
-        for register, value in ((genicam.EXPOSURE, 4000), (genicam.GAIN, 100), (genicam.WIDTH, 640)):
-            before = {genicam.EXPOSURE: 10_000, genicam.GAIN: 0, genicam.WIDTH: 1280}[register]
+        for name, before, value in (("ExposureTime", 10_000, 4000), ("Gain", 0, 100), ("Width", 1280, 640)):
+            register = ADDRESSES[name]
             server.inject("register", [register, value])
             with raises("settings-changed"):
                 await camera.capture()
@@ -91,7 +91,7 @@ async def test_23_a_stream_ends_when_settings_are_changed_and_passes_no_picture_
     def keep(picture: Image) -> None:
         sizes.append(picture.pixels.shape)
         if len(sizes) == 5:
-            server.inject("register", [genicam.WIDTH, 640])
+            server.inject("register", [ADDRESSES["Width"], 640])
 
     await camera.open()
     try:
@@ -99,7 +99,7 @@ async def test_23_a_stream_ends_when_settings_are_changed_and_passes_no_picture_
             await asyncio.wait_for(camera.stream(keep, threading.Event()), 20)
         assert len(sizes) >= 5 and set(sizes) == {(1024, 1280)}
     finally:
-        server.inject("register", [genicam.WIDTH, 1280])
+        server.inject("register", [ADDRESSES["Width"], 1280])
         await camera.close()
 
 

@@ -133,12 +133,16 @@ class Variable:
         return e_series in self.since and self.since[e_series] <= version
 
 
+def version_of(text: str) -> tuple[int, ...]:
+    return tuple(map(int, text.split(".")))
+
+
 def _read() -> dict[str, dict[str, Variable]]:
     found: dict[str, dict[str, Variable]] = {"input": {}, "output": {}}
     with Path(__file__).with_name("variables.csv").open(newline="") as stream:
         for row in csv.DictReader(stream):
             columns = ((False, row["cb3"]), (True, row["e_series"]))
-            since = {e: tuple(map(int, v.split("."))) for e, v in columns if v}
+            since = {e: version_of(v) for e, v in columns if v}
             variable = Variable(row["type"], since, tuple(map(float, row["rest"].split())))
             stem, _, span = row["name"].rpartition("_")
             first, dash, last = span.partition("-")

@@ -19,8 +19,7 @@ from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
 from station.devices.frames import TriggerPulse
 from station.devices.pixels import decode, encode
-from station.simulation import genicam
-from station.simulation.gige import numbered_picture
+from station.simulation.gige import PIXEL_FORMATS, numbered_picture
 from station.simulation.launch import SimulatedGige, start_gige
 from tests.codes import raises
 
@@ -121,7 +120,7 @@ async def test_one_trigger_gives_one_picture_to_the_bit_over_the_wrap_of_the_ids
     assert all(np.array_equal(p.pixels, numbered_picture(n, 1280, 1024)) for n, p in enumerate(pictures))
 
 
-@pytest.mark.parametrize("name", list(genicam.PIXEL_FORMATS))
+@pytest.mark.parametrize("name", list(PIXEL_FORMATS))
 async def test_every_pixel_format_arrives(server: SimulatedGige, name: str) -> None:
     config = CameraConfig(device="127.0.0.1", pixel_format=name, region=(0, 0, 320, 240), packet_size=8996)
     async with Opened(config) as camera:

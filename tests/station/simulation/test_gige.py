@@ -13,8 +13,8 @@ import pytest
 from calibrate.boards.detect import detect
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
-from station.simulation import genicam
 from station.simulation.cell import write_truth
+from station.simulation.gige import DESCRIPTION
 from station.simulation.launch import SimulatedController, start_gige
 from station.simulation.netns import is_isolated, isolated_command
 from station.simulation.scenes import make_cell
@@ -65,7 +65,7 @@ def test_a_command_can_be_run_with_nothing_but_lo() -> None:
 
 
 def test_the_description_is_whole_and_every_reference_leads_somewhere() -> None:
-    root = ElementTree.fromstring(genicam.genicam_xml())
+    root = ElementTree.parse(DESCRIPTION).getroot()
     names = {node.get("Name") for node in root.iter() if node.get("Name")}
     for tag in ("pFeature", "pValue", "pPort", "pMax", "pVariable"):
         for node in root.iter(f"{{http://www.genicam.org/GenApi/Version_1_1}}{tag}"):

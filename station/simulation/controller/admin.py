@@ -23,6 +23,7 @@ from station.simulation.controller.network import Cut
 from station.simulation.controller.paths import JointPath, UnreachableError
 from station.simulation.controller.robot import WAITS
 from station.simulation.controller.rtde_server import ADMIN
+from station.simulation.controller.state import ZEROS, Six
 
 PORT = 29990
 LINE_LIMIT = 1_000_000
@@ -36,8 +37,6 @@ NotNegative = Annotated[float, Meta(ge=0)]
 Count = Annotated[int, Meta(ge=0)]
 JointSpeed = Annotated[float, Meta(ge=1e-3, le=100)]
 Three = tuple[float, float, float]
-Six = tuple[float, float, float, float, float, float]
-ZEROS: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def pstop(machine: Machine) -> None:

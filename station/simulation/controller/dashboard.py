@@ -1,8 +1,8 @@
 """Port 29999: the dashboard's text commands, one reply line each, of `dashboard.csv`.
 
 Source: Universal Robots, "Dashboard Server e-Series / CB-Series, port 29999". Columns: `argument`, whether
-one may follow. `changes`, refused in local control. `cb3` and `e_series`, the first version that knows it (empty:
-none does). `reply`, empty where it depends.
+one may follow. `changes`, refused in local control. `cb3` and `e_series`, the first version that knows it
+(empty: none does). `reply`, empty where it depends.
 """
 
 from __future__ import annotations

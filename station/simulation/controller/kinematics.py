@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import acos, atan2, cos, hypot, pi, sin, sqrt
+from operator import add
 
 Rigid = tuple[float, ...]
 """(12,) r00 r01 r02 tx r10 r11 r12 ty r20 r21 r22 tz"""
@@ -29,17 +30,13 @@ class ArmGeometry:
     published: ArmGeometry | None = field(default=None, compare=False)
     """The table it was made from; None: it is one itself."""
 
-    def plus(self, a_m: Vector, d_m: Vector, alpha_rad: Vector, theta_rad: Vector) -> ArmGeometry:
-        def add(x: Vector, y: Vector) -> Vector:
-            return tuple(i + j for i, j in zip(x, y, strict=True))
-
-        return ArmGeometry(
-            add(self.a_m, a_m),
-            add(self.d_m, d_m),
-            add(self.alpha_rad, alpha_rad),
-            add(self.theta_rad, theta_rad),
-            self.published or self,
-        )
+    def plus(self, *differences: Vector) -> ArmGeometry:
+        """differences: of a_m, d_m, alpha_rad and theta_rad."""
+        if not any(map(any, differences)):
+            return self
+        columns = zip((self.a_m, self.d_m, self.alpha_rad, self.theta_rad), differences, strict=True)
+        a, d, alpha, theta = (tuple(map(add, column, by)) for column, by in columns)
+        return ArmGeometry(a, d, alpha, theta, self.published or self)
 
 
 def _table(a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> ArmGeometry:

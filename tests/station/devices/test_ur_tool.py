@@ -129,8 +129,8 @@ def state_of(made: SimulatedRobot) -> bytes:
 
 
 def test_the_controllers_statements_are_understood() -> None:
-    factory = ((0.0, 1e-4, 0.0, 0.0, 0.0, 0.0), *((0.0,) * 6,) * 3)
-    made = SimulatedRobot(Settings(model="UR10", factory=factory), Journal())
+    factory = (0.0, 1e-4, 0.0, 0.0, 0.0, 0.0)
+    made = SimulatedRobot(Settings(model="UR10", factory_a_m=factory), Journal())
     made.tcp = TOOL
     said = read_state(state_of(made))
     table = made.stated_table

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import os
 import random
-import selectors
 import socket
 import subprocess
 import sys
 import tempfile
-import time
+import threading
 from pathlib import Path
 from typing import Any, Self
 
@@ -25,6 +24,7 @@ ADDRESS_TAKEN = 1
 """Exit code of a controller that cannot listen on its address."""
 STOP_TIMEOUT_S = 3.0
 END_TIMEOUT_S = 0.5
+GIGE_TIMEOUT_S = 30.0
 
 
 class AdminClient:
@@ -143,7 +143,12 @@ def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subp
         child = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, start_new_session=True
         )
-        if b'"ready": true' in _read_line(child, timeout_s):
+        assert child.stdout is not None
+        late = threading.Timer(timeout_s, child.kill)
+        late.start()
+        ready = b'"ready": true' in child.stdout.readline()
+        late.cancel()
+        if ready:
             return child, ""
         try:
             child.wait(END_TIMEOUT_S)  # it may be ending by itself
@@ -153,23 +158,6 @@ def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subp
         stderr.seek(said_before)
         words = stderr.read().decode(errors="replace").strip()
     return child, words or f"no ready line within {timeout_s:g} s"
-
-
-def _read_line(child: subprocess.Popen[bytes], timeout_s: float) -> bytes:
-    """The first line of its standard output, b"" when it ends or is too late."""
-    assert child.stdout is not None
-    deadline_s = time.monotonic() + timeout_s
-    with selectors.DefaultSelector() as selector:
-        selector.register(child.stdout, selectors.EVENT_READ)
-        line = b""
-        while not line.endswith(b"\n"):
-            if not selector.select(max(0.0, deadline_s - time.monotonic())):
-                return b""
-            piece = child.stdout.read1(4096)  # type: ignore[attr-defined]
-            if not piece:
-                return b""
-            line += piece
-    return line
 
 
 class SimulatedGige(ChildProcess):
@@ -197,8 +185,11 @@ def start_gige(
     truth: Path | None = None,
     serial: str = "SIM00000",
     numbered: bool = False,
+    log: Path | None = None,
 ) -> SimulatedGige:
     """Starts the camera on 127.0.0.1 and waits until it listens; blocking, call it outside an event loop.
+
+    log: where its standard error goes.
 
     CameraError where there is any network interface but `lo`: GigE discovery broadcasts on all of them.
     """
@@ -211,10 +202,7 @@ def start_gige(
     command = [sys.executable, "-m", "station.simulation.gige", "--serial", serial]
     command += ["--numbered"] if numbered else ["--controller-host", controller_host]
     command += [] if truth is None else ["--truth", str(truth)]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
-    assert process.stdout is not None
-    if not process.stdout.readline():
-        process.communicate()
-        text = "the GigE simulator did not start; what it said is above"
-        raise CameraError(text, code="simulation-not-started")
+    process, problem = _start(command, GIGE_TIMEOUT_S, log)
+    if problem:
+        raise CameraError(f"the GigE simulator did not start: {problem}", code="simulation-not-started")
     return SimulatedGige(process)

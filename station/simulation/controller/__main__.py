@@ -15,7 +15,7 @@ import msgspec
 from station.simulation.controller.admin import AdminServer
 from station.simulation.controller.kinematics import TABLES
 from station.simulation.controller.machine import Machine
-from station.simulation.controller.state import Settings, version_of
+from station.simulation.controller.state import Settings, Six, version_of
 
 PARENT_POLL_S = 0.5
 
@@ -42,7 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         settings = _settings(options)
     except (OSError, msgspec.MsgspecError) as error:
-        print(f"cannot start: {error}", file=sys.stderr)
+        of = f"{options.truth}: " if options.truth is not None else ""
+        print(f"cannot start: {of}{error}", file=sys.stderr)
         return 2
     try:
         asyncio.run(_serve(options.host, settings, parent if options.die_with_parent else None))
@@ -95,7 +96,12 @@ def _settings(options: argparse.Namespace) -> Settings:
     named = (text.partition("=") for text in options.program)
     programs = {name: Path(file).read_text() if file else None for name, _, file in named}
     given = {name: value for name, value in vars(options).items() if value is not None}
-    return msgspec.convert({**truth, **given, "programs": programs}, Settings)
+    kind = _OfTruth if options.truth is not None else Settings
+    return msgspec.convert({**truth, **given, "programs": programs}, kind)
+
+
+class _OfTruth(Settings, frozen=True, kw_only=True):
+    start_joints_rad: Six
 
 
 async def _serve(host: str, settings: Settings, parent: int | None) -> None:

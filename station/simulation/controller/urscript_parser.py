@@ -349,7 +349,7 @@ class _Parser:
         elif token.kind == "string":
             found = repr(token.text[1:-1])
         elif (token.kind, token.text) == ("sign", "("):
-            found = f"({self._expression()})"
+            found = self._expression()  # what is written in Python needs no brackets
             self._need(")")
         elif (token.kind, token.text) == ("sign", "["):
             found = f"[{', '.join(self._list(']')[0])}]"

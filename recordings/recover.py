@@ -106,15 +106,13 @@ def _recover_session(folder: Path) -> list[Recovery]:
     missing = missing_parts(folder, again, set(present))
     if missing:
         give_up_parts(folder, session, present, missing)
-    return [*results, *(_given_up(folder, part, name) for part, name in missing.items())]
-
-
-def _given_up(folder: Path, part: int, name: str) -> Recovery:
-    reason = (
-        f"segment {part} of the session is not in the folder; noted as lost in {MANIFEST_FILE}. "
-        "Should it turn up, put it back here and it is read again"
-    )
-    return Recovery(folder / name, None, 0, 0, 0, 0, (reason,))
+    for part, name in missing.items():
+        reason = (
+            f"segment {part} of the session is not in the folder; noted as lost in {MANIFEST_FILE}. "
+            "Should it turn up, put it back here and it is read again"
+        )
+        results.append(Recovery(folder / name, None, 0, 0, 0, 0, (reason,)))
+    return results
 
 
 def _recover_part(source: Path) -> tuple[Recovery, SessionInfo | None]:

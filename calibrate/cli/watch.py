@@ -39,7 +39,7 @@ from calibrate.quality.movement.log import FILE, MonitorLog, WatchedTag, WatchEn
 from calibrate.quality.movement.monitor import LARGEST_MISFIT_PX, NAMED_AFTER, EventKind, MovementEvent
 from calibrate.quality.movement.pictures import CellModel
 from recordings.cli.console import progress_bar
-from recordings.errors import BadImageError, ImportSourceError
+from recordings.errors import BadImageError, ImportSourceError, Value
 from recordings.files import MAIN_CAMERA
 from recordings.importers.dataset import DATASET_FILE, PoseRow, read_dataset, read_poses
 from recordings.importers.folder import read_image
@@ -350,12 +350,9 @@ class _Teller:
         if not self._as_json:
             out.print(text)
             return
-        values: dict[str, str | float | int | bool | None] = {
-            "state": state,
-            "needed": monitor.needed,
-            "missed_in_a_row": monitor.missed,
-        }
-        print_json(WatchEventJson("summary", "", monitor.pictures, None, values, text, [], None))
+        told: dict[str, Value] = {"needed": monitor.needed, "missed_in_a_row": monitor.missed}
+        line = {"state": state} | told
+        print_json(WatchEventJson("summary", "", monitor.pictures, None, line, text, [], None))
 
 
 _MOVED_TEXT = {

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import astuple
 
 from recordings.errors import disk_error, exists_error
 from recordings.exporters import Target
@@ -94,7 +95,7 @@ def _write_tables(recording: Recording, folder: Path) -> None:
     modes = ["robot_mode", "safety_mode", "speed_scaling"]
     states = (
         [
-            *_values(state.stamps),
+            *astuple(state.stamps),
             *(*state.joints_rad, *state.joint_speeds_rad_s, *state.tcp_pose),
             *(getattr(state, name) for name in modes),
         ]
@@ -109,19 +110,17 @@ def _write_tables(recording: Recording, folder: Path) -> None:
     told = ["middle_host_monotonic_ns", "time_bound_s", "time_source"]
     rows = (
         [
-            *_values(fact.stamps),
+            *astuple(fact.stamps),
             *(getattr(fact, column) for column in columns),
-            *([""] * len(told) if fact.time is None else msgspec.structs.astuple(fact.time)),
+            *([""] * len(told) if fact.time is None else astuple(fact.time)),
         ]
         for fact in facts
     )
     _write_csv(folder / "pictures.csv", [*_STAMPS, *columns, *told], rows)
-    readings = (
-        list(msgspec.structs.astuple(r)) for segment in recording.segments for r in segment.clock_readings()
-    )
+    readings = (list(astuple(r)) for segment in recording.segments for r in segment.clock_readings())
     _write_csv(folder / "camera_clock.csv", list(ClockReading.__struct_fields__), readings)
     _write_views(recording, folder)
-    events = ([*_values(e.stamps), e.level, e.kind, e.pose_index, e.detail] for e in recording.events())
+    events = ([*astuple(e.stamps), e.level, e.kind, e.pose_index, e.detail] for e in recording.events())
     _write_csv(folder / "events.csv", [*_STAMPS, "level", "kind", "pose_index", "detail"], events)
 
 
@@ -135,12 +134,8 @@ def _write_views(recording: Recording, folder: Path) -> None:
         T = view.base_from_flange
         pose = [T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]
         values = [getattr(view, name) for name in place]
-        rows.append([*values, *pose, *_values(view.stamps), view.time_bound_s, int(view in counted)])
+        rows.append([*values, *pose, *astuple(view.stamps), view.time_bound_s, int(view in counted)])
     _write_csv(folder / "views.csv", header, rows)
-
-
-def _values(stamps: Stamps) -> list[Any]:
-    return [getattr(stamps, name) for name in _STAMPS]
 
 
 def _write_csv(path: Path, header: list[str], rows: Iterable[list[Any]]) -> None:

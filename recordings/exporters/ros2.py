@@ -20,7 +20,13 @@ from recordings.reader import Recording
 from recordings.schema.definitions import PictureFacts
 from recordings.schema.messages import CameraModel, Matrix4, View
 from recordings.schema.topics import Topic
-from recordings.schema.viewing import CAMERA_FRAME, JOINT_NAMES, base_from_flange, quaternion_xyzw
+from recordings.schema.viewing import (
+    CAMERA_FRAME,
+    JOINT_NAMES,
+    base_from_flange,
+    camera_matrix,
+    quaternion_xyzw,
+)
 from recordings.segment import RecordingSegment
 
 FRAME_PERIOD_NS = 10_000_000
@@ -211,8 +217,7 @@ class _Messages:
         return self.make("tf2_msgs/msg/TFMessage", [self.transform(parent, child, T, time_ns)])
 
     def camera_info(self, camera: CameraModel, time_ns: int) -> Any:
-        """A camera that nobody calibrated has a K of zeros, as ROS expects."""
-        K = [number for row in camera.matrix for number in row] if camera.matrix else [0.0] * 9
+        K = camera_matrix(camera)
         count = max(_DISTORTION_COUNT[camera.distortion_model], len(camera.distortion))
         D = [*camera.distortion, *[0.0] * count][:count] if camera.matrix else []
         return self.make(
@@ -222,9 +227,9 @@ class _Messages:
             camera.width,
             camera.distortion_model,
             np.array(D, float),
-            np.array(K, float),
+            K.ravel(),
             np.eye(3).ravel(),
-            np.array([*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0], float),
+            np.column_stack([K, np.zeros(3)]).ravel(),
             0,
             0,
             self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False),

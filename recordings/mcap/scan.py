@@ -205,7 +205,9 @@ class _Scan:
         if opcode == Opcode.CHUNK:
             self._chunk(at, end, content)
         elif opcode == Opcode.MESSAGE:
-            self._message(at, length)
+            if length < MESSAGE_HEAD.size:
+                raise BadRecordError(f"a message of {length} bytes has no head")
+            self._places.append(at)
         elif opcode == Opcode.SCHEMA:
             self.contents.add_schema(content)
         elif opcode == Opcode.CHANNEL:
@@ -217,11 +219,6 @@ class _Scan:
         elif opcode in _FORBIDDEN or opcode == 0:
             raise BadRecordError(f"a record of kind 0x{opcode:02x} does not belong here")
         return position + RECORD_HEAD.size + int(length)
-
-    def _message(self, at: int, length: int) -> None:
-        if length < MESSAGE_HEAD.size:
-            raise BadRecordError(f"a message of {length} bytes has no head")
-        self._places.append(at)
 
     def _chunk(self, at: int, end: int, content: memoryview) -> None:
         self.contents.chunks += 1

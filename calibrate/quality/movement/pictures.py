@@ -107,7 +107,7 @@ def deviations(
     L_t = np.swapaxes(L, 1, 2)
     information = L_t @ L
     step = np.linalg.solve(information, L_t)
-    by_X, by_P, by_flange = _effects_of_poses(cell, flange, P, C)
+    by_X, by_P, by_flange = _effects_of_poses(cell, flange, P)
     assert projected.by_intrinsics is not None
     lens, K = projected.by_intrinsics.reshape(n, 2 * k, -1), camera_matrix(cell.camera)
     focal = lens[..., 0] * K[0, 0] + lens[..., 1] * K[1, 1]
@@ -146,22 +146,19 @@ def _alike(pixels: Array) -> Array:
     return np.asarray(_LENS_PX**2 * np.exp(-apart / (2 * _LENS_REACH_PX**2)))
 
 
-def _effects_of_poses(cell: CellModel, flange: Array, P: Array, C: Array) -> tuple[Array, Array, Array]:
+def _effects_of_poses(cell: CellModel, flange: Array, P: Array) -> tuple[Array, Array, Array]:
     """∂C/∂X, ∂C/∂P and ∂C/∂F, (n, 6, 6): the tag's motion in the camera by deltas of each."""
-    R_C = C[:, :3, :3]
-    near = cell.X
-    if cell.mount == "eye-in-hand":
-        tag = transform_points(inverse(flange), P[:3, 3][None])[:, 0]
-        R_camera = np.broadcast_to(near[:3, :3].T, R_C.shape)
-        R_far = R_camera @ np.swapaxes(flange[:, :3, :3], 1, 2)
-        by_X = -_turned_about(R_camera, tag - near[:3, 3])
+    in_hand = cell.mount == "eye-in-hand"
+    mount = inverse(flange) if in_hand else flange
+    tag = transform_points(mount, P[:3, 3][None])[:, 0]
+    R_camera = np.broadcast_to(cell.X[:3, :3].T, (len(flange), 3, 3))
+    R_far = R_camera @ mount[:, :3, :3]
+    if in_hand:
         by_flange = -_turned_about(R_far, P[:3, 3] - flange[:, :3, 3])
-        return by_X, _turned_about(R_far, np.zeros_like(tag)), by_flange
-    tag = transform_points(flange, P[:3, 3][None])[:, 0]
-    R_camera = np.broadcast_to(near[:3, :3].T, R_C.shape)
-    by_X = -_turned_about(R_camera, tag - near[:3, 3])
-    by_flange = _turned_about(R_camera, tag - flange[:, :3, 3])
-    return by_X, _turned_about(R_camera @ flange[:, :3, :3], np.zeros_like(tag)), by_flange
+    else:
+        by_flange = _turned_about(R_camera, tag - flange[:, :3, 3])
+    by_X = -_turned_about(R_camera, tag - cell.X[:3, 3])
+    return by_X, _turned_about(R_far, np.zeros_like(tag)), by_flange
 
 
 def _turned_about(R: Array, lever: Array) -> Array:

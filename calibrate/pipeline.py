@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -26,7 +27,6 @@ from calibrate.load import FEWEST_VIEWS, Progress, load_views, without_views
 from calibrate.projection import intrinsics_names
 from calibrate.quality.gates import GateInputs, judge
 from calibrate.quality.sweep import at_time_offset
-from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import BoardSpec, CameraModel
@@ -34,19 +34,17 @@ from recordings.schema.messages import BoardSpec, CameraModel
 _WORST_VIEW_PX = 20.0
 
 
-def prepare_views(
-    path: Path,
-    options: JobOptions | None = None,
-    progress: Progress | None = None,
-    fewest: int = FEWEST_VIEWS,
-) -> PreparedViews:
-    """Open, find the boards, the lens where it is not known, and the board poses.
+class _Stopwatch:
+    """Time by stage, in milliseconds, in the order in which stages end."""
 
-    Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
-    """
-    options = options or JobOptions()
-    with single_threaded_opencv():
-        return _prepare(path, options, progress, fewest)
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.stage_ms: dict[str, float] = {}
+
+    def lap(self, stage: str) -> None:
+        """The time since the last lap belongs to `stage`."""
+        now = time.perf_counter()
+        self.stage_ms[stage], self._last = 1e3 * (now - self._last), now
 
 
 @contextmanager
@@ -60,8 +58,19 @@ def single_threaded_opencv() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _prepare(path: Path, options: JobOptions, progress: Progress | None, fewest: int) -> PreparedViews:
-    watch = Stopwatch()
+@single_threaded_opencv()
+def prepare_views(
+    path: Path,
+    options: JobOptions | None = None,
+    progress: Progress | None = None,
+    fewest: int = FEWEST_VIEWS,
+) -> PreparedViews:
+    """Open, find the boards, the lens where it is not known, and the board poses.
+
+    Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
+    """
+    options = options or JobOptions()
+    watch = _Stopwatch()
     recording = open_recording(path)
     watch.lap("open")
     camera = options.camera
@@ -99,6 +108,7 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
     )
 
 
+@single_threaded_opencv()
 def solve_recording(
     path: Path,
     options: JobOptions | None = None,
@@ -112,9 +122,8 @@ def solve_recording(
     options = options or JobOptions()
     prepared = prepare_views(path, options, progress)
     recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
-    watch = Stopwatch()
-    with single_threaded_opencv():
-        solution = solve_views(views, solver_options(options, prepared))
+    watch = _Stopwatch()
+    solution = solve_views(views, solver_options(options, prepared))
     watch.lap("solve")
     verified = None
     if verify is not None:
@@ -146,8 +155,7 @@ def solve_recording(
 
 def _verify(path: Path, options: JobOptions, solution: Solution, progress: Progress | None) -> Verification:
     options = replace(options, camera=solution.camera, find_intrinsics=False, without=(), time_offset=None)
-    with single_threaded_opencv():
-        return verify_elsewhere(solution, _prepare(path, options, progress, 1).views, path.name)
+    return verify_elsewhere(solution, prepare_views(path, options, progress, 1).views, path.name)
 
 
 def _judged_by(verified: Verification, solution: Solution) -> Solution:

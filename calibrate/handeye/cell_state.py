@@ -15,7 +15,7 @@ import numpy as np
 from calibrate.geometry import Array, difference, inverse, perturb, skew
 from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
 from calibrate.results import SHAPE
-from calibrate.views import Observations, Places
+from calibrate.views import Observations
 from recordings.schema.messages import CameraModel, Mount
 
 
@@ -45,10 +45,6 @@ class CellState:
         if observed.moved == "camera":
             return np.where(later, self.second, self.X), self.Y
         return self.X, np.where(later, self.second, self.Y)
-
-    def of_views(self, places: Places) -> CellState:
-        """Select the board poses of these views."""
-        return replace(self, C=self.C[places])
 
     def with_boards(self, C: Array) -> CellState:
         """Replace the board poses by others (m, 4, 4)."""

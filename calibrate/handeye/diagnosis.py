@@ -204,7 +204,7 @@ def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:
     """Residuals (m, 6) of the views left out, and the covariance (m, 6, 6) that the other views give them."""
     others = np.setdiff1d(np.arange(len(fit.views)), left_out)
     whole = fit.estimate
-    start = whole.state.of_views(others)
+    start = whole.state.with_boards(whole.state.C[others])
     found = estimate(fit.observed.part(others), start, fit.priors, whole.scales, max_steps=_STEPS)
     seen = found.state.with_boards(whole.board_poses[left_out])
     linear = Linear.at(fit.observed.part(left_out), seen, whole.corner_weights[left_out])

@@ -282,8 +282,6 @@ class Solution:
     on_box: tuple[str, ...] = ()
     """Paper profile: components of X that lie on the box of equation 22."""
     warnings: tuple[Remark, ...] = ()
-    stage_ms: dict[str, float] = field(default_factory=dict)
-    solve_ms: float = 0.0
     seed: int = 0
 
     @property

@@ -55,7 +55,6 @@ from calibrate.handeye.solution import (
     camera_frames,
 )
 from calibrate.results import BoardShape, HoldoutScore
-from calibrate.stopwatch import Stopwatch
 from calibrate.views import Moved, ViewSet
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
@@ -83,7 +82,6 @@ def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution
 
 def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     """Estimate from all views. PosesDisagreeError names the reading that would explain the recording."""
-    watch = Stopwatch()
     priors = _priors(views, options)
     poses = pose_views(views, _focal_sigma(priors), priors.board.square)
     session, fit, disagree = Explanation(Reading.AS_RECORDED, 0.0), None, None
@@ -91,13 +89,11 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         fit = fit_cell(views, priors, options.seed, options.model_arm)
     except PosesDisagreeError as problem:
         disagree = problem
-    watch.lap("estimate")
 
     def ask() -> tuple[Explanation, CellFit | None]:
         """Find how the recording has to be read, and fit a move that is accepted."""
         found = explain_recording(poses, options.seed)
         moved = _MOVED.get(found.reading)
-        watch.lap("readings")
         if not options.accept_move or moved is None:
             return found, None
         return found, fit_moved(views, priors, poses, found.at, moved, options.seed)
@@ -108,18 +104,16 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     if fit is None:
         remedy = explain_text(session, views)
         raise PosesDisagreeError(str(disagree), session.reading.value, remedy=remedy) from None
-    solution = _describe(fit, options, watch)
+    solution = _describe(fit, options)
     if session.reading is Reading.AS_RECORDED and _doubtful(solution):
         session, after_move = ask()
         if after_move is not None:
-            fit, solution = after_move, _describe(after_move, options, watch)
+            fit, solution = after_move, _describe(after_move, options)
     return replace(
         solution,
         session=session,
         move_accepted=fit.estimate.state.second is not None,
         warnings=_remarks(fit, solution, session),
-        stage_ms=watch.stage_ms,
-        solve_ms=watch.total_ms,
     )
 
 
@@ -149,7 +143,7 @@ def _doubtful(solution: Solution) -> bool:
     )
 
 
-def _describe(fit: CellFit, options: SolveOptions, watch: Stopwatch) -> Solution:
+def _describe(fit: CellFit, options: SolveOptions) -> Solution:
     views, found, state = fit.views, fit.estimate, fit.estimate.state
     at, indices = Layout.of(state), [view.index for view in views]
     used = np.flatnonzero(found.used)
@@ -164,11 +158,8 @@ def _describe(fit: CellFit, options: SolveOptions, watch: Stopwatch) -> Solution
     seen = fit.observed.has_pixels
     lens_finding = judge_lens(fit, distance) if given and seen else None
     board_finding = judge_board(fit, distance) if seen else None
-    watch.lap("findings")
     folds = cross_validate(fit, options.seed) if options.folds and state.second is None else None
-    watch.lap("cross-validation")
     holdout = _holdout(fit) if options.holdout and state.second is None else None
-    watch.lap("hold-out")
     weight = found.weight
     rms_px, view_rms_px = _corner_rms(fit)
     return Solution(
@@ -254,7 +245,8 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
         return None
     whole = fit.estimate
     try:
-        partial = estimate(fit.observed.part(first), whole.state.of_views(first), fit.priors, whole.scales)
+        start = whole.state.with_boards(whole.state.C[first])
+        partial = estimate(fit.observed.part(first), start, fit.priors, whole.scales)
     except BadViewsError:
         return None
     H = mount_poses(fit.views.base_from_flange, fit.views.mount)[last]
@@ -296,14 +288,12 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
 
 def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     """Run the paper's experiment: consecutive pairs (eq. 21), the last 6 of them to score (eqs. 24-26)."""
-    watch = Stopwatch()
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = consecutive_pairs(H, C)
     held = HELD_OUT if options.holdout and len(pairs) >= HELD_OUT + 3 else 0
     fit = pairs.select(slice(0, len(pairs) - held))
     require_motion(fit)
     result = solve_paper(fit, options.seed)
-    watch.lap("evolution")
     X, indices = result.X, [view.index for view in views]
     covariance = pair_covariance(result.objective, fit, X)
     distance = options.working_distance_m or median_distance_m(C)
@@ -312,7 +302,6 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     spread_m, spread_rad = board_spread(H, C, X)
     fitted = len(fit) + 1
     note = f"pairs {len(fit)} and {len(fit) + 1} share a pose, as in the paper"
-    watch.lap("assess")
     return Solution(
         mount=views.mount,
         profile="paper",
@@ -336,8 +325,6 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
         board_spread_rad=spread_rad,
         on_box=result.on_box,
         warnings=_paper_warnings(result.on_box, held, certificate),
-        stage_ms=watch.stage_ms,
-        solve_ms=watch.total_ms,
         seed=options.seed,
     )
 

@@ -6,9 +6,10 @@ import numpy as np
 
 from benchmarks.scene import CellNoise, make_cell, zhang
 from calibrate.geometry import Array, rotation_exp
-from calibrate.lens.intrinsics import fit_lens
+from calibrate.handeye.corners import linearise_corners
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.projection import camera_matrix, project_pixels, undistort
+from calibrate.views import observe_views
 from recordings.schema.messages import CameraModel
 
 PLACES = np.array([[640.0, 512.0], [0.0, 0.0], [1279.0, 0.0], [1279.0, 1023.0], [320.0, 768.0]])
@@ -47,7 +48,10 @@ def test_it_is_the_scatter_of_repeated_calibrations() -> None:
         found = zhang(board, exact + rng.normal(size=exact.shape) * noise, cell.camera)
         shifts.append(shift_after_best_turn(cell.camera, found, exact.reshape(-1, 2), PLACES))
     scatter = np.sqrt(np.square(shifts).sum(axis=-1).mean(axis=0))
-    covariance = fit_lens(cell.views, cell.camera).covariance
+    observed = observe_views(cell.views)
+    blocks = linearise_corners(observed, cell.camera, cell.C, observed.present, with_lens=True)
+    by_pose = np.swapaxes(blocks.LG, 1, 2) @ np.linalg.inv(blocks.LL) @ blocks.LG
+    covariance = noise**2 * np.linalg.inv((blocks.GG - by_pose).sum(axis=0))
     stated = lens_uncertainty(cell.camera, covariance, exact.reshape(-1, 2))
     columns = np.linspace(0, 1279, stated.sigma_px.shape[1])
     lines = np.linspace(0, 1023, stated.sigma_px.shape[0])

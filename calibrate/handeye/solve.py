@@ -11,7 +11,7 @@ from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.arm import FLEX, PARAMETERS, RELATIVE_SIGMA
 from calibrate.handeye.arm_result import table_result
-from calibrate.handeye.axxb.certificate import Certificate, certify
+from calibrate.handeye.axxb.certificate import TOLERANCE, Certificate, certify
 from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective, pair_covariance
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
@@ -340,7 +340,7 @@ def _of_returned(objective: QuadraticObjective, X: Array, pairs: int) -> Certifi
     proof = certify(objective, problem).certificate
     value = objective.value(X)
     gap = max(0.0, value - proof.lower_bound) / max(value, proof.floor)
-    return replace(proof, objective=value, relative_gap=gap, certified=gap <= proof.tolerance)
+    return replace(proof, objective=value, relative_gap=gap, certified=gap <= TOLERANCE)
 
 
 def _paper_warnings(on_box: tuple[str, ...], held: int, proof: Certificate) -> tuple[Remark, ...]:

@@ -14,8 +14,14 @@ from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, inverse, project_to_rotation, rotation_log
 from calibrate.lens.pnp import candidate_poses
 from calibrate.quality.drift import SHIFT_M, TURN_RAD
+from calibrate.quality.movement.comparisons import (
+    FIRST_VISITS,
+    FreePostures,
+    PostureIndex,
+    RepeatedPostures,
+    Row,
+)
 from calibrate.quality.movement.evidence import Moved, has_crept, move_size, what_moved
-from calibrate.quality.movement.free import FreePostures, Row
 from calibrate.quality.movement.pictures import (
     ArmErrors,
     CellModel,
@@ -26,7 +32,6 @@ from calibrate.quality.movement.pictures import (
     fitted_tag,
     same_corners,
 )
-from calibrate.quality.movement.repeated import FIRST_VISITS, PostureIndex, RepeatedPostures
 from calibrate.quality.movement.window import CREEP_WINDOW, KEPT, LEARNING, WindowFinding
 from calibrate.views import BoardView
 from recordings.errors import Value

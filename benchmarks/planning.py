@@ -45,8 +45,7 @@ from station.cell.errors import LimitError
 from station.cell.limits import allowed_speed, check_plan, sample_path
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import Scene, guess_from, scene_of
-from station.plan.belief import BootstrapView, improved_config
-from station.plan.bootstrap import next_move
+from station.plan.bootstrap import BootstrapView, improved_config, next_move
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, candidate_pool, plan_scene
 from station.plan.visibility import ViewRange

@@ -29,8 +29,7 @@ from station.cell.socket_folder import default_socket
 from station.cli.console import Headless, Socket, err, out
 from station.cli.session import joints_of, load_into, session
 from station.operate.motion import wait_until_idle
-from station.plan.belief import BootstrapView, believe, improved_config
-from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
+from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, BootstrapView, believe, improved_config, next_move
 from station.protocol.client import Client
 from station.protocol.verbs import Purpose
 

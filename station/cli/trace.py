@@ -14,8 +14,17 @@ from station.cell.errors import RefusedError, RobotError
 from station.cli.attended import ctrl_c_at_once, no_terminal
 from station.cli.console import AsJson, err, out, print_json
 from station.devices.ur_probe import RobotLock, lock_name, probe
-from station.devices.ur_trace_scenarios import Scenario, ScenarioRecorder, scenarios
-from station.devices.ur_traces import SHIPPED, Difference, TraceFile, compare, read_traces, write_traces
+from station.devices.ur_trace_scenarios import (
+    SHIPPED,
+    Difference,
+    Scenario,
+    ScenarioRecorder,
+    TraceFile,
+    compare,
+    read_traces,
+    scenarios,
+    write_traces,
+)
 
 
 def trace_command(

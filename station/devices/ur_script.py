@@ -19,8 +19,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from station.cell.errors import RobotError
-from station.devices.rtde import PORT, PacketType, RtdeError, RuntimeState
-from station.devices.rtde_link import HANDSHAKE_S, RtdeLink
+from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, RtdeError, RtdeLink, RuntimeState
 from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
 
 SCRIPT_PORT = 30002

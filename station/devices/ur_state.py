@@ -29,8 +29,7 @@ from recordings.schema.messages import RobotState, Stamps, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError, StaleStateError
 from station.cell.scene import pose_vector
-from station.devices.rtde import PORT, PacketType, Recipe, RtdeError
-from station.devices.rtde_link import HANDSHAKE_S, RtdeLink
+from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, Recipe, RtdeError, RtdeLink
 from station.devices.ur_dashboard import connect_trouble
 
 log = logging.getLogger(__name__)

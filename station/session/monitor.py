@@ -19,8 +19,7 @@ from recordings.images import viewable
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import BoardSpec, Image, RobotState
 from station.analysis.pool import WorkerError
-from station.analysis.preview import preview_image
-from station.analysis.worker import BoardDetection, sight
+from station.analysis.worker import BoardDetection, preview_image, sight
 from station.cell.config import SPEED_CAP_M_S, matrix4
 from station.cell.errors import CameraError, RefusedError, RobotError, StationError
 from station.cell.limits import point_speed_m_s

@@ -26,7 +26,7 @@ from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_points
 from recordings.errors import CodedError
 from recordings.schema.messages import BoardSpec, Image
-from station.analysis.preview import preview_image
+from station.analysis.worker import preview_image
 from station.cell.errors import StationError
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup

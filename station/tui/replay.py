@@ -17,8 +17,7 @@ from recordings.images import viewable
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.schema.messages import CaptureEvent, RobotState, View
-from station.analysis.preview import preview_image
-from station.analysis.worker import sight
+from station.analysis.worker import preview_image, sight
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StationError
 from station.cell.scene import flange_pose

@@ -184,7 +184,8 @@ class StatusStore:
         self.entered = 0
         """States entered so far: one that was left and entered again is another."""
         self._watchers: list[Callable[[], None]] = []
-        self._listeners: list[Callable[[Event], None]] = []
+        self.recorded: Callable[[Event], None] = lambda event: None
+        """The recording keeps what people are told."""
 
     @property
     def state(self) -> StationState:
@@ -199,10 +200,6 @@ class StatusStore:
                 self._watchers.remove(changed)
 
         return end
-
-    def on_event(self, listener: Callable[[Event], None]) -> None:
-        """The recording keeps what people are told."""
-        self._listeners.append(listener)
 
     def update(self, **sections: object) -> None:
         changed = {k: v for k, v in sections.items() if getattr(self.status, k) != v}
@@ -235,8 +232,7 @@ class StatusStore:
         pose = f"pose {pose_index + 1}: " if pose_index is not None else ""
         log.log(getattr(logging, level.upper()), "%s%s", pose, text)
         self.update(events=(*self.status.events, event)[-EVENTS_KEPT:])
-        for listener in self._listeners:
-            listener(event)
+        self.recorded(event)
 
     def problem(
         self, error: Exception, level: Level = "warning", pose_index: int | None = None, said: str = "{}"

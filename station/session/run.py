@@ -13,6 +13,7 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.schema.messages import Image, Vector6
+from station.cell.collision import CellGeometry
 from station.cell.errors import (
     CameraError,
     LimitError,
@@ -46,14 +47,16 @@ SHOW_PERIOD_S = 0.1
 class Run:
     """The owner calls `drive` as a task; cancelling it ends it where it is, after the disk has its data."""
 
-    def __init__(self, context: SessionContext, go: MotionApproval) -> None:
+    def __init__(
+        self, context: SessionContext, go: MotionApproval, geometry: CellGeometry | None = None
+    ) -> None:
+        """`geometry`: what a motion beside the plan was checked in; None: the cell, from where it stands."""
         self._context = context
         self._go = go
-        if go.beside is not None:
-            self._geometry = go.beside.geometry
-        else:
+        if geometry is None:
             geometry = geometry_from(context.cell.config, go.start_joints_rad)
-            self._geometry = with_plan_speeds(geometry, context.require_queue().plan)
+            geometry = with_plan_speeds(geometry, context.require_queue().plan)
+        self._geometry = geometry
         self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
         """Poses where something still moved."""

@@ -25,7 +25,7 @@ from station.cell.status import StationState
 from station.cell.stillness import RestingCheck
 from station.protocol import verbs
 from station.session.context import SessionContext, displacement
-from station.session.lease import MotionApproval, StopTestMove
+from station.session.lease import Drive, MotionApproval
 from station.session.run import Run
 from station.session.summary import motion_preview, motion_warnings
 
@@ -53,9 +53,7 @@ _WORDS = {
 }
 
 
-async def prepare_stop_test(
-    context: SessionContext, request: verbs.StopTest
-) -> tuple[StopTestMove, StopTestOffer]:
+async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) -> tuple[Drive, StopTestOffer]:
     """RefusedError, LimitError and RobotError say what is in the way. Nothing moves."""
     robot = context.cell.robot
     await RestingCheck(robot.check).news()
@@ -77,7 +75,7 @@ async def prepare_stop_test(
     offer = StopTestOffer(
         preview, context.cell.subject, request.joint, target[request.joint], move.joint_speed_rad_s
     )
-    return StopTestMove(request.way, target, move, geometry), offer
+    return lambda go: StopTestRun(context, go, geometry, request.way, target).drive(), offer
 
 
 def _require_slider(way: StopWay, fraction: float) -> None:
@@ -142,15 +140,22 @@ def _turns(geometry: CellGeometry, request: verbs.StopTest, start: Vector6) -> I
 class StopTestRun(Run):
     """Carries out one approved stop test: one move, no image, nothing recorded."""
 
-    def __init__(self, context: SessionContext, go: MotionApproval, test: StopTestMove) -> None:
-        super().__init__(context, go)
-        self._test = test
+    def __init__(
+        self,
+        context: SessionContext,
+        go: MotionApproval,
+        geometry: CellGeometry,
+        way: StopWay,
+        target_rad: Vector6,
+    ) -> None:
+        super().__init__(context, go, geometry)
+        self._way, self._target_rad = way, target_rad
 
     async def _poses(self) -> None:
-        context, robot, test = self._context, self._context.cell.robot, self._test
+        context, robot = self._context, self._context.cell.robot
         await RestingCheck(robot.check).news()
         context.store.enter(StationState.MOVING)
-        driving = asyncio.create_task(self._drive(robot.latest().joints_rad, test.target_rad, "stop test"))
+        driving = asyncio.create_task(self._drive(robot.latest().joints_rad, self._target_rad, "stop test"))
         try:
             await self._give_stop(driving)
             await driving
@@ -170,9 +175,8 @@ class StopTestRun(Run):
 
     async def _give_stop(self, driving: asyncio.Task[None]) -> None:
         """Give the stop in mid-move, timed to the microsecond. RobotError where a way is not there."""
-        robot, test = self._context.cell.robot, self._test
-        start, target = (np.array(q) for q in (self._go.start_joints_rad, test.target_rad))
-        way = test.way
+        robot, way = self._context.cell.robot, self._way
+        start, target = (np.array(q) for q in (self._go.start_joints_rad, self._target_rad))
         if way in (StopWay.ARRIVE, StopWay.NETWORK, StopWay.SLIDER):
             return
         while not driving.done():

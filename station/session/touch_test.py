@@ -29,7 +29,7 @@ from station.cell.stillness import JOGGED_RAD, NotStillError, RestingCheck
 from station.plan.hover import HoverAnswer, HoverPath, HoverQuestion, answer_hover, least_standoff_m
 from station.protocol import verbs
 from station.session.context import SessionContext, displacement
-from station.session.lease import MotionApproval
+from station.session.lease import Drive, MotionApproval
 from station.session.run import Run
 from station.session.summary import motion_preview, motion_warnings
 
@@ -59,7 +59,7 @@ class TouchTestPlanner:
         self._context = context
         self._board: _BoardSeen | None = None
 
-    async def prepare(self, request: verbs.Hover) -> tuple[HoverPath, HoverOffer]:
+    async def prepare(self, request: verbs.Hover) -> tuple[Drive, HoverOffer]:
         """RefusedError, LimitError, RobotError and CameraError say what is in the way. Nothing moves."""
         context = self._context
         robot, config = context.cell.robot, context.cell.config
@@ -88,7 +88,8 @@ class TouchTestPlanner:
         except CalibrationError as error:
             raise _refused(error) from error
         summary = self._summary(answer, start, seen, words)
-        return answer.hover, _offer(answer, summary, context, pointer, words)
+        offer = _offer(answer, summary, context, pointer, words)
+        return lambda go: HoverRun(context, go, answer.hover).drive(), offer
 
     def _calibration(self, request: verbs.Hover) -> Calibration:
         """A passed calibration of this very cell: a wrong one would put the board somewhere else."""
@@ -226,7 +227,7 @@ class HoverRun(Run):
     """Carries out one approval over a corner: two moves, no image, nothing recorded."""
 
     def __init__(self, context: SessionContext, go: MotionApproval, hover: HoverPath) -> None:
-        super().__init__(context, go)
+        super().__init__(context, go, hover.geometry)
         self._hover = hover
 
     async def _poses(self) -> None:

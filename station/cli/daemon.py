@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import select
-import struct
 import subprocess
 import sys
 import tempfile
@@ -12,11 +11,12 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from socket import AF_UNIX, SO_PEERCRED, SOL_SOCKET
+from socket import AF_UNIX
 from socket import socket as connection
 
 from recordings.files import state_root
 from station.cell.errors import StationError
+from station.cell.socket_folder import peer_of
 from station.protocol.client import DaemonGoneError, ask
 from station.protocol.verbs import GetPlan
 
@@ -111,8 +111,7 @@ def tell_what_goes_on(socket: Path) -> None:
             link.connect(str(socket))
         except OSError:
             return
-        credentials = link.getsockopt(SOL_SOCKET, SO_PEERCRED, struct.calcsize("3i"))
-    pid, user, _ = struct.unpack("3i", credentials)
+        pid, user, _ = peer_of(link)
     own = pid and user == os.getuid()
     ends = f"; `kill {pid}` ends it: the arm stops first, and the recording is finished" if own else ""
     print(f"The station goes on without this screen. `station` opens it again{ends}.")
@@ -121,8 +120,6 @@ def tell_what_goes_on(socket: Path) -> None:
 def answers(socket: Path) -> bool:
     try:
         ask(socket, GetPlan())
-    except DaemonGoneError:
-        return False
-    except StationError:
-        return True
+    except StationError as problem:
+        return not isinstance(problem, DaemonGoneError)
     return True

@@ -19,7 +19,7 @@ from calibrate.files.touch import Touch, touch_text
 from recordings.schema.messages import BoardSpec
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview
-from station.cli.attended import Attended, ask_person, attended, ctrl_c_at_once
+from station.cli.attended import Attended, attended, ctrl_c_at_once
 from station.cli.console import AsJson, Socket, err, out
 from station.operate.touch_test import (
     STANDOFF_M,
@@ -74,7 +74,7 @@ async def _visit(
     pointer_m: float | None,
     quiet: bool,
 ) -> _ShellToucher:
-    async with attended(socket) as shell:
+    async with attended(socket, headless=quiet) as shell:
         if quiet:
             shell.require_simulated()
         root, camera = shell.client.root, shell.client.camera
@@ -111,12 +111,9 @@ class _ShellToucher:
         return self._pointer_m
 
     async def approves(self, preview: MotionPreview) -> bool:
-        yes = self._quiet or ask_person(preview)
-        await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the approval is sent
-        if not yes:
+        if not (yes := await self._shell.approves(preview)):
             err.print("Nothing moved.")
             self._left.clear()
-        self._shell.moving = yes
         return yes
 
     def refused(self, corner: int, problem: StationError) -> None:

@@ -163,8 +163,8 @@ class UrRobot(UrLink):
         state = await self.fresh()
         if self.remote is False:
             raise _local_control()
-        self.program = await fresh.ask("programState")
-        trouble = safety_stop(state) or not_powered(state) or foreign_program(state, self.program)
+        program = await fresh.ask("programState")
+        trouble = safety_stop(state) or not_powered(state) or foreign_program(state, program)
         if trouble is not None:
             raise trouble
 

@@ -85,7 +85,6 @@ class StateReader(threading.Thread):
         self.newest: Sample | None = None
         self.history: deque[RobotState] = deque(maxlen=1)
         self.clock = ClockEstimator()
-        self.samples = 0
         self.lost = 0
         """Samples that the controller made and that never came."""
         self.frozen = 0
@@ -213,7 +212,6 @@ class StateReader(threading.Thread):
             speed_scaling=v[30],
             target_speed_fraction=v[31],
         )
-        self.samples += 1
         self.stands_still = False
         self.clock.add(controller_s, monotonic_ns)
         self.history.append(state)

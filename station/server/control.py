@@ -142,7 +142,8 @@ class ControlServer:
                 log.warning("a client could not be let in: %s", error)
                 break
             link.setblocking(False)
-            peer = _peer_of(link, self._next_client_id)
+            pid, uid, _ = peer_of(link)
+            peer = Peer(self._next_client_id, pid, uid)
             if (full := self._full_for(peer.uid)) is not None:
                 with link, contextlib.suppress(OSError):
                     link.send(msgspec.json.encode(Reply.refused(0, full)) + b"\n")
@@ -315,12 +316,6 @@ def _full(text: str, limit: int) -> RefusedError:
     return RefusedError(
         text, code="house-full", remedy="Close one, or wait a moment; `station stop` needs none.", limit=limit
     )
-
-
-def _peer_of(link: socket.socket, client_id: int) -> Peer:
-    pid, uid, gid = peer_of(link)
-    log.debug("client %d: pid %d, uid %d, gid %d", client_id, pid, uid, gid)
-    return Peer(client_id, pid, uid)
 
 
 def _remove_stale(path: Path) -> None:

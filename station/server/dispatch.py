@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Awaitable, Callable, Coroutine
+from operator import methodcaller
 
 import msgspec
 
@@ -15,7 +16,7 @@ from station.cell.session_folder import SessionSummary, list_sessions
 from station.cell.socket_folder import user_name
 from station.cell.status import HoverOffer, LeaseStatus, MotionPreview
 from station.protocol import verbs
-from station.protocol.verbs import VERBS, Purpose
+from station.protocol.verbs import VERBS, Purpose, Verb
 from station.server.approval import Applicant, ApprovalRule, Process, process
 from station.server.control import Peer
 from station.session.checklist import checklist
@@ -162,22 +163,13 @@ class SessionDispatcher:
     async def _finish(self, caller: Applicant, args: verbs.Finish) -> None:
         await self._to_the_end(self._session.finish(caller.client_id))
 
-    async def _retake(self, caller: Applicant, args: verbs.Retake) -> None:
-        await self._session.edit(verbs.Retake, caller.client_id, lambda queue: queue.retake(args.index))
+    async def _edit(self, caller: Applicant, args: Verb[object]) -> verbs.PoseNumber | None:
+        """A change of the poses: the queue has a method with the verb's name and arguments."""
+        change = methodcaller(args.verb(), *msgspec.structs.astuple(args))
+        index: int | None = await self._session.edit(type(args), caller.client_id, change)
+        return None if index is None else verbs.PoseNumber(index)
 
-    async def _skip(self, caller: Applicant, args: verbs.Skip) -> None:
-        await self._session.edit(verbs.Skip, caller.client_id, lambda queue: queue.skip(args.index))
-
-    async def _reorder(self, caller: Applicant, args: verbs.Reorder) -> None:
-        await self._session.edit(verbs.Reorder, caller.client_id, lambda queue: queue.reorder(args.order))
-
-    async def _add(self, caller: Applicant, args: verbs.Add) -> verbs.PoseNumber:
-        return verbs.PoseNumber(
-            await self._session.edit(verbs.Add, caller.client_id, lambda queue: queue.add(args.pose))
-        )
-
-    async def _drop(self, caller: Applicant, args: verbs.Drop) -> None:
-        await self._session.edit(verbs.Drop, caller.client_id, lambda queue: queue.drop(args.index))
+    _retake = _skip = _reorder = _add = _drop = _edit
 
     async def _free_drive(self, caller: Applicant, args: verbs.Freedrive) -> None:
         await self._to_the_end(self._session.switch_free_drive(caller.client_id, args.on, args.auto))

@@ -169,11 +169,11 @@ async def _write(context: SessionContext, index: int, image: Image, view: View) 
     sighting = await _sighting(context, image, index)
     unusable = _unusable(sighting) if sighting is not None else None
     if sighting is not None and len(sighting.pixels):
-        recording.corners(image.sequence, sighting.pixels)
+        recording.require_open().corners(image.sequence, sighting.pixels)
     if unusable is not None:
         await recording.sync()
         raise unusable
-    recording.view(view)
+    recording.require_open().view(view)
     await recording.sync()
     if sighting is not None:
         queue.note(index, corners=sighting.status.corners, coverage=sighting.status.coverage)

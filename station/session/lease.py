@@ -96,20 +96,13 @@ class ApprovalManager:
         self.voids = 0
         """Counts voided ones: a check that was under way meanwhile offers none."""
 
-    @staticmethod
-    def new_token() -> str:
-        return secrets.token_urlsafe(16)
-
-    def offer(self, asked: MotionApproval) -> MotionApproval:
+    def offer(self, asked: MotionApproval) -> None:
         """Let this one wait for a person, for two minutes. An older one is void."""
         self.waiting = replace(asked, expires_s=self._clock() + APPROVAL_LIFETIME_S)
-        return self.waiting
 
-    def void(self) -> bool:
-        """True when there was one."""
+    def void(self) -> None:
         self.voids += 1
-        was, self.waiting = self.waiting, None
-        return was is not None
+        self.waiting = None
 
     def redeem(
         self,

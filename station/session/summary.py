@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import secrets
 import shlex
 from typing import Any
 
@@ -19,7 +20,6 @@ from station.cell.status import MotionPreview
 from station.cell.stillness import RestingCheck
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext, displacement
-from station.session.lease import ApprovalManager
 from station.session.queue import PlanRevision, PoseQueue
 
 POSE_OVERHEAD_S = 0.8
@@ -100,7 +100,7 @@ def motion_preview(
 ) -> MotionPreview:
     """The figures of a checked path with the words said of it, and a new token."""
     return MotionPreview(
-        token=ApprovalManager.new_token(),
+        token=secrets.token_urlsafe(16),
         path_m=round(check.path_m, 3),
         largest_step_rad=round(check.largest_step_rad, 4),
         top_speed_m_s=round(check.top_speed_m_s, 3),

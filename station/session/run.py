@@ -362,7 +362,7 @@ class SweepRun(Run):
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._take_pictures())
                 try:
-                    await self._swings()
+                    await super()._all_poses()
                 finally:
                     self._ended.set()  # a camera may swallow being cancelled, just when its image comes
         except ExceptionGroup as failed:
@@ -371,26 +371,20 @@ class SweepRun(Run):
             taken = self._taken
             self._context.store.event("swept", f"{taken} images while the arm moved", images=taken)
 
-    async def _swings(self) -> None:
+    async def _pose(self, index: int) -> None:
         context, queue = self._context, self._context.require_queue()
-        for index in self._go.poses:
-            if context.requests.halt or self._wants_rest() or self._failures >= FAILURES_IN_A_ROW:
-                return
-            if index not in queue.open:
-                continue  # skipped or dropped since the approval
-            context.require_recording().require_space()
-            queue.start_attempt(index)
-            try:
-                await self._move_to(index)
-            except LimitError as error:
-                self._give_up(error)
-                queue.mark(index, "failed", error)
-                return
-            context.store.enter(StationState.SETTLING)
-            await context.require_recording().sync()
-            queue.mark(index, "done")
-            await context.require_recording().save_state(queue)
-            context.show_poses(index)
+        queue.start_attempt(index)
+        try:
+            await self._move_to(index)
+        except LimitError as error:
+            self._give_up(error)
+            queue.mark(index, "failed", error)
+            return
+        context.store.enter(StationState.SETTLING)
+        await context.require_recording().sync()
+        queue.mark(index, "done")
+        await context.require_recording().save_state(queue)
+        context.show_poses(index)
 
     async def _take_pictures(self) -> None:
         """Until the arm rests, or the camera failed several times in a row."""

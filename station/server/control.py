@@ -13,7 +13,6 @@ import os
 import socket
 from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -33,6 +32,7 @@ from station.protocol.messages import (
     Request,
 )
 from station.protocol.verbs import VERBS
+from station.server.approval import Peer
 
 log = logging.getLogger(__name__)
 UNSENT_LIMIT_BYTES = 4 * 1024 * 1024
@@ -43,16 +43,6 @@ ACCEPT_PAUSE_S = 0.01
 """Between batches: a flood of connections costs the working loop no more than that."""
 NEW_PER_S = 200
 """Connections that one user may open within a second."""
-
-
-@dataclass(frozen=True)
-class Peer:
-    """Process at the other end, by the kernel's word."""
-
-    client_id: int
-    """0: it sent STOP without a connection."""
-    pid: int
-    uid: int
 
 
 class Handler(Protocol):

@@ -28,7 +28,8 @@ from station.protocol.messages import (
     Reply,
 )
 from station.protocol.verbs import Go
-from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer, Peer
+from station.server.approval import Peer
+from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer
 
 
 class RecordingHandler:

@@ -275,7 +275,8 @@ class UrRobot(UrLink):
         if not isinstance(error, RobotError) or isinstance(error, SafetyStopError):
             return error
         now_ns = time.monotonic_ns()
-        if error.code == "program-ended" and (state := await self._state_after(now_ns, NEWS_WAIT_NS)):
+        unsure = error.code in ("program-ended", "watchdog")
+        if unsure and (state := await self._state_after(now_ns, NEWS_WAIT_NS)):
             error = safety_stop(state) or not_powered(state) or error
         if self.remote and self.dashboard is not None:
             with contextlib.suppress(RobotError, TimeoutError):

@@ -131,7 +131,8 @@ class StateReader(threading.Thread):
 
     def close(self) -> None:
         """Ends the thread; returns when it has ended (milliseconds, or the connect timeout)."""
-        self.request_end()
+        with contextlib.suppress(OSError):
+            self._stop_write.close()
         self.join(HANDSHAKE_S + 1.0)
 
     def waits_unread(self) -> bool:
@@ -141,10 +142,6 @@ class StateReader(threading.Thread):
             if link is not None and link.fileno() >= 0:
                 return bool(select.select([link], [], [], 0)[0])
         return False
-
-    def request_end(self) -> None:
-        with contextlib.suppress(OSError):
-            self._stop_write.close()
 
     def _handshake(self, link: RtdeLink) -> Recipe:
         begun = time.perf_counter()
@@ -328,8 +325,7 @@ class TraceRecorder:
     async def _close(self) -> None:
         reader, self._reader = self._reader, None
         if reader is not None:
-            reader.request_end()
-            await asyncio.to_thread(reader.join, 3.0)
+            await asyncio.to_thread(reader.close)
 
     async def _keep(self) -> None:
         """A lost connection is opened again until it comes."""

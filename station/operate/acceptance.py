@@ -14,7 +14,15 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import BY_PERSON, Acceptance, ArmSubject, StopResult, StopWay
+from station.cell.acceptance import (
+    BY_PERSON,
+    STOP_GIVEN,
+    STOP_TESTED,
+    Acceptance,
+    ArmSubject,
+    StopResult,
+    StopWay,
+)
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview, StationState
 from station.operate.motion import Link, approved_motion
@@ -34,7 +42,6 @@ PREPARE_S = 60.0
 END_S = 40.0
 BACK_S = 120.0
 """A person has this long to plug the cable in again, or to raise the slider."""
-STOP_TESTED, STOP_GIVEN = "stop-tested", "stop-given"
 TRIES = 3
 BUSY = frozenset({"watchdog-computer", "no-heartbeat", "move-refused"})
 """Causes that end a move when this computer is too busy."""

@@ -24,7 +24,7 @@ from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.collision import CellGeometry
 from station.cell.errors import RefusedError
 from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
-from station.cell.stillness import StillnessMonitor
+from station.cell.stillness import RestingCheck, StillnessMonitor
 from station.devices.cell import Cell
 from station.protocol.states import check_transition
 from station.session.queue import PoseQueue
@@ -85,6 +85,11 @@ class SessionContext:
     def require_recording(self) -> SessionRecording:
         assert self.recording is not None
         return self.recording
+
+    async def arm(self) -> RobotState:
+        """The arm's state, fresh and good; news that are late are waited for. Raises RobotError."""
+        await RestingCheck(self.cell.robot.check).news()
+        return self.cell.robot.latest()
 
     @property
     def recorder(self) -> Recorder | None:

@@ -20,7 +20,6 @@ from station.analysis.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement,
 from station.analysis.pool import WorkerError
 from station.cell.errors import RefusedError
 from station.cell.status import EstimateStatus
-from station.cell.stillness import RestingCheck
 from station.plan.predict import Advice, next_best, next_best_text
 from station.protocol.verbs import Purpose
 from station.session.context import SessionContext
@@ -82,7 +81,7 @@ class Replanner:
                 remedy="Continue with the plan as it is (`station resume`), and ask again after "
                 f"{FEWEST_VIEWS} more.",
             )
-        await RestingCheck(context.cell.robot.check).news()
+        await context.arm()
         return await (
             self._anew(context.queue) if purpose is Purpose.REPLAN else self._one_more(context.queue)
         )

@@ -25,7 +25,7 @@ from station.cell.errors import (
 from station.cell.limits import check_path, with_plan_speeds
 from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
-from station.cell.stillness import JOGGED_RAD, NotStillError, RestingCheck
+from station.cell.stillness import JOGGED_RAD, NotStillError
 from station.devices.base import StreamingCamera
 from station.session.capture import PoseFailedError, show_frame, take_image, take_pose
 from station.session.context import RunRequests, SessionContext
@@ -188,9 +188,8 @@ class Run:
     async def _move_to(self, index: int) -> None:
         """Move from where the arm really is. LimitError when that path is not free."""
         context = self._context
-        robot, queue = context.cell.robot, context.require_queue()
-        await RestingCheck(robot.check).news()
-        here, target = robot.latest().joints_rad, queue.pose(index).joints_rad
+        queue = context.require_queue()
+        here, target = (await context.arm()).joints_rad, queue.pose(index).joints_rad
         queue.mark(index, "moving")
         context.store.enter(StationState.MOVING)
         context.show_poses(index)
@@ -200,17 +199,16 @@ class Run:
 
     async def _drive(self, here: Vector6, target: Vector6, name: str) -> None:
         """LimitError when the path from `here`, where the arm stands, is not free."""
-        robot = self._context.cell.robot
         # In a thread: neither the heartbeat nor STOP waits for it.
         check = await asyncio.to_thread(check_path, self._geometry, here, target, name)
         if check.problems:
             raise LimitError("; ".join(map(str, check.problems)), code="path")
-        await RestingCheck(robot.check).news()
-        moved_rad = float(np.abs(np.subtract(robot.latest().joints_rad, here)).max())
+        now = (await self._context.arm()).joints_rad
+        moved_rad = float(np.abs(np.subtract(now, here)).max())
         if moved_rad > JOGGED_RAD:  # after a swing it may settle by less than that
             text = f"The arm moved by {np.rad2deg(moved_rad):.1f}° while its path was checked."
             raise LimitError(text, code="arm-moved", moved_rad=moved_rad, limit_rad=JOGGED_RAD)
-        await robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
+        await self._context.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 
     def _show_times(self, remaining_s: float) -> None:
         """Elapsed, the session's runs before this one included; remaining, by this one's average."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibrate.kinematics import JOINT_NAMES
 from recordings.schema.messages import Vector6
-from station.cell.acceptance import StopTestOffer, StopWay
+from station.cell.acceptance import STOP_GIVEN, STOP_TESTED, StopTestOffer, StopWay
 from station.cell.collision import CellGeometry
 from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError, RobotError, SafetyStopError, StaleStateError
@@ -22,17 +22,12 @@ from station.cell.limits import PlanCheck, check_path, check_plan, slower
 from station.cell.plan import Plan, plan_sha256
 from station.cell.scene import geometry_from, pose_at
 from station.cell.status import StationState
-from station.cell.stillness import RestingCheck
 from station.protocol import verbs
 from station.session.context import SessionContext, displacement
 from station.session.lease import Drive, MotionApproval
 from station.session.run import Run
 from station.session.summary import motion_preview, motion_warnings
 
-STOP_TESTED = "stop-tested"
-"""Cause of the state after such a move, however it ended."""
-STOP_GIVEN = "stop-given"
-"""Code of the event that tells when: `moment_ns`, host monotonic."""
 ACCELERATION_RAD_S2 = 1.4
 LONGEST_TURN_RAD = 0.4
 _PROBE_RAD = 0.05
@@ -55,9 +50,7 @@ _WORDS = {
 
 async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) -> tuple[Drive, StopTestOffer]:
     """RefusedError, LimitError and RobotError say what is in the way. Nothing moves."""
-    robot = context.cell.robot
-    await RestingCheck(robot.check).news()
-    state = robot.latest()
+    state = await context.arm()
     _require_slider(request.way, state.target_speed_fraction)
     start = state.joints_rad
     target, check, geometry, plan = await asyncio.to_thread(_free_move, context, request, start)
@@ -153,9 +146,9 @@ class StopTestRun(Run):
 
     async def _poses(self) -> None:
         context, robot = self._context, self._context.cell.robot
-        await RestingCheck(robot.check).news()
+        here = (await context.arm()).joints_rad
         context.store.enter(StationState.MOVING)
-        driving = asyncio.create_task(self._drive(robot.latest().joints_rad, self._target_rad, "stop test"))
+        driving = asyncio.create_task(self._drive(here, self._target_rad, "stop test"))
         try:
             await self._give_stop(driving)
             await driving

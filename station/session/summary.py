@@ -17,7 +17,6 @@ from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import PlanCheck
 from station.cell.plan import Plan
 from station.cell.status import MotionPreview
-from station.cell.stillness import RestingCheck
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext, displacement
 from station.session.queue import PlanRevision, PoseQueue
@@ -70,13 +69,11 @@ async def summarise(
     changes: tuple[str, ...] = (),
 ) -> MotionPreview:
     """Checks the whole path in the worker. LimitError: it is not free; RobotError: what the arm lacks."""
-    robot = context.cell.robot
     try:
         require_free_space(context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
         raise RefusedError(f"{full} Nothing moved.", code="disk-full") from None
-    await RestingCheck(robot.check).news()
-    start = robot.latest().joints_rad
+    start = (await context.arm()).joints_rad
     plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
     check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
     if check.problems:

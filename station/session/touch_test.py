@@ -153,8 +153,7 @@ class TouchTestPlanner:
         self._board = None
         before = context.cell.robot.latest().joints_rad
         image = await context.cell.camera.capture()
-        await RestingCheck(context.cell.robot.check).news()
-        state = context.cell.robot.latest()
+        state = await context.arm()
         if np.abs(np.subtract(state.joints_rad, before)).max() > _SAME_PLACE_RAD:
             text = "The arm was moved while the image was taken."
             raise RefusedError(text, code="arm-moved", remedy="Leave it at rest, then retry.")
@@ -232,10 +231,10 @@ class HoverRun(Run):
     async def _poses(self) -> None:
         context, robot = self._context, self._context.cell.robot
         for planned in self._hover.plan.poses:
-            await RestingCheck(robot.check).news()
+            here = (await context.arm()).joints_rad
             context.store.enter(StationState.MOVING)
             try:
-                await self._drive(robot.latest().joints_rad, planned.joints_rad, planned.name)
+                await self._drive(here, planned.joints_rad, planned.name)
             except LimitError as error:
                 context.store.enter(StationState.IDLE, error)
                 return
@@ -249,8 +248,7 @@ class HoverRun(Run):
                 return
         with contextlib.suppress(NotStillError):  # what is read next is the place where it rests
             await context.stillness.settle(RestingCheck(robot.check))
-        await RestingCheck(robot.check).news()
-        there = robot.latest().joints_rad
+        there = (await context.arm()).joints_rad
         if context.requests.halt:
             return
         reason = (

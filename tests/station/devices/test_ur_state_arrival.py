@@ -38,7 +38,7 @@ def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
 def reader(clocks: Clocks) -> Iterator[StateReader]:
     made = StateReader("127.0.0.1", lambda state: None, lambda why: None)
     yield made
-    made.request_end()
+    made._stop_write.close()
     made._stop_read.close()
 
 

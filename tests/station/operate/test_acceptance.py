@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import ArmSubject, Figure, StopTestOffer, StopWay
+from station.cell.acceptance import STOP_GIVEN, STOP_TESTED, ArmSubject, Figure, StopTestOffer, StopWay
 from station.cell.errors import StationError
 from station.cell.status import Event, MotionPreview, StationState, StationStatus
 from station.operate import acceptance
-from station.operate.acceptance import STOP_GIVEN, STOP_TESTED, AcceptanceTest, JudgedStop
+from station.operate.acceptance import AcceptanceTest, JudgedStop
 from station.protocol.verbs import Go, StopTest, Verb
 
 SUBJECT = ArmSubject("real", "UR10e", "1", "5.11", (), "ur_rtde")

@@ -33,8 +33,8 @@ from station.cell.status import MotionPreview
 from station.cli.console import AsJson, Headless, err, out, print_json
 from station.cli.daemon import own_daemon
 from station.cli.progress import SessionProgress
-from station.cli.serve import Control, GigE, Mounting, Noise, Scene, Seed
 from station.cli.session import PosesJson
+from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
 from station.operate.motion import SessionOutcome, carry_out, wait_until_idle
 from station.plan.choose import Aim
 from station.protocol.client import Client

@@ -14,21 +14,11 @@ from typing import Annotated
 import typer
 
 from recordings.files import state_root
-from recordings.schema.messages import Mount
-from station.cell.config import ControlPath
 from station.cell.errors import ConfigError
 from station.cell.process import DAEMON_NICENESS, go_before_others
 from station.cell.socket_folder import default_socket
+from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
 from station.devices.cell import Cell
-from station.simulation.cell import NoiseLevel, SceneName
-
-# Options of a simulated cell, of `station demo` too.
-Seed = Annotated[int, typer.Option(help="Simulated: seed of camera pose, board pose, intrinsics, noise")]
-Scene = Annotated[SceneName, typer.Option(help="Simulated; paper-binned: 640×512 pixels")]
-Noise = Annotated[NoiseLevel, typer.Option(help="Simulated")]
-Mounting = Annotated[Mount, typer.Option("--mount", help="Simulated")]
-GigE = Annotated[bool, typer.Option("--gige", help="Simulated: the camera over GigE Vision packets")]
-Control = Annotated[ControlPath | None, typer.Option("--control", hidden=True)]
 
 
 def serve_command(

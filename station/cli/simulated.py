@@ -1,0 +1,18 @@
+"""Options of a simulated cell, as `station serve` and `station demo` take them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from recordings.schema.messages import Mount
+from station.cell.config import ControlPath
+from station.simulation.cell import NoiseLevel, SceneName
+
+Seed = Annotated[int, typer.Option(help="Simulated: seed of camera pose, board pose, intrinsics, noise")]
+Scene = Annotated[SceneName, typer.Option(help="Simulated; paper-binned: 640×512 pixels")]
+Noise = Annotated[NoiseLevel, typer.Option(help="Simulated")]
+Mounting = Annotated[Mount, typer.Option("--mount", help="Simulated")]
+GigE = Annotated[bool, typer.Option("--gige", help="Simulated: the camera over GigE Vision packets")]
+Control = Annotated[ControlPath | None, typer.Option("--control", hidden=True)]

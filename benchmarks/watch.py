@@ -301,8 +301,7 @@ def simulate(cell: Cell, count: int, what: Happening | None) -> tuple[CellModel,
     pixels = still.seen_by(transform_points(C, still.tag)) + noise_px + still.blur_px
     recorded = forward(_ARM, still.joints)
     return still.model, [
-        Picture(str(i), 0.0, recorded[i], still.joints[i], (0, 1, 2, 3), _TAG, pixels[i])
-        for i in range(count)
+        Picture(str(i), recorded[i], still.joints[i], (0, 1, 2, 3), _TAG, pixels[i]) for i in range(count)
     ]
 
 

@@ -32,8 +32,6 @@ class RobotModel:
     name: str
     a_m: tuple[float, ...]
     d_m: tuple[float, ...]
-    generation: str
-    """'CB3' or 'e-Series'"""
     alpha_rad: tuple[float, ...] = _ALPHA
     theta_offset_rad: tuple[float, ...] = (0.0,) * 6
     beta_rad: tuple[float, ...] = (0.0,) * 6
@@ -66,8 +64,7 @@ class RobotModel:
 
 
 def _model(name: str, a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> RobotModel:
-    generation = "e-Series" if name.endswith("e") else "CB3"
-    return RobotModel(name, (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), generation)
+    return RobotModel(name, (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6))
 
 
 MODELS: dict[str, RobotModel] = {
@@ -192,7 +189,7 @@ def base_from_flange(table: Mapping[str, Sequence[float]], joints_rad: ArrayLike
     `corrected_flange` into `corrected_base`: it belongs to `arm_table.result` alone, never to another X.
     """
     a, d, alpha, theta, beta = (tuple(table[name]) for name in TABLE_COLUMNS)
-    return forward(RobotModel("corrected", a, d, "", alpha, theta, beta), joints_rad)
+    return forward(RobotModel("corrected", a, d, alpha, theta, beta), joints_rad)
 
 
 def jacobian(model: RobotModel, joints_rad: ArrayLike) -> Array:

@@ -167,7 +167,6 @@ def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
         float(np.sqrt(expected.mean())),
         limit,
         FOLDS,
-        dict(zip(full.tolist(), distance.tolist(), strict=True)),
     )
 
 

@@ -95,8 +95,6 @@ class CrossValidation:
     limit: float
     """Limit of `rms_m` over `claimed_m`; beyond it the claim is too small."""
     folds: int
-    residual_m: dict[int, float]
-    """Place of each view → distance by which it was missed."""
 
 
 @dataclass(frozen=True)
@@ -219,8 +217,6 @@ class Explanation:
     """Place of the first view after a change; images by which they are shifted."""
     factor: float = 1.0
     """True over configured size of the squares, or focal length, of the later part where it changed."""
-    share: float = 1.0
-    """Share of the views that carry full weight under this reading."""
 
 
 @dataclass(frozen=True, eq=False)

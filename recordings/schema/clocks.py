@@ -54,7 +54,6 @@ class ClockFit:
     """Host seconds per device second, minus 1."""
     drift_uncertainty: float
     latency_s: float
-    samples: int
     residual_s: float = 0.0
     """The shortest delay of each tenth of the window lies within this above the line."""
     span_s: float = 0.0
@@ -153,7 +152,7 @@ class ClockEstimator:
             if len(self._bins) < LEAST_BINS or self._is_fresh(self._fit):
                 return self._fit
             points, newest_s, samples = np.array(self._bins), self._newest_s, self._samples
-        fit = _estimate(points, newest_s, samples, self.latency_s)
+        fit = _estimate(points, newest_s, self.latency_s)
         with self._lock:
             if self._bins and self._samples >= samples:  # not forgotten meanwhile
                 self._fit = fit
@@ -163,7 +162,7 @@ class ClockEstimator:
         return fit is not None and self._newest_s - fit.reference_s < min(REFIT_S, REFIT_SHARE * fit.span_s)
 
 
-def _estimate(points: Array, newest_s: float, samples: int, latency_s: float) -> ClockFit:
+def _estimate(points: Array, newest_s: float, latency_s: float) -> ClockFit:
     """points: (n, 2), device time [s] and smallest host − device [ns] of each bin, oldest first."""
     device_s, gaps_ns = points.T
     span_s = float(device_s[-1] - device_s[0])
@@ -181,7 +180,6 @@ def _estimate(points: Array, newest_s: float, samples: int, latency_s: float) ->
             UNFITTED_DRIFT if span_s < DRIFT_SPAN_S else min(UNFITTED_DRIFT, residual_s / span_s)
         ),
         latency_s=latency_s,
-        samples=samples,
         span_s=span_s,
     )
 

@@ -117,7 +117,7 @@ def link_origins(table: DhTable) -> Array:
     Raises ExportError where the table moves the flange behind the last joint, which that chain cannot say.
     """
     a, d, alpha, theta, beta = (getattr(table, name) for name in table.__struct_fields__)
-    model, after = RobotModel("corrected", a, d, "", alpha, theta, beta), [a[5], alpha[5], beta[5]]
+    model, after = RobotModel("corrected", a, d, alpha, theta, beta), [a[5], alpha[5], beta[5]]
     if np.abs(after).max() > 1e-12:
         raise ExportError("The table has a, alpha or beta of joint 6.", code="table-behind-joint-6")
     frames, behind, found = link_frames(model, np.zeros(6)), np.eye(4), []

@@ -41,8 +41,6 @@ class Picture:
     """One production picture in which the tag was found."""
 
     name: str
-    wall_s: float
-    """Unix time; 0: unknown."""
     base_from_flange: Array
     """(4, 4)"""
     joints_rad: Array | None

@@ -67,7 +67,7 @@ def test_the_figures_are_those_of_the_middle_the_worst_corner_and_the_worst_plac
     for row, column in ((0, 0), (0, 4), (2, 0), (2, 4)):
         grid = np.array([[4.0, 2, 1, 2, 4], [2, 9, 0.5, 2, 2], [4, 2, 1, 2, 4]])
         grid[row, column] = 5.0
-        figures = LensUncertainty(camera, np.zeros((9, 9)), grid).figures
+        figures = LensUncertainty(camera, grid).figures
         assert figures == {"centre": 0.5, "corner": 5.0, "worst": 9.0}
 
 

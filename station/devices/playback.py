@@ -50,7 +50,6 @@ _HOST_CLOCK = ClockFit(
     residual_s=0.0,
     drift_uncertainty=0.0,
     latency_s=_STAMP_BOUND_S,
-    samples=1,
     span_s=0.0,
 )
 """Played images are stamped by the host's own clock."""

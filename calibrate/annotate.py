@@ -17,9 +17,9 @@ from calibrate.boards.model import board_from_turned, board_points, looks_same_t
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, encode_calibration
 from calibrate.geometry import Array
-from calibrate.handeye.cell_state import board_in_camera
 from calibrate.load import Progress, load_views
 from calibrate.projection import project_pixels
+from calibrate.views import board_in_camera
 from recordings.exporters.excerpt import copied
 from recordings.images import viewable
 from recordings.reader import Recording

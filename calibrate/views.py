@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array
+from calibrate.geometry import Array, inverse
 from calibrate.kinematics import RobotModel
 from recordings.schema.messages import CameraModel, Mount
 
@@ -162,3 +162,15 @@ def extent_of(points: Array) -> Array:
     """Compute middle and half size (2, 2), metres, of points (m, 3) on the board."""
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     return np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-6)])
+
+
+def implied_flange(mount: Mount, X: Array, Y: Array, C: Array) -> Array:
+    """Compute base_from_flange (n, 4, 4): Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand)."""
+    if mount == "eye-in-hand":
+        return np.asarray(Y @ inverse(C) @ inverse(X))
+    return np.asarray(X @ C @ inverse(Y))
+
+
+def board_in_camera(mount: Mount, flange: Array, X: Array, Y: Array) -> Array:
+    """Predict camera_from_board (..., 4, 4) of base_from_flange (..., 4, 4): (F X)⁻¹ Y, or X⁻¹ F Y."""
+    return np.asarray(inverse(flange @ X) @ Y if mount == "eye-in-hand" else inverse(X) @ flange @ Y)

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from calibrate.geometry import Array, difference, inverse, perturb, skew
+from calibrate.geometry import Array, difference, perturb, skew
 from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
 from calibrate.results import SHAPE
-from calibrate.views import Observations
+from calibrate.views import Observations, implied_flange
 from recordings.schema.messages import CameraModel, Mount
 
 
@@ -87,18 +87,6 @@ class Layout:
         slices = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
         X, Y, at_lens, shape, table, at_second = slices
         return cls(X, Y, at_lens, shape, table, at_second, ends[-1])
-
-
-def implied_flange(mount: Mount, X: Array, Y: Array, C: Array) -> Array:
-    """Compute base_from_flange (n, 4, 4): Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand)."""
-    if mount == "eye-in-hand":
-        return np.asarray(Y @ inverse(C) @ inverse(X))
-    return np.asarray(X @ C @ inverse(Y))
-
-
-def board_in_camera(mount: Mount, flange: Array, X: Array, Y: Array) -> Array:
-    """Predict camera_from_board (..., 4, 4) of base_from_flange (..., 4, 4): (F X)⁻¹ Y, or X⁻¹ F Y."""
-    return np.asarray(inverse(flange @ X) @ Y if mount == "eye-in-hand" else inverse(X) @ flange @ Y)
 
 
 def flange_residuals(observed: Observations, state: CellState) -> Array:

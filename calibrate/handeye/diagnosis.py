@@ -9,13 +9,13 @@ from scipy import special
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, skew
-from calibrate.handeye.cell_state import Layout, implied_flange
+from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.estimate import FULL, CellFit, estimate
 from calibrate.handeye.linear import Linear, inverse_of
 from calibrate.handeye.solution import CrossValidation, Finding
 from calibrate.projection import intrinsics_vector
 from calibrate.results import RejectedView
-from calibrate.views import Places
+from calibrate.views import Places, implied_flange
 
 _LOOSER = 0.01
 """A statement is taken back by giving its information this factor, not none: without it X may be open."""

@@ -16,12 +16,12 @@ import numpy as np
 
 from calibrate.geometry import Array
 from calibrate.handeye.arm import PARAMETERS
-from calibrate.handeye.cell_state import CellState, Layout, board_in_camera
+from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.projection import camera_matrix
 from calibrate.results import SHAPE
-from calibrate.views import Observations, extent_of
+from calibrate.views import Observations, board_in_camera, extent_of
 from recordings.schema.messages import CameraModel, Mount
 
 _FOCAL_SHARE = 0.05

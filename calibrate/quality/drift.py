@@ -20,10 +20,9 @@ from calibrate.errors import BadViewsError, TooFewViewsError, UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, perturb
 from calibrate.handeye.axxb.pairs import mount_poses
-from calibrate.handeye.cell_state import board_in_camera
 from calibrate.handeye.corners import bent_points, boards_by_corners
 from calibrate.projection import project_at
-from calibrate.views import ViewSet, extent_of, observe_views, require_no_copies
+from calibrate.views import ViewSet, board_in_camera, extent_of, observe_views, require_no_copies
 from recordings.schema.messages import CameraModel, Mount, SessionInfo, Source
 
 FEWEST_VIEWS = 3

@@ -21,6 +21,7 @@ from scipy.optimize import least_squares
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, difference, perturb, pose, rotation_exp, transform_points
 from calibrate.kinematics import RobotModel, forward, inverse_nearest
+from calibrate.views import board_in_camera
 from station.cell.collision import SPACING_M, CellGeometry, margins
 from station.cell.config import StationConfig
 from station.cell.errors import ConfigError, LimitError
@@ -30,7 +31,6 @@ from station.cell.scene import (
     Scene,
     arm_model,
     board_place,
-    camera_from_board,
     geometry_from,
     geometry_of,
     guess_from,
@@ -331,7 +331,7 @@ class CameraPoseEstimate:
 
     def seen_from(self, targets: Array, X: Array) -> Array:
         """Board poses camera_from_board (n, 4, 4) at flange poses (n, 4, 4), if the mount is X."""
-        return camera_from_board(self.config.mount, targets, X, self.board(X))
+        return board_in_camera(self.config.mount, targets, X, self.board(X))
 
     def spread_after(self, target: Array) -> float:
         """Squared error (m²) of X expected after one more glimpse from a flange pose (4, 4)."""

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, inverse, perturb, skew, transform_points
-from calibrate.handeye.cell_state import board_in_camera
 from calibrate.kinematics import RobotModel, jacobian
 from calibrate.projection import camera_matrix, project
+from calibrate.views import board_in_camera
 from recordings.schema.messages import CameraModel, Mount
 
 DEAD_BAND_M, DEAD_BAND_RAD = 0.03e-3, float(np.radians(0.003))

@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks.watch import Cell, Happening, simulate
 from calibrate.geometry import Array, perturb, transform_points
-from calibrate.handeye.cell_state import board_in_camera
 from calibrate.projection import project_pixels
 from calibrate.quality.movement.evidence import Moved
 from calibrate.quality.movement.monitor import (
@@ -28,6 +27,7 @@ from calibrate.quality.movement.pictures import (
     deviations,
 )
 from calibrate.quality.movement.window import KEPT, LEARNING, RunningSums
+from calibrate.views import board_in_camera
 from recordings.schema.messages import Mount
 
 MOUNTS: tuple[Mount, Mount] = ("eye-in-hand", "eye-to-hand")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import re
 import subprocess
@@ -28,6 +29,7 @@ DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "
 # Hundreds of programs are started: without its byte code each of them compiles the source first.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+gc.set_threshold(10_000, 20, 20)  # the usual ones go through all that was imported every few tests
 for _size in ("COLUMNS", "LINES"):  # a shell may export them: what is printed would break elsewhere
     os.environ.pop(_size, None)
 

@@ -9,7 +9,7 @@ the rows of its upper 3×4 block. Standard Denavit-Hartenberg parameters as publ
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import acos, atan2, cos, hypot, pi, sin, sqrt
+from math import acos, atan2, copysign, cos, hypot, pi, sin, sqrt
 from operator import add
 
 Rigid = tuple[float, ...]
@@ -121,23 +121,15 @@ def from_rotvec(rx: float, ry: float, rz: float, x: float = 0.0, y: float = 0.0,
 def to_rotvec(A: Rigid) -> tuple[float, float, float]:
     """Rotation vector [rad], angle in [0, π], by way of the quaternion (accurate near 0 and near π)."""
     m00, m01, m02, _, m10, m11, m12, _, m20, m21, m22, _ = A
-    trace = m00 + m11 + m22
-    if trace > 0:
-        s = 2 * sqrt(trace + 1)
-        w, x, y, z = s / 4, (m21 - m12) / s, (m02 - m20) / s, (m10 - m01) / s
-    elif m00 > m11 and m00 > m22:
-        s = 2 * sqrt(1 + m00 - m11 - m22)
-        w, x, y, z = (m21 - m12) / s, s / 4, (m01 + m10) / s, (m02 + m20) / s
-    elif m11 > m22:
-        s = 2 * sqrt(1 + m11 - m00 - m22)
-        w, x, y, z = (m02 - m20) / s, (m01 + m10) / s, s / 4, (m12 + m21) / s
-    else:
-        s = 2 * sqrt(1 + m22 - m00 - m11)
-        w, x, y, z = (m10 - m01) / s, (m02 + m20) / s, (m12 + m21) / s, s / 4
-    if w < 0:
-        w, x, y, z = -w, -x, -y, -z
-    norm = sqrt(x * x + y * y + z * z)
-    scale = 2.0 if norm < 1e-12 else 2 * atan2(norm, w) / norm
+    multiples = (  # of the quaternion w, x, y, z: by 4 w, 4 x, 4 y and 4 z
+        (1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01),
+        (m21 - m12, 1 + m00 - m11 - m22, m01 + m10, m02 + m20),
+        (m02 - m20, m01 + m10, 1 + m11 - m00 - m22, m12 + m21),
+        (m10 - m01, m02 + m20, m12 + m21, 1 + m22 - m00 - m11),
+    )
+    w, x, y, z = multiples[max(range(4), key=lambda i: multiples[i][i])]
+    norm = copysign(sqrt(x * x + y * y + z * z), w)
+    scale = 2 / w if abs(norm) < 1e-12 else 2 * atan2(abs(norm), abs(w)) / norm
     return x * scale, y * scale, z * scale
 
 

@@ -95,14 +95,14 @@ class ScriptRun:
         self.halted = False
         self._threads: list[Thread] = []
         self._spent = 0
-        self._program = parse(text, builtins)
+        code, program, self._lines = parse(text, builtins)
         names: dict[str, Any] = {
             "_0": Scope({}), "Pose": Pose, "call": _call, "halt": self._halt, "item": _item, "join": _join,
             "kill": _kill, "operate": operate, "set_item": _set_item, "spend": self._spend,
             "start": self._start, "truth": truth,
         } | {f"f_{name}": function for name, function in builtins.items()}  # fmt: skip
-        exec(self._program.code, names)
-        self._start(names[self._program.function])
+        exec(code, names)
+        self._start(names[program])
 
     def step(self) -> bool:
         """False when the program has ended. Raises ScriptRuntimeError."""
@@ -132,7 +132,7 @@ class ScriptRun:
     def _line(self, error: BaseException) -> int:
         """Return the script's line that is the nearest to where it was raised."""
         places = [at for frame, at in walk_tb(error.__traceback__) if frame.f_code.co_filename == SCRIPT]
-        return self._program.lines[places[-1] - 1] if places else 0
+        return self._lines[places[-1] - 1] if places else 0
 
     def _halt(self) -> Steps:
         self.halted = True

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import CodeType
 from typing import Any, NamedTuple
@@ -91,30 +91,18 @@ def tokens(text: str) -> list[Token]:
 class Function:
     """A `def`, `sec` or `thread` while it is read."""
 
-    name: str
-    outer: Function | None
     parameters: dict[str, bool] = field(default_factory=dict)
     """Those with a default are True."""
-    functions: dict[str, Function] = field(default_factory=dict)
+    inner: dict[str, Function] = field(default_factory=dict)
     written: Lines = field(default_factory=list)
-    """The functions in it, in Python."""
-
-    def around(self) -> Iterator[Function]:
-        """It, and those that it is in."""
-        yield self
-        if self.outer is not None:
-            yield from self.outer.around()
-
-    @property
-    def scope(self) -> str:
-        return f"_{len(list(self.around())) - 1}"
+    """The inner functions in Python."""
 
 
 class Call(NamedTuple):
     """A call, whose meaning is found when the whole text was read: a function of the script, or a builtin."""
 
     name: Token
-    inside: Function
+    around: tuple[Function, ...]
     plain: int
     named: list[str]
     runs: bool
@@ -123,37 +111,33 @@ class Call(NamedTuple):
     def check(self, builtins: Mapping[str, Builtin]) -> None:
         """Raises ScriptSyntaxError for what is nowhere, or called wrongly."""
         _, name, line = self.name
-        found = next((f.functions[name] for f in self.inside.around() if name in f.functions), None)
-        if found is not None:
-            names = list(found.parameters)
-            given = {*names[: self.plain], *self.named, *(n for n in names if found.parameters[n])}
-            fits = self.plain <= len(names) and given == set(names)
-        elif name not in builtins:
+        found = next((f.inner[name].parameters for f in reversed(self.around) if name in f.inner), None)
+        if found is None and name not in builtins:
             raise ScriptSyntaxError(f"compile_error_name_not_found:{name}:", line)
+        if found is None and self.runs:
+            raise ScriptSyntaxError(f"{name} is no thread", line)
+        fits = True
+        if found is not None:
+            given = {
+                *list(found)[: self.plain],
+                *self.named,
+                *(n for n, optional in found.items() if optional),
+            }
+            fits = self.plain <= len(found) and given == found.keys()
         else:
-            fits = not self.runs and _takes(builtins[name], self.plain, self.named)
+            try:
+                inspect.signature(builtins[name]).bind(*[0] * self.plain, **dict.fromkeys(self.named))
+            except TypeError:
+                fits = False
         if not fits:
-            raise ScriptSyntaxError(f"{name} does not take these arguments, or is no thread", line)
+            raise ScriptSyntaxError(f"{name} does not take these arguments", line)
 
 
-def _takes(builtin: Builtin, plain: int, named: list[str]) -> bool:
-    try:
-        inspect.signature(builtin).bind(*[0] * plain, **dict.fromkeys(named))
-    except TypeError:
-        return False
-    return True
+def parse(text: str, builtins: Mapping[str, Builtin]) -> tuple[CodeType, str, list[int]]:
+    """Return code that defines the program, what it defines, and the script's line of each line of it.
 
-
-class Program(NamedTuple):
-    code: CodeType
-    """Defines the function."""
-    function: str
-    lines: list[int]
-    """Line of the script of each line of the code."""
-
-
-def parse(text: str, builtins: Mapping[str, Builtin]) -> Program:
-    """A whole program (`def name(): … end`), or bare statements. Raises ScriptSyntaxError."""
+    The program is a `def name(): … end`, or bare statements. Raises ScriptSyntaxError.
+    """
     parser, lines = _Parser(tokens(text)), [0]
     try:
         outermost = parser.program()
@@ -165,8 +149,8 @@ def parse(text: str, builtins: Mapping[str, Builtin]) -> Program:
         raise ScriptSyntaxError(error.msg, lines[(error.lineno or 1) - 1]) from None
     except (RecursionError, MemoryError, ValueError):
         raise ScriptSyntaxError("nested too deeply") from None
-    (name,) = outermost.functions
-    return Program(code, f"f_{name}", lines)
+    (name,) = outermost.inner
+    return code, f"f_{name}", lines
 
 
 class _Parser:
@@ -176,8 +160,12 @@ class _Parser:
         self._tokens = found
         self._place = 0
         self.calls: list[Call] = []
-        self._inside = Function("", None)
-        """The function that is being read; the outermost one is the text."""
+        self._around = [Function()]
+        """The functions that are being read, the innermost last; the first one is the text."""
+
+    @property
+    def _scope(self) -> str:
+        return f"_{len(self._around) - 1}"
 
     def _is(self, *words: str) -> bool:
         token = self._tokens[self._place]
@@ -209,44 +197,41 @@ class _Parser:
 
     def program(self) -> Function:
         """Return the text as a function that holds another: the program."""
-        text = self._inside
         self._skip_lines()
         if self._is("def", "sec"):
             self._function()
             self._skip_lines()
         else:
-            self._inside = Function("line", text)
-            self._define(1, [], self._body())
+            self._around.append(Function())
+            self._define("line", 1, [], self._body())
         if self._tokens[self._place].kind:
             self._need()
-        return text
+        return self._around[0]
 
     def _function(self) -> None:
         line = self._need("def", "sec", "thread").line
-        around = self._inside
-        self._inside = function = Function(self._need(kind="name").text, around)
-        scope, defaults = function.scope, Lines()
+        name = self._need(kind="name").text
+        self._around.append(Function())
+        parameters, defaults = self._around[-1].parameters, Lines()
         self._need("(")
         while not self._take(")"):
-            name = self._need(kind="name").text
-            function.parameters[name] = self._take("=") is not None
-            if function.parameters[name]:
-                defaults.append((line, f"if {name!r} not in {scope}.maps[0]:"))
-                defaults.append((line, f" {scope}.local_only[{name!r}] = {self._expression()}"))
+            parameter = self._need(kind="name").text
+            parameters[parameter] = self._take("=") is not None
+            if parameters[parameter]:
+                defaults.append((line, f"if {parameter!r} not in {self._scope}.maps[0]:"))
+                defaults.append((line, f" {self._scope}.local_only[{parameter!r}] = {self._expression()}"))
             if not self._is(")"):
                 self._need(",")
-        self._define(line, defaults, self._block())
-        self._inside = around
+        self._define(name, line, defaults, self._block())
 
-    def _define(self, line: int, defaults: Lines, body: Lines) -> None:
+    def _define(self, name: str, line: int, defaults: Lines, body: Lines) -> None:
         """Functions come first where they are: a script may call what stands below."""
-        function, outer = self._inside, self._inside.outer
-        assert outer is not None
-        enter = f"{function.scope} = {outer.scope}.enter({[*function.parameters]}, given, named)"
+        scope, function = self._scope, self._around.pop()
+        enter = f"{scope} = {self._scope}.enter({[*function.parameters]}, given, named)"
         lines = [(line, enter), *defaults, *function.written, *body, (line, "return"), (line, "yield")]
-        outer.written.append((line, f"def f_{function.name}(*given, **named):"))
-        outer.written += _indented(lines)
-        outer.functions[function.name] = function
+        outer = self._around[-1]
+        outer.written += [(line, f"def f_{name}(*given, **named):"), *_indented(lines)]
+        outer.inner[name] = function
 
     def _block(self, *others: str) -> Lines:
         """Read from the colon to `end`, or to one of the other words, which stays."""
@@ -283,7 +268,7 @@ class _Parser:
             case "global" | "local" as scope:
                 name = self._need(kind="name").text
                 self._need("=")
-                return [(line, f"{self._inside.scope}.{scope}_only[{name!r}] = {self._expression()}")]
+                return [(line, f"{self._scope}.{scope}_only[{name!r}] = {self._expression()}")]
             case "kill" | "join" as verb:
                 return [(line, f"yield from call('{verb}', {verb}, {self._expression()})")]
             case "return":
@@ -299,13 +284,13 @@ class _Parser:
         if self._next_is("name", "="):
             name = self._need(kind="name").text
             self._need("=")
-            return f"{self._inside.scope}[{name!r}] = {self._expression()}"
+            return f"{self._scope}[{name!r}] = {self._expression()}"
         if self._next_is("name", "["):
             before, name = self._place, self._need(kind="name").text
             self._need("[")
             index = self._expression()
             if self._take("]") and self._take("="):
-                return f"set_item({self._inside.scope}[{name!r}], {index}, {self._expression()})"
+                return f"set_item({self._scope}[{name!r}], {index}, {self._expression()})"
             self._place = before
         return self._expression()
 
@@ -355,12 +340,13 @@ class _Parser:
             found = f"[{', '.join(self._list(']')[0])}]"
         elif token.text == "p" and self._take("["):
             items = self._list("]")[0]  # a single one is an index into a variable of that name
-            scope = self._inside.scope
-            found = f"item({scope}['p'], {items[0]})" if len(items) == 1 else f"Pose([{', '.join(items)}])"
+            found = (
+                f"item({self._scope}['p'], {items[0]})" if len(items) == 1 else f"Pose([{', '.join(items)}])"
+            )
         elif token.kind != "name":
             raise ScriptSyntaxError(f"{token.text!r} where a value was expected", token.line)
         else:
-            found = self._call(token) if self._is("(") else f"{self._inside.scope}[{token.text!r}]"
+            found = self._call(token) if self._is("(") else f"{self._scope}[{token.text!r}]"
         while self._take("["):
             found = f"item({found}, {self._expression()})"
             while self._take(","):  # a matrix is a list of its rows
@@ -385,7 +371,7 @@ class _Parser:
     def _call(self, name: Token, runs: bool = False) -> str:
         self._need("(")
         plain, named = self._list(")")
-        self.calls.append(Call(name, self._inside, len(plain), list(named), runs))
+        self.calls.append(Call(name, tuple(self._around), len(plain), list(named), runs))
         found = [f"f_{name.text}", *plain]
         if named:
             found.append("**{" + ", ".join(f"{key!r}: {value}" for key, value in named.items()) + "}")

@@ -39,50 +39,15 @@ JointSpeed = Annotated[float, Meta(ge=1e-3, le=100)]
 Three = tuple[float, float, float]
 
 
-def pstop(machine: Machine) -> None:
-    """Protective stop now."""
-    machine.robot.protective_stop("admin")
-
-
-def estop(machine: Machine, on: bool = True) -> None:
-    """Emergency stop button pressed (on) or pulled out again; afterwards the arm has no power: `run`."""
-    machine.robot.emergency_stop(on)
-
-
-def safeguard(machine: Machine, on: bool = True) -> None:
-    """Safeguard stop: the program pauses; released, it stays paused until `play`."""
-    machine.robot.safeguard(on)
-
-
-def power_off(machine: Machine) -> None:
-    """The arm loses power."""
-    machine.robot.power_off()
-
-
 def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> Json:
     """Cuts every connection of these ports (rtde, script, dashboard; all if none named) by fin or rst."""
     return {"cut": machine.cut(how, ports)}
-
-
-def stall(machine: Machine, on: bool = True) -> None:
-    """RTDE links stay open but no data comes; everything else works."""
-    machine.rtde.stalled = on
-
-
-def freeze(machine: Machine, on: bool = True) -> None:
-    """RTDE sends the same packet for ever: the timestamp stands still on a live link."""
-    machine.rtde.frozen = on
 
 
 def mute(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
     """Ports accept connections, but what arrives is lost and nothing is answered."""
     for service in machine.chosen(ports):
         service.silent = on
-
-
-def stall_dash(machine: Machine, on: bool = True) -> None:
-    """The dashboard accepts connections and never says a word."""
-    machine.dashboard.silent = on
 
 
 def black_hole(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
@@ -150,36 +115,6 @@ def dh(
 ) -> None:
     """The true arm differs from the nominal table by these; what the controller reports does not."""
     machine.robot.true_table = machine.robot.table.plus(a_m, d_m, alpha_rad, theta_rad)
-
-
-def unlock(machine: Machine) -> Json:
-    """A person clears the protective stop (refused within 5 s of it). Not in the dashboard's log."""
-    return {"unlocked": machine.robot.unlock()}
-
-
-def run(machine: Machine) -> None:
-    """A person powers the arm on and releases the brakes."""
-    machine.robot.run()
-
-
-def stop_program(machine: Machine) -> None:
-    """Stop pressed on the pendant."""
-    machine.robot.stop_program("pendant")
-
-
-def pause(machine: Machine) -> Json:
-    """Pause pressed on the pendant."""
-    return {"paused": machine.robot.pause_program()}
-
-
-def play(machine: Machine) -> Json:
-    """Play pressed on the pendant: a paused program goes on."""
-    return {"playing": machine.robot.play_program()}
-
-
-def program(machine: Machine) -> Json:
-    """The text of the program that plays."""
-    return {"text": machine.robot.program.text if machine.robot.program else ""}
 
 
 def contact(machine: Machine, cycles: Count = 10) -> None:
@@ -308,27 +243,64 @@ def log(machine: Machine, since_monotonic_ns: int = 0) -> Json:
 
 def help_(_: Machine) -> Json:
     """This list."""
-    return {"commands": {name: " ".join(str(c.__doc__).split()) for name, c in COMMANDS.items()}}
+    return {"commands": {name: text for name, (text, _) in COMMANDS.items()}}
 
 
-COMMANDS: dict[str, Command] = {
-    name.rstrip("_"): function
+_SHORT: dict[str, tuple[str, Command]] = {
+    "pstop": ("Protective stop now.", lambda m: m.robot.protective_stop("admin")),
+    "estop": (
+        "Emergency stop button pressed (on) or pulled out again; afterwards the arm has no power: `run`.",
+        lambda m, on=True: m.robot.emergency_stop(on),
+    ),
+    "safeguard": (
+        "Safeguard stop: the program pauses; released, it stays paused until `play`.",
+        lambda m, on=True: m.robot.safeguard(on),
+    ),
+    "power_off": ("The arm loses power.", lambda m: m.robot.power_off()),
+    "stall": (
+        "RTDE links stay open but no data comes; everything else works.",
+        lambda m, on=True: setattr(m.rtde, "stalled", on),
+    ),
+    "freeze": (
+        "RTDE sends the same packet for ever: the timestamp stands still on a live link.",
+        lambda m, on=True: setattr(m.rtde, "frozen", on),
+    ),
+    "stall_dash": (
+        "The dashboard accepts connections and never says a word.",
+        lambda m, on=True: setattr(m.dashboard, "silent", on),
+    ),
+    "unlock": (
+        "A person clears the protective stop (refused within 5 s of it). Not in the dashboard's log.",
+        lambda m: {"unlocked": m.robot.unlock()},
+    ),
+    "run": ("A person powers the arm on and releases the brakes.", lambda m: m.robot.run()),
+    "stop_program": ("Stop pressed on the pendant.", lambda m: m.robot.stop_program("pendant")),
+    "pause": ("Pause pressed on the pendant.", lambda m: {"paused": m.robot.pause_program()}),
+    "play": (
+        "Play pressed on the pendant: a paused program goes on.",
+        lambda m: {"playing": m.robot.play_program()},
+    ),
+    "program": (
+        "The text of the program that plays.",
+        lambda m: {"text": m.robot.program.text if m.robot.program else ""},
+    ),
+}
+COMMANDS = _SHORT | {
+    name.rstrip("_"): (" ".join(str(function.__doc__).split()), function)
     for name, function in list(globals().items())
     if inspect.isfunction(function) and function.__module__ == __name__
 }
-"""Every function above: what it takes besides the machine is what a client sends."""
+"""Name → what it does, and a function: what this takes besides the machine is what a client sends."""
 
 
 @cache
 def _arguments(name: str) -> type[msgspec.Struct]:
     """Return a struct of what a command takes."""
-    function = COMMANDS[name]
+    _, function = COMMANDS[name]
     hints = get_type_hints(function, include_extras=True)
     _, *parameters = inspect.signature(function).parameters.values()
-    fields = [
-        (p.name, hints[p.name]) if p.default is p.empty else (p.name, hints[p.name], p.default)
-        for p in parameters
-    ]
+    types = {p.name: hints.get(p.name, type(p.default)) for p in parameters}
+    fields = [(p.name, types[p.name], *(() if p.default is p.empty else (p.default,))) for p in parameters]
     return msgspec.defstruct(name, fields, forbid_unknown_fields=True)
 
 
@@ -354,7 +326,7 @@ class AdminServer:
         try:
             request = msgspec.json.decode(line, type=Json)
             name = request.pop("cmd")
-            command = COMMANDS[name]
+            _, command = COMMANDS[name]
         except (msgspec.MsgspecError, KeyError, TypeError):
             return {"ok": False, "error": 'expected {"cmd": name, …}; {"cmd": "help"} lists the names'}
         try:

@@ -17,8 +17,12 @@ from calibrate.files.formatting import (
     PEER_HEAD,
     arm_sentences,
     cell_sentences,
+    error_text,
+    figures,
+    noise_text,
     peer_cells,
     pose_text,
+    shares_text,
     verdict_text,
 )
 from calibrate.files.touch import Touch, agrees, touch_text
@@ -46,15 +50,14 @@ def report_page(
     """The whole page. `history`: rows (version, time, action, change); `touches`: touch tests since."""
     name = job.recording.info.name
     calibration = job.calibration
-    passed = len(job.gates) - len(calibration.quality.failed)
     result = calibration.result
+    told = figures(calibration)
     modelled = _modelled_pixels(job)
-    views = f"{len(job.solution.used)} used, {len(calibration.views.rejected)} rejected"
     return html.page(
         f"Calibration of {name}",
         [
             *_verdict(job, touches),
-            html.folded("Gates", _gates(job), aside=f"{passed} of {len(job.gates)} passed", printed=True),
+            html.folded("Gates", _gates(job), aside=f"{told['gates'].value} passed", printed=True),
             html.folded(
                 "Camera pose",
                 _result(job),
@@ -70,7 +73,7 @@ def report_page(
             html.folded("Arm", _arm(job)),
             html.folded("All methods on the same views", _methods(peers)),
             html.folded("Intrinsics", _lens(job)),
-            html.folded("Views", _views(job, modelled), aside=views),
+            html.folded("Views", _views(job, modelled), aside=f"{told['views'].value} {told['views'].about}"),
             html.folded("Installed versions", _history(history)),
             html.folded("Provenance", _provenance(job), printed=True),
         ],
@@ -91,12 +94,10 @@ def _verdict(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[str]:
     if stamp := source_stamp(calibration.source):
         yield html.stamp(f"{stamp}. It is not installed on a real cell.")
     yield html.paragraph(rehearsal_text(job))
-    expected = " ".join(gate.text for gate in quality.failed)
-    if good and quality.predicted_error_mm is not None and quality.working_distance_m is not None:
-        distance_mm = quality.working_distance_m * 1000
-        expected = f"Predicted error at {distance_mm:.0f} mm: {quality.predicted_error_mm:.2f} mm (1σ)."
+    expected = error_text(calibration) if good else " ".join(gate.text for gate in quality.failed)
     yield html.verdict(_KINDS[calibration.verdict], verdict_text(calibration), expected)
-    yield html.cards(_figures(job, touches))
+    told = figures(calibration, touches).values()
+    yield html.cards([(figure.value, f"{figure.label} {figure.about}") for figure in told])
     for warning in quality.warnings:
         yield html.paragraph(warning, "warning")
 
@@ -120,21 +121,6 @@ def rehearsal_text(job: SolvedRecording) -> str:
         f"Rehearsal of {about['configuration']}. The real run should reach {reached}, if its arm repeats to "
         f"{repeats}. The simulated run was off by {1000 * np.linalg.norm(off[:3]):.2f} mm and {off_deg:.3f}°."
     )
-
-
-def _figures(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[tuple[str, str]]:
-    quality, score = job.calibration.quality, job.solution.holdout
-    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
-        yield (
-            f"± {quality.predicted_error_mm:.2f} mm",
-            f"predicted error (1σ) of a point {1000 * quality.working_distance_m:.0f} mm away",
-        )
-    if score is not None:
-        yield f"{1000 * score.e_t_m:.2f} mm", f"held-out error over {len(score.pairs)} samples"
-    yield f"{len(job.gates) - len(quality.failed)} of {len(job.gates)}", "quality gates passed"
-    yield f"{len(job.solution.used)} views", f"used, {len(job.calibration.views.rejected)} rejected"
-    if touches:
-        yield f"{sum(map(agrees, touches))} of {len(touches)}", "corners as predicted in the touch test"
 
 
 def _result(job: SolvedRecording) -> Iterator[str]:
@@ -182,14 +168,9 @@ def _error(job: SolvedRecording) -> Iterator[str]:
     quality = job.calibration.quality
     if quality.error_shares:
         shares = {name: share for name, share in quality.error_shares.items() if share > 0.001}
-        listed = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares.items())
+        listed = shares_text(job.calibration)
         yield html.figure(plots.error_shares(shares), f"Shares of the variance of X by source: {listed}.")
-    noise = quality.noise
-    if noise:
-        yield html.paragraph(
-            f"Measurement noise (1σ): corners {noise['corner_px']:.3f} px, robot {noise['robot_mm']:.3f} mm "
-            f"and {noise['robot_deg']:.4f}°."
-        )
+    yield html.paragraph(noise_text(job.calibration))
     yield html.paragraph(f"Least known: {quality.weakest}." if quality.weakest else "")
     for sentence in cell_sentences(job.calibration):
         yield html.paragraph(sentence)

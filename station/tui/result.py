@@ -13,7 +13,12 @@ from textual.content import Content
 from textual.widgets import DataTable, Static
 
 from calibrate.files.calibration import Calibration
-from calibrate.files.formatting import arm_sentences
+from calibrate.files.formatting import (
+    arm_sentences,
+    error_text,
+    figures,
+    noise_text,
+)
 from calibrate.files.gate import Gate
 from calibrate.files.touch import agrees, touch_sigmas
 from calibrate.files.validity import ValidityState, validity_text
@@ -24,7 +29,7 @@ from station.tui.drift import drift_lines
 from station.tui.installed import Result, local
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.words import UNKNOWN, Mark, facts, limit_bar, many, mark, shortened, signed
+from station.tui.words import UNKNOWN, Mark, facts, limit_bar, mark, shortened, signed
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter shows older ones."
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
@@ -46,7 +51,8 @@ def verdict_lines(result: Result) -> Content:
     else:
         state = "ready to install" if result.verdict == "PASS" else "installs only with a reason"
     rows = [Content.styled(f"{SIGNS[result.verdict]} {result.verdict}, {state}", "bold")]
-    rows.append(Content.styled(f"  {_accuracy(calibration)}", "bold"))
+    said = failed[0].text.partition(" FAIL")[0] if failed else error_text(calibration)
+    rows.append(Content.styled(f"  {said}", "bold"))
     if result.installed and (validity := result.state.validity) is not None:
         doubted = validity.state is not ValidityState.VALID
         rows.append(Content.styled(f"  {validity_text(validity)}", "bold $warn" if doubted else ""))
@@ -55,32 +61,18 @@ def verdict_lines(result: Result) -> Content:
         rows.append(
             Content(f"  It was installed before, and {ended.how} by {ended.by}. i installs it again.")
         )
-    narrow, touches = sum(gate.narrow for gate in quality.gates), calibration.verification
-    gates = f"{len(quality.gates) - len(failed)} of {len(quality.gates)} gates passed"
-    said = [
-        gates + f", {narrow} narrowly" * bool(narrow),
-        f"{many(len(calibration.views.rejected), 'view')} rejected",
-        f"touch test: {sum(map(agrees, touches))} of {len(touches)} corners" if touches else "no touch test",
+    shown = figures(calibration, calibration.verification)
+    counted = {key: f"{f.value} {f.label} {f.about}" for key, f in shown.items()}
+    narrow = sum(gate.narrow for gate in quality.gates)
+    told = [
+        counted["gates"] + f", {narrow} narrowly" * bool(narrow),
+        counted["views"],
+        counted.get("touch", "no touch test"),
         f"session {calibration.provenance.session}",
     ]
     if calibration.source != "real":
-        said.append(f"{calibration.source.upper()}: never for a real cell")
-    return Content("\n").join([*rows, Content(f"  {'. '.join(said)}.")])
-
-
-def _accuracy(calibration: Calibration) -> str:
-    """The gate that failed, or how far a point may be off."""
-    quality = calibration.quality
-    if quality.failed:
-        return quality.failed[0].text.partition(" FAIL")[0]
-    if quality.predicted_error_mm is None or quality.working_distance_m is None:
-        return (
-            f"Standard uncertainty of the camera's position: {calibration.sigma.translation_mm:.2f} mm (1σ)."
-        )
-    judged = next((gate for gate in quality.gates if gate.name == "predicted_error_m"), None)
-    limit = f" The limit is {judged.shown(judged.limit)}." if judged is not None else ""
-    at = f"Predicted error at {quality.working_distance_m:.2f} m"
-    return f"{at}: {quality.predicted_error_mm:.2f} mm (1σ).{limit}"
+        told.append(f"{calibration.source.upper()}: never for a real cell")
+    return Content("\n").join([*rows, Content(f"  {'. '.join(told)}.")])
 
 
 def _against(result: Result, calibration: Calibration) -> list[str]:
@@ -111,24 +103,15 @@ def gate_row(gate: Gate) -> tuple[Content, ...]:
     )
 
 
-def accuracy_card(calibration: Calibration) -> Content:
-    quality = calibration.quality
-    if quality.predicted_error_mm is None:
-        return facts(("", f"± {calibration.sigma.translation_mm:.2f}", "mm, camera position (1σ)"))
-    far = f"of a point {quality.working_distance_m or 0:.2f} m away (1σ)"
-    return _card(far, ("", f"± {quality.predicted_error_mm:.2f}", "mm"))
-
-
-def _card(below: str, *values: tuple[str, str, str]) -> Content:
-    return facts(*values) + Content("\n") + Content.styled(below, "$dim")
+def card(calibration: Calibration, key: str, missing: str = "") -> Content:
+    """A figure, and below it what it is; `missing`: words where there is none."""
+    if (figure := figures(calibration).get(key)) is None:
+        return Content.styled(f"{UNKNOWN} {missing}", "$dim")
+    return Content.assemble((figure.value, "bold $strong"), (f"\n{figure.label} {figure.about}", "$dim"))
 
 
 def proof_card(calibration: Calibration) -> Content:
-    held = calibration.quality.holdout
-    if held is None:
-        return Content.styled(f"{UNKNOWN} no views were held out", "$dim")
-    below = f"held-out error over {many(len(held.pairs), 'sample')}"
-    return _card(below, ("", f"{1000 * held.e_t_m:.2f}", "mm"), ("", f"{held.e_R:.4f}", "rotation"))
+    return card(calibration, "held_out", "no views were held out")
 
 
 def change_card(result: Result, calibration: Calibration) -> Content:
@@ -142,8 +125,9 @@ def change_card(result: Result, calibration: Calibration) -> Content:
         return mark("look", f"installed: {installed.mount}, this one: {calibration.mount}")
     delta = difference(calibration.transform.matrix, installed.transform.matrix)
     moved_mm, turned_deg = 1000 * np.linalg.norm(delta[:3]), np.degrees(np.linalg.norm(delta[3:]))
-    below = f"from the installed one of {local(installed.created)}"
-    return _card(below, ("", f"{moved_mm:.2f}", "mm"), ("", f"{turned_deg:.3f}", "°"))
+    below = f"\nfrom the installed one of {local(installed.created)}"
+    moved = facts(("", f"{moved_mm:.2f}", "mm"), ("", f"{turned_deg:.3f}", "°"))
+    return moved + Content.styled(below, "$dim")
 
 
 def pose_table(result: Result, calibration: Calibration) -> Content:
@@ -283,7 +267,7 @@ class SolveScreen(ResultScreen):
 
     def evidence(self) -> ComposeResult:
         with Horizontal(id="cards"):
-            yield _panel("Accuracy", lambda r, c, w, h: accuracy_card(c), id="accuracy")
+            yield _panel("Accuracy", lambda r, c, w, h: card(c, "error"), id="accuracy")
             yield _panel("Proof", lambda r, c, w, h: proof_card(c), id="proof")
             yield _panel("Change", lambda r, c, w, h: change_card(r, c), id="change")
         with Horizontal(id="solve"):
@@ -364,16 +348,7 @@ def held_out_lines(calibration: Calibration) -> Content:
                 ("left-out views:", f"{folds.rms_mm:.2f}", "mm"), ("claimed", f"{folds.claimed_mm:.2f}", "mm")
             )
         )
-    if calibration.quality.noise:
-        noise = calibration.quality.noise
-        rows.append(
-            facts(
-                ("robot", f"{noise['robot_mm']:.3f}", "mm"),
-                ("", f"{noise['robot_deg']:.4f}", "°"),
-                ("corners", f"{noise['corner_px']:.3f}", "px (1σ)"),
-            )
-        )
-    return Content("\n").join(rows)
+    return Content("\n").join([*rows, Content(noise_text(calibration))])
 
 
 class InstallScreen(ResultScreen):

@@ -11,6 +11,7 @@ from textual.content import Content
 from textual.message import Message
 from textual.widgets import Static
 
+from calibrate.files.formatting import figures
 from station.cell.session_folder import SessionSummary
 from station.operate.drift_check import POSES
 from station.tui.drift import drift_lines
@@ -109,14 +110,13 @@ class SessionsScreen(StationScreen):
             facts(("", str(session.views), "views"), ("", size(session.bytes), "")) + Content("   ") + state,
         ]
         if found is not None:
-            gates = found.quality.gates
             rows += [
                 Content(
                     f"{found.robot.model} {found.robot.serial}, {found.camera.model} {found.camera.serial}"
                 ),
                 mark(
                     "failed" if found.quality.failed else "done",
-                    f"{sum(g.passed for g in gates)} of {len(gates)} gates passed",
+                    f"{figures(found)['gates'].value} gates passed",
                 ),
             ]
         keys = "Enter result  " * bool(session.calibration) + "F9 solve  w play  k drift check on it"

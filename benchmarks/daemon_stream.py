@@ -203,10 +203,10 @@ async def stream(fps: float, seconds: float, root: Path) -> StreamOutcome:
 
             for _ in range(max(1, round(seconds / SESSION_S))):
                 ended = await carry_out(client, Purpose.RUN, approve_simulated, look)
-                if ended.exit_code != 0:
-                    raise RuntimeError(f"{ended.status.state.value}: {ended.status.reason}")
+                if not ended.session.recording or ended.session.captured < len(ended.session.poses):
+                    raise RuntimeError(f"{ended.state.value}: {ended.reason}")
                 outcome.sessions += 1
-                waiting.append(Path(ended.recording))
+                waiting.append(Path(ended.session.recording))
                 if len(waiting) > WAITING:
                     if verified:  # the disk has an end
                         await asyncio.wrap_future(verified[-1])

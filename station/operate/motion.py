@@ -6,7 +6,6 @@ import contextlib
 import math
 from asyncio import timeout
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -47,33 +46,6 @@ class Link(Protocol):
 
     def statuses(self) -> AsyncIterator[StationStatus]:
         """The full status, never older than the last call, and at every change; ends with the daemon."""
-
-
-@dataclass(frozen=True)
-class SessionOutcome:
-    """The end of a session, or its standstill."""
-
-    status: StationStatus
-
-    @property
-    def recording(self) -> str:
-        """Path of the finished recording; empty while there is none."""
-        return self.status.session.recording
-
-    @property
-    def planned(self) -> int:
-        return len(self.status.session.poses)
-
-    @property
-    def captured(self) -> int:
-        return self.status.session.captured
-
-    @property
-    def exit_code(self) -> int:
-        """0 finished with all poses, 3 finished with fewer, 1 not finished."""
-        if not self.recording:
-            return 1
-        return 0 if self.captured == self.planned else 3
 
 
 async def status_now(socket: Path) -> StationStatus:
@@ -165,7 +137,7 @@ async def carry_out(
     finish_with_loss: bool = False,
     headless: bool = False,
     plans_here: PlansHere | None = None,
-) -> SessionOutcome:
+) -> StationStatus:
     """One session from its approval until it rests. RefusedError when the daemon or the person says no."""
     if not await prepared_motion(link, purpose, approve, headless=headless, plans_here=plans_here):
         raise not_approved()
@@ -176,13 +148,13 @@ def not_approved() -> RefusedError:
     return RefusedError("Nothing moved: the motion was not approved.", code="not-approved")
 
 
-async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> SessionOutcome:
+async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> StationStatus:
     """Watch a session until it rests; `finish_with_loss`: finish it although poses failed."""
     status = await _until_rest(link, watch)
     if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
         await link.call(Finish())
         status = await _until_rest(link, watch)
-    return SessionOutcome(status)
+    return status
 
 
 async def _until_rest(link: Link, watch: Watcher) -> StationStatus:

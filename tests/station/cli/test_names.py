@@ -15,8 +15,7 @@ from station.cell.status import Event, MotionPreview, PoseStatus, SessionStatus,
 from station.cli import control as cli_control
 from station.cli import main
 from station.cli import session as cli_session
-from station.cli.attended import ask_person
-from station.cli.progress import SessionProgress
+from station.cli.attended import SessionProgress, ask_person
 from station.operate.motion import SessionOutcome
 from station.plan.files import save_plan
 from station.protocol.verbs import Check

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import time
 from collections import deque
 
@@ -19,7 +20,7 @@ from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.scene import flange_pose
 from station.cell.status import PoseState, StationState
-from station.cell.stillness import ImageMotion, RestingCheck
+from station.cell.stillness import RestingCheck
 from station.session.context import SessionContext
 from station.session.recording import to_the_end
 
@@ -224,7 +225,7 @@ class ImageWatch:
     def __init__(self, context: SessionContext, index: int) -> None:
         self._context, self._index = context, index
         self._images: deque[tuple[int, Pixels]] = deque(maxlen=IMAGES)
-        self._found: tuple[int, ImageMotion] | None = None
+        self._found: tuple[int, float] | None = None
         """With the time before which none of its images began."""
         self._blind = False
         self._again = asyncio.Event()
@@ -237,10 +238,10 @@ class ImageWatch:
         fixed = context.cell.config.mount == "eye-to-hand" and model is not None
         self._box = board_box(view, model.width, model.height) if fixed and model is not None else None
 
-    def look(self, since_ns: int) -> ImageMotion | None:
-        """The motion in images exposed after this host time; None: not yet, ask again."""
+    def look(self, since_ns: int) -> float | None:
+        """Motion (px) in images exposed after this host time; NaN: not to be measured, None: not yet."""
         if self._blind:
-            return ImageMotion(None)
+            return math.nan
         self._again.set()
         if self._found is None or self._found[0] < since_ns:
             return None
@@ -295,4 +296,4 @@ class ImageWatch:
         motion_px = await self._context.workers.call(
             image_motion, images, self._width, self._box, timeout_s=WORKER_TIMEOUT_S
         )
-        self._found = (self._images[0][0], ImageMotion(motion_px))
+        self._found = self._images[0][0], math.nan if motion_px is None else motion_px

@@ -40,7 +40,6 @@ def serve_command(
     hardware_trigger: Annotated[
         bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera")
     ] = False,
-    frame_rate_hz: Annotated[float, typer.Option(hidden=True)] = 0.0,
     control: Control = None,
     robot: Annotated[str, typer.Option(hidden=True)] = "UR10",
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
@@ -83,7 +82,7 @@ def serve_command(
         from station.simulation.launch_cell import SimulationOptions, simulated_cell
 
         options = SimulationOptions(
-            scene, seed, noise, mount, time_scale, gige, hardware_trigger, frame_rate_hz, control, robot
+            scene, seed, noise, mount, time_scale, gige, hardware_trigger, control, robot
         )
         cell = simulated_cell(options, place / "simulation")
     asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))

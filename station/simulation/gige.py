@@ -8,10 +8,8 @@ input.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import json
-import os
 import socket
 import sys
 import threading
@@ -26,12 +24,10 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from calibrate.kinematics import MODELS, forward
 from station.cell.errors import CameraError, RobotError
 from station.devices.pixels import encode
 from station.simulation.camera_process import CameraProcess
-from station.simulation.cell import CellTruth, read_truth
-from station.simulation.renderer import render
+from station.simulation.cell import read_truth
 from station.simulation.scenes import make_cell
 
 LIBRARY = "libaravis-0.8.so.0"
@@ -192,108 +188,45 @@ def rendered_source(camera: CameraProcess) -> Source:
     return source
 
 
-class NumberedSource:
-    """Source for throughput: frame n is `numbered_picture(n)`, nearly free. `clock`: the device's, ns."""
-
-    def __init__(self, clock: Callable[[], int], still: NDArray[np.uint8] | None = None) -> None:
-        self.next_number = 0
-        self._clock = clock
-        self._still = still
-
-    def __call__(
-        self, width: int, height: int, exposure_us: float, gain_db: float
-    ) -> tuple[NDArray[np.uint8], int]:
-        self.next_number += 1
-        begun_ns = self._clock()
-        time.sleep(exposure_us / 1e6)
-        return numbered_picture(self.next_number - 1, width, height, self._still), begun_ns
-
-
-_noise: dict[tuple[int, int], NDArray[np.uint8]] = {}
-
-
-def numbered_picture(
-    number: int, width: int, height: int, still: NDArray[np.uint8] | None = None
-) -> NDArray[np.uint8]:
-    """Noise that moves with the number, and the number itself in the first eight bytes.
-
-    `still`: (height, width), shown below the noise, which then has three bits.
-    """
-    if (width, height) not in _noise:
-        _noise[width, height] = np.random.default_rng(0).integers(0, 256, (height + 64, width), np.uint8)
-    shift = number % 64
-    picture = _noise[width, height][shift : shift + height].copy()
-    if still is not None:
-        picture = (still[:height, :width] & np.uint8(0xF8)) | (picture >> np.uint8(5))
-    picture.reshape(-1)[:8] = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
-    return picture
-
-
-def still_picture(truth: CellTruth) -> NDArray[np.uint8]:
-    """Image from where the arm starts, without noise: the same bits every time."""
-    camera = CameraProcess(truth, "", truth.exposure_us, truth.gain_db)
-    flange = forward(MODELS[truth.robot_model], truth.start_joints_rad)
-    return render(truth.camera, truth.board, camera.camera_from_board(flange))
-
-
-def _be_hardware() -> None:
-    """Keeps its pace whatever this computer does besides, where that is permitted: a camera would, too."""
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-
-
 def main(
     controller_host: Annotated[str, typer.Option(help="Whose arm the camera looks at.")] = "",
     truth: Annotated[Path | None, typer.Option(help="File of the simulated cell.")] = None,
     address: Annotated[str, typer.Option(help="Loopback address of the camera.")] = "127.0.0.1",
     serial: Annotated[str, typer.Option(help="As the camera reports it.")] = "SIM00000",
-    numbered: Annotated[
-        bool, typer.Option(help="Numbered test pictures, over what the start shows if there is a truth.")
-    ] = False,
 ) -> None:
     """Serves until standard input ends; prints one JSON line when it listens."""
-    cv2.setNumThreads(1)
-    if numbered:
-        _be_hardware()
-    cell: CellTruth = make_cell() if truth is None else read_truth(truth)
+    cell = make_cell() if truth is None else read_truth(truth)
     rendered = CameraProcess(cell, controller_host, cell.exposure_us, cell.gain_db)
-    if not numbered:
-        rendered.warm_up()
+    rendered.warm_up()
+    serve(rendered_source(rendered), rendered, address, serial, rendered.faults.inject)
 
-    def clock() -> int:
-        return rendered.device_ns(time.monotonic_ns())
 
-    numbers = NumberedSource(clock, None if truth is None or not numbered else still_picture(cell))
-    source = numbers if numbered else rendered_source(rendered)
+def serve(
+    source: Source, rendered: CameraProcess, address: str, serial: str, inject: Callable[[str, Any], None]
+) -> None:
+    """`rendered`: whose size and clock the camera has. `inject`: carries out what is no fault of GigE."""
+    cv2.setNumThreads(1)
+    model = rendered.truth.camera
     try:
-        camera = GigeCamera(source, cell.camera.width, cell.camera.height, address, serial)
+        camera = GigeCamera(source, model.width, model.height, address, serial)
     except CameraError as error:
         print(error, file=sys.stderr)
         raise SystemExit(1) from error
-    camera.watch_latch(clock)
+    camera.watch_latch(lambda: rendered.device_ns(time.monotonic_ns()))
     print(json.dumps({"ready": True, "address": address, "serial": serial}), flush=True)
     for line in sys.stdin:
         request = json.loads(line)
-        _carry_out(request["name"], request.get("value"), camera, numbers, rendered)
-        print(json.dumps({"done": request["name"], "number": numbers.next_number}), flush=True)
-
-
-def _carry_out(
-    name: str, value: Any, camera: GigeCamera, numbers: NumberedSource, rendered: CameraProcess
-) -> None:
-    match name:
-        case "packet-loss":
-            camera.set_packet_loss(float(value))
-        case "number":
-            numbers.next_number = int(value)
-        case "sent":
-            pass  # every answer says it
-        case "pulse":
-            camera.set_register(ADDRESSES["TriggerSoftware"], 1)
-        case "register":
-            camera.set_register(*value)
-        case _:
-            rendered.faults.inject(name, value)
+        name, value = request["name"], request.get("value")
+        match name:
+            case "packet-loss":
+                camera.set_packet_loss(float(value))
+            case "pulse":
+                camera.set_register(ADDRESSES["TriggerSoftware"], 1)
+            case "register":
+                camera.set_register(*value)
+            case _:
+                inject(name, value)
+        print(json.dumps({"done": name}), flush=True)
 
 
 if __name__ == "__main__":

@@ -163,20 +163,11 @@ def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subp
 class SimulatedGige(ChildProcess):
     def inject(self, fault: str, value: object = None) -> None:
         """A fault of `CameraFaults`, or `packet-loss` with a share of packets; then it is in force."""
-        self._ask(fault, value)
-
-    def sent(self) -> int:
-        """Numbered images that went out so far, plus the number of the first."""
-        return int(self._ask("sent")["number"])
-
-    def _ask(self, name: str, value: object = None) -> Json:
         assert self.process.stdin is not None and self.process.stdout is not None
-        self.process.stdin.write(json.dumps({"name": name, "value": value}).encode() + b"\n")
+        self.process.stdin.write(json.dumps({"name": fault, "value": value}).encode() + b"\n")
         self.process.stdin.flush()
-        answer = self.process.stdout.readline()
-        if not answer:
-            raise CameraError(f"the GigE simulator ended on the fault '{name}'", code="no-simulation")
-        return dict(json.loads(answer))
+        if not self.process.stdout.readline():
+            raise CameraError(f"the GigE simulator ended on the fault '{fault}'", code="no-simulation")
 
 
 def start_gige(
@@ -184,12 +175,12 @@ def start_gige(
     *,
     truth: Path | None = None,
     serial: str = "SIM00000",
-    numbered: bool = False,
+    module: str = "station.simulation.gige",
     log: Path | None = None,
 ) -> SimulatedGige:
     """Starts the camera on 127.0.0.1 and waits until it listens; blocking, call it outside an event loop.
 
-    log: where its standard error goes.
+    module: another program with the same command line. log: where its standard error goes.
 
     CameraError where there is any network interface but `lo`: GigE discovery broadcasts on all of them.
     """
@@ -199,8 +190,7 @@ def start_gige(
             code="not-isolated",
             remedy="Start the program with `python -m station.simulation.netns` in `unshare --net`.",
         )
-    command = [sys.executable, "-m", "station.simulation.gige", "--serial", serial]
-    command += ["--numbered"] if numbered else ["--controller-host", controller_host]
+    command = [sys.executable, "-m", module, "--serial", serial, "--controller-host", controller_host]
     command += [] if truth is None else ["--truth", str(truth)]
     process, problem = _start(command, GIGE_TIMEOUT_S, log)
     if problem:

@@ -12,7 +12,7 @@ import msgspec
 
 from recordings.schema.messages import Mount
 from station.cell.config import ControlPath, StationConfig, TriggerConfig
-from station.cell.errors import ConfigError, StationError
+from station.cell.errors import StationError
 from station.devices.base import Camera, Trigger
 from station.devices.cell import Cell
 from station.simulation.cell import CellTruth, NoiseLevel, SceneName, write_truth
@@ -37,9 +37,6 @@ class SimulationOptions:
     """The camera over GigE Vision, in a network namespace with only `lo`."""
     hardware_trigger: bool = False
     """A trigger box on a pseudo terminal fires the camera."""
-    frame_rate_hz: float = 0.0
-    """With `gige`: free-running at this rate. Drawing takes longer than a frame, so its images are numbered
-    ones of the board as the camera sees it from where the arm starts."""
     control: ControlPath | None = None
     """Driver of the arm; None = what is installed."""
     robot: str = "UR10"
@@ -53,11 +50,6 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
     from station.devices.ur import UrRobot
     from station.simulation.scenes import cell_config
 
-    if options.frame_rate_hz and (options.hardware_trigger or not options.gige):
-        raise ConfigError(
-            "a simulated camera runs freely only over GigE, and without a trigger box",
-            code="simulation-options",
-        )
     folder.mkdir(parents=True, exist_ok=True)
     truth = make_cell(options.scene, options.seed, options.noise, options.mount)
     truth = msgspec.structs.replace(truth, robot_model=options.robot)
@@ -121,21 +113,17 @@ def _camera(
     from station.devices.aravis import AravisCamera
     from station.simulation.launch import start_gige
 
-    free = options.frame_rate_hz > 0
-    serial = f"SIM{options.seed:05d}"
     simulator = ends.enter_context(
-        start_gige(config.robot.host, truth=truth_file, serial=serial, numbered=free)
+        start_gige(
+            config.robot.host,
+            truth=truth_file,
+            serial=f"SIM{options.seed:05d}",
+            log=truth_file.with_name("camera.log"),
+        )
     )
     # The simulator has no test packets to negotiate the packet size with; loopback carries the largest.
     over_gige = msgspec.structs.replace(
         config.camera, driver="aravis", device="127.0.0.1", packet_size=GIGE_PACKET_BYTES
     )
-    if free:
-        over_gige = msgspec.structs.replace(
-            over_gige,
-            trigger="free-running",
-            frame_rate_hz=options.frame_rate_hz,
-            exposure_us=min(over_gige.exposure_us, 0.5e6 / options.frame_rate_hz),
-        )
     config = msgspec.structs.replace(config, camera=over_gige)
     return config, AravisCamera(over_gige, trigger), lambda: simulator.inject("pulse")

@@ -18,8 +18,9 @@ from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
 from station.simulation.gige import ADDRESSES
-from station.simulation.launch import SimulatedGige, start_gige
+from station.simulation.launch import SimulatedGige
 from tests.codes import raises
+from tests.numbered_gige import start_numbered
 
 pytestmark = pytest.mark.gige
 CONFIG = CameraConfig(device="127.0.0.1", packet_size=8996)
@@ -27,7 +28,7 @@ CONFIG = CameraConfig(device="127.0.0.1", packet_size=8996)
 
 @pytest.fixture
 def server(lonely_network: None) -> Iterator[SimulatedGige]:
-    with start_gige(numbered=True, serial="KJ0042") as running:
+    with start_numbered() as running:
         yield running
 
 
@@ -124,7 +125,7 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
         assert time.monotonic() - start_s < 8
         assert beats >= 20 * (time.monotonic() - start_s) - 1, "the loop goes on while Aravis waits"
         beating.cancel()
-        with start_gige(numbered=True, serial="KJ0042"):
+        with start_numbered():
             assert (await camera.capture()).pixels.shape == (1024, 1280)
             assert camera.identity.serial == "KJ0042"
     finally:
@@ -135,9 +136,9 @@ _LOST_AND_FORGOTTEN = """
 import ctypes, gc, time
 from station.cell.config import CameraConfig
 from station.devices.aravis_device import GenicamDevice
-from station.simulation.launch import start_gige
+from tests.numbered_gige import start_numbered
 
-with start_gige(numbered=True, serial="KJ0042") as server:
+with start_numbered() as server:
     device = GenicamDevice(CameraConfig(device="127.0.0.1", packet_size=8996))
     device.open()
     device._stream = None

@@ -19,9 +19,10 @@ from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
 from station.devices.frames import TriggerPulse
 from station.devices.pixels import decode, encode
-from station.simulation.gige import PIXEL_FORMATS, numbered_picture
-from station.simulation.launch import SimulatedGige, start_gige
+from station.simulation.gige import PIXEL_FORMATS
+from station.simulation.launch import SimulatedGige
 from tests.codes import raises
+from tests.numbered_gige import numbered_picture, start_numbered
 
 pytestmark = pytest.mark.gige
 ADDRESS = CameraConfig(device="127.0.0.1", packet_size=8996)
@@ -29,7 +30,7 @@ ADDRESS = CameraConfig(device="127.0.0.1", packet_size=8996)
 
 @pytest.fixture(scope="module")
 def simulator(lonely_network: None) -> Iterator[SimulatedGige]:
-    with start_gige(numbered=True, serial="KJ0042") as running:
+    with start_numbered() as running:
         yield running
 
 

@@ -80,11 +80,12 @@ class Watchdog:
 
 class Daemon:
     def __init__(self, cell: Cell, root: Path, control: Path) -> None:
-        self._watchdog = Watchdog(self._healthy)
-        self.session = Session(cell, root, ticked=self._watchdog.tick, first=lambda: self._stop.round())
+        self.session = Session(cell, root)
         dispatcher = SessionDispatcher(self.session)
         self._control = ControlServer(control, dispatcher, newest=lambda: self.session.store.status)
         self._stop = StopServer(control, dispatcher.stop_from, self._latched, self._speed_rad_s)
+        self.session.supervisor.first = self._stop.round
+        self.session.supervisor.ticked = Watchdog(self._healthy).tick
         self._changed = asyncio.Event()
         self._ending = asyncio.Event()
         self._served_s = time.monotonic()

@@ -18,7 +18,7 @@ from recordings.errors import CodedError, RecordingError, Value
 from recordings.images import viewable
 from recordings.recorder import Recorder
 from recordings.recover import recover_recording
-from recordings.schema.messages import CameraModel, Image, RobotState, Vector6
+from recordings.schema.messages import CameraModel, CaptureEvent, Image, RobotState, Stamps, Vector6
 from station.analysis.pool import Workers
 from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.collision import CellGeometry
@@ -103,9 +103,11 @@ class SessionContext:
             recorder.robot_state(state)
 
     def record_event(self, event: Event) -> None:
-        if self.recording is not None:
+        """Keeps what people were told; a failing disk is reported elsewhere."""
+        if (recorder := self.recorder) is not None and recorder.error is None:
+            stamps = Stamps(host_monotonic_ns=time.monotonic_ns(), host_wall_ns=event.wall_ns)
             with contextlib.suppress(RecordingError):
-                self.recording.event(event)
+                recorder.event(CaptureEvent(stamps, "station", event.pose_index, event.text, event.level))
 
     async def open_recording(self, queue: PoseQueue, check: bool = False) -> None:
         """Opens the session's next file where none is open; begins a session where there is none.

@@ -41,7 +41,7 @@ from station.cell.session_folder import (
     segment_path,
     write_state,
 )
-from station.cell.status import Event, Level
+from station.cell.status import Level
 from station.devices.cell import Cell
 from station.session.queue import PoseQueue
 
@@ -215,12 +215,6 @@ class SessionRecording:
             return CameraModel(width=width, height=height)
         rough = self._cell.config.camera.model
         return CameraModel(width=rough.width if rough else 0, height=rough.height if rough else 0)
-
-    def event(self, event: Event) -> None:
-        """Keeps what people were told; a failing disk is reported elsewhere."""
-        if self.recorder is not None and self.recorder.error is None:
-            stamps = Stamps(host_monotonic_ns=time.monotonic_ns(), host_wall_ns=event.wall_ns)
-            self.recorder.event(CaptureEvent(stamps, "station", event.pose_index, event.text, event.level))
 
     def number(self, image: Image) -> Image:
         """The same image with its number in this session, and pixels that no camera overwrites."""

@@ -7,7 +7,6 @@ import logging
 import threading
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -262,7 +261,7 @@ def internal_error(error: Exception) -> StationError:
 
 
 async def seal(context: SessionContext) -> None:
-    """Finishes the recording: sealing → idle. A failing disk leaves a fault and the `.part` file."""
+    """Finishes the recording, an interrupted one too: sealing → idle. Raises RecordingError, StationError."""
     context.store.enter(StationState.SEALING)
     context.show_poses()
     context.requests = RunRequests(halt=context.requests.halt)
@@ -270,12 +269,13 @@ async def seal(context: SessionContext) -> None:
 
 
 async def _seal(context: SessionContext) -> None:
-    sealed(context, await context.require_recording().seal(context.require_queue()))
-
-
-def sealed(context: SessionContext, path: Path) -> None:
-    """The session is whole. A STOP meanwhile stays latched; was it acknowledged, nothing is left paused."""
-    queue = context.require_queue()
+    """A STOP meanwhile stays latched; was it acknowledged, nothing is left paused."""
+    recording, queue = context.require_recording(), context.require_queue()
+    if recording.recorder is None:  # nothing was added since the crash
+        await context.recover_segments(recording)
+        await recording.save_state(queue, path := recording.whole)
+    else:
+        path = await recording.seal(queue)
     context.recording = None
     context.store.update_session(recording=str(path), remaining_s=0.0)
     # What matters first: a narrow screen cuts the end.
@@ -312,25 +312,15 @@ def unmark_busy(context: SessionContext) -> None:
 
 
 async def close_or_seal(context: SessionContext) -> None:
-    """Finishes: of an open recording the end is written, an interrupted one is made whole."""
+    """Finishes what rests. A failing disk leaves a fault and the `.part` file."""
     recording = context.require_recording()
     try:
-        if recording.recorder is None:  # nothing was added since the crash
-            context.store.enter(StationState.SEALING)
-            await to_the_end(_make_whole(context, recording))
-        else:
-            await seal(context)
+        await seal(context)
     except (RecordingError, StationError) as error:
         recording.abandon()
         context.store.problem(error, "error", said="not finished: {}")
         if context.store.state is not StationState.STOPPED:
             context.store.enter(StationState.FAULT, f"Recording: {error}", error.code)
-
-
-async def _make_whole(context: SessionContext, recording: SessionRecording) -> None:
-    await context.recover_segments(recording)
-    await recording.save_state(context.require_queue(), recording.whole)
-    sealed(context, recording.whole)
 
 
 class SweepRun(Run):

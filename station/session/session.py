@@ -56,14 +56,7 @@ PLAN_TIMEOUT_S = 180.0
 class Session:
     """Knows devices through `cell`, and nothing of sockets and screens."""
 
-    def __init__(
-        self,
-        cell: Cell,
-        root: Path,
-        ticked: Callable[[], None] = lambda: None,
-        first: Callable[[], None] = lambda: None,
-    ) -> None:
-        """`first`, `ticked`: before and after everything else in each round of the working loop."""
+    def __init__(self, cell: Cell, root: Path) -> None:
         config, playback = cell.config, cell.source == "playback"
         geometry = cell_geometry(config)
         self.store = StatusStore(
@@ -75,7 +68,7 @@ class Session:
         )
         self.leases = LeaseManager()
         self.approvals = ApprovalManager(time.monotonic)
-        self.supervisor = SessionSupervisor(self.context, self._jogged, ticked, self._void, first)
+        self.supervisor = SessionSupervisor(self.context, self._jogged, self._void)
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context)

@@ -146,7 +146,7 @@ class SerialTrigger:
                 code="no-trigger-box",
                 remedy="Check trigger.port.",
             )
-        self._boot_id, count, _ = self._status()
+        self._boot_id, count = self._status()
         self._count = self._first_count = count
         return f"{product} {serial}"
 
@@ -159,7 +159,7 @@ class SerialTrigger:
         except _BoxSilentError:
             # Whether the camera was triggered decides what its next frame belongs to: ask.
             before = self._count
-            self._settle_count(*self._status()[:2])
+            self._settle_count(*self._status())
             if (self._count - before) != 1:
                 raise TriggerError(
                     "the trigger box did not confirm a pulse",
@@ -182,13 +182,13 @@ class SerialTrigger:
             )
         self._count += (count - self._count) % _COUNTS
 
-    def _status(self) -> tuple[str, int, int]:
-        """Boot id, pulses so far, light in permille."""
+    def _status(self) -> tuple[str, int]:
+        """Boot id, pulses so far."""
         try:
-            boot_id, count, light = self._ask("STATUS?", "STATUS", 3)
+            boot_id, count, _ = self._ask("STATUS?", "STATUS", 3)
         except _BoxSilentError as error:
             raise TriggerError(f"trigger box lost: {error}", code="trigger-lost") from error
-        return boot_id, _number(count), _number(light)
+        return boot_id, _number(count)
 
     def _ask(self, request: str, answer: str, fields: int, timeout_s: float = ANSWER_TIMEOUT_S) -> list[str]:
         """The answer's fields. Lines that are no answer to this are skipped; garbage is counted."""

@@ -79,11 +79,10 @@ async def _accept(socket: Path | None, joint: int, fastest_m_s: float, quiet: bo
         try:
             acceptance = await test.run()
         except BaseException:
-            if test.stops and shell.client.root is not None:  # what was measured is not lost
+            if test.stops:  # what was measured is not lost
                 _keep(shell.client.root, test.outcome(False), test.stops)
             raise
-        if shell.client.root is not None:
-            acceptance = _keep(shell.client.root, acceptance, test.stops)
+        acceptance = _keep(shell.client.root, acceptance, test.stops)
         if not quiet:
             words, style = ("ACCEPTED", "green") if acceptance.accepted else ("NOT ACCEPTED", "bold red")
             err.print(words, style=style)

@@ -82,7 +82,7 @@ class Client:
         self._plain_status: dict[str, object] | None = None
         self._fresh = asyncio.Event()
         self._gone = False
-        self.root: Path | None = None
+        self.root = Path()
         """Below which the daemon keeps sessions and what is installed."""
         self.camera = MAIN_CAMERA
         self.max_age_days: float | None = None

@@ -43,7 +43,6 @@ class LoadedViews:
     views: ViewSet
     """With pixels, without board poses; the camera's matrix is None unless it was known."""
     board: BoardSpec
-    pictures: int
     without_board: tuple[RejectedView, ...]
     """Also those whose picture cannot be decoded, and those left out by hand."""
     detections: dict[int, Detection] = field(default_factory=dict)
@@ -104,7 +103,7 @@ def load_views(
         model.distortion_model,
     )
     found = ViewSet(info.mount, tuple(views), model, info.robot.model, _calibrated_arm(recording))
-    return LoadedViews(found, spec, pictures, tuple(missing), seen, recording.losses)
+    return LoadedViews(found, spec, tuple(missing), seen, recording.losses)
 
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:
@@ -258,11 +257,7 @@ def detect_all(
 
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
     picture = recording.image(view)
-    _check_size(view, picture.pixels.shape[1], picture.pixels.shape[0], camera)
-    return detect(viewable(picture.pixels, picture.pixel_format), spec, with_quality=False)
-
-
-def _check_size(view: View, width: int, height: int, camera: CameraModel) -> None:
+    height, width = picture.pixels.shape[:2]
     if camera.width and (width, height) != (camera.width, camera.height):
         raise BadViewsError(
             f"View {view.index + 1} ({view.name}): the image is {width}×{height}, camera or intrinsics are "
@@ -274,6 +269,7 @@ def _check_size(view: View, width: int, height: int, camera: CameraModel) -> Non
             width_px=width,
             height_px=height,
         )
+    return detect(viewable(picture.pixels, picture.pixel_format), spec, with_quality=False)
 
 
 def _image_view(view: View, detection: Detection, spec: BoardSpec) -> BoardView:

@@ -22,7 +22,7 @@ from calibrate.batch.trends import CellHistory, cells, trends_text
 from calibrate.batch.workers import BatchWorkers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.contracts import FleetCameraJson, FleetJson
-from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit, takes
+from calibrate.cli.job import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit, takes
 from calibrate.cli.output import AsJson, err, out, print_json
 from calibrate.errors import UsageError
 from calibrate.job import JobOptions
@@ -71,7 +71,7 @@ def batch(
     recordings: Annotated[list[str], typer.Argument(help="Recordings or session folders; URLs may have *")],
     workers: BatchWorkers,
     output: OutputFolder = "batch",
-    profile: Profile = ProfileName.robust,
+    profile: ProfileName = "robust",
     seed: Seed = 0,
     gates: GatesFile = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
@@ -88,7 +88,7 @@ def batch(
 
     store = _results(output)
     gate_limits = GateLimits() if gates is None else read_limits(gates)
-    options = JobOptions(profile=profile.value, seed=seed, limits=gate_limits)
+    options = JobOptions(profile=profile, seed=seed, limits=gate_limits)
     limits = Limits(time_limit_s, memory_limit_mib)
     places = [place for word in recordings for place in expand(word)]
     with _stoppable("solving") as bar:

@@ -38,14 +38,8 @@ CameraName = Annotated[str, typer.Option("--camera", help="Name of the camera, i
 Named = Annotated[Path | None, typer.Argument(help="A calibration file; default: the installed one")]
 
 
-class CellKind(StrEnum):
-    real = "real"
-    imported = "imported"
-    simulated = "simulated"
-
-
 SameCell = Annotated[
-    CellKind | None,
+    installing.Cell | None,
     typer.Option("--cell", hidden=True, help="Kind of cell, as at install; a root holds one kind"),
 ]
 
@@ -162,9 +156,9 @@ def install(
     file: Annotated[Path, typer.Argument(help="A calibration file")],
     root: Root = None,
     cell: Annotated[
-        CellKind,
+        installing.Cell,
         typer.Option(help="Kind of cell the root belongs to; others than real need --root"),
-    ] = CellKind.real,
+    ] = "real",
     cell_config: Annotated[
         Path | None, typer.Option(help="The station's configuration: robot, camera, greatest age of a proof")
     ] = None,
@@ -186,13 +180,13 @@ def install(
 
     Exit codes: 0 installed, 4 a gate failed, 1 refused for another reason; then nothing was changed.
     """
-    if root is None and cell is not CellKind.real:
+    if root is None and cell != "real":
         raise UsageError(f"{cell} needs its own folder.", code="root-missing", remedy="Name it with --root.")
     facts = CellFacts("", "", "", None) if cell_config is None else read_cell(cell_config)
     made = installing.install(
         file,
         root,
-        cell=cell.value,
+        cell=cell,
         camera=camera or facts.camera,
         override=override,
         robot_serial=facts.robot_serial,
@@ -309,16 +303,8 @@ def history_rows(root: Path | None, camera: str) -> list[tuple[str, str, str, st
 
 
 def _plain(camera: str, version: InstalledVersion) -> ListedJson:
-    found = version.calibration
-    return ListedJson(
-        camera=camera,
-        generation=version.number,
-        current=version.current,
-        path=str(version.path),
-        problem=version.problem,
-        session=None if found is None else found.provenance.session,
-        created=None if found is None else found.created,
-        source=None if found is None else found.source,
-        sigma=None if found is None else found.sigma,
-        validity=version.validity,
-    )
+    found, place = version.calibration, (version.number, version.current, str(version.path), version.problem)
+    if found is None:
+        return ListedJson(camera, *place, None, None, None, None, version.validity)
+    solved = found.provenance.session, found.created, found.source, found.sigma
+    return ListedJson(camera, *place, *solved, version.validity)

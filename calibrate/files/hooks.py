@@ -123,19 +123,14 @@ def _run(path: Path, event: HookEvent, fields: dict[str, str]) -> HookRun:
             exit_code = process.wait(TIME_LIMIT_S)
         except subprocess.TimeoutExpired:
             problem = f"{path} was ended after {TIME_LIMIT_S:g} s."
-        finally:
-            _end_group(process)
+        finally:  # the program and whatever it left running
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
         end = said.seek(0, os.SEEK_END)
         said.seek(max(0, end - OUTPUT_BYTES))
         output = said.read(OUTPUT_BYTES).decode(errors="replace")
     return HookRun(wall, event, path.name, exit_code, output, problem, round(time.monotonic() - begun_s, 3))
-
-
-def _end_group(process: subprocess.Popen[bytes]) -> None:
-    """End the program and whatever it left running."""
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
 
 
 def _tell_journal(fields: dict[str, str], priority: int) -> None:

@@ -270,7 +270,8 @@ def watch(
     while ends_s is None or time.monotonic() < ends_s:
         time.sleep(poll_s)
         seen = _marks(folder)
-        ages = before.installed is not None and _aged(before.installed)
+        held = None if before.installed is None else before.installed.validity
+        ages = held is not None and held.at(datetime.now(UTC)).state is not held.state
         if seen == marks and not ages:
             continue
         marks, now = seen, _look(root, camera, before)
@@ -288,10 +289,6 @@ def _marks(folder: Path) -> list[int]:
         except OSError:
             marks.append(0)
     return marks
-
-
-def _aged(installed: InstalledCalibration) -> bool:
-    return installed.validity.at(datetime.now(UTC)).state is not installed.validity.state
 
 
 def _look(root: Path | str | None, camera: str, before: InstallationChange | None) -> InstallationChange:

@@ -169,15 +169,13 @@ def _vectors(R: Array) -> Array:
     return rotation_exp(np.where(shorter[:, None], angles, other))
 
 
-def _angles(R: Array) -> Array:
-    return np.asarray(Rotation.from_euler("xyz", rotation_log(R)).as_matrix())
-
-
 _CONVENTIONS: dict[Reading, Callable[[Array], Array]] = {
     Reading.INVERSE_POSES: inverse,
     Reading.QUATERNION_ORDER: _rotations(_w_first),
     Reading.ROTATION_VECTOR_AS_ANGLES: _rotations(_vectors),
-    Reading.ANGLES_AS_ROTATION_VECTOR: _rotations(_angles),
+    Reading.ANGLES_AS_ROTATION_VECTOR: _rotations(
+        lambda R: Rotation.from_euler("xyz", rotation_log(R)).as_matrix()
+    ),
     Reading.INVERSE_ROTATIONS: _rotations(lambda R: np.asarray(R.transpose(0, 2, 1))),
 }
 

@@ -29,12 +29,12 @@ _STAMPS = list(Stamps.__struct_fields__)
 def export_recording(recording: Recording, output: Path, target: Target) -> Path:
     """Writes the folder `output`, which must not exist; nothing is left when it fails. RecordingError."""
     with _new_folder(output) as folder:
-        if target is Target.ROS2:
+        if target == "ros2":
             from recordings.exporters.ros2 import write_ros2
 
             write_ros2(recording, folder)
         else:
-            (_write_folder if target is Target.FOLDER else _write_tables)(recording, folder)
+            (_write_folder if target == "folder" else _write_tables)(recording, folder)
     return output
 
 

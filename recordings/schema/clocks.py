@@ -189,8 +189,11 @@ def _supporting_line(points: Array) -> tuple[float, int]:
     hull: list[int] = []
     rows = points.tolist()  # Python's floats: the chain is a loop
     for i, row in enumerate(rows):
-        while len(hull) >= 2 and _turns_right(rows[hull[-2]], rows[hull[-1]], row):
-            hull.pop()
+        while len(hull) >= 2:
+            (x0, y0), (x1, y1) = rows[hull[-2]], rows[hull[-1]]
+            if (y1 - y0) * (row[0] - x0) < (row[1] - y0) * (x1 - x0):
+                break
+            hull.pop()  # on or above the line from the one before to this
         hull.append(i)
     right = max(1, int(np.searchsorted(points[hull, 0], points[:, 0].mean())))
     (d0, g0), (d1, g1) = rows[hull[right - 1]], rows[hull[right]]
@@ -206,8 +209,3 @@ def _worst_best(above_ns: Array, device_s: Array) -> float:
     edges_s = np.linspace(begin_s, end_s, STRETCHES, endpoint=False)
     starts = np.unique(np.searchsorted(device_s, edges_s))
     return float(np.minimum.reduceat(above_ns, starts).max())
-
-
-def _turns_right(a: list[float], b: list[float], c: list[float]) -> bool:
-    """b lies on or above the line a–c, so that it is not part of the lower hull."""
-    return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])

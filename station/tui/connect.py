@@ -16,7 +16,7 @@ from station.tui.frame import Line
 from station.tui.screen import Box, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
-from station.tui.words import Mark, mark
+from station.tui.words import Mark, dim, lines, mark
 
 AGAIN_S = 5.0
 STATES: dict[str, tuple[Mark, str]] = {
@@ -44,13 +44,13 @@ def checklist_text(checks: Sequence[Check], width: int) -> Content:
         rows.append(
             mark(kind, f"{word:<9}")
             + Content.styled(f"{check.name:<15}", style)
-            + Content.styled(hanging(check.text, 26), "$dim")
+            + dim(hanging(check.text, 26))
         )
         if check.remedy and check.state != "ok":
             rows.append(Content.styled(f"{'':11}→ {hanging(check.remedy, 13)}", "$foreground"))
     missing = any(check.state == "failed" for check in checks)
     end = mark("look", NOT_READY) if missing else mark("done", READY)
-    return Content("\n").join([*rows, Content(""), end])
+    return lines(*rows, Content(""), end)
 
 
 class ConnectScreen(StationScreen):
@@ -65,7 +65,6 @@ class ConnectScreen(StationScreen):
 
     def on_mount(self) -> None:
         self.query_one("#checklist-scroll").border_title = "What a capture needs"
-        self.query_one("#checklist-scroll").focus()  # where much is missing, keys reach the end of it
         self.set_interval(AGAIN_S, self.look_again)
 
     def body(self) -> ComposeResult:

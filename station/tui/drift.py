@@ -11,13 +11,13 @@ from textual.content import Content
 from calibrate.quality.checks import FEWEST_FOR_TREND, CheckEntry, find_trend
 from station.operate.ending import Way, after_drift_check
 from station.tui.widgets.canvas import Series, curve
-from station.tui.words import Mark, facts, many, mark
+from station.tui.words import Mark, dim, facts, many, mark
 
 
 def drift_lines(entries: Sequence[CheckEntry], width: int, height: int) -> Content:
     """The camera's shift over time against what would be found, and a sentence; from five checks on."""
     if not entries:
-        return Content.styled("No drift check yet. d on 7 captures one: eight poses, two minutes.", "$dim")
+        return dim("No drift check yet. d on 7 captures one: eight poses, two minutes.")
     trend = find_trend(entries, entries[-1].generation)
     end = after_drift_check(entries[-1], "" if trend is None else trend.text)
     shifts = [1000 * float(np.linalg.norm(entry.shift[:3])) for entry in entries]

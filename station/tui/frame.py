@@ -19,7 +19,7 @@ from textual.widgets import Static
 from station.cell.status import StationStatus
 from station.protocol.states import LATCHED
 from station.tui.task import STEPS, UNTOLD, Action, Known, Step, next_action, steps
-from station.tui.words import MARKS, UNKNOWN, duration, shortened, size, state_of
+from station.tui.words import MARKS, UNKNOWN, dim, duration, shortened, size, state_of
 
 R = TypeVar("R")
 STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
@@ -136,15 +136,15 @@ def _bar_parts(known: Known, title: str) -> Iterator[Content]:
         return
     if status is None:
         yield Content.styled(" ▲ NO DAEMON ", "bold $onstop on $stop")
-        yield Content.styled("  to stop the arm use the pendant", "$dim")
+        yield dim("  to stop the arm use the pendant")
         return
     if status.playback:
         chip, style = state_of(status)
         yield Content.styled(" PLAYBACK, no live arm ", "bold $sim on $simbg")
-        yield Content.styled(f" {chip} ", "$dim")
+        yield dim(f" {chip} ")
         if status.simulated:
             yield Content.styled(" SIMULATED ", "bold $sim on $simbg")
-        yield Content.styled(f"  {status.robot.model}", "$dim")
+        yield dim(f"  {status.robot.model}")
         return
     chip, style = state_of(status)
     yield Content.styled(f" {chip} ", style)
@@ -167,15 +167,15 @@ def _robot_parts(status: StationStatus) -> Iterator[Content]:
     )
     yield Content.styled(f"  {robot.model or 'no robot'}", "bold $strong")
     if status.recorder.free_bytes is not None:
-        yield Content.styled(f"  {size(status.recorder.free_bytes)} free", "$dim")
+        yield dim(f"  {size(status.recorder.free_bytes)} free")
     if robot.remote is not None:
-        yield Content.styled(f"  {'remote' if robot.remote else 'LOCAL'}", "$dim")
+        yield dim(f"  {'remote' if robot.remote else 'LOCAL'}")
     if robot.control_path:
-        yield Content.styled(f"  {DRIVEN_BY[robot.control_path]}", "$dim")
+        yield dim(f"  {DRIVEN_BY[robot.control_path]}")
     if status.lease.holder:
-        yield Content.styled(f"  control: {status.lease.holder}", "$dim")
+        yield dim(f"  control: {status.lease.holder}")
     if status.session.elapsed_s:
-        yield Content.styled(f"  {duration(status.session.elapsed_s)}", "$dim")
+        yield dim(f"  {duration(status.session.elapsed_s)}")
 
 
 _BACK = {"now": "$strong on $accentbg", "stopped": "$strong on $badbg", "look": "$warn", "done": "$ok"}
@@ -319,7 +319,6 @@ class Question(ModalScreen[R], Framed[R]):
     def body(self) -> ComposeResult:
         yield from ()
 
-    def titled(self, title: str, below: str = "") -> None:
+    def on_mount(self) -> None:
         """Say in the window's border what it is about."""
-        box = self.query_one(f"#{self.BOX}")
-        box.border_title, box.border_subtitle = escape(title), escape(below)
+        self.query_one(f"#{self.BOX}").border_title = escape(self.title or "")

@@ -19,13 +19,14 @@ from station.cell.config import CaptureConfig
 from station.cell.scene import Scene
 from station.cell.status import Event, PoseStatus, SessionStatus, StationState, StationStatus
 from station.protocol.states import LATCHED, RUNNING
+from station.tui.frame import Line
 from station.tui.replay import ReplayLink
 from station.tui.screen import Box, Panel, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
 from station.tui.widgets.preview import PreviewPane
 from station.tui.widgets.scene import cell_scene, fields_of
-from station.tui.words import UNKNOWN, clock, degrees, duration, facts, mark, mm
+from station.tui.words import UNKNOWN, clock, degrees, dim, duration, facts, lines, mark, mm
 
 CLOCKS_POOR_MS = 1000 * CaptureConfig().time_bound_s
 """Poses known worse than that are refused by default."""
@@ -54,27 +55,20 @@ def event_text(event: Event, width: int = 0) -> Content:
     return Content.assemble((when, "$faint"), "  ", (said, _LEVELS[event.level]))
 
 
-def lines(*parts: Content) -> Content:
-    return Content("\n").join(parts)
-
-
 def quality_line(status: StationStatus) -> Content:
     """The board in the newest image: each with a mark, a value and, where it is poor, a word."""
     seen = status.detection
     if not seen.found:
         advice = f"  {seen.advice}" if seen.advice else ""
-        return mark("look", seen.reason or "no board in view") + Content.styled(advice, "$dim")
-    whole, burnt = seen.corners == seen.expected, seen.saturated > BURNT
+        return mark("look", seen.reason or "no board in view") + dim(advice)
+    burnt = seen.saturated > BURNT
+    judged = (
+        ("corners", f"{seen.corners}/{seen.expected}", seen.corners == seen.expected),
+        ("sharp", f"{seen.sharpness:.2f}", burnt or not seen.advice),
+        ("saturated", f"{100 * seen.saturated:.1f} %", not burnt),
+    )
     parts = [
-        mark("done" if whole else "look")
-        + Content(" ")
-        + facts(("corners", f"{seen.corners}/{seen.expected}", "")),
-        mark("look" if seen.advice and not burnt else "done")
-        + Content(" ")
-        + facts(("sharp", f"{seen.sharpness:.2f}", "")),
-        mark("look" if burnt else "done")
-        + Content(" ")
-        + facts(("saturated", f"{100 * seen.saturated:.1f} %", "")),
+        mark("done" if good else "look") + " " + facts((name, value, "")) for name, value, good in judged
     ]
     if seen.tilt_rad is not None:
         parts.append(facts(("tilt", degrees(seen.tilt_rad, 0), "")))
@@ -115,15 +109,15 @@ def _under_way(status: StationStatus) -> PoseStatus | None:
 def counted_line(session: SessionStatus) -> Content:
     """Progress of a session while no pose is under way, and what comes next."""
     if not session.poses:
-        return Content.styled("No plan yet: 2, then n makes one.", "$dim")
+        return dim("No plan yet: 2, then n makes one.")
     if not session.name:
-        return Content.styled("Not begun: F5 shows the motion and asks first.", "$dim")
+        return dim("Not begun: F5 shows the motion and asks first.")
     again = sum(pose.kept for pose in session.poses)
     if session.calibration:
         return mark("done", "finished and solved: 4 shows the result")
     if session.recording:
         return mark("done", "finished: k on 7 judges it" if session.check else "finished: F9 solves it")
-    return Content.styled(f"{again} to be captured again" if again else "resting", "$dim")
+    return dim(f"{again} to be captured again" if again else "resting")
 
 
 def progress_lines(known: Known, width: int, height: int) -> Content:
@@ -140,9 +134,7 @@ def progress_lines(known: Known, width: int, height: int) -> Content:
     if status.playback:
         head += Content.styled("   played, no arm moves", "$sim")
     why = "" if pose is None else f"{pose.name}: {pose.why}" if pose.why else pose.name
-    return lines(
-        head, pose_line(status), Content.styled(why, "$dim"), *chips(session, width, max(1, height - 3))
-    )
+    return lines(head, pose_line(status), dim(why), *chips(session, width, max(1, height - 3)))
 
 
 def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:
@@ -173,7 +165,7 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     goal = estimate.goal_mm
     now = estimate.sigma_translation_mm
     if status.playback and estimate.advice:
-        return Content.styled(estimate.advice, "$dim")
+        return dim(estimate.advice)
     head = facts(("", f"± {now:.2f}" if now is not None else f"± {UNKNOWN}", "mm"))
     if goal:
         head += Content.assemble(("   goal ", "$dim"), (f"± {goal:.2f}", "$warn"))
@@ -188,9 +180,7 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     end = f"by the plan ± {planned[-1][1]:.2f} mm" if planned else ""
     rows = [head]
     if end and height > 6:
-        rows.append(
-            Content.styled(f"{end} after {len(poses)} poses" + _advice(estimate.advice, width), "$dim")
-        )
+        rows.append(dim(f"{end} after {len(poses)} poses" + _advice(estimate.advice, width)))
     rows.append(
         curve(
             [Series(planned, "$faint", dash=2), Series(measured, "$accent")],
@@ -215,7 +205,7 @@ def coverage_lines(known: Known, width: int, height: int, scene: Scene | None = 
     status = known.shown
     views = status.estimate.image_views
     if not views:
-        return Content.styled("no image of the board yet", "$dim")
+        return dim("no image of the board yet")
     columns = len(views[0])
     cell = max(3, min(9, (width - 2) // columns - 1))
     most = max(1, max(max(row) for row in views))
@@ -246,9 +236,7 @@ def _empty_words(status: StationStatus, scene: Scene | None) -> Content:
         open_poses = [p for p in status.session.poses if p.state == "planned"]
         filling = [str(p.index + 1) for p in open_poses if (fields_of(scene, p, *empty.shape) & empty).any()]
         if filling:
-            return mark("look", said) + Content.styled(
-                f": pose {', '.join(filling[:6])} will show it there", "$dim"
-            )
+            return mark("look", said) + dim(f": pose {', '.join(filling[:6])} will show it there")
     return mark("look", said)
 
 
@@ -257,7 +245,7 @@ def device_lines(known: Known, width: int, height: int) -> Content:
     status = known.shown
     robot, camera, recorder, bounds = status.robot, status.camera, status.recorder, status.clock
     if status.playback:
-        return Content.styled("robot not live   camera not live", "$dim")
+        return dim("robot not live   camera not live")
     parts = [
         _device("robot", robot.connected, f"{robot.rate_hz:.0f} Hz"),
         _device(
@@ -293,19 +281,13 @@ def device_lines(known: Known, width: int, height: int) -> Content:
 
 
 def _device(name: str, good: bool, text: str) -> Content:
-    return mark("done" if good else "failed", name) + Content.styled(f" {text}", "$dim")
+    return mark("done" if good else "failed", name) + dim(f" {text}")
 
 
-class Events(Panel):
+def newest_events(known: Known, width: int, height: int) -> Content:
     """The newest events, as many as fit."""
-
-    def __init__(self) -> None:
-        super().__init__("What happened", _newest, id="events", below="8 all")
-
-
-def _newest(known: Known, width: int, height: int) -> Content:
-    status = known.shown
-    return lines(*(event_text(event, width) for event in reversed(status.events[-max(1, height) :])))
+    shown = reversed(known.shown.events[-max(1, height) :])
+    return lines(*(event_text(event, width) for event in shown))
 
 
 class Stopped(Static):
@@ -370,8 +352,8 @@ class LiveScreen(StationScreen):
             with Vertical(id="live-left"):
                 with Box("Camera", id="picture", below="+ found corners"):
                     yield PreviewPane(id="preview")
-                    yield Static(id="quality")
-                yield Events()
+                    yield Line(lambda known, _: quality_line(known.shown), id="quality")
+                yield Panel("What happened", newest_events, id="events", below="8 all")
             with Vertical(id="live-right"):
                 with Box("Poses", id="progress"):
                     yield ProgressBar(id="bar-of-poses", show_eta=False, show_percentage=False)
@@ -410,10 +392,7 @@ class LiveScreen(StationScreen):
         saved, total = float(sum(pose.counts for pose in session.poses)), float(len(session.poses) or 1)
         if (bar.progress, bar.total) != (saved, total):
             bar.update(total=total, progress=saved)
-        quality = quality_line(status)
-        if not quality.is_same(getattr(self, "_quality", Content("?"))):
-            self._quality = quality
-            self.query_one("#quality", Static).update(quality, layout=False)
+        self.query_one("#quality", Line).show(known)
         self.query_one("#live").set_class(status.state in LATCHED, "-dimmed")
 
 
@@ -469,7 +448,7 @@ class ReplayScreen(Player, LiveScreen):
 
     def show(self, known: Known) -> None:
         """The cell's own status shows nothing here, but its work ends the playback."""
-        status = known.status
+        status = known.live
         if status is not None and status.state not in WATCHABLE:
             self.notify(f"The playback was closed: the cell is {status.state.value}.", severity="warning")
             self.action_close()
@@ -502,9 +481,6 @@ class LogScreen(StationScreen):
 
     def body(self) -> ComposeResult:
         yield RichLog(id="log", wrap=True, max_lines=2000)
-
-    def on_mount(self) -> None:
-        self.query_one("#log", RichLog).focus()
 
     def show(self, known: Known) -> None:
         super().show(known)

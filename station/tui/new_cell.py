@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
-from rich.segment import Segment
-from rich.style import Style
 from rich.text import Text
 from textual import events, work
 from textual.app import ComposeResult
@@ -18,7 +16,6 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.reactive import reactive
-from textual.strip import Strip
 from textual.widgets import Footer, Input, OptionList, Static
 from textual.widgets.option_list import Option
 
@@ -38,35 +35,13 @@ from station.tui.task import Step
 from station.tui.themes import ThemedApp
 from station.tui.widgets.graphics import Graphics
 from station.tui.widgets.preview import PreviewPane
+from station.tui.words import dim
 
 Ending = Literal["", "serve", "rehearse"]
 """Next wish of the person: nothing, the cell itself, or its rehearsal."""
 ARM_PERIOD_S, CAMERA_PERIOD_S, LOOK_S = 0.1, 0.15, 1.0
 SHOWN_WIDTH_PX = 640
 NO_CAMERA = "No camera answers. Check its power, cable and network; this list refreshes every few seconds."
-AXIS = Style(color="black", bgcolor="bright_yellow", bold=True)
-
-
-class BoardPicture(PreviewPane):
-    """Live picture, the board's corners, and its origin and axes in letters."""
-
-    axes: tuple[tuple[str, float, float], ...] = ()
-    """Letter, x and y as shares of the image."""
-
-    def render_line(self, y: int) -> Strip:
-        strip = super().render_line(y)
-        if self._image is None or not self.axes:
-            return strip
-        height, width = self._image.shape
-        scale = min(self.size.width / width, 2 * self.size.height / height)
-        columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
-        left = (self.size.width - columns) // 2
-        for letter, share_x, share_y in self.axes:
-            column, row = left + int(share_x * columns), int(share_y * rows) // 2
-            if row == y and 0 <= column < self.size.width:
-                mark = Strip([Segment(letter, AXIS)])
-                strip = Strip.join([strip.crop(0, column), mark, strip.crop(column + 1)])
-        return strip
 
 
 class NewCell(ThemedApp[Ending]):
@@ -127,7 +102,7 @@ class NewCell(ThemedApp[Ending]):
                     yield Static("\n".join(DRAWINGS[mount]), id=mount, classes="drawing", markup=False)
             yield Static(id="live-lines", markup=False)
             yield Static(id="problem", markup=False)
-            yield BoardPicture(id="picture")
+            yield PreviewPane(id="picture")
             with VerticalScroll(id="text"):
                 yield Static(id="written", markup=False)
         yield Footer()
@@ -205,14 +180,15 @@ class NewCell(ThemedApp[Ending]):
         self._show()
 
     async def _show_picture(self, image: Image, found: Detection | None) -> None:
-        pane, board = self.query_one(BoardPicture), self.setup.draft.board
+        pane, board = self.query_one(PreviewPane), self.setup.draft.board
         if not pane.display:
             return
         self._pictures += 1
         corners = np.zeros((0, 2)) if found is None else found.pixels
         preview = preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures)
-        pane.axes = () if found is None or board is None else _axes(board, found, preview.corners)
-        await pane.show(preview)
+        await pane.show(
+            preview, () if found is None or board is None else _axes(board, found, preview.corners)
+        )
 
     def _add_view(self) -> None:
         self.setup.take_view()
@@ -353,8 +329,8 @@ class NewCell(ThemedApp[Ending]):
         if setup.arm is not None:
             who = setup.arm.identity
             bar.append(Content.styled(f"  {who.model} {who.serial}", "bold $strong"))
-            bar.append(Content.styled(f"  {setup.arm.trouble() or 'ready'}", "$dim"))
-        bar.append(Content.styled("  Your hand moves the arm, never this wizard.", "$dim"))
+            bar.append(dim(f"  {setup.arm.trouble() or 'ready'}"))
+        bar.append(dim("  Your hand moves the arm, never this wizard."))
         self.query_one("#bar", Static).update(fitting(bar, width))
         self.query_one("#rail", Static).update(rail_line(self._rail(), self.step, width))
         self.query_one("#next", Static).update(next_line(self.page.next, width))

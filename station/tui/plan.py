@@ -20,7 +20,7 @@ from station.tui.frame import Line
 from station.tui.screen import Ask, Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.scene import LEGEND, cell_scene, draw, view_of
-from station.tui.words import MARKS, UNKNOWN, Mark, degrees, facts, limit_bar, many, mark, mm
+from station.tui.words import MARKS, UNKNOWN, Mark, degrees, dim, facts, limit_bar, lines, many, mark, mm
 
 COLUMNS = ("#", "error after", "", "distance", "tilt", "reason", "state")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
@@ -74,7 +74,7 @@ def facts_line(status: StationStatus) -> Content:
     """The plan in one line."""
     poses = status.session.poses
     if not poses:
-        return Content.styled(NO_PLAN, "$dim")
+        return dim(NO_PLAN)
     ends = [pose.predicted_sigma_mm for pose in poses if pose.predicted_sigma_mm is not None]
     line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose"))
     if ends:
@@ -82,7 +82,7 @@ def facts_line(status: StationStatus) -> Content:
         if (goal := status.estimate.goal_mm) is not None:
             line += Content("   ") + mark("done" if ends[-1] <= goal else "look", f"goal {goal:g} mm")
     left_out = sum(pose.state == "skipped" for pose in poses)
-    return line + Content.styled(f"   {many(left_out, 'pose')} skipped" * bool(left_out), "$dim")
+    return line + dim(f"   {many(left_out, 'pose')} skipped" * bool(left_out))
 
 
 def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: Scene | None) -> Content:
@@ -98,7 +98,7 @@ def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: Scene | None) 
     if pose.reason or seen:
         kind: Mark = "failed" if pose.state == "failed" else "look" if pose.reason else "done"
         rows.append(mark(kind, ". ".join(words for words in (pose.reason, seen) if words)))
-    return Content("\n").join(rows)
+    return lines(*rows)
 
 
 class PlanScreen(StationScreen):
@@ -144,13 +144,6 @@ class PlanScreen(StationScreen):
                 yield Panel("The cell", self._cell, id="plan-cell", below="\\[ ] turn  + − zoom")
                 yield Panel("From above", self._above, id="plan-above", below=LEGEND)
 
-    def on_mount(self) -> None:
-        self.table.focus()
-
-    @property
-    def table(self) -> Rows:
-        return self.query_one(Rows)
-
     def show(self, known: Known) -> None:
         super().show(known)
         if (status := known.status) is None:
@@ -161,14 +154,11 @@ class PlanScreen(StationScreen):
         self.table.show([row_of(pose, goal_mm, scene) for pose in poses])
         self.draw_panels(known)
 
-    def on_data_table_row_highlighted(self) -> None:
-        self.draw_panels(self.known)
-
     def _why(self, known: Known, width: int, height: int) -> Content:
         status = known.shown
         poses, line = status.session.poses, self.table.cursor_row
         if not line < len(poses):
-            return Content.styled(NO_PLAN, "$dim")
+            return dim(NO_PLAN)
         before = poses[line - 1] if line else None
         return detail_of(poses[line], before, cell_scene(known.configuration, status))
 
@@ -185,7 +175,7 @@ class PlanScreen(StationScreen):
         scene = cell_scene(known.configuration, status)
         if scene is None:
             words = "To draw the cell, the configuration needs initial camera and board poses."
-            return Content.styled(words, "$dim")
+            return dim(words)
         chosen = self.table.cursor_row if status.session.poses else None
         return draw(scene, status, chosen, width, height, turn_deg=turn_deg, lift_deg=lift_deg, zoom=zoom)
 

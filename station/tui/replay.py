@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from bisect import bisect_right
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import TypeVar, cast
@@ -180,7 +181,7 @@ class Timeline:
 
     def image_s(self, at_s: float, by: int) -> float:
         """Time of the next image (`by` 1) or the one before (-1), seen from `at_s`."""
-        done = sum(time_s <= at_s for time_s in self._times_s)
+        done = bisect_right(self._times_s, at_s)
         if by > 0:
             return self._times_s[done] if done < len(self._times_s) else self.duration_s
         # In the midst of an image's time, back is the image before it.
@@ -188,13 +189,13 @@ class Timeline:
 
     def view_at(self, at_s: float) -> View | None:
         """The newest view taken by then."""
-        done = sum(time_s <= at_s for time_s in self._times_s)
+        done = bisect_right(self._times_s, at_s)
         return self.views[done - 1] if done else None
 
     def status(self, at_s: float) -> StationStatus:
         """`at_s`: since the recording's start."""
         robot = self._robot_at(at_s)
-        done = sum(time_s <= at_s for time_s in self._times_s)
+        done = bisect_right(self._times_s, at_s)
         info = self.recording.info
         ended = at_s >= self.duration_s
         state = StationState.IDLE if ended else _state(robot)

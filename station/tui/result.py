@@ -29,7 +29,7 @@ from station.tui.drift import drift_lines
 from station.tui.installed import Result, local
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.words import UNKNOWN, Mark, facts, limit_bar, mark, shortened, signed
+from station.tui.words import UNKNOWN, Mark, dim, facts, limit_bar, lines, mark, shortened, signed
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter shows older ones."
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
@@ -72,7 +72,7 @@ def verdict_lines(result: Result) -> Content:
     ]
     if calibration.source != "real":
         told.append(f"{calibration.source.upper()}: never for a real cell")
-    return Content("\n").join([*rows, Content(f"  {'. '.join(told)}.")])
+    return lines(*rows, Content(f"  {'. '.join(told)}."))
 
 
 def _against(result: Result, calibration: Calibration) -> list[str]:
@@ -98,7 +98,7 @@ def gate_row(gate: Gate) -> tuple[Content, ...]:
         name,
         Content.styled(gate.shown(gate.value), "bold $strong"),
         limit_bar(gate.value, gate.limit, BAR_CELLS, colour),
-        Content.styled(f"{gate.sense} {gate.shown(gate.limit)}", "$dim"),
+        dim(f"{gate.sense} {gate.shown(gate.limit)}"),
         word,
     )
 
@@ -106,7 +106,7 @@ def gate_row(gate: Gate) -> tuple[Content, ...]:
 def card(calibration: Calibration, key: str, missing: str = "") -> Content:
     """A figure, and below it what it is; `missing`: words where there is none."""
     if (figure := figures(calibration).get(key)) is None:
-        return Content.styled(f"{UNKNOWN} {missing}", "$dim")
+        return dim(f"{UNKNOWN} {missing}")
     return Content.assemble((figure.value, "bold $strong"), (f"\n{figure.label} {figure.about}", "$dim"))
 
 
@@ -120,14 +120,14 @@ def change_card(result: Result, calibration: Calibration) -> Content:
     if result.installed:
         return mark("done", "this one is installed")
     if installed is None:
-        return Content.styled("Nothing is installed yet.", "$dim")
+        return dim("Nothing is installed yet.")
     if installed.mount != calibration.mount:
         return mark("look", f"installed: {installed.mount}, this one: {calibration.mount}")
     delta = difference(calibration.transform.matrix, installed.transform.matrix)
     moved_mm, turned_deg = 1000 * np.linalg.norm(delta[:3]), np.degrees(np.linalg.norm(delta[3:]))
     below = f"\nfrom the installed one of {local(installed.created)}"
     moved = facts(("", f"{moved_mm:.2f}", "mm"), ("", f"{turned_deg:.3f}", "°"))
-    return moved + Content.styled(below, "$dim")
+    return moved + dim(below)
 
 
 def pose_table(result: Result, calibration: Calibration) -> Content:
@@ -135,7 +135,7 @@ def pose_table(result: Result, calibration: Calibration) -> Content:
     installed = result.state.now
     beside = installed is not None and not result.installed and installed.mount == calibration.mount
     frame = f"{calibration.result.parent_frame}_from_{calibration.result.child_frame}"
-    rows = [Content.styled(f"{frame:<26}" + ("installed        difference" if beside else ""), "$dim")]
+    rows = [dim(f"{frame:<26}" + ("installed        difference" if beside else ""))]
     sigmas = 1000 * np.sqrt(np.diag(np.array(calibration.covariance))[:3])
     for axis, ours, sigma, k in zip("xyz", calibration.result.translation_m, sigmas, range(3), strict=True):
         row = Content.assemble(
@@ -145,14 +145,12 @@ def pose_table(result: Result, calibration: Calibration) -> Content:
         )
         if beside and installed is not None:
             theirs = installed.result.translation_m[k]
-            row += Content.styled(
-                f"   {signed(1000 * theirs):>9} mm  {signed(1000 * (ours - theirs)):>8} mm", "$dim"
-            )
+            row += dim(f"   {signed(1000 * theirs):>9} mm  {signed(1000 * (ours - theirs)):>8} mm")
         rows.append(row)
-    rows.append(Content.styled(f"rotation ± {calibration.sigma.rotation_deg:.3f}° (1σ)", "$dim"))
+    rows.append(dim(f"rotation ± {calibration.sigma.rotation_deg:.3f}° (1σ)"))
     quaternion = " ".join(signed(q, 5) for q in calibration.result.rotation_xyzw)
-    rows.append(Content.styled(f"x y z w  {quaternion}", "$dim"))
-    return Content("\n").join([*rows, *map(Content, arm_sentences(calibration))])
+    rows.append(dim(f"x y z w  {quaternion}"))
+    return lines(*rows, *map(Content, arm_sentences(calibration)))
 
 
 def residual_lines(calibration: Calibration, width: int, height: int) -> Content:
@@ -165,18 +163,16 @@ def residual_lines(calibration: Calibration, width: int, height: int) -> Content
     # A limit far above every view would leave nothing to be seen.
     shown = max([4 * max(rms.values(), default=0.0)], default=scale)
     reach = min(scale, shown) or 1.0
-    rows.append(
-        Content.styled(f"bars to {reach:.2g} px" + (f", limit {limit:g} px" if limit else ""), "$dim")
-    )
+    rows.append(dim(f"bars to {reach:.2g} px" + (f", limit {limit:g} px" if limit else "")))
     weights = {v.index: v.weight for v in calibration.views.weights}
     for index, value in sorted(rms.items()):
         doubt = weights.get(index, 1.0) < 0.5
         colour = "$bad" if limit and value > limit else "$warn" if doubt else "$accent"
-        row = Content.styled(f"{index + 1:>3} ", "$dim") + limit_bar(value, reach, cells, colour, 1.0)
+        row = dim(f"{index + 1:>3} ") + limit_bar(value, reach, cells, colour, 1.0)
         rows.append(
             row + Content.assemble((f" {value:.3f} px", "$foreground"), (" suspect" * doubt, "$warn"))
         )
-    return Content("\n").join(rows)
+    return lines(*rows)
 
 
 class ResultScreen(StationScreen):
@@ -282,9 +278,6 @@ class SolveScreen(ResultScreen):
                 below="reprojection error",
             )
 
-    def on_mount(self) -> None:
-        self.query_one(Rows).focus()
-
     def tell(self, calibration: Calibration) -> None:
         self._gates = sorted(calibration.quality.gates, key=lambda gate: (gate.passed, not gate.narrow))
         self.query_one(Rows).show([gate_row(gate) for gate in self._gates])
@@ -336,7 +329,7 @@ def touch_lines(calibration: Calibration) -> Content:
                 ("", f"{touch_sigmas(touch):.1f}", "σ of at most 3.0"),
             )
         )
-    return Content("\n").join(rows)
+    return lines(*rows)
 
 
 def held_out_lines(calibration: Calibration) -> Content:
@@ -348,7 +341,7 @@ def held_out_lines(calibration: Calibration) -> Content:
                 ("left-out views:", f"{folds.rms_mm:.2f}", "mm"), ("claimed", f"{folds.claimed_mm:.2f}", "mm")
             )
         )
-    return Content("\n").join([*rows, Content(noise_text(calibration))])
+    return lines(*rows, Content(noise_text(calibration)))
 
 
 class InstallScreen(ResultScreen):
@@ -376,13 +369,13 @@ def install_lines(result: Result, calibration: Calibration) -> Content:
         rows.append(
             Content.styled(f"{calibration.source.upper()}: for this {calibration.source} cell only.", "$sim")
         )
-    rows.append(Content.styled("Every program that reads this cell's calibration gets it at once.", "$dim"))
-    return Content("\n").join(rows)
+    rows.append(dim("Every program that reads this cell's calibration gets it at once."))
+    return lines(*rows)
 
 
 def log_lines(entries: Sequence[LogEntry], height: int) -> Content:
     if not entries:
-        return Content.styled("Nothing was installed yet.", "$dim")
+        return dim("Nothing was installed yet.")
     return Content("\n").join(
         Content.assemble(
             (f"{local(entry.wall)}  ", "$dim"),

@@ -96,6 +96,7 @@ class Ask(Message):
 class StationScreen(Framed[None]):
     """One screen; `body` is what differs."""
 
+    AUTO_FOCUS = "Rows, #checklist-scroll, #log"
     MODE: ClassVar[str] = ""
     """Its step of the task, or its name."""
     TIP: ClassVar[str] = ""
@@ -128,6 +129,14 @@ class StationScreen(Framed[None]):
         for preview in self.query(PreviewPane):
             preview.old = known.old
         super().show(known)
+
+    @property
+    def table(self) -> Rows:
+        """The one table of a screen that has one."""
+        return self.query_one(Rows)
+
+    def on_data_table_row_highlighted(self) -> None:
+        self.draw_panels(self.known)
 
     def draw_panels(self, known: Known) -> None:
         for panel in self.query(Panel):

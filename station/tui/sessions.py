@@ -18,7 +18,7 @@ from station.tui.drift import drift_lines
 from station.tui.installed import Kept, Past
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.words import UNKNOWN, facts, mark, size
+from station.tui.words import UNKNOWN, facts, lines, mark, size
 
 DRIFT = f"Drift check: capture {POSES} poses in place of the loaded plan (asks)"
 NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
@@ -68,13 +68,6 @@ class SessionsScreen(StationScreen):
                 )
                 yield Panel("Highlighted", self._highlighted, id="highlighted")
 
-    def on_mount(self) -> None:
-        self.table.focus()
-
-    @property
-    def table(self) -> Rows:
-        return self.query_one(Rows)
-
     def show(self, known: Known) -> None:
         super().show(known)
         past = known.past
@@ -88,9 +81,6 @@ class SessionsScreen(StationScreen):
         names = [kept.session.name for kept in past.sessions]
         self.table.move_cursor(row=names.index(at.session.name) if at and at.session.name in names else 0)
         self.draw_panels(known)
-
-    def on_data_table_row_highlighted(self) -> None:
-        self.draw_panels(self.known)
 
     def _highlighted_one(self) -> Kept | None:
         sessions, line = self._past.sessions, self.table.cursor_row
@@ -120,7 +110,7 @@ class SessionsScreen(StationScreen):
                 ),
             ]
         keys = "Enter result  " * bool(session.calibration) + "F9 solve  w play  k drift check on it"
-        return Content("\n").join([*rows, Content(""), Content.styled(keys, "$accent")])
+        return lines(*rows, Content(""), Content.styled(keys, "$accent"))
 
     def action_act(self, what: SessionWork) -> None:
         """Do what a key says with the highlighted session."""

@@ -37,6 +37,7 @@ POINTER = "pointer's length in mm; empty: as configured, or as on the pendant"
 class ChooseCorner(Question[int | None]):
     """Choice of the next corner and of the pointer. None: no more corners."""
 
+    TITLE = "Touch test of this calibration"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "dismiss(None)", "End", tooltip="No more corners")
     ]
@@ -56,7 +57,6 @@ class ChooseCorner(Question[int | None]):
         yield Label("Enter: that corner. Tab: the pointer's length. Escape: no more.", id="dialog-keys")
 
     def on_mount(self) -> None:
-        self.titled("Touch test of this calibration")
         corners = outer_corners(self._board)
         left = [line for line, corner in enumerate(corners) if corner not in self._found]
         self.query_one(OptionList).highlighted = left[0] if left else len(corners)
@@ -86,7 +86,8 @@ class Touching(Question[Touch | None]):
 
     def __init__(self, desk: Desk, corner: int, board: BoardSpec, arrival: Awaitable[Hovering]) -> None:
         super().__init__()
-        self._desk, self._corner, self._board, self._arrival = desk, corner, board, arrival
+        self._desk, self._board, self._arrival = desk, board, arrival
+        self.title = f"Corner {corner}"
         self._hovering: Hovering | None = None
 
     def body(self) -> ComposeResult:
@@ -96,7 +97,6 @@ class Touching(Question[Touch | None]):
         yield Label("Escape leaves this corner out", id="dialog-keys")
 
     def on_mount(self) -> None:
-        self.titled(f"Corner {self._corner}")
         self.query_one(Input).display = False
         self.await_arrival()
 

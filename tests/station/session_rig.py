@@ -36,7 +36,7 @@ from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.scenes import cell_config, make_cell
 
-TRUTH = make_cell()
+TRUTH = make_cell("paper-binned")
 POSES = 4
 GLIMPSED = np.random.default_rng(1).integers(0, 255, (64, 80), dtype=np.uint8)
 RUNNING, NORMAL, STOPPED = 7, 1, 1
@@ -228,7 +228,7 @@ class WorkerInThisProcess:
     def __init__(self) -> None:
         self.waiting = 0
         points = board_points(TRUTH.board)
-        pixels = 300 + 5000 * points[:, :2]
+        pixels = 150 + 2500 * points[:, :2]
         status = DetectionStatus(found=True, corners=len(points), expected=len(points))
         self.sees = BoardDetection(status, np.arange(len(points)), pixels)
 

@@ -22,12 +22,12 @@ import pytest
 
 from station.cell.plan import Plan
 from station.cell.status import StationState, StationStatus
-from station.plan.planner import make_plan
 from station.protocol.client import Client
 from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
 from station.simulation.scenes import cell_config, make_cell
 from tests.conftest import CONTROL_PATHS
+from tests.station.quick_plan import quick_plan
 
 TRUTH = make_cell(seed=5)
 AT_REST_RAD_S = 1e-3
@@ -39,7 +39,7 @@ PROGRAM = (sys.executable, "-m", "tests.system.cell_daemon")
 @pytest.fixture(scope="session")
 def short_plan() -> Plan:
     """Three poses, driven slowly enough to be caught in mid-move."""
-    plan = make_plan(cell_config(TRUTH), start_joints_rad=TRUTH.start_joints_rad, seed=5, count=3)
+    plan = quick_plan(cell_config(TRUTH), TRUTH, seed=5, count=3)
     return msgspec.structs.replace(plan, joint_speed_rad_s=0.4)
 
 

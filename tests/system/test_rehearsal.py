@@ -123,8 +123,8 @@ async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path
             outcome = await carry_out(
                 client, Purpose.RUN, approved, lambda _: None, finish_with_loss=True, headless=True
             )
-            assert outcome.captured >= POSES - 2
-    solved = call(calibrate, "solve", outcome.recording, "-o", result, "--report", report, "--json")
+            assert outcome.session.captured >= POSES - 2
+    solved = call(calibrate, "solve", outcome.session.recording, "-o", result, "--report", report, "--json")
     answer = json.loads(solved.stdout)
     simulated = np.array(read_truth(root / "simulation" / "truth.json").camera_mount)
     off = difference(np.array(answer["result"]["matrix"]), simulated)

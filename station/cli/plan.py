@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -83,7 +84,11 @@ def plan_command(
         standing = asked_standing(cell, socket or default_socket())
     criterion = _criterion(purpose, d_optimal)
     plan = _given(cell, standing, check, from_list, taught)
-    plan = plan or _made(cell, standing, poses, seed, criterion, quiet=as_json)
+    if plan is None:
+        with _progress(quiet=as_json) as report:
+            plan = make_plan(
+                cell, start_joints_rad=standing, seed=seed, count=poses, criterion=criterion, progress=report
+            )
     geometry = cell_geometry(cell) if standing is None else geometry_from(cell, standing)
     outcome = check_plan(plan, standing, geometry)
     shown = _scene(cell, needed=picture is not None or foxglove is not None)
@@ -236,25 +241,14 @@ def _given(
     return None if taught is None else taught_plan(taught, cell.robot.model, cell.mount)
 
 
-def _made(
-    cell: StationConfig,
-    standing: list[float] | None,
-    poses: int,
-    seed: int,
-    criterion: Criterion,
-    quiet: bool,
-) -> Plan:
+@contextlib.contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     with Progress(
         TextColumn("{task.description}"), BarColumn(), console=err, transient=True, disable=quiet
     ) as bar:
         task = bar.add_task("planning", total=1.0)
 
-        def report(text: str, done: float) -> None:
-            bar.update(task, description=text, completed=done)
-
-        return make_plan(
-            cell, start_joints_rad=standing, seed=seed, count=poses, criterion=criterion, progress=report
-        )
+        yield lambda text, done: bar.update(task, description=text, completed=done)
 
 
 class PlanJson(msgspec.Struct, frozen=True):

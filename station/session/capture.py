@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from recordings.images import Pixels, viewable
-from recordings.schema.messages import Image, RobotState, Stamps, Stillness, View
+from recordings.schema.messages import Image, RobotState, Stamps, View
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion
 from station.cell.config import matrix4
@@ -55,7 +55,23 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
     image = context.require_recording().number(await take_image(context, index))
     show_frame(context, image)
     state, bound_s = await at_exposure(context, resting, image)
-    view = _view(context, index, attempt, image, state, still, bound_s)
+    stamps = Stamps(
+        host_monotonic_ns=state.stamps.host_monotonic_ns,
+        host_wall_ns=state.stamps.host_wall_ns,
+        controller_s=state.stamps.controller_s,
+        device_ns=image.stamps.device_ns + round(image.exposure_us * 500),
+    )
+    view = View(
+        index=index,
+        name=context.require_queue().pose(index).name,
+        picture_sequence=image.sequence,
+        base_from_flange=matrix4(flange_pose(state, context.cell.robot.identity.tcp_offset)),
+        joints_rad=state.joints_rad,
+        attempt=attempt,
+        stamps=stamps,
+        time_bound_s=bound_s,
+        stillness=still,
+    )
     _phase(context, index, StationState.WRITING, "writing")
     await to_the_end(_write(context, index, image, view))
 
@@ -133,34 +149,6 @@ async def at_exposure(
             limit_s=limit_s,
         )
     return state, bound_s
-
-
-def _view(
-    context: SessionContext,
-    index: int,
-    attempt: int,
-    image: Image,
-    state: RobotState,
-    still: Stillness,
-    bound_s: float,
-) -> View:
-    exposure_ns = state.stamps.host_monotonic_ns
-    return View(
-        index=index,
-        name=context.require_queue().pose(index).name,
-        picture_sequence=image.sequence,
-        base_from_flange=matrix4(flange_pose(state, context.cell.robot.identity.tcp_offset)),
-        joints_rad=state.joints_rad,
-        attempt=attempt,
-        stamps=Stamps(
-            host_monotonic_ns=exposure_ns,
-            host_wall_ns=state.stamps.host_wall_ns,
-            controller_s=state.stamps.controller_s,
-            device_ns=image.stamps.device_ns + round(image.exposure_us * 500),
-        ),
-        time_bound_s=bound_s,
-        stillness=still,
-    )
 
 
 async def _write(context: SessionContext, index: int, image: Image, view: View) -> None:

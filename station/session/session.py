@@ -164,10 +164,9 @@ class Session:
         """Checks the whole path from where the arm is and offers a one-use approval for it."""
         offer = await self._begin_offer(verbs.Prepare, client_id)
         found = await self._replanner.replan(purpose) or begun_anew(self.context, purpose)
-        poses = found.poses if found else poses_to_drive(self.context, purpose, index)
-        queue, changes = (found.queue, found.changes) if found else (self.context.require_queue(), ())
-        summary = await summarise(self.context, purpose, queue, poses, self._notes, changes)
-        offer(MotionApproval(summary, client_id, poses, purpose, found))
+        offered = found or poses_to_drive(self.context, purpose, index)
+        summary = await summarise(self.context, offered, self._notes)
+        offer(MotionApproval(summary, client_id, offered.poses, purpose, found))
         return summary
 
     async def prepare_hover(self, client_id: int, request: verbs.Hover) -> HoverOffer:

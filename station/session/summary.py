@@ -36,8 +36,8 @@ def begun_anew(context: SessionContext, purpose: Purpose) -> PlanRevision | None
     return PlanRevision(purpose, again, _open(again), queue.sha256, ())
 
 
-def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None) -> tuple[int, ...]:
-    """The poses an approval for this purpose covers. RefusedError when there are none."""
+def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None) -> PlanRevision:
+    """The session's poses that an approval for this purpose covers. RefusedError when there are none."""
     queue = context.loaded()
     if purpose in (Purpose.RETAKE, Purpose.RESUME) and context.recording is None:
         raise RefusedError("No session is open.", code="no-session", remedy="Run the plan to begin one.")
@@ -48,10 +48,10 @@ def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None)
             )
         if queue.status(index).state != "planned":
             queue.retake(index)
-        return (index,)
+        return PlanRevision(purpose, queue, (index,), queue.sha256, ())
     if purpose is Purpose.DRIFT_CHECK and context.recording is not None:
         raise RefusedError("A session is open.", code="session-open", remedy="Finish it first, then check.")
-    return _open(queue)
+    return PlanRevision(purpose, queue, _open(queue), queue.sha256, ())
 
 
 def _open(queue: PoseQueue) -> tuple[int, ...]:
@@ -60,20 +60,14 @@ def _open(queue: PoseQueue) -> tuple[int, ...]:
     return queue.open
 
 
-async def summarise(
-    context: SessionContext,
-    purpose: Purpose,
-    queue: PoseQueue,
-    poses: tuple[int, ...],
-    notes: tuple[str, ...],
-    changes: tuple[str, ...] = (),
-) -> MotionPreview:
+async def summarise(context: SessionContext, offered: PlanRevision, notes: tuple[str, ...]) -> MotionPreview:
     """Checks the whole path in the worker. LimitError: it is not free; RobotError: what the arm lacks."""
     try:
         require_free_space(context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
         raise RefusedError(f"{full} Nothing moved.", code="disk-full") from None
     start = (await context.arm()).joints_rad
+    queue, poses = offered.queue, offered.poses
     plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
     check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
     if check.problems:
@@ -83,11 +77,11 @@ async def summarise(
         check,
         start,
         overhead_s=POSE_OVERHEAD_S * len(poses),
-        purpose=_purpose_words(context, purpose, poses),
+        purpose=_purpose_words(context, offered.purpose, poses),
         plan_sha256=queue.sha256,
         poses=len(poses),
         first_move=f"{displacement(context, start, first)} to pose {poses[0] + 1}",
-        changes=changes,
+        changes=offered.changes,
         warnings=(*notes, *motion_warnings(context)),
     )
 

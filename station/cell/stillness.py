@@ -133,7 +133,8 @@ class StillnessMonitor:
             if found is None or unrest:
                 resting_since_ns = None
             else:
-                resting_since_ns = resting_since_ns or self._window_begin_ns(found)
+                newest_ns = self._states[-1].stamps.host_monotonic_ns
+                resting_since_ns = resting_since_ns or newest_ns - round(found.window_s * 1e9)
                 seen = look(resting_since_ns)
                 if seen is None:
                     unrest, remedy = UNSEEN, CHECK_CAMERA
@@ -165,10 +166,6 @@ class StillnessMonitor:
                 speed_rad_s=float(speeds[joint]),
                 limit_rad_s=limit,
             )
-
-    def _window_begin_ns(self, found: Stillness) -> int:
-        """Host monotonic time."""
-        return self._states[-1].stamps.host_monotonic_ns - round(found.window_s * 1e9)
 
 
 class RestingCheck:

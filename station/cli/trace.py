@@ -53,7 +53,8 @@ def trace_command(
         _record(subject, output, [s for s in _chosen(only) if not (still and s.moves)])
         return
     theirs = read_traces(Path(subject))
-    differences = compare(read_traces(other or _shipped(theirs)), theirs)
+    shipped = SHIPPED[500 if theirs.rate_hz > 125 else 125]
+    differences = compare(read_traces(other or shipped), theirs)
     if as_json:
         print_json(differences)
     else:
@@ -68,10 +69,6 @@ def _chosen(only: list[str] | None) -> list[Scenario]:
         text = f"No scenario is called {', '.join(sorted(unknown))}."
         raise RefusedError(text, code="no-scenario")
     return found
-
-
-def _shipped(theirs: TraceFile) -> Path:
-    return SHIPPED[500 if theirs.rate_hz > 125 else 125]
 
 
 def _record(host: str, output: Path, chosen: list[Scenario]) -> None:

@@ -130,15 +130,12 @@ class Monitor:
             mode=mode_word(state),
             held="" if context.cell.source == "playback" else what_holds(state),
             program=program_word(state),
-            speed_m_s=round(self._speed_m_s(state), 3),
+            speed_m_s=round(point_speed_m_s(context.geometry, state.joints_rad, state.joint_speeds_rad_s), 3),
             slider=round(state.target_speed_fraction, 3),
             joints_rad=state.joints_rad,
             base_from_flange=matrix4(flange_pose(state, identity.tcp_offset)),
             still=context.stillness.at_rest,
         )
-
-    def _speed_m_s(self, state: RobotState) -> float:
-        return point_speed_m_s(self._context.geometry, state.joints_rad, state.joint_speeds_rad_s)
 
     def _rate_hz(self) -> float:
         """Over the last round trip of at least a second."""

@@ -147,7 +147,10 @@ class Run:
             context.require_recording().require_space()
             await self._pose(index)
             taken += 1
-            self._show_times((time.monotonic() - started_s) / taken * len(todo))
+            # By this run's average; elapsed: the session's runs before this one included.
+            remaining_s = round((time.monotonic() - started_s) / taken * len(todo), 1)
+            elapsed_s = round(context.require_recording().elapsed_s, 1)
+            context.store.update_session(elapsed_s=elapsed_s, remaining_s=remaining_s)
 
     def _once_more(self) -> list[int]:
         """Poses that did not settle, once, under the same approval, where nobody can be asked.
@@ -208,11 +211,6 @@ class Run:
             text = f"The arm moved by {np.rad2deg(moved_rad):.1f}° while its path was checked."
             raise LimitError(text, code="arm-moved", moved_rad=moved_rad, limit_rad=JOGGED_RAD)
         await self._context.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
-
-    def _show_times(self, remaining_s: float) -> None:
-        """Elapsed, the session's runs before this one included; remaining, by this one's average."""
-        elapsed_s = round(self._context.require_recording().elapsed_s, 1)
-        self._context.store.update_session(elapsed_s=elapsed_s, remaining_s=round(remaining_s, 1))
 
     async def _rest(self) -> None:
         """Enter the state in which the session stands when its approval is used up."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from calibrate.geometry import Array, pose, project_to_rotation, random_rotation, rotation_exp
 from calibrate.kinematics import MODELS, forward
-from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount
+from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
 from station.cell.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig, matrix4, vector6
 from station.cell.errors import ConfigError
 from station.cell.scene import guess_from

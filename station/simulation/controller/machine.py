@@ -126,7 +126,7 @@ class Machine:
         self.robot.tick(due_ns, late)
         if self.lose_packets > 0:
             self.lose_packets -= 1
-            self.rtde.lose()
+            self.rtde.skipped += 1
         else:
             self.rtde.send_states()
         if self._real_time.connections:

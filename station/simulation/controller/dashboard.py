@@ -7,10 +7,8 @@ one may follow. `changes`, refused in local control. `cb3` and `e_series`, the f
 
 from __future__ import annotations
 
-import csv
-from pathlib import Path
-
 from station.devices.rtde import RuntimeState
+from station.simulation.controller.kinematics import read_table
 from station.simulation.controller.network import Connection, Service
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import version_of
@@ -26,8 +24,7 @@ UNLOCK_TOO_EARLY = (
     "Cannot unlock protective stop until 5s after occurrence. "
     "Always inspect cause of protective stop before unlocking"
 )
-with Path(__file__).with_name("dashboard.csv").open(newline="") as _stream:
-    VERBS = {row["verb"]: row for row in csv.DictReader(_stream)}
+VERBS = {row["verb"]: row for row in read_table("dashboard.csv")}
 
 
 def dashboard_service(host: str, robot: SimulatedRobot) -> Service:

@@ -3,14 +3,17 @@
 `calibrate.kinematics` is deliberately not used: the station compares the controller's flange pose with
 its own, and shared code would let a shared sign error cancel. A rigid transform here is a 12-tuple,
 the rows of its upper 3×4 block. Standard Denavit-Hartenberg parameters as published by Universal Robots,
-"DH parameters for calculations of kinematics and dynamics". Metres and radians.
+"DH parameters for calculations of kinematics and dynamics". Metres and radians. The table
+of every model is in `arms.csv`.
 """
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass, field
 from math import acos, atan2, copysign, cos, hypot, pi, sin, sqrt
 from operator import add
+from pathlib import Path
 
 Rigid = tuple[float, ...]
 """(12,) r00 r01 r02 tx r10 r11 r12 ty r20 r21 r22 tz"""
@@ -39,18 +42,19 @@ class ArmGeometry:
         return ArmGeometry(a, d, alpha, theta, self.published or self)
 
 
-def _table(a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> ArmGeometry:
-    return ArmGeometry((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6))
+def read_table(name: str) -> list[dict[str, str]]:
+    """Rows of a CSV file beside this module."""
+    with Path(__file__).with_name(name).open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def _geometry(a2_m: float, a3_m: float, d1_m: float, d4_m: float, d5_m: float, d6_m: float) -> ArmGeometry:
+    return ArmGeometry((0.0, a2_m, a3_m, 0.0, 0.0, 0.0), (d1_m, 0.0, 0.0, d4_m, d5_m, d6_m))
 
 
 TABLES = {
-    "UR3": _table(-0.24365, -0.21325, 0.1519, 0.11235, 0.08535, 0.0819),
-    "UR5": _table(-0.425, -0.39225, 0.089159, 0.10915, 0.09465, 0.0823),
-    "UR10": _table(-0.612, -0.5723, 0.1273, 0.163941, 0.1157, 0.0922),
-    "UR3e": _table(-0.24355, -0.2132, 0.15185, 0.13105, 0.08535, 0.0921),
-    "UR5e": _table(-0.425, -0.3922, 0.1625, 0.1333, 0.0997, 0.0996),
-    "UR10e": _table(-0.6127, -0.57155, 0.1807, 0.17415, 0.11985, 0.11655),
-    "UR16e": _table(-0.4784, -0.36, 0.1807, 0.17415, 0.11985, 0.11655),
+    row.pop("model"): _geometry(**{name: float(value) for name, value in row.items()})
+    for row in read_table("arms.csv")
 }
 
 

@@ -8,14 +8,12 @@ one of RTDE; empty: never.
 
 from __future__ import annotations
 
-import csv
 import random
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import msgspec
@@ -38,6 +36,7 @@ from station.simulation.controller.kinematics import (
     compose,
     forward,
     from_pose,
+    read_table,
     to_pose,
 )
 
@@ -157,16 +156,15 @@ def version_of(text: str) -> tuple[int, ...]:
 
 def _read() -> dict[str, dict[str, Variable]]:
     found: dict[str, dict[str, Variable]] = {"input": {}, "output": {}}
-    with Path(__file__).with_name("variables.csv").open(newline="") as stream:
-        for row in csv.DictReader(stream):
-            columns = ((False, row["cb3"]), (True, row["e_series"]))
-            since = {e: version_of(v) for e, v in columns if v}
-            variable = Variable(row["type"], since, tuple(map(float, row["rest"].split())))
-            stem, _, span = row["name"].rpartition("_")
-            first, dash, last = span.partition("-")
-            numbers = range(int(first), int(last) + 1) if dash else ()
-            names = [f"{stem}_{i}" for i in numbers] or [row["name"]]
-            found[row["direction"]] |= dict.fromkeys(names, variable)
+    for row in read_table("variables.csv"):
+        columns = ((False, row["cb3"]), (True, row["e_series"]))
+        since = {e: version_of(v) for e, v in columns if v}
+        variable = Variable(row["type"], since, tuple(map(float, row["rest"].split())))
+        stem, _, span = row["name"].rpartition("_")
+        first, dash, last = span.partition("-")
+        numbers = range(int(first), int(last) + 1) if dash else ()
+        names = [f"{stem}_{i}" for i in numbers] or [row["name"]]
+        found[row["direction"]] |= dict.fromkeys(names, variable)
     return found
 
 

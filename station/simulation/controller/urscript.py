@@ -79,6 +79,11 @@ class Scope(ChainMap[str, Value]):
     def global_only(self) -> Scope:
         return Scope(self.maps[-1])
 
+    def set_item(self, name: str, index: Value, value: Value) -> None:
+        """Change the list that has this name now: what made the value may have made another."""
+        items = self[name]
+        items[_place_of(items, index)] = value
+
     def enter(self, parameters: list[str], given: Sequence[Value], named: Mapping[str, Value]) -> Scope:
         """Make the scope of a function in this one."""
         values = {**dict(zip(parameters, given, strict=False)), **named}
@@ -98,7 +103,7 @@ class ScriptRun:
         code, program, self._lines = parse(text, builtins)
         names: dict[str, Any] = {
             "_0": Scope({}), "Pose": Pose, "call": _call, "halt": self._halt, "item": _item, "join": _join,
-            "kill": _kill, "operate": operate, "set_item": _set_item, "spend": self._spend,
+            "kill": _kill, "operate": operate, "spend": self._spend,
             "start": self._start, "truth": truth,
         } | {f"f_{name}": function for name, function in builtins.items()}  # fmt: skip
         exec(code, names)
@@ -215,10 +220,6 @@ def copied(value: Value) -> Value:
 
 def _item(items: Value, index: Value) -> Value:
     return items[_place_of(items, index)]
-
-
-def _set_item(items: Value, index: Value, value: Value) -> None:
-    items[_place_of(items, index)] = value
 
 
 def _place_of(items: Value, index: Value) -> int:

@@ -290,7 +290,7 @@ class _Parser:
             self._need("[")
             index = self._expression()
             if self._take("]") and self._take("="):
-                return f"set_item({self._scope}[{name!r}], {index}, {self._expression()})"
+                return f"{self._scope}.set_item({name!r}, {index}, {self._expression()})"
             self._place = before
         return self._expression()
 

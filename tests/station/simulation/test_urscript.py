@@ -188,6 +188,13 @@ end
     assert said(text) == [1, [9, 7], [9, 2]]
 
 
+def test_an_item_is_set_in_the_list_that_is_there_when_its_value_is_known() -> None:
+    text = (
+        "def prog():\n a = [1, 2]\n def other():\n a = [3, 4]\n return 9\n end\n a[0] = other()\n say(a)\nend"
+    )
+    assert said(text) == [[9, 4]]
+
+
 def test_threads_share_globals_and_have_one_turn_each_cycle() -> None:
     text = """
 def prog():

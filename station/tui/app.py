@@ -37,15 +37,14 @@ from station.tui.desk import Connect, Desk, KnowingApp, ScreenLink, StatusChange
 from station.tui.dialogs import Confirm, ConfirmMotion, Help
 from station.tui.frame import SESSION
 from station.tui.installed import LOOK_S, Marks, Result, marks, read_past, read_result, state_root
-from station.tui.live import WATCHABLE, LiveScreen, LogScreen, Player, ReplayScreen
+from station.tui.live import PLAYER_KEYS, WATCHABLE, LiveScreen, LogScreen, ReplayScreen
 from station.tui.plan import PlanScreen
 from station.tui.replay import ReplayLink
 from station.tui.result import InstallScreen, SolveScreen, VerifyScreen
 from station.tui.results import (
-    begin_drift_check,
+    check_drift,
     check_session,
     discard,
-    end_drift_check,
     export_result,
     install_result,
     recover_session,
@@ -222,13 +221,27 @@ class StationApp(KnowingApp):
         """Only for a screen that shows them, and only as large as it can show."""
         while True:
             await asyncio.sleep(PREVIEW_PERIOD_S)
-            screen = self.screen
-            link = screen.player if isinstance(screen, ReplayScreen) else self.desk.link
-            if link is None:
+            if (link := self.shown_link) is None:
                 continue
-            for preview in screen.query(PreviewPane):
+            for preview in self.screen.query(PreviewPane):
                 with contextlib.suppress(OSError, StationError):
                     await preview.fetch(link)
+
+    @property
+    def shown_link(self) -> ScreenLink | None:
+        """What the screen shows: the daemon, or a recording."""
+        return self.screen.player if isinstance(self.screen, ReplayScreen) else self.desk.link
+
+    def action_play(self, what: str, by: float = 0.0) -> None:
+        """Steer the playback that is shown."""
+        if isinstance(player := self.shown_link, ReplayLink):
+            match what:
+                case "toggle":
+                    player.toggle()
+                case "step":
+                    player.step(int(by))
+                case "seek":
+                    player.seek(by)
 
     def on_status_changed(self, message: StatusChanged) -> None:
         before, status = self.known.live, message.status
@@ -377,9 +390,7 @@ class StationApp(KnowingApp):
 
     @work(exclusive=True, group="drift", exit_on_error=False)
     async def action_drift_check(self) -> None:
-        if plan_sha256 := await begin_drift_check(self.desk, self.approves):
-            await self.switch_mode("capture")
-            await end_drift_check(self.desk, plan_sha256)
+        await check_drift(self.desk, self.approves)
 
     # --- keys ---
 
@@ -496,17 +507,10 @@ class StationApp(KnowingApp):
                 )
 
 
-class ReplayApp(Player, StationApp):
+class ReplayApp(StationApp):
     """The same screens over a recording alone: no station stands behind them."""
 
-    BINDINGS: ClassVar[list[BindingType]] = [*Player.BINDINGS, *StationApp.BINDINGS]
-
-    def __init__(self, link: ReplayLink) -> None:
-        async def connect() -> ScreenLink:
-            return link
-
-        super().__init__(connect)
-        self.player = link
+    BINDINGS: ClassVar[list[BindingType]] = [*PLAYER_KEYS, *StationApp.BINDINGS]
 
 
 def run(socket: Path, who: str = "") -> None:
@@ -523,6 +527,11 @@ def run(socket: Path, who: str = "") -> None:
 
 def run_replay(recording: Path) -> None:
     """The live screen over a recording; no daemon is asked. StationError when it cannot be read."""
-    app = ReplayApp(ReplayLink(recording))
+    link = ReplayLink(recording)
+
+    async def connect() -> ScreenLink:
+        return link
+
+    app = ReplayApp(connect)
     PreviewPane.graphics = detect()
     app.run()

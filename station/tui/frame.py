@@ -294,9 +294,9 @@ class Framed(Screen[R]):
 
     def _hear(self, known: Known) -> None:
         self.known = known
-        self.call_next(self._draw)
+        self.call_next(self._show_known)
 
-    def _draw(self) -> None:
+    def _show_known(self) -> None:
         # Closing, the app takes the screens' parts away before its workers end.
         if self.is_mounted and self.app.is_running and self in self.app.screen_stack:
             self.show(self.known)

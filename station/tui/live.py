@@ -398,35 +398,19 @@ class LiveScreen(StationScreen):
 
 WATCHABLE = (StationState.IDLE, StationState.DISCONNECTED)
 """A cell at rest: nobody looks at an old recording while the arm works or waits for an answer."""
-
-
 JUMP_S = 10.0
+PLAYER_KEYS: list[BindingType] = [
+    Binding("space", "app.play('toggle')", "Play/Pause", tooltip="Stop the playback here, or go on"),
+    Binding("left", "app.play('step', -1)", "Image back", tooltip="To the image before this one"),
+    Binding("right", "app.play('step', 1)", "Image on", tooltip="To the next image"),
+    Binding("pageup", f"app.play('seek', {-JUMP_S})", "10 s back", show=False, tooltip="Ten seconds back"),
+    Binding("pagedown", f"app.play('seek', {JUMP_S})", "10 s on", show=False, tooltip="Ten seconds on"),
+    Binding("home", "app.play('seek', -1e9)", "Start", show=False, tooltip="To the start of the recording"),
+]
+"""For a playback beside a cell, and for an app over a recording alone."""
 
 
-class Player:
-    """The keys of a playback; for a screen of its own beside a cell, and for a whole app without one."""
-
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("space", "play", "Play/Pause", tooltip="Stop the playback here, or go on"),
-        Binding("left", "step(-1)", "Image back", tooltip="To the image before this one"),
-        Binding("right", "step(1)", "Image on", tooltip="To the next image"),
-        Binding("pageup", f"seek({-JUMP_S})", "10 s back", show=False, tooltip="Ten seconds back"),
-        Binding("pagedown", f"seek({JUMP_S})", "10 s on", show=False, tooltip="Ten seconds on"),
-        Binding("home", f"seek({-1e9})", "Start", show=False, tooltip="To the start of the recording"),
-    ]
-    player: ReplayLink
-
-    def action_play(self) -> None:
-        self.player.toggle()
-
-    def action_step(self, by: int) -> None:
-        self.player.step(by)
-
-    def action_seek(self, by_s: float) -> None:
-        self.player.seek(by_s)
-
-
-class ReplayScreen(Player, LiveScreen):
+class ReplayScreen(LiveScreen):
     """Shows `link`'s statuses in place of the daemon's. STOP still goes to the daemon."""
 
     NAME = "Playback"
@@ -434,7 +418,7 @@ class ReplayScreen(Player, LiveScreen):
         "PLAYBACK of a recording. Nothing can be commanded; F12 still stops this cell's arm. Escape leaves."
     )
     BINDINGS: ClassVar[list[BindingType]] = [
-        *Player.BINDINGS,
+        *PLAYER_KEYS,
         Binding("escape", "close", "Back", tooltip="Leave the playback"),
     ]
 
@@ -444,7 +428,7 @@ class ReplayScreen(Player, LiveScreen):
         self._played: StationStatus | None = None
 
     def on_mount(self) -> None:
-        self.play()
+        self.follow()
 
     def show(self, known: Known) -> None:
         """The cell's own status shows nothing here, but its work ends the playback."""
@@ -456,7 +440,7 @@ class ReplayScreen(Player, LiveScreen):
         super().show(Known(self._played))
 
     @work(exclusive=True, exit_on_error=False)
-    async def play(self) -> None:
+    async def follow(self) -> None:
         async for status in self.player.statuses():
             self._played = status
             super().show(Known(status))

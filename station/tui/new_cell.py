@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -33,7 +34,6 @@ from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_l
 from station.tui.new_cell_steps import DRAWINGS, SavePage, StepPage, pages
 from station.tui.task import Step
 from station.tui.themes import ThemedApp
-from station.tui.widgets.graphics import Graphics
 from station.tui.widgets.preview import PreviewPane
 from station.tui.words import dim
 
@@ -77,7 +77,6 @@ class NewCell(ThemedApp[Ending]):
         "rehearse": (CellStep.SAVE,),
     }
     """Steps in which an action means something."""
-    graphics: Graphics | None = None
     step: reactive[CellStep] = reactive(CellStep.ROBOT, init=False)
 
     def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
@@ -121,16 +120,13 @@ class NewCell(ThemedApp[Ending]):
     async def resume(self) -> None:
         """Connect to what the draft names; the first step that is not done is shown."""
         draft = self.setup.draft
-        try:
+        with self._problems():
             if draft.host:
                 self._say_live(f"Asking {draft.host} …")
                 await self.setup.connect(draft.host)
             if draft.camera is not None:
                 await self.setup.open(draft.camera)
-        except StationError as problem:
-            self._say_problem(str(problem))
-            return
-        self.step = flow.next_step(self.setup.draft)
+            self.step = flow.next_step(self.setup.draft)
 
     # --- what the devices show ---
 
@@ -237,19 +233,15 @@ class NewCell(ThemedApp[Ending]):
         page = self.page
         if page.working:
             self._say_live(page.working)
-        try:
+        with self._problems():
             if chosen is not None:
                 await self.setup.open(chosen)
-            done = await page.accept(self.query_one("#typed", Input).value.strip())
-        except (CodedError, OSError) as problem:
-            self._say_problem(str(problem))
-            return
-        if not done:
-            self.watch_step()
-        elif page.step is CellStep.SAVE:
-            self.exit("serve")
-        else:
-            self.step = STEPS[STEPS.index(page.step) + 1]
+            if not await page.accept(self.query_one("#typed", Input).value.strip()):
+                self.watch_step()
+            elif page.step is CellStep.SAVE:
+                self.exit("serve")
+            else:
+                self.step = STEPS[STEPS.index(page.step) + 1]
 
     def action_rehearse(self) -> None:
         if self.setup.draft.written:
@@ -269,22 +261,15 @@ class NewCell(ThemedApp[Ending]):
 
     @work(group="print", exclusive=True, exit_on_error=False)
     async def action_print_board(self) -> None:
-        try:
+        with self._problems():
             path = await asyncio.to_thread(self.setup.print_board)
-        except (CodedError, OSError) as problem:
-            self._say_problem(str(problem))
-            return
-        self.notify(
-            f"Written: {path}. Print it at 100 %, glue it to something flat, and measure one square.",
-            timeout=20,
-        )
+            how = "Print it at 100 %, glue it to something flat, and measure one square."
+            self.notify(f"Written: {path}. {how}", timeout=20)
 
     @work(group="expose", exclusive=True, exit_on_error=False)
     async def action_expose(self, factor: float) -> None:
-        try:
+        with self._problems():
             await self.setup.expose(factor)
-        except StationError as problem:
-            self._say_problem(str(problem))
 
     def action_table_here(self) -> None:
         if self.setup.state is not None:
@@ -350,6 +335,14 @@ class NewCell(ThemedApp[Ending]):
 
     def _say_live(self, text: str) -> None:
         self.query_one("#live-lines", Static).update(text)
+
+    @contextmanager
+    def _problems(self) -> Iterator[None]:
+        """What goes wrong is said on the page."""
+        try:
+            yield
+        except (CodedError, OSError) as problem:
+            self._say_problem(str(problem))
 
     def _say_problem(self, text: str) -> None:
         problem = self.query_one("#problem", Static)

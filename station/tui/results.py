@@ -47,14 +47,14 @@ async def check_session(desk: Desk, recording: str, folder: str) -> None:
     await desk.question(JobScreen(title, "calibrate.cli", *arguments, close_on=()))
 
 
-async def begin_drift_check(desk: Desk, approves: Approve) -> str:
-    """Plan, ask, start; the plan's SHA-256, empty when nothing moves."""
-    status = desk.known.live
-    return "" if status is None else await desk.start(start_drift_check(desk, status, approves)) or ""
-
-
-async def end_drift_check(desk: Desk, plan_sha256: str) -> None:
-    """Wait for its recording, also after pauses and new approvals in between; then the verdict."""
+async def check_drift(desk: Desk, approves: Approve) -> None:
+    """Plan, ask, capture, also after pauses and new approvals in between; then the verdict."""
+    if (status := desk.known.live) is None:
+        return
+    plan_sha256 = await desk.start(start_drift_check(desk, status, approves))
+    if not plan_sha256:
+        return
+    await desk.app.switch_mode("capture")
     session = await recorded(desk, plan_sha256)
     if session is None:
         desk.app.notify(NO_VERDICT, timeout=10)

@@ -25,7 +25,10 @@ SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 
 
 def replay_app(pace: float) -> ReplayApp:
-    return ReplayApp(ReplayLink(SAMPLE, pace))
+    async def connect() -> ReplayLink:
+        return ReplayLink(SAMPLE, pace)
+
+    return ReplayApp(connect)
 
 
 def test_the_arm_stands_where_it_stood_when_each_picture_was_taken() -> None:

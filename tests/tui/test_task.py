@@ -175,6 +175,11 @@ async def test_stop_stands_whole_on_every_screen_and_question(link: FakeLink, si
             stops = link.verbs.count("stop")
             await pilot.click(StopBlock)
             await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops + 1)  # type: ignore[misc]
+            link.show(idle(StationState.STOPPED))  # what is known goes on while a question is open
+            await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))
+            assert pilot.app.screen.query_one(StopBlock).latched
+            link.show(idle())
+            await until(pilot, lambda: "IDLE" in text_of(pilot.app, "#bar"))
             await pilot.app.pop_screen()
 
 

@@ -411,7 +411,7 @@ def _wrong_arm(rng: np.random.Generator, joints: Array, factor: float) -> RobotM
             a_m=tuple((_ARM.a_m + a).tolist()),
             d_m=tuple((_ARM.d_m + d).tolist()),
             alpha_rad=tuple((_ARM.alpha_rad + alpha).tolist()),
-            theta_offset_rad=tuple((_ARM.theta_offset_rad + theta).tolist()),
+            theta_rad=tuple((_ARM.theta_rad + theta).tolist()),
         )
 
     scatter = (forward(arm(1e-4), joints) - forward(_ARM, joints))[:, :3, 3].std(axis=0)

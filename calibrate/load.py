@@ -95,13 +95,9 @@ def load_views(
                 images=pictures,
             )
         raise _too_few(recording, len(views), pictures, missing, fewest)
-    model = CameraModel(
-        model.width or next(iter(seen.values())).width,
-        model.height or next(iter(seen.values())).height,
-        model.matrix,
-        model.distortion,
-        model.distortion_model,
-    )
+    if not (model.width and model.height):
+        first = next(iter(seen.values()))
+        model = msgspec.structs.replace(model, width=first.width, height=first.height)
     found = ViewSet(info.mount, tuple(views), model, info.robot.model, _calibrated_arm(recording))
     return LoadedViews(found, spec, tuple(missing), seen, recording.losses)
 
@@ -129,13 +125,8 @@ def _calibrated_arm(recording: Recording) -> RobotModel | None:
             code="arm-kinematics",
             remedy="Export the recording to a folder and import it again without the robot's model.",
         ) from None
-    return replace(
-        published,
-        a_m=stated.a_m,
-        d_m=stated.d_m,
-        alpha_rad=stated.alpha_rad,
-        theta_offset_rad=stated.theta_rad,
-    )
+    a, d, alpha, theta = stated.a_m, stated.d_m, stated.alpha_rad, stated.theta_rad
+    return replace(published, a_m=a, d_m=d, alpha_rad=alpha, theta_rad=theta)
 
 
 class _Origin(msgspec.Struct):

@@ -11,23 +11,10 @@ import typer
 from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
-from calibrate.cli.contracts import (
-    CompareJson,
-    MethodJson,
-    RejectedJson,
-    SolveJson,
-    ViewsJson,
-    WarningJson,
-)
+from calibrate.cli.contracts import CompareJson, MethodJson, RejectedJson, SolveJson, ViewsJson, WarningJson
 from calibrate.cli.installed import Root, history_rows
 from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
-from calibrate.cli.output import (
-    AsJson,
-    check_target,
-    detection_progress,
-    out,
-    print_json,
-)
+from calibrate.cli.output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError, UsageError
 from calibrate.files.calibration import ViewWeight, write_calibration, write_output
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
@@ -177,11 +164,7 @@ def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:
 
 
 @takes(picture_options)
-def compare(
-    recording: Rec,
-    options: JobOptions,
-    as_json: AsJson = False,
-) -> None:
+def compare(recording: Rec, options: JobOptions, as_json: AsJson = False) -> None:
     """Compare all methods on the same views.
 
     e_t, e_R: held-out error; spread: of the board's pose over the views; px: reprojection error; σ from ours:

@@ -169,8 +169,7 @@ class DhTable(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, model: RobotModel) -> DhTable:
-        columns = (model.a_m, model.d_m, model.alpha_rad, model.theta_offset_rad, model.beta_rad)
-        return cls(*columns)  # type: ignore[arg-type]
+        return msgspec.convert(model, cls, from_attributes=True)
 
 
 class HeldOutViews(msgspec.Struct, frozen=True):

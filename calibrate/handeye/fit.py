@@ -9,12 +9,7 @@ from scipy import special
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
-from calibrate.handeye.arm import (
-    RELATIVE_SIGMA,
-    arm_postures,
-    by_parameters,
-    flex_motion,
-)
+from calibrate.handeye.arm import RELATIVE_SIGMA, arm_postures, by_parameters, flex_motion
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.cell_state import CellState, Layout

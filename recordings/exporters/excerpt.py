@@ -19,7 +19,7 @@ _SHOWN = (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM, Topic.ANNOTATIONS)
 
 
 def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> Path:
-    """Writes `output` (.mcap) with lossless PNG images; it solves like the whole. RecordingError.
+    """Writes `output` (.mcap), raw images as lossless PNG; it solves like the whole. RecordingError.
 
     Robot states stay when they lie within `window_s` of a view by the host's monotonic clock.
     """

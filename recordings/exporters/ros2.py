@@ -173,22 +173,11 @@ class _Messages:
         """A late listener still gets the fixed frames."""
         if topic != "/tf_static":
             return []
-        from rosbags.interfaces import (
-            Qos,
-            QosDurability,
-            QosHistory,
-            QosLiveliness,
-            QosReliability,
-            QosTime,
-        )  # fmt: skip
+        from rosbags import interfaces as ros
 
-        never = QosTime(2147483647, 4294967295)
-        return [
-            Qos(
-                QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
-                never, never, QosLiveliness.AUTOMATIC, never, False,
-            )
-        ]  # fmt: skip
+        never, kept = ros.QosTime(2147483647, 4294967295), (ros.QosHistory.KEEP_LAST, 1)
+        sent = ros.QosReliability.RELIABLE, ros.QosDurability.TRANSIENT_LOCAL
+        return [ros.Qos(*kept, *sent, never, never, ros.QosLiveliness.AUTOMATIC, never, False)]
 
     def header(self, time_ns: int, frame: str) -> Any:
         seconds, nanoseconds = divmod(time_ns, _NS)

@@ -14,12 +14,7 @@ from array import array
 from collections.abc import Callable
 from pathlib import Path
 
-from recordings.errors import (
-    CorruptRecordingError,
-    RecordingError,
-    UnfinishedRecordingError,
-    recover_line,
-)
+from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError, recover_line
 from recordings.mcap import checksum
 from recordings.mcap.contents import Contents
 from recordings.mcap.records import (

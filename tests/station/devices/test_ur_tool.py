@@ -39,7 +39,7 @@ def sample(arm: RobotModel, joints_rad: Vector6, tool: Vector6) -> RobotState:
 
 
 def stated(arm: RobotModel, tool: Vector6) -> Installation:
-    return Installation(tool, (arm.theta_offset_rad, arm.a_m, arm.d_m, arm.alpha_rad))  # type: ignore[arg-type]
+    return Installation(tool, (arm.theta_rad, arm.a_m, arm.d_m, arm.alpha_rad))  # type: ignore[arg-type]
 
 
 def test_the_controllers_words_are_taken_when_they_fit() -> None:
@@ -52,7 +52,7 @@ def test_the_factory_calibration_is_told_where_it_explains_the_poses() -> None:
     own = FACTORY
     told = TcpCheck(UR10, False, sample(own, HERE, TOOL), stated(own, TOOL)).kinematics
     assert told is not None and (told.model, told.source) == ("UR10", "controller")
-    assert told.a_m == own.a_m and told.theta_rad == own.theta_offset_rad
+    assert told.a_m == own.a_m and told.theta_rad == own.theta_rad
     # Stated untruly: the poses follow another table than the one on the wire.
     far = UR10.calibrated(a_m=(0.0, 0.003, 0.0, 0.0, 0.0, 0.0))
     assert TcpCheck(UR10, False, sample(far, HERE, TOOL), stated(UR10, TOOL)).kinematics is None

@@ -209,18 +209,14 @@ class ArmMotions:
             raise ScriptRuntimeError(f"{name} with a={a}, t={t}")
         self._take_arm(name)
         self._robot.journal.count("script", name)
-        motion = self._robot.arm.stream(wanted, a)
-        self._mover, self._orphan = self._thread(), None
         left = self._robot.cycles(t) if t > 0 else 0
-        try:
-            while True:
-                yield
-                left -= 1
-                if motion.done or (left <= 0 if t > 0 else arrived()):
-                    return
-        finally:
-            self._mover = None
-            self._orphan = motion
+
+        def over() -> bool:
+            nonlocal left
+            left -= 1
+            return left <= 0 if t > 0 else arrived()
+
+        yield from self._hold(self._robot.arm.stream(wanted, a), over)
 
     def _optimovej(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
         """a and v are shares of what the arm can do, as in optimovel."""
@@ -249,16 +245,17 @@ class ArmMotions:
         if self._mover not in (None, self._thread()):
             raise ScriptRuntimeError(f"{name}: another thread is already controlling the robot")
 
-    def _hold(self, motion: JointMotion) -> Wait:
-        """Waits for its end. A thread killed meanwhile leaves it to whoever stops it in the same cycle."""
+    def _hold(self, motion: JointMotion, over: Callable[[], bool] = lambda: False) -> Wait:
+        """Waits for its end, or until it is over. Then whoever moves or stops in the same cycle has it."""
         self._mover, self._orphan = self._thread(), None
         try:
             while not motion.done:
                 yield
+                if over():
+                    return
         finally:
             self._mover = None
-            if not motion.done:
-                self._orphan = motion
+            self._orphan = None if motion.done else motion
 
     # -- torques ----------------------------------------------------------------------------------------
 

@@ -74,9 +74,8 @@ def make_cell(
         raise ConfigError(
             f"no simulated cell '{scene}' with noise '{noise}' and mount '{mount}'",
             code="unknown-cell",
-            remedy=f"Scenes are {', '.join(scenes)}, noise levels {', '.join(_NOISE)}, mounts eye-in-hand "
-            "and "
-            "eye-to-hand.",
+            remedy=f"Scenes are {', '.join(scenes)}, noise levels {', '.join(_NOISE)}, "
+            "mounts eye-in-hand and eye-to-hand.",
         )
     rng = np.random.default_rng([2026, seed])
     published = scenes[scene]()

@@ -215,8 +215,10 @@ async def test_free_running_frames_come_in_order_and_complete(server: SimulatedG
     assert numbers == list(range(numbers[0], numbers[0] + 60))
     assert [p.sequence for p in pictures] == list(range(60))
     assert {p.gain_db for p in pictures} == {2.0}
-    seconds = (pictures[-1].stamps.device_ns - pictures[0].stamps.device_ns) / 1e9
-    assert 40 < 59 / seconds < 80, "75 a second; less where the simulator is held up"
+    apart_s = np.diff([p.stamps.device_ns for p in pictures]) / 1e9
+    assert apart_s.mean() > 1 / 80 and apart_s.min() < 1 / 60, (
+        "75 a second, where nothing holds up the simulator"
+    )
 
 
 async def test_without_pygobject_the_operator_is_told_what_to_install(

@@ -127,7 +127,10 @@ def solve_recording(
     watch.lap("solve")
     verified = None
     if verify is not None:
-        verified = _verify(verify, replace(options, board=loaded.board, square_m=None), solution, progress)
+        same = replace(options, board=loaded.board, square_m=None, camera=solution.camera, without=())
+        same = replace(same, find_intrinsics=False, time_offset=None)
+        elsewhere = prepare_views(verify, same, progress, 1)
+        verified = verify_elsewhere(solution, elsewhere.views, verify.name)
         solution = _judged_by(verified, solution)
         watch.lap("verify")
     used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
@@ -151,11 +154,6 @@ def solve_recording(
         calibration=calibration,
         verified=verified,
     )
-
-
-def _verify(path: Path, options: JobOptions, solution: Solution, progress: Progress | None) -> Verification:
-    options = replace(options, camera=solution.camera, find_intrinsics=False, without=(), time_offset=None)
-    return verify_elsewhere(solution, prepare_views(path, options, progress, 1).views, path.name)
 
 
 def _judged_by(verified: Verification, solution: Solution) -> Solution:

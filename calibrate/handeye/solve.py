@@ -83,7 +83,8 @@ def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution
 def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     """Estimate from all views. PosesDisagreeError names the reading that would explain the recording."""
     priors = _priors(views, options)
-    poses = pose_views(views, _focal_sigma(priors), priors.board.square)
+    focal_sigma = float(min(priors.lens.sigma[0] / priors.lens.mean[0], _FREE_FOCAL))
+    poses = pose_views(views, focal_sigma, priors.board.square)
     session, fit, disagree = Explanation(Reading.AS_RECORDED, 0.0), None, None
     try:
         fit = fit_cell(views, priors, options.seed, options.model_arm)
@@ -125,11 +126,6 @@ def _priors(views: ViewSet, options: SolveOptions) -> Priors:
         return Priors(LensPrior.unknown(views.camera), options.board)
     sigma = None if options.lens_sigma is None else np.array(options.lens_sigma)
     return Priors(LensPrior.given(views.camera, sigma), options.board)
-
-
-def _focal_sigma(priors: Priors) -> float:
-    sigma, focal = priors.lens.sigma[0], priors.lens.mean[0]
-    return float(min(sigma / focal, _FREE_FOCAL))
 
 
 def _doubtful(solution: Solution) -> bool:

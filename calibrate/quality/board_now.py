@@ -47,7 +47,8 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
     readings = [_shaped(reading, view, calibration) for reading in candidate_poses(view, camera, board)]
     at = [E @ X @ r.camera_from_board if in_hand else X @ r.camera_from_board for r in readings]
     misses = [difference(each if in_hand else inverse(E) @ each, place) for each in at]
-    same = [k for k, miss in enumerate(misses) if _is_small(miss)]
+    near = (_SAME_PLACE_M, _SAME_PLACE_RAD)
+    same = [k for k, miss in enumerate(misses) if (np.linalg.norm(miss.reshape(2, 3), axis=1) < near).all()]
     if same and not in_hand:
         raise BadViewsError(
             "The board is still on the flange.",
@@ -88,10 +89,6 @@ def found_points(calibration: Calibration, board: BoardSpec) -> Array:
     whole = BoardView(0, "", np.eye(4), points, np.zeros((len(points), 2)))
     observed = observe_views(ViewSet(calibration.mount, (whole,), calibration.intrinsics.model))
     return np.asarray(bent_points(observed, found.numbers)[0])
-
-
-def _is_small(miss: Array) -> bool:
-    return bool(np.linalg.norm(miss[:3]) < _SAME_PLACE_M and np.linalg.norm(miss[3:]) < _SAME_PLACE_RAD)
 
 
 def offset_covariance(

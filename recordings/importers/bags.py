@@ -138,18 +138,19 @@ class _McapBag:
     """One or several MCAP files, with ROS 2 messages, foxglove's, or both."""
 
     def __init__(self, paths: list[Path], progress: Progress) -> None:
+        self._descriptors: list[int] = []
         self._files: list[tuple[Contents, Source]] = []
         self.declared: list[tuple[str, str, str, int]] = []
         done, total = 0, sum(path.stat().st_size for path in paths)
         try:
             for path in paths:
-                self._files.append((Contents(), Source(open_file(path))))
+                self._descriptors.append(open_file(path))
 
                 def scanned(bytes_done: int, before: int = done) -> None:
                     progress(before + bytes_done, total, "checking the bag")
 
-                contents, source, _ = scan_file(self._files[-1][1].descriptor, path, _RESCUE, scanned)
-                self._files[-1] = (contents, source)
+                contents, source, _ = scan_file(self._descriptors[-1], path, _RESCUE, scanned)
+                self._files.append((contents, source))
                 done += source.size_bytes
                 if SESSION_RECORDS[0] in contents.metadata:
                     remedy = f"Solve it: calibrate solve {path}"
@@ -167,9 +168,8 @@ class _McapBag:
             raise
 
     def close(self) -> None:
-        for _, source in self._files:
-            os.close(source.descriptor)
-        self._files = []
+        while self._descriptors:
+            os.close(self._descriptors.pop())
 
     def read(self, topic: str, places: list[int] | None, limit_bytes: int | None) -> _Messages:
         first, wanted = 0, None if places is None else list(places)

@@ -21,19 +21,13 @@ from calibrate.files.calibration import (
 from calibrate.files.gate import Gate
 from calibrate.files.hooks import HookRun
 from calibrate.files.validity import Validity
-from calibrate.results import BoardShape, HoldoutScore
+from calibrate.results import BoardShape, HoldoutScore, RejectedView
 from recordings.schema.messages import Matrix4, Mount, TimeSource
-
-
-class RejectedJson(msgspec.Struct, frozen=True):
-    index: int
-    reason: str
-    kind: str
 
 
 class ViewsJson(msgspec.Struct, frozen=True):
     used: list[int]
-    rejected: list[RejectedJson]
+    rejected: list[RejectedView]
     weights: list[ViewWeight]
 
 

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
-from calibrate.cli.contracts import CompareJson, MethodJson, RejectedJson, SolveJson, ViewsJson, WarningJson
+from calibrate.cli.contracts import CompareJson, MethodJson, SolveJson, ViewsJson, WarningJson
 from calibrate.cli.installed import Root, history_rows
 from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.cli.output import AsJson, check_target, detection_progress, out, print_json
@@ -90,7 +90,7 @@ def solve_json(job: SolvedRecording) -> SolveJson:
         covariance=found.covariance,
         views=ViewsJson(
             found.views.used,
-            [RejectedJson(view.index, view.reason, view.kind) for view in found.views.rejected],
+            found.views.rejected,
             [ViewWeight(index, weight) for index, weight in job.solution.weights.items()],
         ),
         intrinsics=found.intrinsics,

@@ -56,12 +56,12 @@ CONTROL_PATHS = [pytest.param("ur_rtde", marks=no_library), "script"]
 
 @pytest.fixture(params=CONTROL_PATHS)
 def control_path(request: pytest.FixtureRequest) -> ControlPath:
-    """What asks for it is tested with both ways of driving an arm."""
+    """Both ways of driving an arm, each in a test of its own."""
     return request.param
 
 
 def asked(admin: AdminClient, what: str) -> int:
-    """How often a controller was told this: a key of its log's counts, or of CONTROL_WORDS."""
+    """Count what a controller was told: a key of its log's counts, or of CONTROL_WORDS."""
     counts = admin.ask("log")["counts"]
     return sum(int(counts.get(word, 0)) for word in CONTROL_WORDS.get(what, (what,)))
 
@@ -91,7 +91,7 @@ def functions_called(text: str) -> set[str]:
 
 
 def check_allow_list(host: str) -> None:
-    """What the simulated controller there was ever asked is on the list, and its moves within the caps."""
+    """Check that all it was ever asked is on the list, and its moves are within the caps."""
     with AdminClient(host) as admin:
         log = admin.ask("log")
     foreign = {c for c in log["counts"] if not c.startswith("controller: ")} - MAY_BE_SENT

@@ -31,13 +31,13 @@ TRIES = 4
 
 @dataclass
 class Outcome:
-    """What a fault in mid-move did. Times since the fault, less what this computer came late itself."""
+    """Effect of a fault in mid-move. Times since the fault, less what this computer came late itself."""
 
     error: RobotError
     noticed_s: float
     stopped_s: float
     late_s: float
-    """How late this process or the controller's clock came meanwhile, at worst."""
+    """Worst lateness of this process or of the controller's clock meanwhile."""
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Cell:
     robot: UrRobot
     beating: bool = True
     late_s: float = 0.0
-    """How late the heart beat, at worst."""
+    """Worst lateness of the heartbeat."""
     _tasks: list[asyncio.Task[Any]] = field(default_factory=list)
 
     def start_heart(self) -> None:
@@ -69,7 +69,7 @@ class Cell:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def speed_rad_s(self) -> float:
-        """Of the fastest joint, by the controller's own account; works when every link to it is cut."""
+        """Speed of the fastest joint by the controller's own account, which outlives every cut link."""
         return max(map(abs, self.admin.ask("state")["joint_speeds_rad_s"]))
 
     def joints_rad(self) -> list[float]:
@@ -137,7 +137,7 @@ class Cell:
         return Outcome(error, noticed[0] - late_s, stopped - late_s, late_s)
 
     def clock_late_s(self) -> float:
-        """How late the controller's cycles came, at worst since its start."""
+        """Worst lateness of the controller's cycles since its start."""
         return float(self.admin.ask("stats")["worst_lateness_ms"]) / 1000
 
     async def stays_at_rest(self, seconds: float = 0.2) -> None:

@@ -33,7 +33,7 @@ PLAIN = re.compile(
 
 
 def sources(pattern: str) -> list[Path]:
-    """What is shipped or started by people; not the simulation, which must know what it must refuse."""
+    """List what is shipped or started by people; not the simulation, which must know what it must refuse."""
     folders = ["recordings", "calibrate", "station", "systemd", "benchmarks", "docs"]
     found = [p for folder in folders for p in (ROOT / folder).rglob(pattern) if p.is_file()]
     return [p for p in found if ROOT / "station" / "simulation" not in p.parents]

@@ -276,7 +276,7 @@ DOCUMENT = Path(__file__).parent.parent.parent / "docs/integrator/import.md"
 
 
 def test_the_recipes_for_poses_of_other_tools_give_the_pose(tmp_path: Path) -> None:
-    """As they stand in the document, for one flange pose told in each convention."""
+    """Rows as they stand in the document, for one flange pose told in each convention."""
     from scipy.spatial.transform import Rotation
 
     text = DOCUMENT.read_text()

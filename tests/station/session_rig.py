@@ -335,11 +335,11 @@ class HeldDisk(asyncio.Event):
 
     fails = False
     asked = 0
-    """How often it was to take everything so far."""
+    """Requests to take everything so far."""
 
 
 def crash(rig: Rig) -> None:
-    """What SIGKILL leaves: no sealing, no goodbye, the file as the disk has it."""
+    """Leave what SIGKILL leaves: no sealing, no goodbye, the file as the disk has it."""
     for task in (*rig.session._tasks, rig.session._run):
         if task is not None:
             task.cancel()
@@ -351,7 +351,7 @@ def crash(rig: Rig) -> None:
 
 
 def sealed(rig: Rig) -> Recording:
-    """What the session wrote."""
+    """Open what the session wrote."""
     return open_recording(Path(rig.session.store.status.session.recording))
 
 

@@ -44,7 +44,7 @@ def short_plan() -> Plan:
 
 
 class Notified:
-    """What systemd would hear."""
+    """A socket in systemd's place, with what it would hear."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "notify"
@@ -143,7 +143,7 @@ class SystemRig:
     def __init__(self, controller: SimulatedController, folder: Path, root: Path, control: str = "") -> None:
         self.controller, self.folder, self.root = controller, folder, root
         self.control = control
-        """What drives the arm; empty: what is installed."""
+        """Control path that drives the arm; empty: the installed one."""
         self.admin: AdminClient = controller.admin()
         self.daemons: list[DaemonProcess] = []
         self._watch = Stopwatch()
@@ -203,7 +203,7 @@ async def status_when(
 
 
 async def go(client: Client, plan: Plan | None, purpose: str = "run") -> None:
-    """What an operator does up to the first motion."""
+    """Take control, load the plan and approve its motion, like an operator."""
     rest = (StationState.IDLE, StationState.PAUSED)
     await status_when(client, lambda s: s.state in rest and s.camera.connected)
     await client.request("lease", action="take")

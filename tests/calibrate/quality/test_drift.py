@@ -50,7 +50,7 @@ def few_views(rng: np.random.Generator, X: Array, count: int = 5, mount: Mount =
 def checks(
     count: int, shift_m: float, shift_rad: float, seed: int, mount: Mount = "eye-in-hand"
 ) -> list[DriftCheck]:
-    """As after an installation with its own error, and a shift in a random direction since."""
+    """Views after an installation with its own error, and a shift in a random direction since."""
     rng = np.random.default_rng(seed)
     root = np.linalg.cholesky(INSTALLED_COVARIANCE)
     found = []

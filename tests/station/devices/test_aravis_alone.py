@@ -54,7 +54,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def shown_ns(device: Any, camera: Clockwork) -> list[int]:
-    """What the clock was told, one latch."""
+    """Result of one latch of the clock."""
     device._camera = camera
     clock = DeviceClock()
     device.latch(clock)

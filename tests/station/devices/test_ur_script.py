@@ -88,7 +88,7 @@ class Registers:
     def say(
         self, verb: int, goal: tuple[float, ...] = GOAL, speed: float = 0.5, acceleration: float = 1.0
     ) -> int:
-        """What the script answered: 1 taken, -1 refused, 0 nothing."""
+        """The script's answer: 1 taken, -1 refused, 0 nothing."""
         self.sequence += 1
         self.verb, self.numbers = verb, (*goal, speed, acceleration)  # type: ignore[assignment]
         self.run(0.03)

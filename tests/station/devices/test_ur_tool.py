@@ -26,7 +26,7 @@ FACTORY = UR10.calibrated(
 
 
 def sample(arm: RobotModel, joints_rad: Vector6, tool: Vector6) -> RobotState:
-    """What a controller with this arm reports."""
+    """Give what a controller with this arm reports."""
     T = forward(arm, joints_rad) @ pose_from_rotvec(tool[:3], tool[3:])
     pose = tuple(np.concatenate([T[:3, 3], rotation_log(T[:3, :3])]).tolist())
     fields = dict.fromkeys(RobotState.__struct_fields__, 0)

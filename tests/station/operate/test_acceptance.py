@@ -90,7 +90,7 @@ class Nothing:
 
 @pytest.fixture(autouse=True)
 def verdicts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What the judge says: anything in it is bad."""
+    """Findings of the judge: any is bad."""
     bad: list[str] = []
 
     async def at_once(*_: object) -> None: ...

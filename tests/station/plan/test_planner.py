@@ -109,7 +109,7 @@ def test_the_board_stays_in_the_picture_along_the_way():
 
 
 def test_an_order_takes_the_way_that_keeps_the_board_in_the_picture(monkeypatch):
-    """Of two equally long ways round, the one that sees the board."""
+    """Two ways round are equally long; one of them sees the board."""
     _, config = cell()
     times = np.array([[0, 1, 1.01], [1, 0, 1], [1.01, 1, 0.0]])
     monkeypatch.setattr(planner, "time_matrix", lambda *_: times)
@@ -278,7 +278,7 @@ def test_a_plan_without_a_start_and_with_few_poses():
 
 
 def test_six_poses_for_a_known_lens_tell_more_of_where_the_camera_sits():
-    """As `station check` asks for them: the installed calibration knows the lens."""
+    """A drift check asks for them so: the installed calibration knows the lens."""
     truth, config = cell()
     scene, sigmas_m = scene_of(config), []
     for known in (False, True):

@@ -59,7 +59,7 @@ class WorkerThatSees(WorkerInThisProcess):
 
 @pytest.fixture(autouse=True)
 def _few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in the plan that is replaced."""
+    """As few as the plan that is replaced was made from."""
     monkeypatch.setattr("station.analysis.improvement.PlanOptions", partial(PlanOptions, pool=POOL))
 
 

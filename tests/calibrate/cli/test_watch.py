@@ -236,9 +236,10 @@ def test_a_shortened_log_remembers_what_was_learned(
     assert sum(line.gap for line in read_lines(path, WatchEntry)) == 1
     again = MonitorLog(path, WATCHED, model)
     assert not again.monitor.alarmed
-    told = [event for picture in pictures[1100:] for event in again.add(entry(picture))]
+    near = int(wanted.picture) + 100
+    told = [event for picture in pictures[1100:near] for event in again.add(entry(picture))]
     assert told[0].values["crept"] is True
-    assert abs(int(told[0].picture) - int(wanted.picture)) < 100
+    assert int(told[0].picture) > int(wanted.picture) - 100
 
 
 def test_another_version_or_tag_begins_anew(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from station.cell.config import ControlPath
 from station.cell.errors import StationError
@@ -32,6 +33,10 @@ sys.dont_write_bytecode = False
 gc.set_threshold(10_000, 20, 20)  # the usual ones go through all that was imported every few tests
 for _size in ("COLUMNS", "LINES"):  # a shell may export them: what is printed would break elsewhere
     os.environ.pop(_size, None)
+
+# How long an example takes is no property: a computer may have much else to do.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 MAY_BE_SENT = {
     "dashboard: stop", "dashboard: PolyscopeVersion", "dashboard: get serial number",

@@ -75,7 +75,7 @@ def test_every_pass_over_a_bag_tells_how_far_it_is(tmp_path: Path, description: 
         source,
         tmp_path / "out.mcap",
         description,
-        progress=lambda text, done, total: told.setdefault(text, []).append((done, total)),
+        progress=lambda done, total, text: told.setdefault(text, []).append((done, total)),
     )
     assert len(told) == (3 if "mcap" in kind else 2), "sqlite3 has no checksums to prove first"
     for steps in told.values():

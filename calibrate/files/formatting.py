@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
+from scipy.spatial.transform import Rotation
 
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override, source_stamp
@@ -88,9 +88,7 @@ def override_text(override: Override) -> str:
 def pose_text(calibration: Calibration) -> str:
     """Position in mm, then roll, pitch, yaw about fixed axes in degrees."""
     x, y, z = (v * 1000 for v in calibration.result.translation_m)
-    roll, pitch, yaw = scipy.spatial.transform.Rotation.from_quat(calibration.result.rotation_xyzw).as_euler(
-        "xyz", degrees=True
-    )
+    roll, pitch, yaw = Rotation.from_quat(calibration.result.rotation_xyzw).as_euler("xyz", degrees=True)
     return f"{x:.3f}  {y:.3f}  {z:.3f} mm,  roll {roll:.4f}°  pitch {pitch:.4f}°  yaw {yaw:.4f}°"
 
 

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import scipy
+from scipy import linalg
 
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic, flange_derivatives, flange_residuals
@@ -346,7 +346,7 @@ def inverse_of(N: Array) -> Array:
     try:
         values, vectors = np.linalg.eigh(scaled)
     except np.linalg.LinAlgError:  # LAPACK's divide and conquer gives up on a matrix in some thousand
-        values, vectors = scipy.linalg.eigh(scaled, driver="ev")
+        values, vectors = linalg.eigh(scaled, driver="ev")
     if not values[0] > -_ROUNDING:
         raise np.linalg.LinAlgError("some unknowns are left open")
     root = vectors * scale[:, None]

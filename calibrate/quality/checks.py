@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import scipy
+from scipy import special
 
 from calibrate.errors import InstallError
 from calibrate.files.folders import calibrations_folder
@@ -96,7 +96,7 @@ def find_trend(history: Sequence[CheckEntry], generation: int) -> Trend | None:
     covariance = np.linalg.inv(normal)
     slope = (covariance @ right)[6:]
     statistic = float(slope @ np.linalg.solve(covariance[6:, 6:], slope))
-    if scipy.special.chdtrc(6, statistic) > _TREND_P:
+    if special.chdtrc(6, statistic) > _TREND_P:
         return None
     millimetres = float(np.linalg.norm(slope[:3]) * 1e3 * span)
     degrees = float(np.degrees(np.linalg.norm(slope[3:])) * span)

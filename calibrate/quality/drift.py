@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import scipy
+from scipy import special
 
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError, UsageError
@@ -162,7 +162,7 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
     total = fitted + covariance
     statistic = float(shift @ np.linalg.solve(total, shift))
     nu = noise.degrees_of_freedom
-    threshold = float(6 * scipy.special.fdtri(6, nu, 1 - FALSE_ALARM))
+    threshold = float(6 * special.fdtri(6, nu, 1 - FALSE_ALARM))
     power_translation, power_rotation = powers(total, nu)
     enough = min(power_translation, power_rotation) >= POWER
     return DriftCheck(
@@ -171,7 +171,7 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
         covariance=total,
         statistic=statistic,
         threshold=threshold,
-        p_value=float(scipy.special.fdtrc(6, nu, statistic / 6)),
+        p_value=float(special.fdtrc(6, nu, statistic / 6)),
         power_translation=power_translation,
         power_rotation=power_rotation,
         views_needed=len(views) if enough else _views_needed(fitted, covariance, len(views), nu),
@@ -200,13 +200,13 @@ def powers(covariance: Array, nu: float) -> tuple[float, float]:
     After a true shift d, δᵀ S⁻¹ δ / 6 follows the non-central F(6, nu) of noncentrality dᵀ S⁻¹ d.
     """
     weight: Any = np.linalg.inv(covariance)
-    threshold = scipy.special.fdtri(6, nu, 1 - FALSE_ALARM)
+    threshold = special.fdtri(6, nu, 1 - FALSE_ALARM)
 
     def power(block: Array, size: float) -> float:
         noncentrality = size**2 * float(np.linalg.eigvalsh(block)[0])
         if noncentrality < 1e-6:  # where SciPy's ncf is not to be trusted
             return FALSE_ALARM
-        return 1 - float(scipy.special.ncfdtr(6, nu, noncentrality, threshold))
+        return 1 - float(special.ncfdtr(6, nu, noncentrality, threshold))
 
     return power(weight[:3, :3], SHIFT_M), power(weight[3:, 3:], TURN_RAD)
 

@@ -17,7 +17,7 @@ from functools import cache
 
 import clarabel
 import numpy as np
-import scipy
+from scipy import sparse
 
 from calibrate.geometry import Array, project_to_rotation
 from calibrate.handeye.axxb.objective import QuadraticObjective
@@ -109,7 +109,7 @@ def _solve_dual(S: Array) -> tuple[Array, Array]:
     linear = np.zeros(21)
     linear[20] = -1.0
     solver = clarabel.DefaultSolver(
-        scipy.sparse.csc_matrix((21, 21)),
+        sparse.csc_matrix((21, 21)),
         linear,
         _dual_columns(),
         _pack(S),
@@ -121,10 +121,10 @@ def _solve_dual(S: Array) -> tuple[Array, Array]:
 
 
 @cache
-def _dual_columns() -> scipy.sparse.csc_matrix:
+def _dual_columns() -> sparse.csc_matrix:
     E = np.zeros((10, 10))
     E[9, 9] = 1.0
-    return scipy.sparse.csc_matrix(np.column_stack([_pack(C) for C in [*_constraints(), E]]))
+    return sparse.csc_matrix(np.column_stack([_pack(C) for C in [*_constraints(), E]]))
 
 
 _UPPER = tuple(np.array([(i, j) for j in range(10) for i in range(j + 1)]).T)

@@ -54,11 +54,3 @@ def test_a_command_loads_what_it_needs_alone(argument: str, foreign: tuple[str, 
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
-
-
-@pytest.mark.parametrize("module", ["station.daemon", "station.tui.app"])
-def test_daemon_and_screen_start_without_scipy(module: str) -> None:
-    """A third of the processor time of their start; it is loaded where a figure needs it."""
-    program = f"import sys, {module}; print([m for m in sys.modules if m.startswith('scipy.linalg')])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

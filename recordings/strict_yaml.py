@@ -131,15 +131,14 @@ def examine(content: bytes, kind: type[Any]) -> Examined:
 
     Raises StrictYamlError where the file is no YAML at all.
     """
-    problems = []
     try:
         load(content, kind)
+        problems = []
     except StrictYamlError as error:
         problems = error.problems
     try:
-        loader = _loader()(content)
-        node = loader.get_single_node()
-        plain = loader.construct_document(node)
+        node = _loader()(content).get_single_node()
+        plain = _loader()(content).get_single_data()
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, OverflowError):
         raise StrictYamlError(problems) from None
     if not isinstance(plain, dict) or len(content) > LIMIT_BYTES:

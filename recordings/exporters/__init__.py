@@ -1,6 +1,13 @@
 """Recordings for other people's programs: folders and tables, ROS 2 bags, smaller recordings."""
 
-from typing import Literal
+from __future__ import annotations
 
-Target = Literal["folder", "csv", "ros2"]
-"""Kind of output of `recordings export`."""
+from enum import StrEnum
+
+
+class Target(StrEnum):
+    """Kind of output of `recordings export`."""
+
+    FOLDER = "folder"
+    CSV = "csv"
+    ROS2 = "ros2"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
+from rich.segment import Segment
+from rich.style import Style
 from rich.text import Text
 from textual import events, work
 from textual.app import ComposeResult
@@ -17,6 +18,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.reactive import reactive
+from textual.strip import Strip
 from textual.widgets import Footer, Input, OptionList, Static
 from textual.widgets.option_list import Option
 
@@ -24,7 +26,7 @@ from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_points
 from recordings.errors import CodedError
 from recordings.schema.messages import BoardSpec, Image
-from station.analysis.worker import preview_image
+from station.analysis.preview import preview_image
 from station.cell.errors import StationError
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
@@ -34,14 +36,37 @@ from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_l
 from station.tui.new_cell_steps import DRAWINGS, SavePage, StepPage, pages
 from station.tui.task import Step
 from station.tui.themes import ThemedApp
+from station.tui.widgets.graphics import Graphics
 from station.tui.widgets.preview import PreviewPane
-from station.tui.words import dim
 
 Ending = Literal["", "serve", "rehearse"]
 """Next wish of the person: nothing, the cell itself, or its rehearsal."""
 ARM_PERIOD_S, CAMERA_PERIOD_S, LOOK_S = 0.1, 0.15, 1.0
 SHOWN_WIDTH_PX = 640
 NO_CAMERA = "No camera answers. Check its power, cable and network; this list refreshes every few seconds."
+AXIS = Style(color="black", bgcolor="bright_yellow", bold=True)
+
+
+class BoardPicture(PreviewPane):
+    """Live picture, the board's corners, and its origin and axes in letters."""
+
+    axes: tuple[tuple[str, float, float], ...] = ()
+    """Letter, x and y as shares of the image."""
+
+    def render_line(self, y: int) -> Strip:
+        strip = super().render_line(y)
+        if self._image is None or not self.axes:
+            return strip
+        height, width = self._image.shape
+        scale = min(self.size.width / width, 2 * self.size.height / height)
+        columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
+        left = (self.size.width - columns) // 2
+        for letter, share_x, share_y in self.axes:
+            column, row = left + int(share_x * columns), int(share_y * rows) // 2
+            if row == y and 0 <= column < self.size.width:
+                mark = Strip([Segment(letter, AXIS)])
+                strip = Strip.join([strip.crop(0, column), mark, strip.crop(column + 1)])
+        return strip
 
 
 class NewCell(ThemedApp[Ending]):
@@ -77,6 +102,7 @@ class NewCell(ThemedApp[Ending]):
         "rehearse": (CellStep.SAVE,),
     }
     """Steps in which an action means something."""
+    graphics: Graphics | None = None
     step: reactive[CellStep] = reactive(CellStep.ROBOT, init=False)
 
     def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
@@ -101,7 +127,7 @@ class NewCell(ThemedApp[Ending]):
                     yield Static("\n".join(DRAWINGS[mount]), id=mount, classes="drawing", markup=False)
             yield Static(id="live-lines", markup=False)
             yield Static(id="problem", markup=False)
-            yield PreviewPane(id="picture")
+            yield BoardPicture(id="picture")
             with VerticalScroll(id="text"):
                 yield Static(id="written", markup=False)
         yield Footer()
@@ -120,13 +146,16 @@ class NewCell(ThemedApp[Ending]):
     async def resume(self) -> None:
         """Connect to what the draft names; the first step that is not done is shown."""
         draft = self.setup.draft
-        with self._problems():
+        try:
             if draft.host:
                 self._say_live(f"Asking {draft.host} …")
                 await self.setup.connect(draft.host)
             if draft.camera is not None:
                 await self.setup.open(draft.camera)
-            self.step = flow.next_step(self.setup.draft)
+        except StationError as problem:
+            self._say_problem(str(problem))
+            return
+        self.step = flow.next_step(self.setup.draft)
 
     # --- what the devices show ---
 
@@ -176,15 +205,14 @@ class NewCell(ThemedApp[Ending]):
         self._show()
 
     async def _show_picture(self, image: Image, found: Detection | None) -> None:
-        pane, board = self.query_one(PreviewPane), self.setup.draft.board
+        pane, board = self.query_one(BoardPicture), self.setup.draft.board
         if not pane.display:
             return
         self._pictures += 1
         corners = np.zeros((0, 2)) if found is None else found.pixels
         preview = preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures)
-        await pane.show(
-            preview, () if found is None or board is None else _axes(board, found, preview.corners)
-        )
+        pane.axes = () if found is None or board is None else _axes(board, found, preview.corners)
+        await pane.show(preview)
 
     def _add_view(self) -> None:
         self.setup.take_view()
@@ -233,15 +261,19 @@ class NewCell(ThemedApp[Ending]):
         page = self.page
         if page.working:
             self._say_live(page.working)
-        with self._problems():
+        try:
             if chosen is not None:
                 await self.setup.open(chosen)
-            if not await page.accept(self.query_one("#typed", Input).value.strip()):
-                self.watch_step()
-            elif page.step is CellStep.SAVE:
-                self.exit("serve")
-            else:
-                self.step = STEPS[STEPS.index(page.step) + 1]
+            done = await page.accept(self.query_one("#typed", Input).value.strip())
+        except (CodedError, OSError) as problem:
+            self._say_problem(str(problem))
+            return
+        if not done:
+            self.watch_step()
+        elif page.step is CellStep.SAVE:
+            self.exit("serve")
+        else:
+            self.step = STEPS[STEPS.index(page.step) + 1]
 
     def action_rehearse(self) -> None:
         if self.setup.draft.written:
@@ -261,15 +293,22 @@ class NewCell(ThemedApp[Ending]):
 
     @work(group="print", exclusive=True, exit_on_error=False)
     async def action_print_board(self) -> None:
-        with self._problems():
+        try:
             path = await asyncio.to_thread(self.setup.print_board)
-            how = "Print it at 100 %, glue it to something flat, and measure one square."
-            self.notify(f"Written: {path}. {how}", timeout=20)
+        except (CodedError, OSError) as problem:
+            self._say_problem(str(problem))
+            return
+        self.notify(
+            f"Written: {path}. Print it at 100 %, glue it to something flat, and measure one square.",
+            timeout=20,
+        )
 
     @work(group="expose", exclusive=True, exit_on_error=False)
     async def action_expose(self, factor: float) -> None:
-        with self._problems():
+        try:
             await self.setup.expose(factor)
+        except StationError as problem:
+            self._say_problem(str(problem))
 
     def action_table_here(self) -> None:
         if self.setup.state is not None:
@@ -314,8 +353,8 @@ class NewCell(ThemedApp[Ending]):
         if setup.arm is not None:
             who = setup.arm.identity
             bar.append(Content.styled(f"  {who.model} {who.serial}", "bold $strong"))
-            bar.append(dim(f"  {setup.arm.trouble() or 'ready'}"))
-        bar.append(dim("  Your hand moves the arm, never this wizard."))
+            bar.append(Content.styled(f"  {setup.arm.trouble() or 'ready'}", "$dim"))
+        bar.append(Content.styled("  Your hand moves the arm, never this wizard.", "$dim"))
         self.query_one("#bar", Static).update(fitting(bar, width))
         self.query_one("#rail", Static).update(rail_line(self._rail(), self.step, width))
         self.query_one("#next", Static).update(next_line(self.page.next, width))
@@ -335,14 +374,6 @@ class NewCell(ThemedApp[Ending]):
 
     def _say_live(self, text: str) -> None:
         self.query_one("#live-lines", Static).update(text)
-
-    @contextmanager
-    def _problems(self) -> Iterator[None]:
-        """What goes wrong is said on the page."""
-        try:
-            yield
-        except (CodedError, OSError) as problem:
-            self._say_problem(str(problem))
 
     def _say_problem(self, text: str) -> None:
         problem = self.query_one("#problem", Static)

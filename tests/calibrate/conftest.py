@@ -10,8 +10,7 @@ import pytest
 
 from calibrate.files.calibration import FramePose, write_calibration
 from calibrate.geometry import Transform, perturb
-from calibrate.job import SolvedRecording
-from calibrate.pipeline import solve_recording
+from calibrate.pipeline import SolvedRecording, solve_recording
 from tests.calibrate.sessions import Scene, write_session
 
 

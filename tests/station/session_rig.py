@@ -36,11 +36,9 @@ from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.scenes import cell_config, make_cell
 
-TRUTH = make_cell("paper-binned")
+TRUTH = make_cell()
 POSES = 4
 GLIMPSED = np.random.default_rng(1).integers(0, 255, (64, 80), dtype=np.uint8)
-PATIENCE_S = 30.0
-"""A test fails by what is wrong, not because the computer has much else to do."""
 RUNNING, NORMAL, STOPPED = 7, 1, 1
 
 
@@ -230,7 +228,7 @@ class WorkerInThisProcess:
     def __init__(self) -> None:
         self.waiting = 0
         points = board_points(TRUTH.board)
-        pixels = 150 + 2500 * points[:, :2]
+        pixels = 300 + 5000 * points[:, :2]
         status = DetectionStatus(found=True, corners=len(points), expected=len(points))
         self.sees = BoardDetection(status, np.arange(len(points)), pixels)
 
@@ -292,7 +290,7 @@ class Rig:
 
     async def until(self, *states: StationState) -> None:
         """A slow arm that is `moving` is under way: its way was checked."""
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(10):
             while self.state not in states or self._waits_for_its_check:
                 await asyncio.sleep(0.002)
 
@@ -301,7 +299,7 @@ class Rig:
         return self.state is StationState.MOVING and self.arm.slow and not self.arm.under_way
 
     async def until_true(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(PATIENCE_S):
+        async with asyncio.timeout(10):
             while not condition():
                 await asyncio.sleep(0.002)
 
@@ -337,11 +335,11 @@ class HeldDisk(asyncio.Event):
 
     fails = False
     asked = 0
-    """Requests to take everything so far."""
+    """How often it was to take everything so far."""
 
 
 def crash(rig: Rig) -> None:
-    """Leave what SIGKILL leaves: no sealing, no goodbye, the file as the disk has it."""
+    """What SIGKILL leaves: no sealing, no goodbye, the file as the disk has it."""
     for task in (*rig.session._tasks, rig.session._run):
         if task is not None:
             task.cancel()
@@ -353,7 +351,7 @@ def crash(rig: Rig) -> None:
 
 
 def sealed(rig: Rig) -> Recording:
-    """Open what the session wrote."""
+    """What the session wrote."""
     return open_recording(Path(rig.session.store.status.session.recording))
 
 

@@ -12,7 +12,8 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Button, Label, RichLog
 
-from station.tui.dialogs import READ, JobScreen
+from station.tui.dialogs import READ
+from station.tui.results import JobScreen
 from tests.tui.conftest import FakeLink, app_on, text_of, until
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from math import atan2, cos, hypot, pi, sin, sqrt
+from typing import Protocol
 
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
@@ -31,6 +32,14 @@ from station.simulation.controller.kinematics import (
 
 class UnreachableError(Exception):
     """The arm cannot go there: no inverse solution, or a joint beyond its limit."""
+
+
+class Path(Protocol):
+    @property
+    def length(self) -> float: ...
+
+    def at(self, s: float) -> Vector:
+        """Joints at s. Asked for in increasing order. Raises UnreachableError."""
 
 
 class JointPath:
@@ -122,16 +131,17 @@ class ArcPath(LinePath):
         return tuple(m + c * x + s * y for m, x, y in zip(self._centre, self._u, self._v, strict=True))
 
 
-Path = JointPath | LinePath
-"""`at(s)` gives the joints, asked for in increasing order. Raises UnreachableError."""
+class Profile(Protocol):
+    @property
+    def duration_s(self) -> float: ...
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """(s, ds/dt) at a time from the start."""
 
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """Constant acceleration, constant speed, constant deceleration (or a triangle, when short).
-
-    `at` gives (s, ds/dt) at a time from the start.
-    """
+    """Constant acceleration, constant speed, constant deceleration (or a triangle, when short)."""
 
     length: float
     speed: float
@@ -174,6 +184,3 @@ class Braking:
         t = min(t_s, self.duration_s)
         u = t / self.duration_s
         return self.start + self.speed * t * (1 - u / 2), self.speed * (1 - u)
-
-
-Profile = Trapezoid | Braking

@@ -21,8 +21,7 @@ from station.simulation.controller.kinematics import (
     plus,
     to_pose,
 )
-from station.simulation.controller.urscript import Pose, ScriptRuntimeError, Value
-from station.simulation.controller.urscript_parser import Builtin
+from station.simulation.controller.urscript import Builtin, Pose, ScriptRuntimeError, Value
 
 
 def six(values: Sequence[float]) -> Vector:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import compileall
 import re
 import shutil
 import subprocess
@@ -14,17 +13,14 @@ import msgspec
 import numpy as np
 import pytest
 
-import calibrate
-import recordings
 from calibrate.cli import main
 from calibrate.errors import CalibrationFileError, GateFailedError, InstallError
-from calibrate.files.calibration import read_calibration
+from calibrate.files.calibration import Touch, read_calibration
 from calibrate.files.gate import Gate
 from calibrate.files.install import install, install_line, installed_calibration, rollback
 from calibrate.files.loader import load_installed
-from calibrate.files.touch import Touch
 from calibrate.files.versions import installed_versions, read_log
-from calibrate.job import SolvedRecording
+from calibrate.pipeline import SolvedRecording
 from tests.calibrate.calling import raises_code
 from tests.command_line import call
 
@@ -194,7 +190,7 @@ NOTE = """
 import sys
 from pathlib import Path
 from calibrate.files.calibration import read_calibration
-from calibrate.files.versions import note_installed
+from calibrate.files.verification import note_installed
 note_installed(Path(sys.argv[2]), read_calibration(Path(sys.argv[1])).verification)
 """
 TOUCH = Touch(
@@ -246,9 +242,6 @@ def test_a_kill_at_any_system_call_leaves_old_or_new(  # type: ignore[no-untyped
 
 
 def _traced(program: str, new: Path, root: Path, *options: str) -> int:
-    # A module that is compiled in one run and not in the next would shift the places of its system calls.
-    for package in (calibrate, recordings):
-        compileall.compile_dir(Path(package.__file__).parent, quiet=2)
     command = ["strace", "-f", "-qq", *options, sys.executable, "-c", program, str(new), str(root)]
     return subprocess.run(command, capture_output=True, timeout=60, check=False).returncode
 

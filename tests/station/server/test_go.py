@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
-
 import msgspec
 import pytest
 
@@ -35,12 +33,10 @@ def offered(
     desk: ApprovalManager, client_id: int = 1, replanned: PlanRevision | None = None
 ) -> MotionApproval:
     summary = MotionPreview(
-        secrets.token_urlsafe(16), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1"
+        desk.new_token(), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1"
     )
     summary = msgspec.structs.replace(summary, start_joints_rad=HERE)
-    desk.offer(MotionApproval(summary, client_id, (0, 1, 2, 3), replanned=replanned))
-    assert desk.waiting is not None
-    return desk.waiting
+    return desk.offer(MotionApproval(summary, client_id, (0, 1, 2, 3), replanned=replanned))
 
 
 def test_a_go_is_for_one_use() -> None:
@@ -94,8 +90,8 @@ def test_a_newer_go_replaces_the_older_and_void_ends_both() -> None:
     desk = ApprovalManager(Clock())
     old, new = offered(desk), offered(desk)
     assert old.summary.token != new.summary.token
-    desk.void()
-    assert desk.waiting is None
+    assert desk.void()
+    assert not desk.void()
     for go in (old, new):
         with pytest.raises(RefusedError):
             desk.redeem(go.summary.token, 1, PLAN, HERE)

@@ -47,7 +47,7 @@ def test_truth_waits_for_the_near_future_and_refuses_the_rest(controller, admin)
 def test_the_arm_is_led_by_hand_only_when_it_is_free(controller, admin) -> None:
     ask = admin(controller("UR10"))
     ask.ask("foreign")
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 2
     while ask.ask("state")["runtime_state"] != "PLAYING":
         assert time.monotonic() < deadline
     with raises("simulation-refused"):
@@ -55,7 +55,7 @@ def test_the_arm_is_led_by_hand_only_when_it_is_free(controller, admin) -> None:
     ask.ask("stop_program")
     corners = [[0.1, *HOME[1:]], [0.1, -1.4, *HOME[2:]]]
     assert ask.ask("hand_move", path=corners, speed_rad_s=2.0)["length_rad"] == pytest.approx(0.1 + 0.1708)
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 3
     while ask.ask("state")["moving"]:
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -69,15 +69,13 @@ def test_the_admin_port_explains_itself_and_survives_nonsense(controller, admin)
     assert all(commands.values()) and {"pstop", "truth", "drop", "hand_move"} <= set(commands)
     for nonsense, words in (
         ({"cmd": "explode"}, "lists the names"),
-        ({"cmd": "slider", "fraction": 3}, "$.fraction"),
-        ({"cmd": "delay", "ms": float("nan")}, "lists the names"),
-        ({"cmd": "delay", "ms": -1}, "$.ms"),
-        ({"cmd": "jog", "joints_rad": HOME, "speed_rad_s": 0}, "$.speed_rad_s"),
-        ({"cmd": "vibrate", "amplitude_rad": 0.001, "decay_s": 0}, "$.decay_s"),
-        ({"cmd": "tcp", "pose": "here"}, "$.pose"),
-        ({"cmd": "jog"}, "`joints_rad`"),
-        ({"cmd": "jog", "joint": HOME}, "`joint`"),
-        ({"cmd": "tcp", "pose": [1, 2]}, "$.pose"),
+        ({"cmd": "slider", "fraction": 3}, "0…1"),
+        ({"cmd": "delay", "ms": float("nan")}, "ms must be a number in 0…10000"),
+        ({"cmd": "jog", "joints_rad": HOME, "speed_rad_s": 0}, "speed_rad_s"),
+        ({"cmd": "vibrate", "amplitude_rad": 0.001, "decay_s": 0}, "decay_s"),
+        ({"cmd": "tcp", "pose": "here"}, "expected 6 numbers"),
+        ({"cmd": "jog"}, "missing 1 required"),
+        ({"cmd": "tcp", "pose": [1, 2]}, "expected 6 numbers"),
         ({"cmd": "drop", "ports": ["moon"]}, "not ['moon']"),
     ):
         with raises("simulation-refused") as refusal:

@@ -39,6 +39,8 @@ from station.simulation.scenes import cell_config, make_cell
 TRUTH = make_cell()
 POSES = 4
 GLIMPSED = np.random.default_rng(1).integers(0, 255, (64, 80), dtype=np.uint8)
+PATIENCE_S = 30.0
+"""A test fails by what is wrong, not because the computer has much else to do."""
 RUNNING, NORMAL, STOPPED = 7, 1, 1
 
 
@@ -290,7 +292,7 @@ class Rig:
 
     async def until(self, *states: StationState) -> None:
         """A slow arm that is `moving` is under way: its way was checked."""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE_S):
             while self.state not in states or self._waits_for_its_check:
                 await asyncio.sleep(0.002)
 
@@ -299,7 +301,7 @@ class Rig:
         return self.state is StationState.MOVING and self.arm.slow and not self.arm.under_way
 
     async def until_true(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE_S):
             while not condition():
                 await asyncio.sleep(0.002)
 

@@ -56,7 +56,7 @@ async def test_it_swings_takes_pictures_and_comes_back(sweeping: Rig) -> None:
 async def test_stop_ends_swing_and_pictures(sweeping: Rig) -> None:
     sweeping.arm.slow = True
     await sweeping.give_go()
-    await sweeping.until_true(lambda: sweeping.camera.taken > 3)
+    await sweeping.until_true(lambda: sweeping.camera.taken > 3 and sweeping.arm.under_way)
     await sweeping.session.stop("anna")
     taken = sweeping.camera.taken
     assert sweeping.session.store.state is S.STOPPED and "stop" in sweeping.arm.log

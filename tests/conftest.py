@@ -14,6 +14,7 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from station.cell.config import ControlPath
 from station.cell.errors import StationError
@@ -26,6 +27,10 @@ DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "
 
 for _size in ("COLUMNS", "LINES"):  # a shell may export them: what is printed would break elsewhere
     os.environ.pop(_size, None)
+
+# How long an example takes is no property: a computer may have much else to do.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 MAY_BE_SENT = {
     "dashboard: stop", "dashboard: PolyscopeVersion", "dashboard: get serial number",

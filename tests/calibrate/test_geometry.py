@@ -33,14 +33,14 @@ def test_a_mirror_image_is_no_transform() -> None:
 
 
 @given(vectors, deltas)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_difference_undoes_perturb(v: np.ndarray, delta: np.ndarray) -> None:
     reference = g.pose_from_rotvec(v[::-1], v)
     np.testing.assert_allclose(g.difference(g.perturb(reference, delta), reference), delta, atol=1e-9)
 
 
 @given(vectors, vectors)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_inverse_and_quaternion_round_trip(t: np.ndarray, v: np.ndarray) -> None:
     T = g.pose_from_rotvec(t, v)
     np.testing.assert_allclose(g.inverse(T) @ T, np.eye(4), atol=1e-12)

@@ -87,7 +87,7 @@ def test_forward_takes_any_leading_shape() -> None:
     assert link_frames(UR10, q).shape == (2, 3, 7, 4, 4)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(q=joints, name=st.sampled_from(NAMES))
 def test_every_inverse_solution_reaches_the_pose_and_the_joints_are_among_them(q: Array, name: str) -> None:
     model = MODELS[name]
@@ -133,7 +133,7 @@ def test_near_singular_poses_are_reached_with_full_precision(q3: float, q5: floa
     assert np.abs(forward(UR10, solutions) - T).max() < 1e-7
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(q=st.lists(st.floats(-6.2, 6.2), min_size=6, max_size=6).map(np.array))
 def test_nearest_inverse_keeps_the_branch_and_the_turn(q: Array) -> None:
     if singularity_measure(UR10, q) < 0.02:
@@ -145,7 +145,7 @@ def test_nearest_inverse_keeps_the_branch_and_the_turn(q: Array) -> None:
     assert np.abs(found).max() <= 2 * pi
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(q=joints, name=st.sampled_from(NAMES))
 def test_jacobian_is_the_derivative_of_forward(q: Array, name: str) -> None:
     model, step = MODELS[name], 1e-6

@@ -41,7 +41,7 @@ def fit(clock: ClockEstimator) -> ClockFit:
     return found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     drift_ppm=st.floats(-150, 150),
     delay_s=st.floats(1e-5, 2e-3),

@@ -284,7 +284,7 @@ def test_lies_about_size_cost_no_memory(tmp_path: Path, name: str) -> None:
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 8 * 1024
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_any_bytes_give_a_recording_or_a_recording_error(small: Path, data: st.DataObject) -> None:
     """Random edits of a good file: cut, repeat, overwrite. Recovery keeps to the same contract."""

@@ -21,7 +21,7 @@ times = st.one_of(st.just(0), st.integers(-(2**63), 2**63 - 1), st.integers(0, 2
 stamps = st.builds(Stamps, times, times, st.floats(allow_nan=False), times)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(stamps, min_size=1, max_size=40), st.booleans(), st.booleans())
 def test_every_stamp_comes_back(tmp_path: Path, wanted: list[Stamps], packed: bool, reordered: bool) -> None:
     states = [msgspec.structs.replace(make_state(0), stamps=value) for value in wanted]

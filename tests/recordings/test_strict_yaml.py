@@ -79,7 +79,7 @@ def test_traps_are_refused(text: str, said: str) -> None:
 
 
 @given(st.binary(max_size=200))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_any_bytes_give_a_value_or_a_report(content: bytes) -> None:
     try:
         assert math.isfinite(load(content, Outer).inner.speed_m_s)

@@ -113,7 +113,7 @@ def with_error(name: str, size: float, joints: Array) -> Array:
     return forward(UR10.calibrated(**{field: tuple(size * np.eye(6)[joint])}), joints)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10_000))
 def test_each_error_moves_the_flange_as_stated(seed):
     joints = np.random.default_rng(seed).uniform(-3, 3, size=(3, 6))

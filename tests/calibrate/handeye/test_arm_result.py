@@ -136,7 +136,7 @@ def test_flanges_of_a_factory_calibration_need_that_table(worn: Worn, stated: bo
         assert table.refused == "not-nominal"
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10_000))
 def test_far_axes_are_restated_and_the_flange_stays(seed: int) -> None:
     rng = np.random.default_rng(seed)

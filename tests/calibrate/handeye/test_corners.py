@@ -26,7 +26,7 @@ def observed_cell(seed, camera):
 
 
 @pytest.mark.parametrize("model", LENSES)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 10_000))
 def test_normal_equations_are_those_of_differences(model, seed):
     camera = LENSES[model]

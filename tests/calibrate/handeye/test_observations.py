@@ -19,7 +19,7 @@ def anywhere(rng, count=None):
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10_000), far=st.sampled_from([1e-9, 0.01, 0.5]))
 def test_derivatives_are_those_of_differences_near_and_far(mount, seed, far):
     rng = np.random.default_rng(seed)

@@ -44,7 +44,7 @@ def test_the_turned_frame_is_the_board_seen_turned() -> None:
         assert np.linalg.matrix_power(turned, 4 // quarters) == pytest.approx(np.eye(4), abs=1e-12)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     seed=st.integers(0, 10_000),
     mount=st.sampled_from(["eye-in-hand", "eye-to-hand"]),

@@ -30,7 +30,7 @@ def look(exposure_us: float, gain_db: float, light: float = 1.0, **other: float)
     return assess(picture, corners(), exposure_us, gain_db)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.floats(60.0, 40_000.0), st.floats(0.0, 12.0), st.floats(0.4, 4.0))
 def test_following_the_advice_ends_at_a_well_exposed_board(
     exposure_us: float, gain_db: float, light: float

@@ -26,7 +26,7 @@ coordinate = st.floats(-1, 1)
 point = st.tuples(coordinate, coordinate, coordinate)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(point, point, point, point)
 def test_segment_distance_is_the_smallest_over_all_pairs_of_points(a0, a1, b0, b1):
     a0, a1, b0, b1 = (np.array(p) for p in (a0, a1, b0, b1))

@@ -47,7 +47,7 @@ def test_truth_waits_for_the_near_future_and_refuses_the_rest(controller, admin)
 def test_the_arm_is_led_by_hand_only_when_it_is_free(controller, admin) -> None:
     ask = admin(controller("UR10"))
     ask.ask("foreign")
-    deadline = time.monotonic() + 2
+    deadline = time.monotonic() + 30
     while ask.ask("state")["runtime_state"] != "PLAYING":
         assert time.monotonic() < deadline
     with raises("simulation-refused"):
@@ -55,7 +55,7 @@ def test_the_arm_is_led_by_hand_only_when_it_is_free(controller, admin) -> None:
     ask.ask("stop_program")
     corners = [[0.1, *HOME[1:]], [0.1, -1.4, *HOME[2:]]]
     assert ask.ask("hand_move", path=corners, speed_rad_s=2.0)["length_rad"] == pytest.approx(0.1 + 0.1708)
-    deadline = time.monotonic() + 3
+    deadline = time.monotonic() + 30
     while ask.ask("state")["moving"]:
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -52,7 +52,7 @@ def test_both_kinematics_agree(model: str) -> None:
         assert np.allclose(matrix(forward(TABLES[model], tuple(q))), expected, atol=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(q=joints, model=st.sampled_from(sorted(TABLES)))
 def test_inverses_reach_the_pose_and_agree_in_number(q: tuple[float, ...], model: str) -> None:
     T = forward(TABLES[model], q)
@@ -84,7 +84,7 @@ def test_the_nearest_inverse_stays_within_a_turn_either_way(q1: float, near: flo
     assert forward(TABLES["UR10"], found) == pytest.approx(T, abs=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(pose=st.tuples(*[numbers] * 6))
 def test_poses_and_rotation_vectors_agree_with_geometry(pose: tuple[float, ...]) -> None:
     T = from_pose(pose)

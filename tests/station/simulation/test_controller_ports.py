@@ -98,7 +98,7 @@ def test_inputs_are_claimed_until_the_link_ends(controller, rtde, admin) -> None
         second.inputs("input_int_register_0", "input_int_register_1")
     first.close()
     ask = admin(running)
-    deadline = time.monotonic() + 2
+    deadline = time.monotonic() + 30
     while ask.ask("state")["connections"]["rtde"] > 1 and time.monotonic() < deadline:
         time.sleep(0.01)
     assert second.inputs("input_int_register_0").id == 1
@@ -153,7 +153,7 @@ def test_hundreds_of_links_leave_nothing_behind(controller, rtde, admin) -> None
             link.recv(100)
 
     def files_when_quiet() -> int:
-        deadline = time.monotonic() + 3
+        deadline = time.monotonic() + 30
         while ask.ask("state")["connections"]["rtde"] and time.monotonic() < deadline:
             time.sleep(0.01)
         time.sleep(0.05)
@@ -186,7 +186,7 @@ def test_a_client_that_does_not_read_loses_packets_and_slows_nobody(controller, 
     names = ["timestamp", *[f"output_double_register_{i}" for i in range(48)] * 4]
     deaf.start(*names)
     good.start("timestamp")
-    deadline = time.monotonic() + 15
+    deadline = time.monotonic() + 30
     while ask.ask("stats")["packets_skipped"] == 0 and time.monotonic() < deadline:
         for _ in range(100):
             good.sample()

@@ -28,7 +28,7 @@ def test_the_twenty_constraints_hold_on_rotations_and_only_there():
 
 
 @given(seed=st.integers(0, 10_000), views=st.integers(3, 12), sigma=st.sampled_from([0.0, 1e-4, 1e-2, 0.1]))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_any_mount_at_any_noise_is_solved_and_proven(seed, views, sigma):
     pairs, X = problem(seed, views, sigma)
     result = solve_global(pairs, seed=0)

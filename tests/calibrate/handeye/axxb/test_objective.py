@@ -36,7 +36,7 @@ def by_loop(pairs: Pairs, X: np.ndarray, form: str, weight: float) -> float:
 
 @pytest.mark.parametrize("form", ["log", "chordal"])
 @given(seed=st.integers(0, 10_000), views=st.integers(3, 8), weight=st.sampled_from([0.1, 1.0, 10.0]))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_the_form_equals_the_sum_over_pairs_anywhere(form, seed, views, weight):
     pairs, X = noisy_pairs(seed, views)
     objective = build_objective(pairs, form, weight)

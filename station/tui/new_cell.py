@@ -230,6 +230,7 @@ class NewCell(ThemedApp[Ending]):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         return action not in self.ONLY or self.step in self.ONLY[action]
 
+    @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
         await self.setup.stop()
         self.notify(

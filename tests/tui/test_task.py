@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import cast
+
 import msgspec
 import pytest
 from hypothesis import given
@@ -9,9 +12,12 @@ from hypothesis import strategies as st
 from textual.screen import Screen
 
 from station.cell.status import LeaseStatus, RecorderStatus, RobotStatus, StationState, StationStatus
+from station.operate.cell_setup import CellSetup
+from station.operate.draft import Hardware
 from station.protocol.verbs import Check
 from station.tui.dialogs import ChooseFormat, Confirm, ConfirmMotion, Help, Reason
 from station.tui.frame import StopBlock, bar_line, keys_line, next_line, rail_line
+from station.tui.new_cell import NewCell
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from station.tui.words import shortened
 from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, opened, text_of, until
@@ -170,6 +176,20 @@ async def test_stop_stands_whole_on_every_screen_and_question(link: FakeLink, si
             await pilot.click(StopBlock)
             await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops + 1)  # type: ignore[misc]
             await pilot.app.pop_screen()
+
+
+async def test_stop_can_be_clicked_in_the_wizard_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stops: list[CellSetup] = []
+
+    async def stop(setup: CellSetup) -> None:
+        stops.append(setup)
+
+    monkeypatch.setattr(CellSetup, "stop", stop)
+    app = NewCell(cast(Hardware, None), tmp_path, tmp_path / "station.yaml")
+    async with app.run_test(size=(80, 24)) as pilot:
+        await pilot.click(StopBlock)
+        await pilot.pause()
+        assert stops == [app.setup]
 
 
 async def test_every_screen_can_be_drawn_in_every_theme(link: FakeLink) -> None:

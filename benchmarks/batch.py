@@ -11,7 +11,8 @@ from pathlib import Path
 
 from benchmarks.offline import make_recording
 from benchmarks.trials import trials
-from calibrate.batch.run import BatchResult, Progress, run_batch
+from calibrate.batch.run import Progress, run_batch
+from calibrate.batch.storage import BatchResult
 from calibrate.batch.workers import BatchWorkers, Lost, R, T, pool
 
 _PARTS = 4

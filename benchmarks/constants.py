@@ -35,7 +35,7 @@ CONSTANTS = {
     ),
     "calibrate.handeye.poses": ("_SUBSETS", "_VOTERS", "_OPEN", "_LEVER_M", "_SETTLED"),
     "calibrate.handeye.priors": ("ASPECT_SIGMA", "_NOT_SQUARE", "_KNOWN_SHARE", "_UNKNOWN_CENTRE"),
-    "calibrate.handeye.profile_robust": ("_ENOUGH", "_NOISY_M", "_NOISY_RAD", "_FREE_FOCAL"),
+    "calibrate.handeye.solve": ("_ENOUGH", "_NOISY_M", "_NOISY_RAD", "_FREE_FOCAL"),
 }
 FACTORS = (0.5, 2.0)
 

@@ -16,26 +16,31 @@ import subprocess
 import sys
 import tempfile
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from benchmarks.processes import DaemonUsage, daemon_of_this_process, put_before_others, step_behind_others
+from benchmarks.processes import DaemonUsage, put_before_others, step_behind_others
 from recordings.reader import open_recording
 from recordings.schema.frame_ids import frames_between
 from recordings.segment import RecordingSegment
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
-from station.cli.demo import approve_simulated, simulated_daemon
+from station.cli.demo import approve_simulated
+from station.cli.serve import log_to_stderr, serve_cell
+from station.devices.aravis import AravisCamera
+from station.devices.cell import Cell
 from station.operate.motion import carry_out, wait_until_idle
 from station.plan.files import sweep_plan
 from station.protocol.client import Client
 from station.protocol.verbs import Purpose
 from station.simulation.cell import CellTruth
-from station.simulation.gige import numbered_picture, still_picture
+from station.simulation.launch import ChildProcess
+from station.simulation.launch_cell import GIGE_PACKET_BYTES, SimulationOptions, simulated_cell
 from station.simulation.netns import isolated_command
+from tests.numbered_gige import numbered_picture, start_numbered, still_picture
 
 SESSION_S = 60.0
 STATE_PERIOD_S = 0.002
@@ -179,18 +184,25 @@ def long_sweep(status: StationStatus, seconds: float) -> Plan:
 async def stream(fps: float, seconds: float, root: Path) -> StreamOutcome:
     verifier = ProcessPoolExecutor(1, initializer=step_behind_others)
     verifier.submit(int).result()  # forked before there is much to share
-    arguments = ["--gige", "--frame-rate-hz", str(fps), "--robot", "UR10e"]
     outcome = StreamOutcome(fps, 0, Checked(), 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     waiting: list[Path] = []
     verified: list[Future[Checked]] = []
-    with simulated_daemon(root, arguments) as socket:
+    socket = root / "control.sock"
+    command = [sys.executable, "-m", "benchmarks.daemon_stream", "serve", str(fps), str(root)]
+    with (
+        (root / "daemon.log").open("wb") as log,
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log) as started,
+        ChildProcess(started) as child,
+    ):
+        assert child.process.stdout is not None
+        child.process.stdout.readline()  # ready
+        daemon = child.process.pid
         async with await Client.connect(socket) as client:
             idle = await wait_until_idle(client)
             await client.request("lease", action="take")
             await client.request(
                 "load_plan", plan=msgspec.to_builtins(long_sweep(idle, min(seconds, SESSION_S)))
             )
-            daemon = daemon_of_this_process()
             usage = DaemonUsage(daemon)
 
             def look(status: StationStatus) -> None:
@@ -203,10 +215,10 @@ async def stream(fps: float, seconds: float, root: Path) -> StreamOutcome:
 
             for _ in range(max(1, round(seconds / SESSION_S))):
                 ended = await carry_out(client, Purpose.RUN, approve_simulated, look)
-                if ended.exit_code != 0:
-                    raise RuntimeError(f"{ended.status.state.value}: {ended.status.reason}")
+                if not ended.session.recording or ended.session.captured < len(ended.session.poses):
+                    raise RuntimeError(f"{ended.state.value}: {ended.reason}")
                 outcome.sessions += 1
-                waiting.append(Path(ended.recording))
+                waiting.append(Path(ended.session.recording))
                 if len(waiting) > WAITING:
                     if verified:  # the disk has an end
                         await asyncio.wrap_future(verified[-1])
@@ -220,6 +232,29 @@ async def stream(fps: float, seconds: float, root: Path) -> StreamOutcome:
     return outcome
 
 
-if __name__ == "__main__":
+def streaming_cell(fps: float, folder: Path) -> Cell:
+    """Make a simulated cell whose GigE camera runs freely: numbered images over what the start shows."""
+    cell = simulated_cell(SimulationOptions(robot="UR10e"), folder)
+    simulator = start_numbered(folder / "truth.json", serial="SIM00000")
+    camera = msgspec.structs.replace(
+        cell.config.camera, driver="aravis", device="127.0.0.1", packet_size=GIGE_PACKET_BYTES,
+        trigger="free-running", frame_rate_hz=fps,
+        exposure_us=min(cell.config.camera.exposure_us, 0.5e6 / fps),
+    )  # fmt: skip
+    config = msgspec.structs.replace(cell.config, camera=camera)
+
+    def ended() -> None:
+        simulator.stop()
+        cell.ended()
+
+    return replace(cell, config=config, camera=AravisCamera(camera, None), ended=ended)
+
+
+if __name__ == "__main__" and sys.argv[1] == "serve":
+    log_to_stderr()
+    place = Path(sys.argv[3])
+    made = streaming_cell(float(sys.argv[2]), place / "simulation")
+    asyncio.run(serve_cell(made, place, place / "control.sock", end_with_stdin=True))
+elif __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         print(json.dumps(asdict(asyncio.run(stream(float(sys.argv[1]), float(sys.argv[2]), Path(folder))))))

@@ -18,7 +18,7 @@ from benchmarks.trials import table, trials
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, pose, rotation_exp
-from calibrate.lens.model import project
+from calibrate.projection import project_at
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from station.simulation.renderer import Light, render
 
@@ -103,7 +103,7 @@ def _cells(methods: Sequence[Method], spec: BoardSpec, case: Case, count: int) -
     whole, misses = [0] * len(methods), [list[float]() for _ in methods]
     for seed in range(count):
         image, seen = scene(spec, case, seed)
-        truth = project(CAMERA, seen, board_points(spec))
+        truth = project_at(CAMERA, seen, board_points(spec))
         for k, method in enumerate(methods):
             found = method(image, spec)
             if found is None:

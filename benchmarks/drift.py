@@ -20,8 +20,8 @@ from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
 from calibrate.handeye.information import MeasurementNoise as PlanNoise
 from calibrate.handeye.information import prior_information, view_information
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
+from calibrate.projection import project_at
 from calibrate.quality.drift import SHIFT_M, TURN_RAD, DriftCheck, Noise, judge_shift
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
@@ -192,7 +192,7 @@ def _views(noise: Noise, poses: _Set, mount: Mount, X: Array, rng: np.random.Gen
     points, found = board_points(_BOARD), []
     for k, seen in enumerate(poses.seen):
         error = np.r_[rng.normal(size=3) * noise.robot_m, rng.normal(size=3) * noise.robot_rad]
-        pixels = project(_CAMERA, seen, points) + rng.normal(size=(len(points), 2)) * noise.corner_px
+        pixels = project_at(_CAMERA, seen, points) + rng.normal(size=(len(points), 2)) * noise.corner_px
         found.append(BoardView(k, str(k), perturb(_flange(seen, mount, X, poses.Y), error), points, pixels))
     return solve_pnp(ViewSet(mount, tuple(found), _CAMERA), _BOARD)
 

@@ -17,13 +17,13 @@ from calibrate.boards.model import board_points
 from calibrate.geometry import Array, difference
 from calibrate.handeye.information import MeasurementNoise as ViewNoise
 from calibrate.handeye.information import covariance_of, view_information
-from calibrate.handeye.observations import SHAPE
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import intrinsics_names, intrinsics_vector
+from calibrate.results import SHAPE
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 
 TRIALS = 300

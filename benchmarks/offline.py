@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from benchmarks.detection import Case, scene
-from calibrate.pipeline import JobOptions, solve_recording
+from calibrate.job import JobOptions
+from calibrate.pipeline import solve_recording
 from recordings.reader import open_recording
 from recordings.schema.messages import (
     CameraIdentity,

@@ -13,13 +13,12 @@ from benchmarks.scene import MID
 from benchmarks.trials import in_processes, rms, table, trials
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp, transform_points
-from calibrate.handeye.observations import Places
 from calibrate.handeye.solution import Reading, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import single_threaded_opencv
 from calibrate.quality.gates import GateInputs, judge
-from calibrate.views import BoardView, ViewSet
+from calibrate.views import BoardView, Places, ViewSet
 from recordings.schema.messages import Mount
 
 TRIALS = 60

@@ -31,20 +31,21 @@ from benchmarks.random_cells import (
 from benchmarks.scene import MID
 from benchmarks.trials import trials
 from calibrate.geometry import Array, difference, perturb, pose, rotation_exp
+from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.information import MeasurementNoise
-from calibrate.handeye.observations import SHAPE, CellState, Observations, extent_of
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.kinematics import forward
 from calibrate.projection import project
+from calibrate.results import SHAPE
+from calibrate.views import Observations, extent_of
 from station.analysis.worker import check_run
 from station.cell.errors import LimitError
 from station.cell.limits import allowed_speed, check_plan, sample_path
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import Scene, guess_from, scene_of
-from station.plan.belief import BootstrapView, improved_config
-from station.plan.bootstrap import next_move
+from station.plan.bootstrap import BootstrapView, improved_config, next_move
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, candidate_pool, plan_scene
 from station.plan.visibility import ViewRange

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-SIMULATORS = "station.simulation"
+SIMULATORS = ("station.simulation", "tests.numbered_gige")
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
@@ -32,7 +32,7 @@ class DaemonUsage:
             except OSError:  # it has just ended
                 continue
             first_s = self._used_s[pid][0] if pid in self._used_s else now_s
-            self._used_s[pid] = first_s, now_s, SIMULATORS in command
+            self._used_s[pid] = first_s, now_s, any(name in command for name in SIMULATORS)
 
     def cores(self, *, simulators: bool) -> float:
         used_s = sum(
@@ -44,14 +44,6 @@ class DaemonUsage:
         """The most that the daemon itself ever had in memory."""
         status = Path(f"/proc/{self._daemon}/status").read_text()
         return int(status.split("VmHWM:")[1].split()[0]) / 1024
-
-
-def daemon_of_this_process() -> int:
-    """The `station serve` among the children."""
-    for pid in _family(os.getpid()):
-        if b"station.cli\0serve" in Path(f"/proc/{pid}/cmdline").read_bytes():
-            return pid
-    raise RuntimeError("no daemon was started from here")
 
 
 def put_before_others(daemon: int, niceness: int) -> None:

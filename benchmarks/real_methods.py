@@ -14,13 +14,12 @@ from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose_from_quaternion, quaternion_from_matrix
 from calibrate.handeye.axxb.peer_methods import HAND_EYE, ROBOT_WORLD, opencv_hand_eye, opencv_robot_world
 from calibrate.handeye.corners import bent_points
-from calibrate.handeye.observations import observe_views
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import single_threaded_opencv
-from calibrate.views import BoardView, ViewSet
+from calibrate.views import BoardView, ViewSet, observe_views
 from recordings.schema.messages import BoardSpec, CameraModel
 
 FAILURES = (CalibrationError, cv2.error, np.linalg.LinAlgError, ValueError, RuntimeError)

@@ -195,7 +195,6 @@ async def _move(operator: Client, plan: object) -> None:
             purpose = "run"
         summary = await operator.call(Prepare(Purpose(purpose)), timeout_s=60.0)
         await operator.call(Go(summary.token))
-        operator.outdate()
         states: list[StationState] = []
 
         def moves(status: StationStatus, seen: list[StationState] = states) -> bool:

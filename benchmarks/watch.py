@@ -301,8 +301,7 @@ def simulate(cell: Cell, count: int, what: Happening | None) -> tuple[CellModel,
     pixels = still.seen_by(transform_points(C, still.tag)) + noise_px + still.blur_px
     recorded = forward(_ARM, still.joints)
     return still.model, [
-        Picture(str(i), 0.0, recorded[i], still.joints[i], (0, 1, 2, 3), _TAG, pixels[i])
-        for i in range(count)
+        Picture(str(i), recorded[i], still.joints[i], (0, 1, 2, 3), _TAG, pixels[i]) for i in range(count)
     ]
 
 
@@ -412,7 +411,7 @@ def _wrong_arm(rng: np.random.Generator, joints: Array, factor: float) -> RobotM
             a_m=tuple((_ARM.a_m + a).tolist()),
             d_m=tuple((_ARM.d_m + d).tolist()),
             alpha_rad=tuple((_ARM.alpha_rad + alpha).tolist()),
-            theta_offset_rad=tuple((_ARM.theta_offset_rad + theta).tolist()),
+            theta_rad=tuple((_ARM.theta_rad + theta).tolist()),
         )
 
     scatter = (forward(arm(1e-4), joints) - forward(_ARM, joints))[:, :3, 3].std(axis=0)

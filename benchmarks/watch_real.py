@@ -135,9 +135,7 @@ def _pictures(folder: Path, name: str, camera: int, arm: Array, markers: Array) 
         flange = _flange(arm, joints)
         corners = tuple(faces.tolist())
         pixels = seen[first, 4:6].copy()
-        found.append(
-            Picture(f"{name}-{number:.0f}", 0.0, flange, joints[1:], corners, markers[faces], pixels)
-        )
+        found.append(Picture(f"{name}-{number:.0f}", flange, joints[1:], corners, markers[faces], pixels))
     return found
 
 

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from calibrate.files.validity import ValidityReason as ValidityReason
     from calibrate.files.validity import ValidityState as ValidityState
     from calibrate.geometry import Transform as Transform
-    from calibrate.pipeline import JobOptions as JobOptions
-    from calibrate.pipeline import SolvedRecording as SolvedRecording
+    from calibrate.job import JobOptions as JobOptions
+    from calibrate.job import SolvedRecording as SolvedRecording
     from calibrate.pipeline import solve_recording as solve_recording
     from calibrate.quality.gates import GateLimits as GateLimits
 
@@ -50,7 +50,8 @@ _MODULES = {
     "files.loader": "InstallationChange InstalledCalibration load_installed watch",
     "files.validity": "Validity ValidityReason ValidityState",
     "geometry": "Transform",
-    "pipeline": "JobOptions SolvedRecording solve_recording",
+    "job": "JobOptions SolvedRecording",
+    "pipeline": "solve_recording",
     "quality.gates": "GateLimits",
 }
 """Module → names that it gives."""

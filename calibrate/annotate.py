@@ -6,7 +6,6 @@ and exported like it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,14 +16,17 @@ from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_from_turned, board_points, looks_same_turns
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, encode_calibration
-from calibrate.geometry import Array, inverse
+from calibrate.geometry import Array
 from calibrate.load import Progress, load_views
 from calibrate.projection import project_pixels
+from calibrate.views import board_in_camera
+from recordings.exporters.excerpt import copied
+from recordings.images import viewable
 from recordings.reader import Recording
 from recordings.scene import Entity, Polyline
 from recordings.schema.messages import CameraModel, Matrix4, View
 from recordings.schema.viewing import DETECTED, Marks, drawn
-from recordings.writer import RecordingWriter, derived_recording
+from recordings.writer import derived_recording
 
 USED, REJECTED, PREDICTED = DETECTED, (0.95, 0.1, 0.1), (1.0, 0.8, 0.1)
 MAGNIFIED = 50.0
@@ -68,56 +70,32 @@ def annotate(
         )
     seen = load_views(recording, calibration.board, camera, progress, fewest=_FEWEST_VIEWS).detections
     rejected = {view.index: view.reason for view in calibration.views.rejected}
-    chain = _camera_from_board(calibration)
+    X, B = calibration.transform.matrix, calibration.board_place.transform.matrix
     marks: list[list[Marks]] = []
     found: list[ViewResidual] = []
     for view in recording.views():
         why = rejected.get(view.index, "")
-        of_view, rms_px = _marks(calibration, camera, chain(view), seen.get(view.index), bool(why))
+        C = board_in_camera(info.mount, np.array(view.base_from_flange), X, B)
+        of_view, rms_px = _marks(calibration, camera, C, seen.get(view.index), bool(why))
         marks.append(of_view)
         found.append(ViewResidual(view.index, rms_px, why))
     with derived_recording(output, msgspec.structs.replace(info, part=1)) as writer:
-        _copy_beside_views(recording, writer)
         writer.attach("calibration.yaml", "application/yaml", encode_calibration(calibration))
         writer.camera_model(camera)
         for place in (calibration.result, calibration.board_place):
             T: Matrix4 = tuple(tuple(map(float, row)) for row in place.transform.matrix)
             writer.frame(place.parent_frame, place.child_frame, T)
-        for sequence, (view, picture) in enumerate(recording.images()):
-            stored = recording.stored_image(view)
-            writer.image(msgspec.structs.replace(picture, sequence=sequence), stored[1] if stored else None)
-            writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
-            text = _text(found[sequence])
-            writer.marks(sequence, marks[sequence], text)
-            writer.drawn_image(sequence, drawn(picture.viewable(), marks[sequence], text))
+        copies = copied(recording, writer, replaced=["calibration.yaml"])
+        for (_, image), of_view, residual in zip(copies, marks, found, strict=True):
+            text = _text(residual)
+            writer.marks(image.sequence, of_view, text)
+            shown = viewable(image.pixels, image.pixel_format)
+            writer.drawn_image(image.sequence, drawn(shown, of_view, text))
         pairs = zip(recording.views(), found, strict=True)
         cameras = [_camera_entity(calibration, camera, view, residual) for view, residual in pairs]
         writer.scene(0, [_board_entity(calibration), *cameras])
         writer.finish()
     return found
-
-
-def _copy_beside_views(recording: Recording, writer: RecordingWriter) -> None:
-    kinds = recording.media_types()
-    for name, content in recording.attachments().items():
-        if name != "calibration.yaml":
-            writer.attach(name, kinds[name], content)
-    for state in recording.robot_states():
-        writer.robot_state(state)
-    for event in recording.events():
-        writer.event(event)
-
-
-def _camera_from_board(calibration: Calibration) -> Callable[[View], Array]:
-    """View → camera_from_board as robot, X and the board's place say it."""
-    X, B = calibration.transform.matrix, calibration.board_place.transform.matrix
-    in_hand = calibration.mount == "eye-in-hand"
-
-    def chain(view: View) -> Array:
-        F = np.array(view.base_from_flange)
-        return np.asarray(inverse(X) @ (inverse(F) if in_hand else F) @ B)
-
-    return chain
 
 
 def _marks(

@@ -36,8 +36,7 @@ from calibrate.files.calibration import (
 from calibrate.files.gate import Gate
 from calibrate.geometry import Transform
 from calibrate.handeye.arm import HELD, PARAMETERS
-from calibrate.handeye.arm_result import Verification
-from calibrate.handeye.solution import Remark, Solution, TableResult
+from calibrate.handeye.solution import Remark, Solution, TableResult, Verification
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty
@@ -111,7 +110,10 @@ def _arm_table(solution: Solution, arm: TableResult, verified: Verification | No
         without, with_table = 1e3 * np.sqrt(np.nanmean(arm.held_out_m**2, axis=1))
         seen = int(np.isfinite(arm.held_out_m[0]).sum())
         held_out = HeldOutViews(float(without), float(with_table), seen)
-    own = Transform(f"corrected_{X.parent}", X.child, X.matrix)
+    own, later = Transform(f"corrected_{X.parent}", X.child, X.matrix), None
+    if verified is not None:
+        without_m, with_m = verified.rms_m
+        later = HeldOutViews(1e3 * without_m, 1e3 * with_m, len(verified.flange_m), verified.recording)
     return CorrectedArm(
         offered=arm.offered,
         model=arm.nominal.name,
@@ -124,16 +126,11 @@ def _arm_table(solution: Solution, arm: TableResult, verified: Verification | No
         without_table_mm=1e3 * arm.without_table_m,
         if_measured_mm={name: 1e3 * value for name, value in arm.if_measured_m.items()},
         held_out=held_out,
-        verified=None if verified is None else _verified(verified),
+        verified=later,
         refused=arm.refused or "",
         corrected=DhTable.of(arm.corrected) if arm.offered else None,
         result=FramePose.of(own) if arm.offered else None,
     )
-
-
-def _verified(found: Verification) -> HeldOutViews:
-    without_m, with_table_m = found.rms_m
-    return HeldOutViews(1e3 * without_m, 1e3 * with_table_m, len(found.flange_m), found.recording)
 
 
 @cache

@@ -32,10 +32,8 @@ class RobotModel:
     name: str
     a_m: tuple[float, ...]
     d_m: tuple[float, ...]
-    generation: str
-    """'CB3' or 'e-Series'"""
     alpha_rad: tuple[float, ...] = _ALPHA
-    theta_offset_rad: tuple[float, ...] = (0.0,) * 6
+    theta_rad: tuple[float, ...] = (0.0,) * 6
     beta_rad: tuple[float, ...] = (0.0,) * 6
     joint_limit_rad: float = 2 * np.pi
     """Joints turn within ± this."""
@@ -60,14 +58,13 @@ class RobotModel:
             a_m=add(self.a_m, a_m),
             d_m=add(self.d_m, d_m),
             alpha_rad=add(self.alpha_rad, alpha_rad),
-            theta_offset_rad=add(self.theta_offset_rad, theta_rad),
+            theta_rad=add(self.theta_rad, theta_rad),
             beta_rad=add(self.beta_rad, beta_rad),
         )
 
 
 def _model(name: str, a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> RobotModel:
-    generation = "e-Series" if name.endswith("e") else "CB3"
-    return RobotModel(name, (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), generation)
+    return RobotModel(name, (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6))
 
 
 MODELS: dict[str, RobotModel] = {
@@ -90,7 +87,7 @@ def link_frames(model: RobotModel, joints_rad: ArrayLike) -> Array:
     frames = np.zeros((*q.shape[:-1], 7, 4, 4))
     frames[..., 0, :, :] = np.eye(4)
     for i in range(6):
-        theta = q[..., i] + model.theta_offset_rad[i]
+        theta = q[..., i] + model.theta_rad[i]
         ct, st = np.cos(theta), np.sin(theta)
         ca, sa = np.cos(model.alpha_rad[i]), np.sin(model.alpha_rad[i])
         step = np.zeros((*q.shape[:-1], 4, 4))
@@ -169,7 +166,7 @@ _ON_AXIS = 1e-6
 
 def _with_columns(like: RobotModel, columns: Array) -> RobotModel:
     a, d, alpha, theta, beta = (tuple(column) for column in columns.tolist())
-    return replace(like, a_m=a, d_m=d, alpha_rad=alpha, theta_offset_rad=theta, beta_rad=beta)
+    return replace(like, a_m=a, d_m=d, alpha_rad=alpha, theta_rad=theta, beta_rad=beta)
 
 
 def _turn_z(angle: float) -> Array:
@@ -192,7 +189,7 @@ def base_from_flange(table: Mapping[str, Sequence[float]], joints_rad: ArrayLike
     `corrected_flange` into `corrected_base`: it belongs to `arm_table.result` alone, never to another X.
     """
     a, d, alpha, theta, beta = (tuple(table[name]) for name in TABLE_COLUMNS)
-    return forward(RobotModel("corrected", a, d, "", alpha, theta, beta), joints_rad)
+    return forward(RobotModel("corrected", a, d, alpha, theta, beta), joints_rad)
 
 
 def jacobian(model: RobotModel, joints_rad: ArrayLike) -> Array:

@@ -20,6 +20,7 @@ from calibrate.views import BoardView, ViewSet
 from recordings import strict_yaml
 from recordings.errors import BadImageError
 from recordings.files import usable_cores
+from recordings.images import viewable
 from recordings.reader import Recording
 from recordings.schema.messages import (
     ARM_KINEMATICS_NAME,
@@ -42,7 +43,6 @@ class LoadedViews:
     views: ViewSet
     """With pixels, without board poses; the camera's matrix is None unless it was known."""
     board: BoardSpec
-    pictures: int
     without_board: tuple[RejectedView, ...]
     """Also those whose picture cannot be decoded, and those left out by hand."""
     detections: dict[int, Detection] = field(default_factory=dict)
@@ -95,15 +95,11 @@ def load_views(
                 images=pictures,
             )
         raise _too_few(recording, len(views), pictures, missing, fewest)
-    model = CameraModel(
-        model.width or next(iter(seen.values())).width,
-        model.height or next(iter(seen.values())).height,
-        model.matrix,
-        model.distortion,
-        model.distortion_model,
-    )
+    if not (model.width and model.height):
+        first = next(iter(seen.values()))
+        model = msgspec.structs.replace(model, width=first.width, height=first.height)
     found = ViewSet(info.mount, tuple(views), model, info.robot.model, _calibrated_arm(recording))
-    return LoadedViews(found, spec, pictures, tuple(missing), seen, recording.losses)
+    return LoadedViews(found, spec, tuple(missing), seen, recording.losses)
 
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:
@@ -129,13 +125,8 @@ def _calibrated_arm(recording: Recording) -> RobotModel | None:
             code="arm-kinematics",
             remedy="Export the recording to a folder and import it again without the robot's model.",
         ) from None
-    return replace(
-        published,
-        a_m=stated.a_m,
-        d_m=stated.d_m,
-        alpha_rad=stated.alpha_rad,
-        theta_offset_rad=stated.theta_rad,
-    )
+    a, d, alpha, theta = stated.a_m, stated.d_m, stated.alpha_rad, stated.theta_rad
+    return replace(published, a_m=a, d_m=d, alpha_rad=alpha, theta_rad=theta)
 
 
 class _Origin(msgspec.Struct):
@@ -257,11 +248,7 @@ def detect_all(
 
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
     picture = recording.image(view)
-    _check_size(view, picture.pixels.shape[1], picture.pixels.shape[0], camera)
-    return detect(picture.viewable(), spec, with_quality=False)
-
-
-def _check_size(view: View, width: int, height: int, camera: CameraModel) -> None:
+    height, width = picture.pixels.shape[:2]
     if camera.width and (width, height) != (camera.width, camera.height):
         raise BadViewsError(
             f"View {view.index + 1} ({view.name}): the image is {width}×{height}, camera or intrinsics are "
@@ -273,6 +260,7 @@ def _check_size(view: View, width: int, height: int, camera: CameraModel) -> Non
             width_px=width,
             height_px=height,
         )
+    return detect(viewable(picture.pixels, picture.pixel_format), spec, with_quality=False)
 
 
 def _image_view(view: View, detection: Detection, spec: BoardSpec) -> BoardView:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
@@ -15,106 +15,36 @@ import numpy as np
 from calibrate.boards.model import check_board
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
-from calibrate.files.calibration import Calibration
-from calibrate.files.gate import Gate
-from calibrate.handeye.arm_result import Verification, verify_elsewhere
+from calibrate.handeye.arm_result import verify_elsewhere
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.handeye.solution import Profile, Solution, SolveOptions
+from calibrate.handeye.solution import Solution, SolveOptions, Verification
 from calibrate.handeye.solve import solve_views
-from calibrate.lens.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
+from calibrate.job import JobOptions, PreparedViews, SolvedRecording
+from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
-from calibrate.load import FEWEST_VIEWS, LoadedViews, Progress, load_views, without_views
+from calibrate.load import FEWEST_VIEWS, Progress, load_views, without_views
 from calibrate.projection import intrinsics_names
-from calibrate.quality.gates import GateInputs, GateLimits, judge
+from calibrate.quality.gates import GateInputs, judge
 from calibrate.quality.sweep import at_time_offset
-from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 from recordings.reader import Recording, open_recording
-from recordings.schema.messages import BoardSpec, CameraModel, TimeCorrection
+from recordings.schema.messages import BoardSpec, CameraModel
 
 _WORST_VIEW_PX = 20.0
 
 
-@dataclass(frozen=True)
-class JobOptions:
-    """Choices of one offline run; recorded in the calibration's provenance."""
+class _Stopwatch:
+    """Time by stage, in milliseconds, in the order in which stages end."""
 
-    profile: Profile = "robust"
-    seed: int = 0
-    board: BoardSpec | None = None
-    """Instead of the recorded one."""
-    square_m: float | None = None
-    """Another size of square; a charuco board's markers and an april-grid's gaps grow with it."""
-    camera: CameraModel | None = None
-    """Known intrinsics, instead of the recorded ones or of finding them."""
-    camera_sigma: dict[str, float] = field(default_factory=dict)
-    """Their 1σ by parameter, where it is stated; else the usual 0.2 %."""
-    lens_model: LensModel = "plumb_bob"
-    find_intrinsics: bool = False
-    """Find them from these pictures even where some are recorded."""
-    limits: GateLimits = field(default_factory=GateLimits)
-    accept_move: bool = False
-    """Use both parts of a session in which camera or board was moved half-way."""
-    working_distance_m: float | None = None
-    without: tuple[int, ...] = ()
-    """Numbers, from 1, of the poses that a person leaves out."""
-    time_offset: TimeCorrection | None = None
-    """Poses are read from the robot states so much later than the frames' times."""
-    threads: int | None = None
-    """Threads of the board detection; the result does not depend on it."""
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.stage_ms: dict[str, float] = {}
 
-    @property
-    def chosen(self) -> dict[str, Any]:
-        """The choices that differ from the defaults, as plain values; profile and seed stand elsewhere."""
-        default = JobOptions()
-        return {
-            name: msgspec.to_builtins(value)
-            for name, value in vars(self).items()
-            if name not in ("threads", "profile", "seed") and value != getattr(default, name)
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class PreparedViews:
-    """A recording's views with lens and board poses: what every solver starts from."""
-
-    recording: Recording
-    loaded: LoadedViews
-    views: ViewSet
-    intrinsics: Intrinsics | None
-    """Estimated intrinsics; None when they were given."""
-    stage_ms: dict[str, float]
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedRecording(PreparedViews):
-    solution: Solution
-    coverage: float
-    lens_known: LensUncertainty | None
-    """None without corners, or with the paper's profile."""
-    gates: tuple[Gate, ...]
-    calibration: Calibration
-    verified: Verification | None = None
-
-    @property
-    def passed(self) -> bool:
-        return all(gate.passed for gate in self.gates)
-
-
-def prepare_views(
-    path: Path,
-    options: JobOptions | None = None,
-    progress: Progress | None = None,
-    fewest: int = FEWEST_VIEWS,
-) -> PreparedViews:
-    """Open, find the boards, the lens where it is not known, and the board poses.
-
-    Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
-    """
-    options = options or JobOptions()
-    with single_threaded_opencv():
-        return _prepare(path, options, progress, fewest)
+    def lap(self, stage: str) -> None:
+        """The time since the last lap belongs to `stage`."""
+        now = time.perf_counter()
+        self.stage_ms[stage], self._last = 1e3 * (now - self._last), now
 
 
 @contextmanager
@@ -128,8 +58,19 @@ def single_threaded_opencv() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _prepare(path: Path, options: JobOptions, progress: Progress | None, fewest: int) -> PreparedViews:
-    watch = Stopwatch()
+@single_threaded_opencv()
+def prepare_views(
+    path: Path,
+    options: JobOptions | None = None,
+    progress: Progress | None = None,
+    fewest: int = FEWEST_VIEWS,
+) -> PreparedViews:
+    """Open, find the boards, the lens where it is not known, and the board poses.
+
+    Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
+    """
+    options = options or JobOptions()
+    watch = _Stopwatch()
     recording = open_recording(path)
     watch.lap("open")
     camera = options.camera
@@ -167,6 +108,7 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
     )
 
 
+@single_threaded_opencv()
 def solve_recording(
     path: Path,
     options: JobOptions | None = None,
@@ -180,13 +122,15 @@ def solve_recording(
     options = options or JobOptions()
     prepared = prepare_views(path, options, progress)
     recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
-    watch = Stopwatch()
-    with single_threaded_opencv():
-        solution = solve_views(views, solver_options(options, prepared))
+    watch = _Stopwatch()
+    solution = solve_views(views, solver_options(options, prepared))
     watch.lap("solve")
     verified = None
     if verify is not None:
-        verified = _verify(verify, replace(options, board=loaded.board, square_m=None), solution, progress)
+        same = replace(options, board=loaded.board, square_m=None, camera=solution.camera, without=())
+        same = replace(same, find_intrinsics=False, time_offset=None)
+        elsewhere = prepare_views(verify, same, progress, 1)
+        verified = verify_elsewhere(solution, elsewhere.views, verify.name)
         solution = _judged_by(verified, solution)
         watch.lap("verify")
     used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
@@ -210,12 +154,6 @@ def solve_recording(
         calibration=calibration,
         verified=verified,
     )
-
-
-def _verify(path: Path, options: JobOptions, solution: Solution, progress: Progress | None) -> Verification:
-    options = replace(options, camera=solution.camera, find_intrinsics=False, without=(), time_offset=None)
-    with single_threaded_opencv():
-        return verify_elsewhere(solution, _prepare(path, options, progress, 1).views, path.name)
 
 
 def _judged_by(verified: Verification, solution: Solution) -> Solution:

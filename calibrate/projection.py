@@ -1,4 +1,4 @@
-"""Pinhole projection with lens distortion and its exact derivatives, for many points at once.
+"""Pinhole projection with lens distortion and its exact derivatives, for many points at once; its inverse.
 
 OpenCV's models and coefficient order: plumb_bob k1 k2 p1 p2 k3, rational_polynomial + k4 k5 k6,
 equidistant (fisheye) k1 … k4. Pixel (0, 0) is the centre of the top left pixel.
@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array
+from calibrate.geometry import Array, transform_points
 from recordings.schema.messages import CameraModel
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -183,3 +185,38 @@ def _by_intrinsics(camera: CameraModel, K: Array, x: Array, y: Array, xd: Array,
         J[..., 0, place] = K[0, 0] * a + K[0, 1] * b
         J[..., 1, place] = K[1, 1] * b
     return J
+
+
+_UNDISTORT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-10)
+
+
+def distortion(camera: CameraModel) -> Array:
+    """Return OpenCV's coefficients: (4,) for equidistant, otherwise (5,) or (8,), zeros appended."""
+    values = np.array(camera.distortion, dtype=float)
+    size = 4 if camera.distortion_model == "equidistant" else (8 if len(values) > 5 else 5)
+    if len(values) > size or not np.isfinite(values).all():
+        raise BadViewsError(
+            f"The distortion {camera.distortion} does not fit {camera.distortion_model}.",
+            code="distortion",
+            remedy=f"Write at most {size} finite numbers.",
+        )
+    return np.concatenate([values, np.zeros(size - len(values))])
+
+
+def project_at(camera: CameraModel, camera_from_board: Array, points: Array) -> Array:
+    """Project points (n, 3) of `board` to pixels (n, 2)."""
+    return project_pixels(camera, transform_points(camera_from_board, np.asarray(points, dtype=float)))
+
+
+def undistort(camera: CameraModel, pixels: Array) -> Array:
+    """Map pixels (n, 2) to those that a lens without distortion and the same matrix would show.
+
+    OpenCV passes over a skew in the matrix: good enough for a start.
+    """
+    K, D = camera_matrix(camera), distortion(camera)
+    points = np.ascontiguousarray(pixels, dtype=float).reshape(-1, 1, 2)
+    if camera.distortion_model == "equidistant":
+        plain: Any = cv2.fisheye.undistortPoints(points, K, D, P=K)
+    else:
+        plain = cv2.undistortPointsIter(points, K, D, np.eye(3), K, _UNDISTORT_STEPS)
+    return np.asarray(plain, dtype=np.float64).reshape(-1, 2)

@@ -43,7 +43,7 @@ class HoldoutScore(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class BoardShape(msgspec.Struct, frozen=True):
-    """Shape of the board by the views, with 1σ each; see `handeye.observations.SHAPE`."""
+    """Shape of the board by the views, with 1σ each; see `SHAPE`."""
 
     scale: float
     """True over stated size, minus 1."""
@@ -51,6 +51,16 @@ class BoardShape(msgspec.Struct, frozen=True):
     """x against y of the print."""
     bend_m: tuple[float, float, float]
     sigma: tuple[float, float, float, float, float]
+
+    @property
+    def numbers(self) -> NDArray[np.float64]:
+        """(5,) in the order of `SHAPE`."""
+        return np.array([self.scale, self.anisotropy, *self.bend_m])
+
+
+SHAPE = ("scale", "anisotropy", "bend xx", "bend yy", "bend xy")
+"""The board's shape: a point (x, y) of the sheet, (u, v) the same mapped to -1 … 1 over the corners, lies at
+(x + s x + a x/2, y + s y - a y/2, b1 (1 - u²) + b2 (1 - v²) + b3 u v); s and a plain, b in metres."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array
+from calibrate.geometry import Array, inverse
 from calibrate.kinematics import RobotModel
 from recordings.schema.messages import CameraModel, Mount
 
@@ -96,3 +98,79 @@ def require_no_copies(views: ViewSet) -> None:
                 other=other.index + 1,
             )
         first[key] = view
+
+
+Places = NDArray[np.intp]
+Moved = Literal["camera", "board"]
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Padded arrays of all views, one row a view."""
+
+    mount: Mount
+    flange: Array
+    """(n, 4, 4) recorded base_from_flange."""
+    points: Array
+    """(n, k, 3) corners on the board, metres; rows beyond a view's own corners are padding."""
+    pixels: Array
+    """(n, k, 2)"""
+    present: Array
+    """(n, k) 1 for a corner, 0 for padding."""
+    table: Array | None = None
+    """(n, 6, q) motion of the flange, in base, by each error of the kinematic table; None without joints."""
+    extent: Array = field(default_factory=lambda: np.array([[0.0, 0.0], [1.0, 1.0]]))
+    """(2, 2) middle and half size of all corners seen, metres: what the board's bends refer to."""
+    later: NDArray[np.bool_] | None = None
+    """(n,) the views after something was moved (`CellState.second`); None where nothing was."""
+    moved: Moved = "board"
+    """Camera (X has a second value) or board (Y has)."""
+
+    def __len__(self) -> int:
+        return len(self.flange)
+
+    @property
+    def has_pixels(self) -> bool:
+        return bool(self.present.any())
+
+    def part(self, places: Places) -> Observations:
+        """Select these views."""
+        return replace(
+            self,
+            flange=self.flange[places],
+            points=self.points[places],
+            pixels=self.pixels[places],
+            present=self.present[places],
+            table=None if self.table is None else self.table[places],
+            later=None if self.later is None else self.later[places],
+        )
+
+
+def observe_views(views: ViewSet) -> Observations:
+    """Pad the views' corners to one array."""
+    count = max(1, max(len(view.pixels) for view in views))
+    n = len(views)
+    points, pixels, present = np.zeros((n, count, 3)), np.zeros((n, count, 2)), np.zeros((n, count))
+    for i, view in enumerate(views):
+        k = len(view.pixels)
+        points[i, :k], pixels[i, :k], present[i, :k] = view.board_points, view.pixels, 1.0
+    extent = extent_of(points[present > 0]) if present.any() else np.array([[0.0, 0.0], [1.0, 1.0]])
+    return Observations(views.mount, views.base_from_flange, points, pixels, present, extent=extent)
+
+
+def extent_of(points: Array) -> Array:
+    """Compute middle and half size (2, 2), metres, of points (m, 3) on the board."""
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    return np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-6)])
+
+
+def implied_flange(mount: Mount, X: Array, Y: Array, C: Array) -> Array:
+    """Compute base_from_flange (n, 4, 4): Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand)."""
+    if mount == "eye-in-hand":
+        return np.asarray(Y @ inverse(C) @ inverse(X))
+    return np.asarray(X @ C @ inverse(Y))
+
+
+def board_in_camera(mount: Mount, flange: Array, X: Array, Y: Array) -> Array:
+    """Predict camera_from_board (..., 4, 4) of base_from_flange (..., 4, 4): (F X)⁻¹ Y, or X⁻¹ F Y."""
+    return np.asarray(inverse(flange @ X) @ Y if mount == "eye-in-hand" else inverse(X) @ flange @ Y)

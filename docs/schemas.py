@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from calibrate.batch.run import BatchResult
+from calibrate.batch.storage import BatchResult
 from calibrate.cli.contracts import (
     CompareJson,
     DiffJson,

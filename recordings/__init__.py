@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from recordings.errors import UnfinishedRecordingError as UnfinishedRecordingError
     from recordings.exporters.excerpt import write_excerpt as write_excerpt
     from recordings.exporters.folder import export_recording as export_recording
+    from recordings.images import viewable as viewable
     from recordings.importers.bag import import_bag as import_bag
     from recordings.importers.folder import import_folder as import_folder
     from recordings.info import recording_info as recording_info
@@ -52,6 +53,7 @@ _MODULES = {
     "UnfinishedRecordingError",
     "exporters.excerpt": "write_excerpt",
     "exporters.folder": "export_recording",
+    "images": "viewable",
     "importers.bag": "import_bag",
     "importers.folder": "import_folder",
     "info": "recording_info",

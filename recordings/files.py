@@ -6,6 +6,7 @@ import errno
 import fcntl
 import os
 import re
+import stat
 from pathlib import Path
 
 from recordings.errors import RecordingError, disk_error, exists_error
@@ -52,6 +53,18 @@ def create_exclusively(path: Path) -> int:
             "create", path, error, "Create its folder first." if error.errno == errno.ENOENT else ""
         ) from error
     lock(descriptor, path)
+    return descriptor
+
+
+def open_file(path: Path) -> int:
+    """Descriptor for reading. RecordingError when it is no readable file."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError as error:
+        raise disk_error("open", path, error) from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise RecordingError(f"{path} is not a file", code="no-file")
     return descriptor
 
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import msgspec
 
 from recordings.errors import CorruptRecordingError, RecordingError, disk_error
-from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, write_atomically
-from recordings.mcap.scan import open_file
+from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, open_file, write_atomically
 
 MANIFEST_FILE = "parts.json"
 PARTS_LIMIT = 100

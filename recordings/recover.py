@@ -15,11 +15,18 @@ from recordings.errors import (
     disk_error,
     exists_error,
 )
-from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, discard_leftover, lock, rename_new, sync_folder
+from recordings.files import (
+    EMPTY_SUFFIX,
+    PART_SUFFIX,
+    discard_leftover,
+    lock,
+    open_file,
+    rename_new,
+    sync_folder,
+)
 from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
 from recordings.mcap.records import MESSAGE_HEAD, Opcode, with_crc
 from recordings.mcap.salvage import Salvage, salvage
-from recordings.mcap.scan import open_file
 from recordings.mcap.writer import McapFile
 from recordings.schema.definitions import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
 from recordings.schema.messages import SessionInfo, View
@@ -99,15 +106,13 @@ def _recover_session(folder: Path) -> list[Recovery]:
     missing = missing_parts(folder, again, set(present))
     if missing:
         give_up_parts(folder, session, present, missing)
-    return [*results, *(_given_up(folder, part, name) for part, name in missing.items())]
-
-
-def _given_up(folder: Path, part: int, name: str) -> Recovery:
-    reason = (
-        f"segment {part} of the session is not in the folder; noted as lost in {MANIFEST_FILE}. "
-        "Should it turn up, put it back here and it is read again"
-    )
-    return Recovery(folder / name, None, 0, 0, 0, 0, (reason,))
+    for part, name in missing.items():
+        reason = (
+            f"segment {part} of the session is not in the folder; noted as lost in {MANIFEST_FILE}. "
+            "Should it turn up, put it back here and it is read again"
+        )
+        results.append(Recovery(folder / name, None, 0, 0, 0, 0, (reason,)))
+    return results
 
 
 def _recover_part(source: Path) -> tuple[Recovery, SessionInfo | None]:

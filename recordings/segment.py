@@ -13,12 +13,12 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from recordings.errors import BadImageError, CorruptRecordingError
-from recordings.files import is_attachment_name, is_session_name
+from recordings.files import is_attachment_name, is_session_name, open_file
 from recordings.images import ImageError, Pixels, decode_image, raw_array
 from recordings.manifest import PARTS_LIMIT
 from recordings.mcap.contents import MessageIndex, joined
 from recordings.mcap.records import BadRecordError, require_crc
-from recordings.mcap.scan import open_file, scan_file
+from recordings.mcap.scan import scan_file
 from recordings.mcap.source import Message, ShortFileError
 from recordings.schema.definitions import (
     FORMATS,

@@ -131,14 +131,15 @@ def examine(content: bytes, kind: type[Any]) -> Examined:
 
     Raises StrictYamlError where the file is no YAML at all.
     """
+    problems = []
     try:
         load(content, kind)
-        problems = []
     except StrictYamlError as error:
         problems = error.problems
     try:
-        node = _loader()(content).get_single_node()
-        plain = _loader()(content).get_single_data()
+        loader = _loader()(content)
+        node = loader.get_single_node()
+        plain = loader.construct_document(node)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, OverflowError):
         raise StrictYamlError(problems) from None
     if not isinstance(plain, dict) or len(content) > LIMIT_BYTES:

@@ -22,9 +22,9 @@ import msgspec
 from recordings.errors import RecordingError, disk_error, exists_error, recover_line
 from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, rename_new, sync_folder
 from recordings.images import ImageError, encode_png, read_header
-from recordings.mcap.records import with_crc
+from recordings.mcap.records import Piece, with_crc
 from recordings.mcap.source import Message
-from recordings.mcap.writer import McapFile, Piece
+from recordings.mcap.writer import McapFile
 from recordings.scene import Entity, scene_update
 from recordings.schema import viewing
 from recordings.schema.definitions import FORMATS, SESSION_RECORDS, PictureFacts, encode

@@ -36,18 +36,15 @@ def freeze_startup() -> None:
     gc.freeze()
 
 
-def notify(*lines: str) -> bool:
-    """Tells systemd 'READY=1', 'STATUS=…' (sd_notify). False where none listens. Never blocks."""
-    address = os.environ.get("NOTIFY_SOCKET", "")
-    if not address:
-        return False
+def notify(line: str) -> None:
+    """Tells systemd 'READY=1', 'STATUS=…' (sd_notify), where it listens. Never blocks."""
+    if not (address := os.environ.get("NOTIFY_SOCKET", "")):
+        return
     if address.startswith("@"):
         address = "\0" + address[1:]
     with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
         link.setblocking(False)
-        link.sendto("\n".join(lines).encode(), address)
-        return True
-    return False
+        link.sendto(line.encode(), address)
 
 
 def watchdog_period_s() -> float | None:
@@ -61,30 +58,15 @@ def watchdog_period_s() -> float | None:
     return limit_s / 2 if limit_s > 0 else None
 
 
-class Watchdog:
-    """Pings systemd from the working loop, and only while the loop and the recorder do their work."""
-
-    def __init__(self, healthy: Callable[[], bool]) -> None:
-        self._healthy = healthy
-        self._period_s = watchdog_period_s()
-        self._pinged_s = 0.0
-
-    def tick(self) -> None:
-        now_s = time.monotonic()
-        if self._period_s is None or now_s - self._pinged_s < min(self._period_s, 1.0):
-            return
-        if self._healthy():
-            self._pinged_s = now_s
-            notify("WATCHDOG=1")
-
-
 class Daemon:
     def __init__(self, cell: Cell, root: Path, control: Path) -> None:
-        self._watchdog = Watchdog(self._healthy)
-        self.session = Session(cell, root, ticked=self._watchdog.tick, first=lambda: self._stop.round())
+        self.session = Session(cell, root)
         dispatcher = SessionDispatcher(self.session)
         self._control = ControlServer(control, dispatcher, newest=lambda: self.session.store.status)
         self._stop = StopServer(control, dispatcher.stop_from, self._latched, self._speed_rad_s)
+        self.session.supervisor.first = self._stop.round
+        self.session.supervisor.ticked = self._ping
+        self._watchdog_s, self._pinged_s = watchdog_period_s(), 0.0
         self._changed = asyncio.Event()
         self._ending = asyncio.Event()
         self._served_s = time.monotonic()
@@ -137,6 +119,15 @@ class Daemon:
             self._control.publish(self.session.store.status)
             self._tell_systemd()
             await asyncio.sleep(GATHER_S)
+
+    def _ping(self) -> None:
+        """Pings systemd from the working loop, and only while the loop and the recorder do their work."""
+        now_s = time.monotonic()
+        if self._watchdog_s is None or now_s - self._pinged_s < min(self._watchdog_s, 1.0):
+            return
+        if self._healthy():
+            self._pinged_s = now_s
+            notify("WATCHDOG=1")
 
     def _healthy(self) -> bool:
         """systemd may restart us when this stays false."""

@@ -12,7 +12,7 @@ import pytest
 
 
 def call(main: Callable[[], None], *arguments: object) -> CompletedProcess[str]:
-    """What `main` said and ended with, when a shell had called it with the arguments."""
+    """Call `main` with the arguments as a shell would; give its output and exit code."""
     command = [main.__module__.partition(".")[0], *map(str, arguments)]
     out, err, code = io.StringIO(), io.StringIO(), 0
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import re
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,10 @@ from tests.isolated_network import isolated_thread
 
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
 
+# Hundreds of programs are started: without its byte code each of them compiles the source first.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+gc.set_threshold(10_000, 20, 20)  # the usual ones go through all that was imported every few tests
 for _size in ("COLUMNS", "LINES"):  # a shell may export them: what is printed would break elsewhere
     os.environ.pop(_size, None)
 
@@ -55,12 +61,12 @@ CONTROL_PATHS = [pytest.param("ur_rtde", marks=no_library), "script"]
 
 @pytest.fixture(params=CONTROL_PATHS)
 def control_path(request: pytest.FixtureRequest) -> ControlPath:
-    """What asks for it is tested with both ways of driving an arm."""
+    """Both ways of driving an arm, each in a test of its own."""
     return request.param
 
 
 def asked(admin: AdminClient, what: str) -> int:
-    """How often a controller was told this: a key of its log's counts, or of CONTROL_WORDS."""
+    """Count what a controller was told: a key of its log's counts, or of CONTROL_WORDS."""
     counts = admin.ask("log")["counts"]
     return sum(int(counts.get(word, 0)) for word in CONTROL_WORDS.get(what, (what,)))
 
@@ -90,7 +96,7 @@ def functions_called(text: str) -> set[str]:
 
 
 def check_allow_list(host: str) -> None:
-    """What the simulated controller there was ever asked is on the list, and its moves within the caps."""
+    """Check that all it was ever asked is on the list, and its moves are within the caps."""
     with AdminClient(host) as admin:
         log = admin.ask("log")
     foreign = {c for c in log["counts"] if not c.startswith("controller: ")} - MAY_BE_SENT

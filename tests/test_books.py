@@ -37,7 +37,7 @@ def pages() -> list[Path]:
 
 
 def prepare(folder: Path) -> None:
-    """What a cell or a reader has before the first page."""
+    """Make what a cell or a reader has before the first page."""
     write_session(folder / "session.mcap", Scene(views=14), known_lens=True, source="real")
     write_session(folder / "new.mcap", Scene(views=6, seed=5), known_lens=True, source="real", name="new")
     run("calibrate solve session.mcap -o cell.yaml")

@@ -31,9 +31,8 @@ MADE = {
 def test_a_made_page_is_fresh(page: str) -> None:
     """`make pages` makes them anew."""
     program, *words = MADE[page].split()
-    command = [sys.executable, ROOT / "docs" / f"{program}.py", *words]
-    made = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert made.stdout == (ROOT / "docs" / f"{page}.md").read_text()
+    made = runpy.run_path(str(ROOT / "docs" / f"{program}.py"))["page"](*words)
+    assert made == (ROOT / "docs" / f"{page}.md").read_text()
 
 
 def test_the_books_have_few_words_in_short_sentences() -> None:
@@ -80,9 +79,7 @@ def test_every_error_has_a_code_of_its_own_kind() -> None:
 
 @pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
 def test_a_manual_page_names_every_command(program: str) -> None:
-    done = subprocess.run(
-        [sys.executable, ROOT / "docs" / "man.py", program], capture_output=True, text=True, check=True
-    )
+    page = runpy.run_path(str(ROOT / "docs" / "man.py"))["page"](program)
     asked = call(import_module(f"{program}.cli").main, "--help")
-    commands = re.findall(r"^\.SS \w+ ([\w-]+)$", done.stdout, re.MULTILINE)
+    commands = re.findall(r"^\.SS \w+ ([\w-]+)$", page, re.MULTILINE)
     assert len(commands) > 3 and all(command in asked.stdout for command in commands)

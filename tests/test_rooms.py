@@ -6,8 +6,10 @@ import re
 import shutil
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
+import grimp
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -79,3 +81,17 @@ def test_every_contract_breaks_when_it_is_broken(verdict: str) -> None:
 def test_a_forbidden_import_is_found(number: int, room: str, module: str, verdict: str) -> None:
     importer = f"{room.replace('/', '.')}.planted_{number}"
     assert re.search(rf"{re.escape(importer)} -> {re.escape(module)}\b", verdict)
+
+
+LONGEST_CHAIN = 14
+"""Modules one above the other; imports for types and inside functions count."""
+
+
+def test_imports_make_no_circle_and_no_long_chain() -> None:
+    graph = grimp.build_graph("recordings", "calibrate", "station", cache_dir=None)
+    imported = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    chains: dict[str, list[str]] = {}
+    for module in TopologicalSorter(imported).static_order():  # CycleError names a circle
+        chains[module] = [module, *max((chains[other] for other in imported[module]), key=len, default=[])]
+    longest = max(chains.values(), key=len)
+    assert len(longest) <= LONGEST_CHAIN, " > ".join(longest)

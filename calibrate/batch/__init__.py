@@ -6,7 +6,8 @@ there already; `collect_fleet(cells, workers=…)` reads the state of every cell
 
 from calibrate.batch.cluster import Cluster, cluster_workers, dask_workers
 from calibrate.batch.fleet import CameraRecord, collect_fleet, fleet_table
-from calibrate.batch.run import BatchResult, run_batch
+from calibrate.batch.run import run_batch
+from calibrate.batch.storage import BatchResult
 from calibrate.batch.workers import BatchError, pool
 
 __all__ = [

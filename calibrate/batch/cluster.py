@@ -32,14 +32,8 @@ class Cluster:
     tls_key: Path | None = None
 
     @classmethod
-    def from_file(
-        cls,
-        path: Path,
-        tls_ca: Path | None = None,
-        tls_cert: Path | None = None,
-        tls_key: Path | None = None,
-    ) -> Cluster:
-        """Read `dask scheduler --scheduler-file`'s JSON. Raises UsageError."""
+    def from_file(cls, path: Path, *tls: Path | None) -> Cluster:
+        """Read `dask scheduler --scheduler-file`'s JSON; `tls`: as the other fields. Raises UsageError."""
         try:
             address = msgspec.json.decode(path.read_bytes(), type=_SchedulerFile).address
         except (OSError, msgspec.DecodeError, UnicodeDecodeError) as problem:
@@ -48,7 +42,7 @@ class Cluster:
                 code="cluster-file",
                 remedy="Start the scheduler with: dask scheduler --scheduler-file FILE",
             ) from None
-        return cls(address, tls_ca, tls_cert, tls_key)
+        return cls(address, *tls)
 
     def check(self) -> None:
         """Raises UsageError where address and files do not belong together."""

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import msgspec
 
-from calibrate.batch.run import whole
-from calibrate.batch.storage import cell_folder
+from calibrate.batch.storage import cell_folder, whole
 from calibrate.batch.workers import BatchWorkers, Lost, pool
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration
-from calibrate.files.loader import cameras, current_validity, current_version, readable_folder
+from calibrate.files.folders import cameras, current_validity, current_version, readable_folder
 from calibrate.files.validity import ValidityState, time_text
 from calibrate.quality.checks import CheckEntry, Trend, find_trend, read_checks
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
 from calibrate.batch.fleet import UNREADABLE, CameraRecord
-from calibrate.batch.run import BatchResult
+from calibrate.batch.storage import BatchResult
 from calibrate.batch.trends import HEAD, NOT_FOLLOWED, CellHistory, place, quiet_text, rows
 from calibrate.files.validity import ValidityState, parse_time
 from calibrate.geometry import Array, difference

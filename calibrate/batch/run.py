@@ -7,7 +7,7 @@ import hashlib
 import io
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,55 +15,17 @@ from typing import Any
 import cv2
 import msgspec
 
-from calibrate.batch.storage import Results, facts, is_url, local_copy
+from calibrate.batch.storage import BatchResult, Results, facts, is_url, local_copy, whole
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.bounds import Limits, bounded
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import encode_calibration
 from calibrate.files.proof import content_sha256
-from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
+from calibrate.job import JobOptions, SolvedRecording
+from calibrate.pipeline import solve_recording
 from recordings.errors import RecordingError
 
 RESULTS = "results.jsonl"
-
-
-class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One recording of a batch: its camera pose and how good it is, or why it could not be solved."""
-
-    recording: str
-    key: str
-    """Key of recording and options: a finished one is not solved again."""
-    solved: bool
-    passed: bool = False
-    error: str = ""
-    session: str = ""
-    robot: str = ""
-    camera: str = ""
-    recorded_wall_ns: int = 0
-    mount: str = ""
-    translation_m: tuple[float, ...] = ()
-    rotation_xyzw: tuple[float, ...] = ()
-    covariance: tuple[tuple[float, ...], ...] = ()
-    sigma_mm: float | None = None
-    sigma_deg: float | None = None
-    e_t_mm: float | None = None
-    rms_px: float | None = None
-    views: int = 0
-    rejected: int = 0
-    failed_gates: tuple[str, ...] = ()
-    calibration: str = ""
-    """File name in the output folder."""
-    content_sha256: str = ""
-    """Hash of the calibration: equal for equal results, whoever computed them."""
-
-
-@dataclass(frozen=True)
-class Solved:
-    """Answer of a worker; workers write no file."""
-
-    result: BatchResult
-    content: bytes = b""
-    """Bytes of the calibration file."""
 
 
 Progress = Callable[[int, int, BatchResult], None]
@@ -94,10 +56,10 @@ def run_batch(
         with closing((workers or pool())(work, todo)) as answers:
             for count, ((recording, key), answer) in enumerate(answers, 1):
                 if isinstance(answer, Lost):
-                    answer = Solved(BatchResult(recording, key, False, error=answer.reason))
-                result = answer.result
-                if answer.content:
-                    store.write(result.calibration, answer.content)
+                    answer = BatchResult(recording, key, False, error=answer.reason), b""
+                result, content = answer
+                if content:
+                    store.write(result.calibration, content)
                 done[key] = result
                 store.add(RESULTS, key, result)
                 if progress:
@@ -107,11 +69,6 @@ def run_batch(
     except OSError as problem:
         raise BatchError(f"{output}: {problem.strerror or problem}.", code="batch-folder") from None
     return results
-
-
-def whole(place: Path | str) -> str:
-    """An absolute path, or the URL as it is."""
-    return str(place) if is_url(str(place)) else str(Path(place).resolve())
 
 
 def batch_key(place: Path | str, options: JobOptions) -> str:
@@ -127,8 +84,11 @@ def batch_key(place: Path | str, options: JobOptions) -> str:
     return hashlib.sha256(msgspec.json.encode([found, chosen], order="deterministic")).hexdigest()[:24]
 
 
-def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> Solved:
-    """Solve (recording, key) in a worker, here or on a cluster. Any failure is a result."""
+def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> tuple[BatchResult, bytes]:
+    """Solve (recording, key) in a worker, here or on a cluster. Any failure is a result.
+
+    The second value is the calibration file, which workers do not write; empty where there is none.
+    """
     recording, key = task
     cv2.setNumThreads(1)
     try:
@@ -136,11 +96,11 @@ def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> Sol
             job = solve_recording(path, replace(options, threads=1))
         content = encode_calibration(job.calibration)
     except (CalibrationError, RecordingError) as problem:
-        return Solved(BatchResult(recording, key, False, error=str(problem)))
+        return BatchResult(recording, key, False, error=str(problem)), b""
     except Exception as problem:  # a defect in one recording must not stop the other 199
         error = f"internal error: {type(problem).__name__}: {problem}"
-        return Solved(BatchResult(recording, key, False, error=error))
-    return Solved(_result(recording, key, job, f"{path.stem}-{key[:8]}.calibration.yaml"), content)
+        return BatchResult(recording, key, False, error=error), b""
+    return _result(recording, key, job, f"{path.stem}-{key[:8]}.calibration.yaml"), content
 
 
 def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchResult:

@@ -10,7 +10,7 @@ from itertools import pairwise, zip_longest
 import numpy as np
 from scipy import special
 
-from calibrate.batch.run import BatchResult
+from calibrate.batch.storage import BatchResult
 from calibrate.geometry import Array, difference, matrix_from_quaternion, pose
 
 _FALSE_ALARM = 1e-4

@@ -48,9 +48,8 @@ def local_spacing(grid: Array) -> Array:
     across = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
     down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
     spacing = np.full(grid.shape[:2], np.inf)
-    for shifted, steps in ((spacing[:, :-1], across), (spacing[:, 1:], across)):
-        np.minimum(shifted, steps, out=shifted)
-    for shifted, steps in ((spacing[:-1], down), (spacing[1:], down)):
+    along, below = (spacing[:, :-1], spacing[:, 1:]), (spacing[:-1], spacing[1:])
+    for shifted, steps in (*((part, across) for part in along), *((part, down) for part in below)):
         np.minimum(shifted, steps, out=shifted)
     return spacing
 

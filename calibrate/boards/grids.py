@@ -132,14 +132,16 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
         if spec.kind is BoardKind.ASYMMETRIC_CIRCLES
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
-    largest = grey.size / (spec.columns * spec.rows)
+    blobs = cv2.SimpleBlobDetector.Params()
+    blobs.minArea, blobs.minDistBetweenBlobs = 12.0, 4.0
+    blobs.maxArea = grey.size / (spec.columns * spec.rows)
     for image in (grey, cv2.bitwise_not(grey)):
         for clustering in (0, cv2.CALIB_CB_CLUSTERING):
             found, centres = cv2.findCirclesGrid(
                 image,
                 (spec.columns, spec.rows),
                 flags=kind | clustering,
-                blobDetector=_blobs(largest),
+                blobDetector=cv2.SimpleBlobDetector.create(blobs),
             )
             if found:
                 ordered = _best_order(np.asarray(centres, dtype=float).reshape(-1, 2), spec)
@@ -199,14 +201,6 @@ def _ink(grey: Grey, H: Array, bend: Array, spec: BoardSpec) -> tuple[float, Arr
     offset = np.stack([(share * u).sum(axis=(1, 2)), (share * v).sum(axis=(1, 2))], axis=-1) / area[:, None]
     middles: Any = cv2.perspectiveTransform((centres + offset).reshape(-1, 1, 2), H).reshape(-1, 2)
     return radius, middles + bend
-
-
-def _blobs(largest_area_px: float) -> cv2.SimpleBlobDetector:
-    parameters = cv2.SimpleBlobDetector.Params()
-    parameters.minArea = 12.0
-    parameters.maxArea = largest_area_px
-    parameters.minDistBetweenBlobs = 4.0
-    return cv2.SimpleBlobDetector.create(parameters)
 
 
 def _best_order(centres: Array, spec: BoardSpec) -> Array | None:

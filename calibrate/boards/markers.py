@@ -96,14 +96,8 @@ def _snap_to_corners(
     miss = (weight @ (pixels - shown)) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
     predicted += miss
     spacing = local_spacing(predicted.reshape(spec.rows - 1, spec.columns - 1, 2)).ravel()
-    height, width = grey.shape
-    margin = np.maximum(spacing * 0.4, 4.0)
-    inside = (
-        (predicted[:, 0] > margin)
-        & (predicted[:, 0] < width - 1 - margin)
-        & (predicted[:, 1] > margin)
-        & (predicted[:, 1] < height - 1 - margin)
-    )
+    margin, last = np.maximum(spacing * 0.4, 4.0)[:, None], np.array(grey.shape[::-1]) - 1
+    inside = ((predicted > margin) & (predicted < last - margin)).all(axis=1)
     chosen = np.flatnonzero(known & inside & (spacing > 5.0))
     if len(chosen) == 0:
         return NOTHING
@@ -145,11 +139,16 @@ def _apply(H: Array, points: Array) -> Array:
 
 
 @lru_cache(maxsize=8)
-def marker_detector(dictionary: str, border_bits: int, smallest: float = _SMALLEST_PERIMETER) -> Any:
+def marker_detector(
+    dictionary: str,
+    border_bits: int,
+    smallest: float = _SMALLEST_PERIMETER,
+    refinement: int = cv2.aruco.CORNER_REFINE_SUBPIX,
+) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = smallest
     parameters.markerBorderBits = border_bits
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.cornerRefinementMethod = refinement
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)), parameters)
 
 
@@ -202,7 +201,10 @@ def find_tag(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indice
 
     `thorough`: where it is not seen, the dark parts of the image are brightened.
     """
-    quick, other = (marker_detector(tag_dictionary(spec), 1), _quad_detector(tag_dictionary(spec)))
+    quick = marker_detector(tag_dictionary(spec), 1)
+    # AprilTag's search for quadrilaterals: slower, finds what OpenCV's leaves out (8 of 55 rendered). Its
+    # corners are half a pixel off; the fit of the sides mends that.
+    other = marker_detector(tag_dictionary(spec), 1, refinement=cv2.aruco.CORNER_REFINE_APRILTAG)
     attempts = [(quick, grey), (other, grey)]
     if thorough:
         attempts.append((other, equalise(grey)))
@@ -210,17 +212,6 @@ def find_tag(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indice
     if corners is None:
         return NOTHING
     return np.arange(4), fit_sides(grey, corners)[_ROW_BY_ROW]
-
-
-@lru_cache(maxsize=8)
-def _quad_detector(dictionary: str) -> Any:
-    """AprilTag's search for quadrilaterals: slower, finds what OpenCV's leaves out (8 of 55 rendered).
-
-    Its corners are half a pixel off; the fit of the sides mends that.
-    """
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
-    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)), parameters)
 
 
 def _seen(detector: Any, grey: Grey, spec: BoardSpec) -> Array | None:

@@ -74,8 +74,6 @@ def check_board(spec: BoardSpec) -> None:
     elif tag:
         _require((columns, rows) == (1, 1), "tag-columns-rows", "a tag has no columns and rows", "Omit them.")
         _require(spec.tag_id >= 0, "tag-id", f"id {spec.tag_id} is negative", "Use the tag's number.")
-    else:
-        _require(columns * rows >= 4, "board-points", "fewer than 4 points fix no pose", "Add columns.")
     if charuco or april or tag:
         named = spec.kind in (BoardKind.APRIL_GRID, BoardKind.APRIL_TAG) or bool(spec.dictionary)
         remedy = "Write for example DICT_4X4_50."

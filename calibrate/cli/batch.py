@@ -16,18 +16,19 @@ import typer
 
 from calibrate.batch.cluster import Cluster, cluster_workers
 from calibrate.batch.fleet import UNREADABLE, collect_fleet, fleet_table
-from calibrate.batch.run import BatchResult, run_batch
-from calibrate.batch.storage import Results, expand
+from calibrate.batch.run import run_batch
+from calibrate.batch.storage import BatchResult, Results, expand
 from calibrate.batch.trends import CellHistory, cells, trends_text
 from calibrate.batch.workers import BatchWorkers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.contracts import FleetCameraJson, FleetJson
-from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit, takes
-from calibrate.cli.output import AsJson, err, out, print_json, progress_bar
+from calibrate.cli.job import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit, takes
+from calibrate.cli.output import AsJson, err, out, print_json
 from calibrate.errors import UsageError
+from calibrate.job import JobOptions
 from calibrate.load import Progress as LoadProgress
-from calibrate.pipeline import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
+from recordings.cli.console import progress_bar
 
 DONE_WITH_LOSS = 3
 OutputFolder = Annotated[str, typer.Option("-o", "--output", help="Folder of the results, or a URL")]
@@ -70,7 +71,7 @@ def batch(
     recordings: Annotated[list[str], typer.Argument(help="Recordings or session folders; URLs may have *")],
     workers: BatchWorkers,
     output: OutputFolder = "batch",
-    profile: Profile = ProfileName.robust,
+    profile: ProfileName = "robust",
     seed: Seed = 0,
     gates: GatesFile = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
@@ -87,7 +88,7 @@ def batch(
 
     store = _results(output)
     gate_limits = GateLimits() if gates is None else read_limits(gates)
-    options = JobOptions(profile=profile.value, seed=seed, limits=gate_limits)
+    options = JobOptions(profile=profile, seed=seed, limits=gate_limits)
     limits = Limits(time_limit_s, memory_limit_mib)
     places = [place for word in recordings for place in expand(word)]
     with _stoppable("solving") as bar:
@@ -168,7 +169,7 @@ def _stoppable(label: str) -> Iterator[LoadProgress | None]:
     """A bar on a terminal. SIGTERM ends the command as Ctrl-C does, with everything it started."""
     before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
-        with progress_bar(label) if err.is_terminal else nullcontext() as bar:
+        with progress_bar(label, err) if err.is_terminal else nullcontext() as bar:
             yield bar
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -21,25 +21,14 @@ from calibrate.files.calibration import (
 from calibrate.files.gate import Gate
 from calibrate.files.hooks import HookRun
 from calibrate.files.validity import Validity
-from calibrate.results import BoardShape
+from calibrate.results import BoardShape, HoldoutScore, RejectedView
 from recordings.schema.messages import Matrix4, Mount, TimeSource
-
-
-class RejectedJson(msgspec.Struct, frozen=True):
-    index: int
-    reason: str
-    kind: str
 
 
 class ViewsJson(msgspec.Struct, frozen=True):
     used: list[int]
-    rejected: list[RejectedJson]
+    rejected: list[RejectedView]
     weights: list[ViewWeight]
-
-
-class HoldoutJson(msgspec.Struct, frozen=True):
-    e_t_m: float
-    e_R: float
 
 
 class WarningJson(msgspec.Struct, frozen=True):
@@ -56,7 +45,7 @@ class SolveJson(msgspec.Struct, frozen=True):
     covariance: tuple[tuple[float, ...], ...]
     views: ViewsJson
     intrinsics: Lens
-    holdout: HoldoutJson | None
+    holdout: HoldoutScore | None
     certificate: Proof
     gates: list[Gate]
     verdict: Literal["pass", "fail"]

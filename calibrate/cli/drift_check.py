@@ -7,40 +7,36 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 
 from calibrate.cli.contracts import DriftCheckJson, DriftPowerJson
 from calibrate.cli.installed import Root, named_or_installed
 from calibrate.cli.job import Threads
 from calibrate.cli.output import AsJson, detection_progress, out, print_json
-from calibrate.errors import BadViewsError, UsageError
+from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration, Provenance
+from calibrate.files.folders import current_version, readable_folder
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
-from calibrate.files.loader import current_version, readable_folder
 from calibrate.files.validity import Validity, ValidityReason, validity_text
-from calibrate.pipeline import JobOptions, prepare_views
+from calibrate.job import JobOptions
+from calibrate.pipeline import prepare_views
 from calibrate.quality.checks import CheckEntry, Trend, append_check, earlier_results, find_trend, read_checks
-from calibrate.quality.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
+from calibrate.quality.drift import (
+    FEWEST_VIEWS,
+    POWER,
+    CellIdentity,
+    DriftCheck,
+    OtherCellError,
+    check_drift,
+    require_same_cell,
+)
 from recordings.files import MAIN_CAMERA, state_root
 from recordings.reader import open_recording
-from recordings.schema.messages import Mount, SessionInfo, Source
+from recordings.schema.messages import SessionInfo
 
 DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
-
-
-class OtherCellError(UsageError):
-    """The views are of another cell, robot or camera than the calibration."""
-
-    code = "other-cell"
-
-    @property
-    def device(self) -> str:
-        """robot or camera; empty when more than that differs."""
-        differs = str(self.values.get("differs", ""))
-        return differs if differs in ("robot", "camera") else ""
 
 
 MOST_DISAGREEMENT = 3.0
@@ -112,7 +108,17 @@ def _log(
     """Log the check: results of the earlier ones of the installed calibration, and the trend with it."""
     number, _ = current_version(readable_folder(root, camera))
     before = earlier_results(read_checks(root, camera), number)
-    append_check(CheckEntry.of(result, _taken(info).timestamp(), number, info.name), root, camera)
+    entry = CheckEntry(
+        _taken(info).timestamp(),
+        number,
+        info.name,
+        result.passed,
+        tuple(result.shift.tolist()),
+        tuple(tuple(row) for row in result.covariance.tolist()),
+        result.statistic,
+        result.threshold,
+    )
+    append_check(entry, root, camera)
     return before, find_trend(read_checks(root, camera), number)
 
 
@@ -165,43 +171,6 @@ def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
     session = (info.name, info.created_wall_ns)
     known = bool(info.created_wall_ns) and session == (provenance.session, provenance.recorded_wall_ns)
     return known or sha256 == provenance.recording_sha256
-
-
-class CellIdentity(msgspec.Struct, frozen=True):
-    """Facts of a cell that its images state."""
-
-    mount: Mount
-    source: Source
-    robot_serial: str
-    camera_serial: str
-
-    @classmethod
-    def of(cls, info: SessionInfo) -> CellIdentity:
-        """Read the facts of a recording."""
-        return cls(info.mount, info.source, info.robot.serial, info.camera_identity.serial)
-
-
-def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) -> None:
-    """Raise OtherCellError for pictures of another mounting, source, robot or camera."""
-    simulated = calibration.source == "simulated"
-    for name, new, known, same in (
-        ("mounting", seen.mount, calibration.mount, seen.mount == calibration.mount),
-        ("source", seen.source, calibration.source, (seen.source == "simulated") == simulated),
-        ("robot", *_serials(seen.robot_serial, calibration.robot.serial)),
-        ("camera", *_serials(seen.camera_serial, calibration.camera.serial)),
-    ):
-        if not same:
-            raise OtherCellError(
-                f"{where} has {name} {new}, the calibration {known}: that is no drift.",
-                remedy="Check with images of the calibrated cell, or calibrate this one.",
-                differs=name,
-                found=str(new),
-                calibrated=str(known),
-            )
-
-
-def _serials(new: str, known: str) -> tuple[str, str, bool]:
-    return new, known, not new or not known or new == known
 
 
 def check_text(result: DriftCheck, calibration: Calibration) -> str:

@@ -12,8 +12,7 @@ from calibrate.boards.model import check_board
 from calibrate.errors import UsageError
 from calibrate.files.calibration import FORMAT, read_calibration
 from calibrate.lens.intrinsics import LensModel
-from calibrate.lens.model import distortion
-from calibrate.projection import camera_matrix
+from calibrate.projection import camera_matrix, distortion
 from recordings import strict_yaml
 from recordings.schema.messages import BoardSpec, CameraModel, TimeCorrection
 

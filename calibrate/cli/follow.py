@@ -56,7 +56,7 @@ def _followed(change: InstallationChange, camera: str) -> Followed:
     found = change.installed
     if found is None:
         return Followed(change.event, camera, str(change.problem))
-    said = ". ".join(filter(None, (source_stamp(found), validity_text(found.validity))))
+    said = ". ".join(filter(None, (source_stamp(found.source), validity_text(found.validity))))
     result, lens = msgspec.convert((found.plain["result"], found.plain["intrinsics"]), tuple[FramePose, Lens])
     return Followed(
         change.event, camera, said, found.version, found.source, found.mount, found.validity, result, lens

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from dataclasses import replace
-from enum import StrEnum
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,22 +13,12 @@ import typer
 
 from calibrate.cli.files import read_board, read_camera, read_lens_sigma, read_time_offset
 from calibrate.errors import UsageError
-from calibrate.pipeline import JobOptions
+from calibrate.handeye.solution import Profile
+from calibrate.job import JobOptions
+from calibrate.lens.intrinsics import LensModel
 from calibrate.quality.gates import GateLimits, read_limits
 
-
-class ProfileName(StrEnum):
-    robust = "robust"
-    paper = "paper"
-
-
-class LensName(StrEnum):
-    plumb_bob = "plumb_bob"
-    rational = "rational_polynomial"
-    fisheye = "equidistant"
-
-
-Profile = Annotated[ProfileName, typer.Option(help="robust: the station's; paper: the published method")]
+ProfileName = Annotated[Profile, typer.Option(help="robust: the station's; paper: the published method")]
 Seed = Annotated[int, typer.Option(min=0, help="Random seed")]
 BoardFile = Annotated[
     Path | None, typer.Option("--board", help="YAML of a board that replaces the recorded one")
@@ -52,7 +41,7 @@ AcceptMove = Annotated[
     bool,
     typer.Option("--accept-move", help="Use both halves of a session in which camera or board moved"),
 ]
-LensKind = Annotated[LensName, typer.Option("--lens", help="Lens model of estimated intrinsics")]
+LensKind = Annotated[LensModel, typer.Option("--lens", help="Lens model of estimated intrinsics")]
 GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other gate limits")]
 Without = Annotated[str | None, typer.Option(help="Poses to exclude, e.g. 3,7")]
 TimeOffsetFile = Annotated[
@@ -100,7 +89,7 @@ def picture_options(
     square_mm: SquareMm = None,
     camera: CameraFile = None,
     find_intrinsics: Find = False,
-    lens: LensKind = LensName.plumb_bob,
+    lens: LensKind = "plumb_bob",
     without: Without = None,
     time_offset: TimeOffsetFile = None,
     threads: Threads = None,
@@ -118,7 +107,7 @@ def picture_options(
         square_m=None if square_mm is None else square_mm / 1000,
         camera=None if camera is None else read_camera(camera),
         camera_sigma={} if camera is None else read_lens_sigma(camera),
-        lens_model=lens.value,
+        lens_model=lens,
         find_intrinsics=find_intrinsics,
         time_offset=None if time_offset is None else read_time_offset(time_offset),
         without=() if without is None else _numbers(without),
@@ -136,7 +125,7 @@ def _numbers(words: str) -> tuple[int, ...]:
 @takes(picture_options)
 def job_options(
     options: JobOptions,
-    profile: Profile = ProfileName.robust,
+    profile: ProfileName = "robust",
     gates: GatesFile = None,
     accept_move: AcceptMove = False,
     working_distance_mm: Distance = None,
@@ -144,7 +133,7 @@ def job_options(
     """Add how they are solved and judged."""
     return replace(
         options,
-        profile=profile.value,
+        profile=profile,
         limits=GateLimits() if gates is None else read_limits(gates),
         accept_move=accept_move,
         working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,

@@ -14,7 +14,7 @@ from calibrate.cli.installed import Root
 from calibrate.cli.output import check_target
 from calibrate.errors import CalibrationFileError, UsageError
 from calibrate.files.calibration import read_calibration, write_output
-from calibrate.files.loader import cameras, current_validity, current_version, readable_folder
+from calibrate.files.folders import cameras, current_validity, current_version, readable_folder
 from calibrate.files.validity import ValidityState, parse_time
 from calibrate.quality.checks import read_checks
 

@@ -9,13 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from calibrate.errors import CalibrationFileError, UsageError
 from calibrate.files.calibration import FORMAT, read_calibration
 from calibrate.load import Progress as LoadProgress
 from recordings.cli.console import AsJson as AsJson
-from recordings.cli.console import plain_console
+from recordings.cli.console import plain_console, progress_bar
 from recordings.cli.console import print_json as print_json
 from recordings.mcap.records import MAGIC
 
@@ -37,11 +35,12 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
             )
         if target.exists() and not target.is_file():
             raise UsageError(f"{target} is a folder, a device or a pipe.", remedy="Name a file.")
-        start = _beginning(target) if target.exists() else b""
+        if not target.exists():
+            return
+        with target.open("rb") as file:
+            start = file.read(64)
     except OSError as problem:
         raise UsageError(f"{target}: {problem.strerror}.", remedy="Name another place.") from None
-    if not target.exists():
-        return
     if kind == "calibration":
         spared = not _is_calibration(target)
     elif kind == "report":
@@ -54,11 +53,6 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
             code="target-exists",
             remedy="Give another name with -o or --report.",
         )
-
-
-def _beginning(target: Path) -> bytes:
-    with target.open("rb") as file:
-        return file.read(64)
 
 
 def _is_calibration(target: Path) -> bool:
@@ -75,23 +69,8 @@ def detection_progress() -> Iterator[LoadProgress | None]:
     if not err.is_terminal:
         yield _progress_line if os.environ.get("CALIBRATE_PROGRESS") == "lines" else None
         return
-    with progress_bar("finding the board") as bar:
+    with progress_bar("finding the board", err) as bar:
         yield bar
-
-
-@contextmanager
-def progress_bar(label: str) -> Iterator[LoadProgress]:
-    """A bar on stderr that is gone at the end; called with done, total and what is done."""
-    columns = (
-        TextColumn(label),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}", markup=False),
-    )
-    with Progress(*columns, console=err, transient=True) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=name)
 
 
 def _progress_line(done: int, total: int, name: str) -> None:

@@ -11,31 +11,19 @@ import typer
 from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
-from calibrate.cli.contracts import (
-    CompareJson,
-    HoldoutJson,
-    MethodJson,
-    RejectedJson,
-    SolveJson,
-    ViewsJson,
-    WarningJson,
-)
+from calibrate.cli.contracts import CompareJson, MethodJson, SolveJson, ViewsJson, WarningJson
 from calibrate.cli.installed import Root, history_rows
 from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
-from calibrate.cli.output import (
-    AsJson,
-    check_target,
-    detection_progress,
-    out,
-    print_json,
-)
+from calibrate.cli.output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError, UsageError
-from calibrate.files.calibration import Touch, ViewWeight, write_calibration, write_output
+from calibrate.files.calibration import ViewWeight, write_calibration, write_output
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
 from calibrate.files.install import install_line, installed_calibration
+from calibrate.files.touch import Touch
 from calibrate.geometry import rotation_log
 from calibrate.handeye.solution import camera_frames
-from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
+from calibrate.job import JobOptions, SolvedRecording
+from calibrate.pipeline import prepare_views, solve_recording, solver_options
 from calibrate.results import PeerResult
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
@@ -95,7 +83,6 @@ def solve(
 def solve_json(job: SolvedRecording) -> SolveJson:
     """Build the object that `calibrate solve --json` prints."""
     found, quality = job.calibration, job.calibration.quality
-    score = quality.holdout
     return SolveJson(
         mount=found.mount,
         result=found.result,
@@ -103,11 +90,11 @@ def solve_json(job: SolvedRecording) -> SolveJson:
         covariance=found.covariance,
         views=ViewsJson(
             found.views.used,
-            [RejectedJson(view.index, view.reason, view.kind) for view in found.views.rejected],
+            found.views.rejected,
             [ViewWeight(index, weight) for index, weight in job.solution.weights.items()],
         ),
         intrinsics=found.intrinsics,
-        holdout=None if score is None else HoldoutJson(score.e_t_m, score.e_R),
+        holdout=quality.holdout,
         certificate=quality.certificate,
         gates=quality.gates,
         verdict="pass" if job.passed else "fail",
@@ -177,11 +164,7 @@ def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:
 
 
 @takes(picture_options)
-def compare(
-    recording: Rec,
-    options: JobOptions,
-    as_json: AsJson = False,
-) -> None:
+def compare(recording: Rec, options: JobOptions, as_json: AsJson = False) -> None:
     """Compare all methods on the same views.
 
     e_t, e_R: held-out error; spread: of the board's pose over the views; px: reprojection error; σ from ours:
@@ -194,7 +177,8 @@ def compare(
         results = compare_all(prepared.views, solver_options(options, prepared))
     if as_json:
         views = [view.index for view in prepared.views]
-        print_json(CompareJson(prepared.views.mount, views, [_method(peer) for peer in results]))
+        plain = msgspec.to_builtins(results, enc_hook=lambda array: array.tolist())
+        print_json(CompareJson(prepared.views.mount, views, msgspec.convert(plain, list[MethodJson])))
         return
     table = Table(*PEER_HEAD, box=None)
     for peer in results:
@@ -214,12 +198,3 @@ def _table_of_X(results: list[PeerResult]) -> Table:
         turn = [f"{v:.4f}" for v in np.degrees(rotation_log(peer.matrix[:3, :3]))] if peer.rigid else ["-"]
         table.add_row(peer.name, *(f"{1e3 * v:.3f}" for v in peer.matrix[:3, 3]), *turn)
     return table
-
-
-def _method(peer: PeerResult) -> MethodJson:
-    plain = {name: getattr(peer, name) for name in MethodJson.__struct_fields__}
-    plain = {
-        name: value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-        for name, value in plain.items()
-    }
-    return msgspec.convert(plain, MethodJson)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import os
 import shlex
 import time
 from collections.abc import Callable, Iterator
@@ -20,29 +19,30 @@ import typer
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import check_board, describe_board
 from calibrate.cli.contracts import WatchEventJson
-from calibrate.cli.drift_check import CellIdentity, require_same_cell
 from calibrate.cli.files import read_board
 from calibrate.cli.installed import CameraName, Root, named_or_installed
 from calibrate.cli.job import BoardFile, Threads
-from calibrate.cli.output import err, out, print_json, progress_bar
+from calibrate.cli.output import err, out, print_json
 from calibrate.errors import InstallError, UsageError
 from calibrate.files.calibration import Calibration
+from calibrate.files.folders import current_version, readable_folder
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
 from calibrate.files.lines import share
-from calibrate.files.loader import current_version, readable_folder
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
 from calibrate.kinematics import MODELS
 from calibrate.load import detect_all
 from calibrate.pipeline import single_threaded_opencv
+from calibrate.quality.drift import CellIdentity, require_same_cell
 from calibrate.quality.movement.evidence import Moved
 from calibrate.quality.movement.log import FILE, MonitorLog, WatchedTag, WatchEntry
 from calibrate.quality.movement.monitor import LARGEST_MISFIT_PX, NAMED_AFTER, EventKind, MovementEvent
 from calibrate.quality.movement.pictures import CellModel
-from recordings.errors import BadImageError
+from recordings.cli.console import progress_bar
+from recordings.errors import BadImageError, ImportSourceError, Value
 from recordings.files import MAIN_CAMERA
-from recordings.images import IMAGE_LIMIT_BYTES, ImageError, decode_image, read_header
 from recordings.importers.dataset import DATASET_FILE, PoseRow, read_dataset, read_poses
+from recordings.importers.folder import read_image
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec
 
@@ -203,7 +203,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _read(source: WatchSource, tag: BoardSpec, log: MonitorLog, teller: _Teller, threads: int | None) -> None:
-    with progress_bar("watching") if err.is_terminal else nullcontext() as bar:
+    with progress_bar("watching", err) if err.is_terminal else nullcontext() as bar:
         for done, total, entry in source.entries(tag, log.knows, threads):
             if bar is not None:
                 bar(done, total, entry.name)
@@ -267,26 +267,16 @@ def _open_folder(folder: Path, calibration: Calibration) -> WatchSource:
 
 def _detect(folder: Path, row: PoseRow, tag: BoardSpec, size: tuple[int, int]) -> Detection:
     """Raises WatchSourceError with file and line."""
-    path, reason = folder / row.image, ""
     try:
-        if not Path(os.path.realpath(path)).is_relative_to(folder.resolve()):
-            reason = "lies outside the folder"
-        else:
-            with path.open("rb") as file:
-                data = file.read(IMAGE_LIMIT_BYTES)
-            header = read_header(data)
-            if (header.width, header.height) == size:
-                return detect(decode_image(data, *size), tag, thorough=False, with_quality=False)
-            reason = f"is {header.width}×{header.height}, the calibration is of {size[0]}×{size[1]}"
-    except ImageError as problem:
-        reason = f"is no usable image: {problem}"
-    except OSError as problem:
-        reason = f"cannot be read ({problem.strerror})"
-    raise WatchSourceError(
-        f"{folder}/poses.csv line {row.line}: image {row.image} {reason}.",
-        remedy="Write an image before its line in poses.csv; delete lines of images that are not to be used.",
-        line=row.line,
-    )
+        _, _, pixels = read_image(folder, row, size)
+    except ImportSourceError as problem:
+        raise WatchSourceError(
+            problem.text,
+            remedy="Write an image before its line in poses.csv; delete lines of images that are not to be "
+            "used.",
+            line=row.line,
+        ) from None
+    return detect(pixels, tag, thorough=False, with_quality=False)
 
 
 def _with_corners(entry: WatchEntry, detection: Detection | None) -> WatchEntry:
@@ -360,12 +350,9 @@ class _Teller:
         if not self._as_json:
             out.print(text)
             return
-        values: dict[str, str | float | int | bool | None] = {
-            "state": state,
-            "needed": monitor.needed,
-            "missed_in_a_row": monitor.missed,
-        }
-        print_json(WatchEventJson("summary", "", monitor.pictures, None, values, text, [], None))
+        told: dict[str, Value] = {"needed": monitor.needed, "missed_in_a_row": monitor.missed}
+        line = {"state": state} | told
+        print_json(WatchEventJson("summary", "", monitor.pictures, None, line, text, [], None))
 
 
 _MOVED_TEXT = {

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 
 from calibrate.errors import CalibrationFileError
 from calibrate.files.gate import Gate
-from calibrate.files.loader import InstalledCalibration, refused_table
-from calibrate.files.proof import check_result, content_sha256, proven_plain, read_bounded
+from calibrate.files.proof import check_result, content_sha256, proven_plain, read_bounded, refused_table
+from calibrate.files.touch import Touch
 from calibrate.geometry import Transform
 from calibrate.kinematics import RobotModel, base_from_flange
 from calibrate.results import BoardShape, HoldoutScore, RejectedView
@@ -169,8 +169,7 @@ class DhTable(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, model: RobotModel) -> DhTable:
-        columns = (model.a_m, model.d_m, model.alpha_rad, model.theta_offset_rad, model.beta_rad)
-        return cls(*columns)  # type: ignore[arg-type]
+        return msgspec.convert(model, cls, from_attributes=True)
 
 
 class HeldOutViews(msgspec.Struct, frozen=True):
@@ -282,25 +281,6 @@ class Override(msgspec.Struct, frozen=True):
     overridden: list[str]
 
 
-class Touch(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The tip was brought down by hand where the calibration says that a corner is."""
-
-    corner: int
-    """Row of `board.board_points`."""
-    corner_mm: tuple[float, float]
-    """x, y on the board."""
-    offset_mm: tuple[float, float]
-    """Tip minus true corner along the board's x and y, when the tip is lowered straight down."""
-    sigma_mm: tuple[float, float]
-    """1 sigma of it that calibration, picture and robot predict."""
-    found: Literal["told by a person", "read from the arm"]
-    who: str
-    wall: str
-    pointer: str = ""
-    standoff_mm: float = 0.0
-    note: str = ""
-
-
 class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     format: Literal["handeye-calibration/1"]
     created: str
@@ -321,7 +301,7 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     provenance: Provenance
     override: Override | None = None
     verification: list[Touch] = []
-    """Checks by hand, oldest first; see `verification`."""
+    """Checks by hand, oldest first; see `touch`."""
     arm_table: CorrectedArm | None = None
     """Where the arm's model is known. `result` is then for the arm as it is, without this table."""
 
@@ -390,6 +370,6 @@ def write_output(path: Path, content: bytes) -> None:
         raise CalibrationFileError(f"{path} cannot be written: {problem.strerror or problem}.") from None
 
 
-def source_stamp(calibration: Calibration | InstalledCalibration) -> str:
+def source_stamp(source: Source) -> str:
     """Stamp for everything that shows a calibration of no real cell; else empty."""
-    return _STAMPS.get(calibration.source, "")
+    return _STAMPS.get(source, "")

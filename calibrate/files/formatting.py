@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override, source_stamp
+from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
-from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import MEASURED
@@ -24,12 +25,60 @@ if TYPE_CHECKING:
     from calibrate.results import PeerResult
 
 
+@dataclass(frozen=True)
+class ShownFigure:
+    """A figure of a calibration, as terminal, page and screen say it."""
+
+    label: str
+    value: str
+    about: str = ""
+    """What it holds for, or what it counts: 'at 487 mm', 'passed'."""
+
+
+def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str, ShownFigure]:
+    """The figures that a calibration is judged by, most important first; without what is not known."""
+    quality, gates, views = calibration.quality, calibration.quality.gates, calibration.views
+    shown = {"error": ShownFigure("camera position", f"± {calibration.sigma.translation_mm:.3g} mm (1σ)")}
+    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
+        at = f"at {1000 * quality.working_distance_m:.0f} mm"
+        shown["error"] = ShownFigure("predicted error", f"± {quality.predicted_error_mm:.3g} mm (1σ)", at)
+    if (held := quality.holdout) is not None:
+        missed = f"{1000 * held.e_t_m:.3g} mm, e_R {held.e_R:.3g}"
+        shown["held_out"] = ShownFigure("held-out error", missed, f"over {len(held.pairs)} samples")
+    passed = len(gates) - len(quality.failed)
+    shown["gates"] = ShownFigure("quality gates", f"{passed} of {len(gates)}", "passed")
+    shown["views"] = ShownFigure("views", f"{len(views.used)}", f"used, {len(views.rejected)} rejected")
+    if touches:
+        agreed = f"{sum(map(agrees, touches))} of {len(touches)}"
+        shown["touch"] = ShownFigure("corners of the touch test", agreed, "as predicted")
+    return shown
+
+
+def error_text(calibration: Calibration) -> str:
+    """The error as a sentence with its limit."""
+    figure = figures(calibration)["error"]
+    gates = [gate for gate in calibration.quality.gates if gate.name == "predicted_error_m"]
+    limit = f" The limit is {gates[0].shown(gates[0].limit)}." if gates and figure.about else ""
+    return f"{f'{figure.label} {figure.about}'.strip().capitalize()}: {figure.value}.{limit}"
+
+
+def noise_text(calibration: Calibration) -> str:
+    """Measurement noise; empty where it was not estimated."""
+    noise = calibration.quality.noise
+    robot = f"robot {noise['robot_mm']:.3g} mm, {noise['robot_deg']:.3g}°" if noise else ""
+    return f"Measurement noise (1σ): corners {noise['corner_px']:.3g} px, {robot}." if noise else ""
+
+
+def shares_text(calibration: Calibration) -> str:
+    """Sources of the error of X, the largest first."""
+    shares = sorted(calibration.quality.error_shares.items(), key=lambda item: -item[1])
+    return ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares if share > 0.005)
+
+
 def verdict_text(calibration: Calibration) -> str:
-    failed = [gate.name for gate in calibration.quality.failed]
     if calibration.verdict == "FAIL":
-        return f"FAIL: {', '.join(failed)}"
-    count = len(calibration.quality.gates)
-    return f"{calibration.verdict}: {count - len(failed)} of {count} gates"
+        return f"FAIL: {', '.join(gate.name for gate in calibration.quality.failed)}"
+    return f"{calibration.verdict}: {figures(calibration)['gates'].value} gates"
 
 
 def override_text(override: Override) -> str:
@@ -58,8 +107,8 @@ def summary(calibration: Calibration, validity: Validity | None = None) -> Rende
     if validity is not None:
         shown = f"Installed: {validity_text(validity)}"
         parts.append(Text(shown, style=VALIDITY_STYLES[validity.state]))
-    if source_stamp(calibration):
-        parts.append(Text(source_stamp(calibration), style="bold yellow"))
+    if source_stamp(calibration.source):
+        parts.append(Text(source_stamp(calibration.source), style="bold yellow"))
     if calibration.override is not None:
         parts.append(Text(override_text(calibration.override), style="bold yellow"))
     parts += [_result_table(calibration), _gate_table(calibration)]
@@ -80,15 +129,8 @@ def _result_table(calibration: Calibration) -> Table:
     table.add_row(f"{result.parent_frame}_from_{result.child_frame}", position)
     table.add_row("rotation", f"{rotation.strip()}  (fixed axes)")
     table.add_row("1σ", f"{calibration.sigma.translation_mm:.3f} mm  {calibration.sigma.rotation_deg:.4f}°")
-    if quality.predicted_error_mm is not None:
-        table.add_row(
-            "predicted error",
-            f"{quality.predicted_error_mm:.3f} mm (1σ) at {(quality.working_distance_m or 0) * 1000:.0f} mm",
-        )
-    if quality.holdout is not None:
-        table.add_row(
-            "held-out error", f"e_t {quality.holdout.e_t_m * 1000:.4f} mm   e_R {quality.holdout.e_R:.6f}"
-        )
+    for figure in figures(calibration, calibration.verification).values():
+        table.add_row(figure.label, f"{figure.value} {figure.about}")
     if quality.board_spread_mm is not None:
         spread_deg = quality.board_spread_deg or 0.0
         table.add_row("board spread", f"{quality.board_spread_mm:.3f} mm  {spread_deg:.4f}°")
@@ -97,12 +139,8 @@ def _result_table(calibration: Calibration) -> Table:
     fy, cy = lens.matrix[1][1], lens.matrix[1][2]
     rms = "" if lens.rms_px is None else f"  RMS {lens.rms_px:.3f} px"
     table.add_row("intrinsics", f"f {fx:.1f} {fy:.1f}  c {cx:.1f} {cy:.1f} px{rms}  ({lens.found})")
-    if quality.error_shares:
-        shares = sorted(quality.error_shares.items(), key=lambda item: -item[1])
-        text = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares if share > 0.005)
+    if text := shares_text(calibration):
         table.add_row("error comes from", text)
-    used, rejected = len(calibration.views.used), len(calibration.views.rejected)
-    table.add_row("views", f"{used} used, {rejected} rejected")
     table.add_row("board", describe_board(calibration.board))
     robot, camera = calibration.robot, calibration.camera
     table.add_row(

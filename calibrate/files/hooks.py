@@ -16,14 +16,13 @@ import subprocess
 import tempfile
 import time
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 
+from calibrate.files.folders import calibrations_folder
 from calibrate.files.lines import append_line
-from calibrate.files.loader import calibrations_folder
 from calibrate.files.validity import Validity, ValidityState, time_text
 from recordings.files import state_root
 
@@ -82,7 +81,7 @@ def _runs(folder: Path, event: HookEvent, fields: dict[str, str]) -> list[HookRu
     if not folder.is_dir():
         return []
     if problem := _distrusted(folder):
-        return [HookRun(time_text(datetime.now(UTC)), event, str(folder), problem=problem)]
+        return [HookRun(time_text(), event, str(folder), problem=problem)]
     programs = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     return [_run(path, event, fields) for path in programs if not path.is_dir()]
 
@@ -100,7 +99,7 @@ def _distrusted(path: Path) -> str:
 
 
 def _run(path: Path, event: HookEvent, fields: dict[str, str]) -> HookRun:
-    wall, begun_s = time_text(datetime.now(UTC)), time.monotonic()
+    wall, begun_s = time_text(), time.monotonic()
     problem = _distrusted(path)
     if not problem and not os.access(path, os.X_OK):
         problem = f"{path} is not executable."
@@ -124,19 +123,14 @@ def _run(path: Path, event: HookEvent, fields: dict[str, str]) -> HookRun:
             exit_code = process.wait(TIME_LIMIT_S)
         except subprocess.TimeoutExpired:
             problem = f"{path} was ended after {TIME_LIMIT_S:g} s."
-        finally:
-            _end_group(process)
+        finally:  # the program and whatever it left running
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
         end = said.seek(0, os.SEEK_END)
         said.seek(max(0, end - OUTPUT_BYTES))
         output = said.read(OUTPUT_BYTES).decode(errors="replace")
     return HookRun(wall, event, path.name, exit_code, output, problem, round(time.monotonic() - begun_s, 3))
-
-
-def _end_group(process: subprocess.Popen[bytes]) -> None:
-    """End the program and whatever it left running."""
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
 
 
 def _tell_journal(fields: dict[str, str], priority: int) -> None:

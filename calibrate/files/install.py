@@ -15,15 +15,11 @@ import numpy as np
 
 from calibrate.errors import GateFailedError, InstallError
 from calibrate.files.calibration import Calibration, Override, read_calibration
+from calibrate.files.folders import calibrations_folder, current_validity, current_version, readable_folder
 from calibrate.files.gate import Gate
 from calibrate.files.hooks import HookEvent, announce
 from calibrate.files.lines import append_line
-from calibrate.files.loader import (
-    calibrations_folder,
-    current_validity,
-    current_version,
-    readable_folder,
-)
+from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import (
     CheckKind,
@@ -34,7 +30,6 @@ from calibrate.files.validity import (
     time_text,
     unrecorded,
 )
-from calibrate.files.verification import agrees, touch_text
 from calibrate.files.versions import (
     InstalledVersion,
     add_version,
@@ -105,7 +100,8 @@ def install(
         if calibration.camera.name and calibration.camera.name != camera:
             objections.append(f"It is of the camera named {calibration.camera.name}, not {camera}.")
         objections += [f"Touch test, {touch_text(t)}." for t in calibration.verification if not agrees(t)]
-        failed = [f"{gate.name}: {gate.text}" for gate in _failed_gates(calibration, before)]
+        gates = [*calibration.quality.failed, *_regression(calibration, before)]
+        failed = [f"{gate.name}: {gate.text}" for gate in gates]
         overridden = [*objections, *failed]
         if overridden and not override.strip():
             kind = InstallError if objections else GateFailedError
@@ -199,7 +195,7 @@ def _validity_again(target: InstalledVersion, max_age_days: float | None) -> Val
     if was.state is ValidityState.IN_DOUBT or target.current:
         return replace(was, max_age_days=max_age_days)
     text = "Rolled back to. Run a drift check."
-    now = time_text(datetime.now(UTC))
+    now = time_text()
     state = ValidityState.UNVERIFIED
     return Validity(
         target.number, state, now, ValidityReason("rolled-back", text), who(), was.verified, max_age_days
@@ -220,7 +216,7 @@ def set_validity(
     (`other-version`) where another is installed by now, and `nothing-installed` where nothing is. VALID makes
     now the time of the last proof.
     """
-    now = time_text(datetime.now(UTC))
+    now = time_text()
 
     def change(before: Validity) -> Validity:
         since = before.since if before.state is state else now
@@ -290,8 +286,8 @@ def _require_words(reason: str) -> None:
 def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
     """Objections against following the installed one: another robot, camera or mounting, or less certain."""
     before = _installed_before(root, calibration.camera_name)
-    regression = _regression(calibration, before)
-    return [*_objections(calibration, before, "", ""), *([regression.text] if regression else [])]
+    worse = [gate.text for gate in _regression(calibration, before)]
+    return [*_objections(calibration, before, "", ""), *worse]
 
 
 def change_text(before: Calibration | None, after: Calibration) -> str:
@@ -342,15 +338,10 @@ def _refuse_foreign_source(
         )
 
 
-def _failed_gates(calibration: Calibration, before: Calibration | None) -> list[Gate]:
-    regression = _regression(calibration, before)
-    return [*calibration.quality.failed, *([regression] if regression else [])]
-
-
-def _regression(calibration: Calibration, before: Calibration | None) -> Gate | None:
+def _regression(calibration: Calibration, before: Calibration | None) -> list[Gate]:
     """The failed gate of one much less certain than what it would replace, unless that failed its own."""
     if before is None or before.quality.failed:
-        return None
+        return []
     new, old = calibration.quality, before.quality
     same_place = new.working_distance_m == old.working_distance_m
     if same_place and new.predicted_error_mm is not None and old.predicted_error_mm is not None:
@@ -361,7 +352,7 @@ def _regression(calibration: Calibration, before: Calibration | None) -> Gate | 
         title = "Regression: standard uncertainty of the position"
     remedy = "Capture more or better poses, or keep the installed one."
     gate = Gate.measured("no_worse", title, ours / 1e3, "≤", WORSE_TIMES * theirs / 1e3, "m", remedy)
-    return None if gate.passed else gate
+    return [] if gate.passed else [gate]
 
 
 def _objections(

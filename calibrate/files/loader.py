@@ -1,12 +1,7 @@
-"""The installed calibration for programs that use a camera. NumPy and PyYAML are enough here.
-
-ROOT/calibrations/                  camera `main`: its versions, `current`, logs and validity
-ROOT/calibrations/cameras/NAME/     the same for every other camera of the cell
-"""
+"""The installed calibration for programs that use a camera. NumPy and PyYAML are enough here."""
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,96 +14,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibrate.errors import CalibrationError, CalibrationFileError, InstallError
-from calibrate.files.proof import check_result, proven_plain, read_bounded
+from calibrate.files.folders import calibrations_folder, current_version, readable_folder, validity_of
+from calibrate.files.proof import check_result, proven_plain, read_bounded, refused_table
 from calibrate.files.validity import (
     FILE,
     Validity,
     ValidityReason,
     ValidityState,
     parse_time,
-    read_validity,
     time_text,
-    unrecorded,
     validity_text,
 )
 from calibrate.geometry import Array, Transform
 from calibrate.kinematics import base_from_flange
-from recordings.files import MAIN_CAMERA, is_session_name, state_root
+from recordings.files import MAIN_CAMERA
 
 if TYPE_CHECKING:
     from recordings.schema.messages import CameraModel, Mount, Source
 
-VERSION_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
 _NOT_REAL = ("simulated", "playback")
 
 
-# --- where calibrations lie ---
-def calibrations_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
-    """Folder of one camera's installed calibrations. InstallError for what is no name of a camera."""
-    if not is_session_name(camera):
-        raise InstallError(
-            f"{camera!r} is no name of a camera.", code="camera-name", remedy="Use 1 to 40 of a-z, 0-9 and -."
-        )
-    folder = state_root(root) / "calibrations"
-    return folder if camera == MAIN_CAMERA else folder / "cameras" / camera
-
-
-def readable_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
-    """Folder of the calibrations; InstallError where it may not be looked into."""
-    folder = calibrations_folder(root, camera)
-    try:
-        (folder / "gen").exists()
-    except PermissionError as problem:
-        raise InstallError(
-            f"{folder}: {problem.strerror}.",
-            code="state-folder",
-            remedy="Name another state folder with --root.",
-        ) from None
-    return folder
-
-
-def cameras(root: Path | str | None = None) -> list[str]:
-    """Names of the cameras for which something was ever installed below `root`, `main` first."""
-    folder = readable_folder(root)
-    others = sorted(path.parent.name for path in (folder / "cameras").glob("*/gen"))
-    return [*([MAIN_CAMERA] if (folder / "gen").is_dir() else []), *filter(is_session_name, others)]
-
-
-def current_version(folder: Path) -> tuple[int, Path]:
-    """(number, file) of what `current` points to. InstallError when nothing is installed."""
-    try:
-        name = (folder / "current").readlink().name
-    except OSError:
-        name = ""
-    match = VERSION_NAME.fullmatch(name)
-    if match is None:
-        raise InstallError(
-            f"{folder / 'current'}: nothing is installed.",
-            code="nothing-installed",
-            remedy="Run: calibrate install FILE",
-        )
-    return int(match[1]), folder / "gen" / name
-
-
-def current_validity(folder: Path, now: datetime | None = None) -> Validity:
-    """Validity of what is installed there, at `now` (default: this moment). InstallError when nothing is."""
-    return _validity_of(folder, current_version(folder)[0], now)
-
-
-def _validity_of(folder: Path, number: int, now: datetime | None = None) -> Validity:
-    """Read the validity of one version: what is current may change while it is read."""
-    try:
-        installed = datetime.fromtimestamp((folder / "current").lstat().st_mtime, UTC)
-        found = read_validity(folder).get(number) or unrecorded(number, time_text(installed))
-    except OSError as problem:
-        raise InstallError(
-            f"{problem.filename or folder}: {problem.strerror}. Its validity is not known.",
-            code="state-folder",
-        ) from None
-    return found.at(now or datetime.now(UTC))
-
-
-# --- what lies there ---
 @dataclass(frozen=True)
 class InstalledDevice:
     model: str
@@ -154,16 +80,6 @@ class InstalledArm:
     def base_from_flange(self, joints_rad: ArrayLike) -> Transform:
         """Compute corrected_base_from_corrected_flange, metres, of joints (6,), radians."""
         return Transform("corrected_base", "corrected_flange", base_from_flange(self.table, joints_rad))
-
-
-def refused_table(reason: str) -> CalibrationFileError:
-    """Make the error of a calibration that offers no table of the arm."""
-    return CalibrationFileError(
-        f"This calibration offers no table of the arm ({reason}).",
-        code="table-not-offered",
-        remedy="Use its result, for the arm as it is, or record poses of station plan --for arm.",
-        reason=reason,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,9 +196,7 @@ def load_installed(
             if found.validity.state is not ValidityState.WITHDRAWN:
                 found = replace(
                     found,
-                    validity=replace(
-                        found.validity, state=doubt, since=time_text(datetime.now(UTC)), reason=reason
-                    ),
+                    validity=replace(found.validity, state=doubt, since=time_text(), reason=reason),
                 )
     _require(found, require_valid)
     return found
@@ -298,7 +212,7 @@ def _read(root: Path | str | None, camera: str) -> InstalledCalibration:
         raise CalibrationFileError(
             f"{path}: {problem} is missing or of another kind.", code="contradiction"
         ) from None
-    return InstalledCalibration(camera, number, path, _validity_of(folder, number), plain)
+    return InstalledCalibration(camera, number, path, validity_of(folder, number), plain)
 
 
 def _require(found: InstalledCalibration, valid: bool | None) -> None:
@@ -356,7 +270,8 @@ def watch(
     while ends_s is None or time.monotonic() < ends_s:
         time.sleep(poll_s)
         seen = _marks(folder)
-        ages = before.installed is not None and _aged(before.installed)
+        held = None if before.installed is None else before.installed.validity
+        ages = held is not None and held.at(datetime.now(UTC)).state is not held.state
         if seen == marks and not ages:
             continue
         marks, now = seen, _look(root, camera, before)
@@ -374,10 +289,6 @@ def _marks(folder: Path) -> list[int]:
         except OSError:
             marks.append(0)
     return marks
-
-
-def _aged(installed: InstalledCalibration) -> bool:
-    return installed.validity.at(datetime.now(UTC)).state is not installed.validity.state
 
 
 def _look(root: Path | str | None, camera: str, before: InstallationChange | None) -> InstallationChange:

@@ -176,3 +176,13 @@ def _rotation(quaternion_xyzw: Array) -> Array:
     """(3, 3) of a unit quaternion (4,): R = (w² - v·v) I + 2 v vᵀ + 2 w [v]× (Kuipers 1999, eq. 5.11)."""
     v, w = quaternion_xyzw[:3], quaternion_xyzw[3]
     return np.asarray((w * w - v @ v) * np.eye(3) + 2 * np.outer(v, v) + 2 * w * skew(v))
+
+
+def refused_table(reason: str) -> CalibrationFileError:
+    """Make the error of a calibration that offers no table of the arm."""
+    return CalibrationFileError(
+        f"This calibration offers no table of the arm ({reason}).",
+        code="table-not-offered",
+        remedy="Use its result, for the arm as it is, or record poses of station plan --for arm.",
+        reason=reason,
+    )

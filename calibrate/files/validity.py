@@ -130,8 +130,9 @@ def _parse(line: bytes) -> Validity | None:
         return None
 
 
-def time_text(when: datetime) -> str:
-    return when.astimezone(UTC).isoformat(timespec="seconds")
+def time_text(when: datetime | None = None) -> str:
+    """Write a time, now unless given."""
+    return (when or datetime.now(UTC)).astimezone(UTC).isoformat(timespec="seconds")
 
 
 def parse_time(text: str) -> datetime | None:

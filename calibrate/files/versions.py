@@ -5,7 +5,7 @@
     ROOT/calibrations/log.jsonl                  who switched to what, when and why
     ROOT/calibrations/validity.jsonl             whether each still holds (`validity`)
 
-Camera `main` lies there, any other in ROOT/calibrations/cameras/NAME (`loader.calibrations_folder`).
+Camera `main` lies there, any other in ROOT/calibrations/cameras/NAME (`folders.calibrations_folder`).
 
 Whoever loses power or is killed at any moment finds the old calibration or the new one.
 """
@@ -16,7 +16,7 @@ import fcntl
 import getpass
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -26,12 +26,26 @@ from typing import Literal, NoReturn
 import msgspec
 
 from calibrate.errors import CalibrationFileError, InstallError
-from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration, read_calibration
-from calibrate.files.hooks import HookRun
+from calibrate.files.calibration import (
+    Calibration,
+    decode_calibration,
+    encode_calibration,
+    read_calibration,
+    write_calibration,
+)
+from calibrate.files.folders import VERSION_NAME, calibrations_folder, readable_folder
+from calibrate.files.hooks import HookRun, announce
 from calibrate.files.lines import append_line, read_lines, share
-from calibrate.files.loader import VERSION_NAME, readable_folder
+from calibrate.files.touch import LIMIT_SIGMAS, Touch, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
-from calibrate.files.validity import Validity, ValidityState, read_validity, time_text, unrecorded
+from calibrate.files.validity import (
+    Validity,
+    ValidityReason,
+    ValidityState,
+    read_validity,
+    time_text,
+    unrecorded,
+)
 from recordings.files import MAIN_CAMERA, sync_folder, write_atomically
 
 LOG = "log.jsonl"
@@ -122,7 +136,8 @@ def add_version(
     It is on the disk, whole, and read back before anything points to it. InstallError, CalibrationFileError.
     """
     content = encode_calibration(calibration)
-    number = _next_number(folder)
+    numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := VERSION_NAME.fullmatch(p.name))]
+    number = max(numbers, default=0) + 1
     path = folder / "gen" / f"{number:04d}-{content_name(content)}.yaml"
     write_atomically(path, content)
     decode_calibration(path.read_bytes(), str(path))
@@ -137,7 +152,7 @@ def make_current(
     validity = replace(validity, version=version.number)
     append_line(folder / VALIDITY_FILE, validity)  # before anybody can ask for it
     _switch(folder, version.path.name, version.path.read_bytes())
-    entry = LogEntry(_now_text(), action, version.number, who(), change, reason)
+    entry = LogEntry(time_text(), action, version.number, who(), change, reason)
     append_line(folder / LOG, entry)
     return replace(version, current=True, validity=validity)
 
@@ -155,11 +170,6 @@ def _current_name(folder: Path) -> str:
         return (folder / "current").readlink().name
     except OSError:
         return ""
-
-
-def _next_number(folder: Path) -> int:
-    numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := VERSION_NAME.fullmatch(p.name))]
-    return max(numbers, default=0) + 1
 
 
 def _switch(folder: Path, name: str, content: bytes) -> None:
@@ -219,12 +229,54 @@ def no_such_version(folder: Path, number: int, known: list[InstalledVersion]) ->
     )
 
 
-def _now_text() -> str:
-    return time_text(datetime.now(UTC))
-
-
 def who() -> str:
     try:
         return getpass.getuser()
     except (OSError, KeyError):
         return f"uid {os.getuid()}"
+
+
+def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
+    """Add them to a calibration file, atomically; nothing else in it changes. CalibrationFileError."""
+    calibration = _with_touches(read_calibration(path), touches)
+    write_calibration(calibration, path)
+    return calibration
+
+
+def note_installed(
+    root: Path | None, touches: Sequence[Touch], camera: str = MAIN_CAMERA
+) -> InstalledVersion:
+    """Add them to the installed calibration: a new version, for versions never change.
+
+    A corner that is missed puts it in doubt, and hooks are told when that changes. Raises InstallError where
+    no whole calibration is installed, or the folder or the disk does not allow it.
+    """
+    folder = calibrations_folder(root, camera)
+    with locked(folder):
+        current = next((g for g in installed_versions(root, camera) if g.current), None)
+        if current is None or current.calibration is None:
+            raise InstallError(
+                f"{folder}: no whole calibration is installed, so nothing was noted.",
+                code="nothing-installed",
+                remedy="Install one: calibrate install FILE.",
+            )
+        calibration = _with_touches(current.calibration, touches)
+        found = "; ".join(touch_text(touch) for touch in touches)
+        before = read_validity(folder).get(current.number) or unrecorded(current.number)
+        worst = max(map(touch_sigmas, touches), default=0.0)
+        reason = ValidityReason(
+            "touch-test",
+            f"Touch test: {found}.",
+            {"worst_sigmas": round(worst, 2), "limit_sigmas": round(LIMIT_SIGMAS, 2)},
+        )
+        now = datetime.now(UTC)
+        passed = all(map(agrees, touches))
+        validity = before.after_check("touch-test", passed, False, now, reason, who())
+        made = add_version(folder, calibration, "verify", validity, found)
+    if validity.state is not before.state:
+        made = replace(made, hooks=announce(root, camera, validity.state.value, made.validity or validity))
+    return made
+
+
+def _with_touches(calibration: Calibration, touches: Sequence[Touch]) -> Calibration:
+    return msgspec.structs.replace(calibration, verification=[*calibration.verification, *touches])

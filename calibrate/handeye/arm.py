@@ -12,14 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, difference, skew
-from calibrate.kinematics import (
-    MODELS,
-    RobotModel,
-    forward,
-    inverse_many,
-    link_frames,
-    with_near_axes,
-)
+from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, link_frames, with_near_axes
 from calibrate.views import ViewSet
 from recordings.schema.messages import Mount
 

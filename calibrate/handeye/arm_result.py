@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,24 +10,27 @@ from numpy.typing import NDArray
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb
 from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA, ArmPostures, corrected_model
+from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corners import boards_by_corners
-from calibrate.handeye.diagnosis import held_out_elsewhere
-from calibrate.handeye.fit import CellFit
-from calibrate.handeye.observations import SHAPE, Layout, observe_views
-from calibrate.handeye.solution import MEASURED, Solution, TableRefusal, TableResult
+from calibrate.handeye.estimate import CellFit
+from calibrate.handeye.solution import MEASURED, Solution, TableRefusal, TableResult, Verification
 from calibrate.handeye.workspace import MIDDLE, SPREAD, Workspace, sample_workspace
 from calibrate.kinematics import forward
 from calibrate.projection import intrinsics_vector
-from calibrate.views import BoardView, ViewSet
+from calibrate.results import SHAPE
+from calibrate.views import BoardView, ViewSet, observe_views
 
 _NOMINAL_M = 1e-4
 """Recorded flanges farther than this from the nominal table, rms, are another table's."""
 
 
 def table_result(
-    fit: CellFit, arm: ArmPostures, detected: bool, distance_m: float, with_folds: bool
+    fit: CellFit, arm: ArmPostures, detected: bool, distance_m: float, missed: Array | None
 ) -> TableResult:
-    """Derive from a fit with errors of the arm's table what may be installed, and how good each way is."""
+    """Derive from a fit with errors of the arm's table what may be installed, and how good each way is.
+
+    missed: (2, n) of `TableResult.held_out_m`.
+    """
     found, state = fit.estimate, fit.estimate.state
     places = Layout.of(state).table.start + np.arange(len(PARAMETERS))
     errors = RELATIVE_SIGMA * state.table[: len(PARAMETERS)]
@@ -43,7 +45,6 @@ def table_result(
     both = np.concatenate([np.eye(6), by_errors], axis=1)
     with_table_m = room.rms_m(covariance)
     left_m = room.error_m(by_errors @ errors, errors)
-    missed = held_out_elsewhere(fit, arm.joints_rad) if detected and with_folds else None
     return TableResult(
         nominal=arm.model,
         factory=fit.views.arm is not None,
@@ -63,26 +64,6 @@ def table_result(
 _ELSEWHERE_RAD = 0.1
 """A view from where a joint differs by this from every view of the fit is one elsewhere."""
 _FEWEST_ELSEWHERE = 5
-
-
-@dataclass(frozen=True, eq=False)
-class Verification:
-    """The arm without and with its table at poses that took no part in the fit, n of them."""
-
-    recording: str
-    flange_m: Array
-    """(n, 3) where the flange stood."""
-    missed_m: Array
-    """(2, n) distance of the board's middle from its mean place: without, with the table."""
-
-    @property
-    def rms_m(self) -> tuple[float, float]:
-        without, with_table = np.sqrt(np.mean(self.missed_m**2, axis=1)).tolist()
-        return without, with_table
-
-    @property
-    def better(self) -> bool:
-        return self.rms_m[1] < self.rms_m[0]
 
 
 def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") -> Verification:
@@ -111,9 +92,7 @@ def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") ->
         )
     views, shape = views.select(far), solution.board
     observed = observe_views(views)
-    numbers = (
-        np.zeros(len(SHAPE)) if shape is None else np.array([shape.scale, shape.anisotropy, *shape.bend_m])
-    )
+    numbers = np.zeros(len(SHAPE)) if shape is None else shape.numbers
     C = boards_by_corners(observed, solution.camera, views.camera_from_board, numbers)
     joints = np.array([view.joints_rad for view in views], dtype=float)
     middle = np.array([*observed.extent[0], 0.0, 1.0])

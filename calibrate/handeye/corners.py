@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, perturb, skew
-from calibrate.handeye.observations import SHAPE, Observations
 from calibrate.projection import intrinsics_names, project, project_pixels
+from calibrate.results import SHAPE
+from calibrate.views import Observations
 from recordings.schema.messages import CameraModel
 
 _CHUNK_POINTS = 40_000
@@ -100,45 +101,29 @@ def linearise_corners(
     )
     step = max(1, _CHUNK_POINTS // observed.points.shape[1])
     for start in range(0, n, step):
-        _linearise_chunk(blocks, observed, camera, C, weights, with_lens, shape, slice(start, start + step))
+        part = slice(start, start + step)
+        chunk = observed.part(np.arange(n)[part])
+        points = chunk.points if shape is None else bent_points(chunk, shape)
+        turned, p = _in_camera(chunk, points, C[part])
+        projected = project(camera, p, with_intrinsics=with_lens)
+        root = np.sqrt(weights[part] * chunk.present)[..., None]
+        r = ((chunk.pixels - projected.pixels) * root).reshape(len(chunk), -1)
+        L = np.concatenate([projected.by_point, projected.by_point @ -skew(turned)], axis=-1)
+        L = (L * root[..., None]).reshape(len(chunk), -1, 6)
+        L_t = np.swapaxes(L, 1, 2)
+        blocks.LL[part] = L_t @ L
+        blocks.Lr[part] = (L_t @ r[..., None])[..., 0]
+        blocks.rr[part] = (r * r).sum(axis=1)
+        columns = [] if projected.by_intrinsics is None else [projected.by_intrinsics]
+        if shape is not None:
+            columns.append(projected.by_point @ (C[part, None, :3, :3] @ _by_shape(chunk)))
+        if columns:
+            G = (np.concatenate(columns, axis=-1) * root[..., None]).reshape(len(chunk), L.shape[1], -1)
+            G_t = np.swapaxes(G, 1, 2)
+            blocks.LG[part] = L_t @ G
+            blocks.GG[part] = G_t @ G
+            blocks.Gr[part] = (G_t @ r[..., None])[..., 0]
     return blocks
-
-
-def _linearise_chunk(
-    blocks: CornerBlocks,
-    observed: Observations,
-    camera: CameraModel,
-    C: Array,
-    weights: Array,
-    with_lens: bool,
-    shape: Array | None,
-    part: slice,
-) -> None:
-    chunk = observed.part(np.arange(len(C))[part])
-    C = C[part]
-    n = len(C)
-    points = chunk.points if shape is None else bent_points(chunk, shape)
-    turned, p = _in_camera(chunk, points, C)
-    projected = project(camera, p, with_intrinsics=with_lens)
-    root = np.sqrt(weights[part] * chunk.present)[..., None]
-    r = ((chunk.pixels - projected.pixels) * root).reshape(n, -1)
-    L = np.concatenate([projected.by_point, projected.by_point @ -skew(turned)], axis=-1)
-    L = (L * root[..., None]).reshape(n, -1, 6)
-    L_t = np.swapaxes(L, 1, 2)
-    blocks.LL[part] = L_t @ L
-    blocks.Lr[part] = (L_t @ r[..., None])[..., 0]
-    blocks.rr[part] = (r * r).sum(axis=1)
-    columns = []
-    if projected.by_intrinsics is not None:
-        columns.append(projected.by_intrinsics)
-    if shape is not None:
-        columns.append(projected.by_point @ (C[:, None, :3, :3] @ _by_shape(chunk)))
-    if columns:
-        G = (np.concatenate(columns, axis=-1) * root[..., None]).reshape(n, L.shape[1], -1)
-        G_t = np.swapaxes(G, 1, 2)
-        blocks.LG[part] = L_t @ G
-        blocks.GG[part] = G_t @ G
-        blocks.Gr[part] = (G_t @ r[..., None])[..., 0]
 
 
 def boards_by_corners(observed: Observations, camera: CameraModel, C: Array, shape: Array) -> Array:

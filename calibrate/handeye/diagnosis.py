@@ -9,13 +9,13 @@ from scipy import special
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, skew
-from calibrate.handeye.estimate import FULL, estimate
-from calibrate.handeye.fit import CellFit
+from calibrate.handeye.cell_state import Layout
+from calibrate.handeye.estimate import FULL, CellFit, estimate
 from calibrate.handeye.linear import Linear, inverse_of
-from calibrate.handeye.observations import Layout, Places, implied_flange
 from calibrate.handeye.solution import CrossValidation, Finding
 from calibrate.projection import intrinsics_vector
 from calibrate.results import RejectedView
+from calibrate.views import Places, implied_flange
 
 _LOOSER = 0.01
 """A statement is taken back by giving its information this factor, not none: without it X may be open."""
@@ -167,7 +167,6 @@ def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
         float(np.sqrt(expected.mean())),
         limit,
         FOLDS,
-        dict(zip(full.tolist(), distance.tolist(), strict=True)),
     )
 
 
@@ -204,7 +203,7 @@ def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:
     """Residuals (m, 6) of the views left out, and the covariance (m, 6, 6) that the other views give them."""
     others = np.setdiff1d(np.arange(len(fit.views)), left_out)
     whole = fit.estimate
-    start = whole.state.of_views(others)
+    start = whole.state.with_boards(whole.state.C[others])
     found = estimate(fit.observed.part(others), start, fit.priors, whole.scales, max_steps=_STEPS)
     seen = found.state.with_boards(whole.board_poses[left_out])
     linear = Linear.at(fit.observed.part(left_out), seen, whole.corner_weights[left_out])

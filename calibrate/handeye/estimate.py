@@ -14,10 +14,14 @@ from scipy import optimize, special
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
+from calibrate.handeye.arm import ArmPostures
+from calibrate.handeye.axxb.pairs import Pairs
+from calibrate.handeye.axxb.robust import GlobalResult
+from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corners import corner_distance, corner_residuals
 from calibrate.handeye.linear import GAIN, ROBOT_PRIOR_COUNT, STUDENT, WIDE, Fit, Linear, Scales, first_scales
-from calibrate.handeye.observations import CellState, Observations
 from calibrate.handeye.priors import Priors
+from calibrate.views import Observations, ViewSet
 
 MAX_STEPS = 15
 REJECTED = 0.05
@@ -155,3 +159,26 @@ def corner_weights(observed: Observations, state: CellState, sigma_px: float) ->
     distance = corner_distance(corner_residuals(observed, state.camera, state.C, state.shape))
     square = (np.nan_to_num(distance, nan=1e6, posinf=1e6) / sigma_px) ** 2
     return (STUDENT + 2) / (STUDENT + square) * observed.present
+
+
+@dataclass(frozen=True, eq=False)
+class CellFit:
+    """Everything about a cell that its views tell."""
+
+    views: ViewSet
+    """The input, boards turned where that was needed."""
+    turned: tuple[int, ...]
+    """Places of the views whose board was turned."""
+    observed: Observations
+    priors: Priors
+    estimate: Estimate
+    log_bayes: float | None
+    """Log evidence of systematic errors of arm and bracket; None where they were not modelled."""
+    arm: ArmPostures | None
+    """None where errors of the arm's kinematic table are not among them."""
+    plain: Estimate
+    """The estimate without them."""
+    pairs: Pairs
+    """Pairs of the views that count; after a move, of those after it."""
+    certified: GlobalResult
+    """Optimum of the quadratic objective over these pairs."""

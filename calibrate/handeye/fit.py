@@ -9,30 +9,17 @@ from scipy import special
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
-from calibrate.handeye.arm import (
-    RELATIVE_SIGMA,
-    ArmPostures,
-    arm_postures,
-    by_parameters,
-    flex_motion,
-)
+from calibrate.handeye.arm import RELATIVE_SIGMA, arm_postures, by_parameters, flex_motion
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
-from calibrate.handeye.estimate import Estimate, MeanParts, corner_weights, estimate
+from calibrate.handeye.cell_state import CellState, Layout
+from calibrate.handeye.estimate import CellFit, Estimate, MeanParts, corner_weights, estimate
 from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.metrics import require_motion
-from calibrate.handeye.observations import (
-    SHAPE,
-    CellState,
-    Layout,
-    Moved,
-    Observations,
-    Places,
-    observe_views,
-)
 from calibrate.handeye.poses import BoardPoses, PoseViews, agreed_start, fit_poses
 from calibrate.handeye.priors import Priors
-from calibrate.views import BoardView, ViewSet
+from calibrate.results import SHAPE
+from calibrate.views import BoardView, Moved, Observations, Places, ViewSet, observe_views
 
 FEWEST_FOR_TABLE = 8
 """Fewer views cannot tell 18 errors of a table from noise."""
@@ -43,29 +30,6 @@ _CLEARLY = 5.0
 """Log evidence."""
 MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
 """Noise beyond this per axis is none: no X is returned."""
-
-
-@dataclass(frozen=True, eq=False)
-class CellFit:
-    """Everything about a cell that its views tell."""
-
-    views: ViewSet
-    """The input, boards turned where that was needed."""
-    turned: tuple[int, ...]
-    """Places of the views whose board was turned."""
-    observed: Observations
-    priors: Priors
-    estimate: Estimate
-    log_bayes: float | None
-    """Log evidence of systematic errors of arm and bracket; None where they were not modelled."""
-    arm: ArmPostures | None
-    """None where errors of the arm's kinematic table are not among them."""
-    plain: Estimate
-    """The estimate without them."""
-    pairs: Pairs
-    """Pairs of the views that count; after a move, of those after it."""
-    certified: GlobalResult
-    """Optimum of the quadratic objective over these pairs."""
 
 
 def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True) -> CellFit:

@@ -2,7 +2,7 @@
 
 The model is the estimate's own (`handeye.linear`): corner noise, and on every robot pose an independent error
 that is a nuisance of its own view. Parameter order: δX (6), δY (6), the lens (`projection.intrinsics_names`),
-the board's shape (`handeye.observations.SHAPE`), and the errors of the arm's table (`handeye.arm.PARAMETERS`,
+the board's shape (`results.SHAPE`), and the errors of the arm's table (`handeye.arm.PARAMETERS`,
 over `RELATIVE_SIGMA`) where their motion is given. Deltas are those of `geometry.perturb`.
 X = flange_from_camera, Y = base_from_board (eye-in-hand), or X = base_from_camera, Y = flange_from_board
 (eye-to-hand).
@@ -14,12 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, inverse
+from calibrate.geometry import Array
 from calibrate.handeye.arm import PARAMETERS
+from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.linear import Linear
-from calibrate.handeye.observations import SHAPE, CellState, Layout, Observations, extent_of
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.projection import camera_matrix
+from calibrate.results import SHAPE
+from calibrate.views import Observations, board_in_camera, extent_of
 from recordings.schema.messages import CameraModel, Mount
 
 _FOCAL_SHARE = 0.05
@@ -35,6 +37,9 @@ class MeasurementNoise:
     pixel_px: float = 0.15
     robot_m: float = 0.0001
     robot_rad: float = 0.00017
+
+
+USUAL_NOISE = MeasurementNoise()
 
 
 def view_information(
@@ -53,10 +58,7 @@ def view_information(
     by each error of the arm's table.
     """
     n, k = len(base_from_flange), len(board_points)
-    if mount == "eye-in-hand":
-        C = inverse(base_from_flange @ X) @ Y
-    else:
-        C = inverse(X) @ base_from_flange @ Y
+    C = board_in_camera(mount, base_from_flange, X, Y)
     observed = Observations(
         mount,
         base_from_flange,
@@ -111,3 +113,9 @@ def covariance_of(information: Array, prior: Array | None = None) -> Array:
     scaled = M * scale[..., :, None] * scale[..., None, :]
     scaled = scaled + 1e-12 * np.eye(M.shape[-1])
     return np.asarray(np.linalg.inv(scaled) * scale[..., :, None] * scale[..., None, :])
+
+
+def sigma_of(information: Array, prior: Array) -> tuple[float, float]:
+    """1σ of X from a sum of informations: translation (m, root of the summed variances), rotation (rad)."""
+    diagonal = np.diag(covariance_of(information, prior))
+    return float(np.sqrt(diagonal[:3].sum())), float(np.sqrt(diagonal[3:6].sum()))

@@ -16,15 +16,9 @@ import numpy as np
 from scipy import linalg
 
 from calibrate.geometry import Array, perturb
+from calibrate.handeye.cell_state import CellState, Layout, Quadratic, flange_derivatives, flange_residuals
 from calibrate.handeye.corners import CornerBlocks, linearise_corners
-from calibrate.handeye.observations import (
-    CellState,
-    Layout,
-    Observations,
-    flange_derivatives,
-    flange_residuals,
-)
-from calibrate.handeye.priors import Quadratic
+from calibrate.views import Observations
 
 ROUNDS = 8
 GAIN = np.array([1.0, 3.0, 10.0])
@@ -214,18 +208,16 @@ class Linear:
         self, prior: Quadratic, scales: Scales, fit: Fit = "all", rounds: int = ROUNDS
     ) -> LinearSolution:
         """Find the step and the noise scales to be fitted, by rounds of expectation and maximisation."""
-        residual = self.m
+        residual, modes = self.m, self.modes
         for _ in range(1 if fit == "nothing" else rounds):
             S, S_inverse = self._noise(scales)
             chances, _ = _chances(residual, S, S_inverse, scales.shares)
             WJ = np.einsum("nk,nkij->nij", chances, S_inverse) @ self.J
             N = prior.N + np.einsum("nia,nib->ab", self.J, WJ, optimize=True)
             right = prior.right - np.einsum("nia,ni->a", WJ, self.m)
-            if self.modes is not None:
-                N[self.modes.shared, self.modes.shared] += (
-                    self.modes.information.sum(axis=0) / scales.lambda_px**2
-                )
-                right[self.modes.shared] += self.modes.right.sum(axis=0) / scales.lambda_px**2
+            if modes is not None:
+                N[modes.shared, modes.shared] += modes.information.sum(axis=0) / scales.lambda_px**2
+                right[modes.shared] += modes.right.sum(axis=0) / scales.lambda_px**2
             covariance = inverse_of(N)
             step = covariance @ right
             residual = self.m + self.J @ step
@@ -237,8 +229,8 @@ class Linear:
         evidence = (
             float(log_density.sum()) + prior.log + prior.gain(step) - 0.5 * float(np.linalg.slogdet(N)[1])
         )
-        if self.modes is not None:
-            evidence += self.modes.gain(step) / scales.lambda_px**2
+        if modes is not None:
+            evidence += modes.gain(step) / scales.lambda_px**2
         return LinearSolution(step, N, scales, chances, residual, z, evidence)
 
     def _noise(self, scales: Scales) -> tuple[Array, Array]:

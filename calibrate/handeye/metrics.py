@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.errors import DegenerateMotionError
-from calibrate.geometry import Array, difference, pose, project_to_rotation, rotation_angle, skew
+from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsError
+from calibrate.geometry import Array, difference, is_rigid, pose, project_to_rotation, rotation_angle, skew
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses, screw_invariants
+from calibrate.projection import camera_matrix
 from calibrate.results import HoldoutScore
-from calibrate.views import ViewSet
+from calibrate.views import BoardView, ViewSet, require_no_copies
 
 _MIN_SECOND_AXIS_RAD = np.radians(0.3)
 """Root mean square rotation about the second axis below which no X is worth the name."""
@@ -99,6 +100,68 @@ def require_motion(pairs: Pairs) -> None:
             second_axis_rad=float(singular[1]),
             limit_rad=float(needed),
         )
+
+
+MIN_VIEWS = 4
+
+
+FEWEST_CORNERS = 4
+
+
+MAX_VIEWS = 20_000
+"""Beyond this the last stage would need more than a minute and a gigabyte."""
+
+
+def require_solvable(views: ViewSet) -> None:
+    """Raise TooFewViewsError or BadViewsError, naming view and remedy."""
+    if len(views) < MIN_VIEWS:
+        raise TooFewViewsError(
+            f"{len(views)} usable views (minimum {MIN_VIEWS}).",
+            remedy="Record 15 to 25 poses, or check why the board was not found in the others.",
+            views=len(views),
+            minimum=MIN_VIEWS,
+        )
+    if len(views) > MAX_VIEWS:
+        raise BadViewsError(
+            f"{len(views)} views (limit {MAX_VIEWS}).", code="too-many-views", remedy="Split the recording."
+        )
+    fewest = FEWEST_CORNERS if any(len(view.pixels) for view in views) else 0
+    if views.camera.matrix is not None or fewest:
+        camera_matrix(views.camera)
+        if not np.isfinite(views.camera.distortion).all():
+            raise BadViewsError(
+                "The distortion is not finite.", code="distortion", remedy="Correct it, or estimate it."
+            )
+    for view in views:
+        _require_view(view, fewest)
+    first = views.views[0].base_from_flange
+    if all(np.abs(view.base_from_flange - first).max() < 1e-9 for view in views):
+        raise BadViewsError(
+            "All robot poses are identical.", code="poses-identical", remedy="Check how they were recorded."
+        )
+    require_no_copies(views)
+
+
+def _require_view(view: BoardView, fewest_corners: int) -> None:
+    def require(right: bool, code: str, wrong: str) -> None:
+        if not right:
+            raise BadViewsError(
+                f"View {view.index + 1} ({view.name}): {wrong}.",
+                code=code,
+                remedy="Correct or remove this view.",
+                view=view.index + 1,
+            )
+
+    T, corners = np.array(view.camera_from_board), len(view.pixels)
+    require(is_rigid(np.asarray(view.base_from_flange)), "robot-pose", "the robot pose is no rigid transform")
+    require(T.shape == (4, 4), "no-board-pose", "no board pose is known")
+    require(is_rigid(T), "board-pose", "the board pose is mirrored or no rigid transform")
+    require(T[2, 3] > 0, "board-pose", "the board pose lies behind the camera")
+    points = len(view.board_points)
+    require(corners == points, "corners", f"{corners} pixels for {points} board points")
+    require(corners >= fewest_corners, "corners", f"{corners} corners (minimum {fewest_corners})")
+    finite = np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()
+    require(bool(finite), "corners", "a corner is not finite")
 
 
 def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> Observability:

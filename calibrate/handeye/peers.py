@@ -25,6 +25,7 @@ from calibrate.handeye.axxb.peer_methods import (
     zhao_minimax,
     zhi_linear,
 )
+from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corners import corner_residuals, linearise_corners
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.linear import Scales
@@ -37,15 +38,14 @@ from calibrate.handeye.metrics import (
     mean_pose,
     motion_errors,
     placed_boards,
+    require_solvable,
 )
-from calibrate.handeye.observations import SHAPE, CellState, observe_views
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
-from calibrate.handeye.profile_robust import solve_robust_profile
 from calibrate.handeye.solution import Solution, SolveOptions
-from calibrate.handeye.solve import require_solvable
+from calibrate.handeye.solve import solve_robust_profile
 from calibrate.projection import intrinsics_vector
-from calibrate.results import PeerResult
-from calibrate.views import ViewSet
+from calibrate.results import SHAPE, PeerResult
+from calibrate.views import ViewSet, observe_views
 
 Method = Callable[[ViewSet], Array]
 PAPER = "DE, paper"

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from calibrate.geometry import Array, difference, inverse, perturb, pose, project_to_rotation, rotation_log
 from calibrate.handeye.axxb.pairs import mount_poses
+from calibrate.handeye.cell_state import Quadratic, flange_derivatives
 from calibrate.handeye.corners import linearise_corners
 from calibrate.handeye.linear import CornerModes, Linear, LinearSolution, Scales, first_scales
-from calibrate.handeye.observations import Moved, Places, flange_derivatives, implied_flange, observe_views
-from calibrate.handeye.priors import Quadratic
 from calibrate.projection import intrinsics_vector
-from calibrate.views import ViewSet
+from calibrate.views import Moved, Places, ViewSet, implied_flange, observe_views
 from recordings.schema.messages import Mount
 
 _SUBSETS, _OF = 120, 4

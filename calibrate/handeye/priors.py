@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calibrate.geometry import Array
-from calibrate.handeye.observations import SHAPE, CellState, Layout
+from calibrate.handeye.cell_state import CellState, Layout, Quadratic
 from calibrate.projection import intrinsics_names, intrinsics_vector
+from calibrate.results import SHAPE
 from recordings.schema.messages import BoardSpec, CameraModel
 
 ASPECT_SIGMA = 0.001
@@ -78,21 +79,6 @@ class LensPrior:
 def _log_aspect(vector: Array) -> float:
     ratio = float(np.log(vector[1] / vector[0]))
     return ratio if abs(ratio) > _NOT_SQUARE else 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Quadratic:
-    """Log density around a state: log + right · step - ½ step · N · step."""
-
-    N: Array
-    """(G, G)"""
-    right: Array
-    """(G,)"""
-    log: float = 0.0
-
-    def gain(self, step: Array) -> float:
-        """Compute the log density at a step (G,) against that at the state."""
-        return float(self.right @ step - 0.5 * step @ self.N @ step)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,11 +22,9 @@ from calibrate.geometry import (
     rotation_exp,
     rotation_log,
 )
-from calibrate.handeye.estimate import FULL
-from calibrate.handeye.observations import Moved
 from calibrate.handeye.poses import BoardPoses, PoseFit, PoseViews, fit_poses
 from calibrate.handeye.solution import Explanation, Reading
-from calibrate.views import ViewSet
+from calibrate.views import Moved, ViewSet
 
 _CLEAR = 10.0
 """Log evidence beyond chance by which another reading has to win."""
@@ -53,7 +51,7 @@ def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
     """Find the best reading; AS_RECORDED unless another one's evidence is clear beyond chance."""
     as_recorded = _fit(views, seed)
     base = -np.inf if as_recorded is None else as_recorded.log_evidence
-    best = Explanation(Reading.AS_RECORDED, 0.0, share=_share(as_recorded))
+    best = Explanation(Reading.AS_RECORDED, 0.0)
     winning = _CLEAR + np.log(max(len(views), 2))
     for reading, changed, at, charge in _readings(views, as_recorded):
         fit = _fit(changed, seed)
@@ -67,7 +65,7 @@ def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
                 continue
             if reading is Reading.SQUARE_SIZE and abs(abs(np.log(factor)) - np.log(1000.0)) < _NEAR:
                 reading = Reading.MILLIMETRES
-            best = Explanation(reading, float(gain), at, factor, _share(fit))
+            best = Explanation(reading, float(gain), at, factor)
     return best
 
 
@@ -76,10 +74,6 @@ def _fit(views: PoseViews, seed: int) -> PoseFit | None:
         return fit_poses(views, seed)
     except np.linalg.LinAlgError:
         return None
-
-
-def _share(fit: PoseFit | None) -> float:
-    return 0.0 if fit is None else float((fit.full > FULL).mean())
 
 
 def _readings(
@@ -175,15 +169,13 @@ def _vectors(R: Array) -> Array:
     return rotation_exp(np.where(shorter[:, None], angles, other))
 
 
-def _angles(R: Array) -> Array:
-    return np.asarray(Rotation.from_euler("xyz", rotation_log(R)).as_matrix())
-
-
 _CONVENTIONS: dict[Reading, Callable[[Array], Array]] = {
     Reading.INVERSE_POSES: inverse,
     Reading.QUATERNION_ORDER: _rotations(_w_first),
     Reading.ROTATION_VECTOR_AS_ANGLES: _rotations(_vectors),
-    Reading.ANGLES_AS_ROTATION_VECTOR: _rotations(_angles),
+    Reading.ANGLES_AS_ROTATION_VECTOR: _rotations(
+        lambda R: Rotation.from_euler("xyz", rotation_log(R)).as_matrix()
+    ),
     Reading.INVERSE_ROTATIONS: _rotations(lambda R: np.asarray(R.transpose(0, 2, 1))),
 }
 

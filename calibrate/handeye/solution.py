@@ -95,8 +95,6 @@ class CrossValidation:
     limit: float
     """Limit of `rms_m` over `claimed_m`; beyond it the claim is too small."""
     folds: int
-    residual_m: dict[int, float]
-    """Place of each view → distance by which it was missed."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +138,26 @@ class TableResult:
     @property
     def offered(self) -> bool:
         return self.refused is None
+
+
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """The arm without and with its table at poses that took no part in the fit, n of them."""
+
+    recording: str
+    flange_m: Array
+    """(n, 3) where the flange stood."""
+    missed_m: Array
+    """(2, n) distance of the board's middle from its mean place: without, with the table."""
+
+    @property
+    def rms_m(self) -> tuple[float, float]:
+        without, with_table = np.sqrt(np.mean(self.missed_m**2, axis=1)).tolist()
+        return without, with_table
+
+    @property
+    def better(self) -> bool:
+        return self.rms_m[1] < self.rms_m[0]
 
 
 TableRefusal = Literal["no-evidence", "no-joints", "not-nominal", "not-better"]
@@ -199,8 +217,6 @@ class Explanation:
     """Place of the first view after a change; images by which they are shifted."""
     factor: float = 1.0
     """True over configured size of the squares, or focal length, of the later part where it changed."""
-    share: float = 1.0
-    """Share of the views that carry full weight under this reading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,8 +278,6 @@ class Solution:
     on_box: tuple[str, ...] = ()
     """Paper profile: components of X that lie on the box of equation 22."""
     warnings: tuple[Remark, ...] = ()
-    stage_ms: dict[str, float] = field(default_factory=dict)
-    solve_ms: float = 0.0
     seed: int = 0
 
     @property

@@ -1,4 +1,4 @@
-"""ViewSet in, Solution out: checks of the input, the profile asked for, and the paper's own experiment."""
+"""ViewSet in, Solution out: one estimate of all that a cell does not know, and what may be said of it."""
 
 from __future__ import annotations
 
@@ -7,30 +7,64 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
-from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import Array, Transform, is_rigid
-from calibrate.handeye.axxb.certificate import Certificate, certify
+from calibrate.errors import BadViewsError, PosesDisagreeError
+from calibrate.geometry import Array, Transform
+from calibrate.handeye.arm import FLEX, PARAMETERS, RELATIVE_SIGMA
+from calibrate.handeye.arm_result import table_result
+from calibrate.handeye.axxb.certificate import TOLERANCE, Certificate, certify
 from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective, pair_covariance
-from calibrate.handeye.axxb.pairs import consecutive_pairs, mount_poses
+from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
+from calibrate.handeye.cell_state import Layout
+from calibrate.handeye.corners import boards_by_corners, corner_distance, corner_residuals
+from calibrate.handeye.diagnosis import (
+    cross_validate,
+    error_shares,
+    explain_views,
+    held_out_elsewhere,
+    judge_board,
+    judge_lens,
+)
+from calibrate.handeye.estimate import FULL, CellFit, estimate
+from calibrate.handeye.fit import fit_cell, fit_moved
 from calibrate.handeye.metrics import (
     HELD_OUT,
     board_spread,
+    distance_in_sigmas,
     mean_pose,
     median_distance_m,
     observe,
     placed_boards,
     point_error_m,
     require_motion,
+    require_solvable,
     score_holdout,
 )
-from calibrate.handeye.profile_robust import solve_robust_profile
-from calibrate.handeye.solution import Remark, Solution, SolveOptions, board_frames, camera_frames
-from calibrate.projection import camera_matrix
-from calibrate.stopwatch import Stopwatch
-from calibrate.views import BoardView, ViewSet, require_no_copies
+from calibrate.handeye.poses import pose_views
+from calibrate.handeye.priors import LensPrior, Priors
+from calibrate.handeye.readings import explain_recording, explain_text
+from calibrate.handeye.solution import (
+    ArmTable,
+    Explanation,
+    NoiseScales,
+    Reading,
+    Remark,
+    Solution,
+    SolveOptions,
+    board_frames,
+    camera_frames,
+)
+from calibrate.results import BoardShape, HoldoutScore
+from calibrate.views import Moved, ViewSet
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
+
+_ENOUGH = 0.9
+"""Share of views with full weight above which a recording is taken as it stands."""
+_NOISY_M, _NOISY_RAD = 0.002, float(np.radians(0.3))
+"""Noise of the robot that is more than an arm's."""
+_FREE_FOCAL = 0.02
+"""1σ of the focal length of a lens that was found from the same images, relative, for other readings."""
 
 
 def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution:
@@ -46,74 +80,216 @@ def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution
     return solve_robust_profile(views, options)
 
 
-MIN_VIEWS = 4
-FEWEST_CORNERS = 4
-MAX_VIEWS = 20_000
-"""Beyond this the last stage would need more than a minute and a gigabyte."""
+def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
+    """Estimate from all views. PosesDisagreeError names the reading that would explain the recording."""
+    priors = _priors(views, options)
+    focal_sigma = float(min(priors.lens.sigma[0] / priors.lens.mean[0], _FREE_FOCAL))
+    poses = pose_views(views, focal_sigma, priors.board.square)
+    session, fit, disagree = Explanation(Reading.AS_RECORDED, 0.0), None, None
+    try:
+        fit = fit_cell(views, priors, options.seed, options.model_arm)
+    except PosesDisagreeError as problem:
+        disagree = problem
+
+    def ask() -> tuple[Explanation, CellFit | None]:
+        """Find how the recording has to be read, and fit a move that is accepted."""
+        found = explain_recording(poses, options.seed)
+        moved = _MOVED.get(found.reading)
+        if not options.accept_move or moved is None:
+            return found, None
+        return found, fit_moved(views, priors, poses, found.at, moved, options.seed)
+
+    if fit is None or float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH:
+        session, after_move = ask()
+        fit = after_move or fit
+    if fit is None:
+        remedy = explain_text(session, views)
+        raise PosesDisagreeError(str(disagree), session.reading.value, remedy=remedy) from None
+    solution = _describe(fit, options)
+    if session.reading is Reading.AS_RECORDED and _doubtful(solution):
+        session, after_move = ask()
+        if after_move is not None:
+            fit, solution = after_move, _describe(after_move, options)
+    return replace(
+        solution,
+        session=session,
+        move_accepted=fit.estimate.state.second is not None,
+        warnings=_remarks(fit, solution, session),
+    )
 
 
-def require_solvable(views: ViewSet) -> None:
-    """Raise TooFewViewsError or BadViewsError, naming view and remedy."""
-    if len(views) < MIN_VIEWS:
-        raise TooFewViewsError(
-            f"{len(views)} usable views (minimum {MIN_VIEWS}).",
-            remedy="Record 15 to 25 poses, or check why the board was not found in the others.",
-            views=len(views),
-            minimum=MIN_VIEWS,
-        )
-    if len(views) > MAX_VIEWS:
-        raise BadViewsError(
-            f"{len(views)} views (limit {MAX_VIEWS}).", code="too-many-views", remedy="Split the recording."
-        )
-    fewest = FEWEST_CORNERS if any(len(view.pixels) for view in views) else 0
-    if views.camera.matrix is not None or fewest:
-        camera_matrix(views.camera)
-        if not np.isfinite(views.camera.distortion).all():
-            raise BadViewsError(
-                "The distortion is not finite.", code="distortion", remedy="Correct it, or estimate it."
-            )
-    for view in views:
-        _require_view(view, fewest)
-    first = views.views[0].base_from_flange
-    if all(np.abs(view.base_from_flange - first).max() < 1e-9 for view in views):
-        raise BadViewsError(
-            "All robot poses are identical.", code="poses-identical", remedy="Check how they were recorded."
-        )
-    require_no_copies(views)
+_MOVED: dict[Reading, Moved] = {Reading.BOARD_MOVED: "board", Reading.CAMERA_MOVED: "camera"}
 
 
-def _require_view(view: BoardView, fewest_corners: int) -> None:
-    def require(right: bool, code: str, wrong: str) -> None:
-        if not right:
-            raise BadViewsError(
-                f"View {view.index + 1} ({view.name}): {wrong}.",
-                code=code,
-                remedy="Correct or remove this view.",
-                view=view.index + 1,
-            )
+def _priors(views: ViewSet, options: SolveOptions) -> Priors:
+    if options.intrinsics_from_same_pictures:
+        return Priors(LensPrior.unknown(views.camera), options.board)
+    sigma = None if options.lens_sigma is None else np.array(options.lens_sigma)
+    return Priors(LensPrior.given(views.camera, sigma), options.board)
 
-    T, corners = np.array(view.camera_from_board), len(view.pixels)
-    require(is_rigid(np.asarray(view.base_from_flange)), "robot-pose", "the robot pose is no rigid transform")
-    require(T.shape == (4, 4), "no-board-pose", "no board pose is known")
-    require(is_rigid(T), "board-pose", "the board pose is mirrored or no rigid transform")
-    require(T[2, 3] > 0, "board-pose", "the board pose lies behind the camera")
-    points = len(view.board_points)
-    require(corners == points, "corners", f"{corners} pixels for {points} board points")
-    require(corners >= fewest_corners, "corners", f"{corners} corners (minimum {fewest_corners})")
-    finite = np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()
-    require(bool(finite), "corners", "a corner is not finite")
+
+def _doubtful(solution: Solution) -> bool:
+    """Tell whether something is left that another reading of the whole recording might explain."""
+    folds, noise = solution.cross_validation, solution.noise
+    findings = (solution.lens_finding, solution.board_finding)
+    return bool(
+        (folds is not None and folds.rms_m > folds.limit * folds.claimed_m)
+        or any(finding is not None and finding.unexplained_m > 0 for finding in findings)
+        or (noise is not None and (noise.robot_m > _NOISY_M or noise.robot_rad > _NOISY_RAD))
+    )
+
+
+def _describe(fit: CellFit, options: SolveOptions) -> Solution:
+    views, found, state = fit.views, fit.estimate, fit.estimate.state
+    at, indices = Layout.of(state), [view.index for view in views]
+    used = np.flatnonzero(found.used)
+    H, C = mount_poses(views.base_from_flange, views.mount), found.board_poses
+    parent, child = camera_frames(views.mount)
+    distance = options.working_distance_m or median_distance_m(C[used])
+    covariance = found.covariance[:6, :6]
+    pairs, certified = fit.pairs, fit.certified
+    apart = distance_in_sigmas(certified.X, state.X, pair_covariance(certified.objective, pairs, certified.X))
+    spread_m, spread_rad = board_spread(H[used], C[used], state.X)
+    given = not options.intrinsics_from_same_pictures
+    seen = fit.observed.has_pixels
+    lens_finding = judge_lens(fit, distance) if given and seen else None
+    board_finding = judge_board(fit, distance) if seen else None
+    folds = cross_validate(fit, options.seed) if options.folds and state.second is None else None
+    holdout = _holdout(fit) if options.holdout and state.second is None else None
+    weight = found.weight
+    rms_px, view_rms_px = _corner_rms(fit)
+    return Solution(
+        mount=views.mount,
+        profile="robust",
+        parent_from_child=Transform(parent, child, state.X),
+        covariance=covariance,
+        confidence_threshold=found.threshold,
+        board_place=Transform(*board_frames(views.mount), state.Y),
+        camera=state.camera,
+        rms_px=rms_px,
+        used=tuple(indices[i] for i in used),
+        rejected=explain_views(fit, np.flatnonzero(~found.used)),
+        certificate=replace(certified.certificate, distance_sigma=apart),
+        observability=observe(pairs, covariance, distance, parent),
+        holdout=holdout,
+        kept=tuple(replace(views.views[i], camera_from_board=C[i]) for i in used),
+        turned=tuple(indices[i] for i in fit.turned),
+        weights={index: float(w) for index, w in zip(indices, weight, strict=True)},
+        suspects={indices[i]: float(1 - found.chances[i, 0]) for i in used if found.chances[i, 0] <= FULL},
+        cross_validation=folds,
+        lens_finding=lens_finding,
+        lens_covariance=found.covariance[at.lens, at.lens] if seen else None,
+        board=_board(fit, found.covariance[at.shape, at.shape]) if seen else None,
+        board_finding=board_finding,
+        noise=NoiseScales(found.scales.tau_px, *(float(s) for s in found.scales.robot)),
+        error_shares=error_shares(fit),
+        arm=_arm(fit, found.covariance[at.table, at.table], options, distance),
+        predicted_error_m=point_error_m(state.X, covariance, distance),
+        working_distance_m=distance,
+        board_spread_m=spread_m,
+        board_spread_rad=spread_rad,
+        residual_px={indices[i]: float(view_rms_px[i]) for i in used} if seen else {},
+        residual_robot={
+            indices[i]: (float(np.linalg.norm(found.robot[i, :3])), float(np.linalg.norm(found.robot[i, 3:])))
+            for i in used
+        },
+        seed=options.seed,
+    )
+
+
+def _corner_rms(fit: CellFit) -> tuple[float | None, Array]:
+    """Over all corners of the used views, and for each view (n,), at the board poses that fit its corners."""
+    found = fit.estimate
+    if not fit.observed.has_pixels:
+        return None, np.zeros(len(fit.views))
+    residual = corner_residuals(fit.observed, found.state.camera, found.board_poses, found.state.shape)
+    square = np.nan_to_num(corner_distance(residual), nan=1e6, posinf=1e6) ** 2 * fit.observed.present
+    count = fit.observed.present.sum(axis=1)
+    used = found.used
+    return float(np.sqrt(square[used].sum() / count[used].sum())), np.sqrt(square.sum(axis=1) / count)
+
+
+def _board(fit: CellFit, covariance: Array) -> BoardShape:
+    scale, anisotropy, *bend = fit.estimate.state.shape.tolist()
+    return BoardShape(scale, anisotropy, tuple(bend), tuple(np.sqrt(np.diag(covariance)).tolist()))
+
+
+def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: float) -> ArmTable | None:
+    if fit.log_bayes is None:
+        return None
+    names = (*PARAMETERS, *FLEX) if fit.arm is not None else FLEX
+    unit = np.concatenate([RELATIVE_SIGMA, np.ones(len(FLEX))])[-len(names) :]
+    value = unit * fit.estimate.state.table
+    sigma = unit * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    errors = dict(zip(names, zip(value.tolist(), sigma.tolist(), strict=True), strict=True))
+    found = ArmTable(fit.log_bayes, float(fit.estimate.scales.table[0]), errors, fit.arm is not None)
+    if fit.arm is None:
+        return found
+    missed = held_out_elsewhere(fit, fit.arm.joints_rad) if found.detected and options.folds else None
+    return replace(found, result=table_result(fit, fit.arm, found.detected, distance_m, missed))
+
+
+def _holdout(fit: CellFit) -> HoldoutScore | None:
+    """Fit on all but the last 6 used views, lens included; score all pairs inside those 6.
+
+    That fit starts at the estimate of all views: a start decides how long the way to its own optimum is, not
+    where the optimum lies.
+    """
+    used = np.flatnonzero(fit.estimate.used)
+    first, last = used[:-HELD_OUT], used[-HELD_OUT:]
+    if len(first) < 5:
+        return None
+    whole = fit.estimate
+    try:
+        start = whole.state.with_boards(whole.state.C[first])
+        partial = estimate(fit.observed.part(first), start, fit.priors, whole.scales)
+    except BadViewsError:
+        return None
+    H = mount_poses(fit.views.base_from_flange, fit.views.mount)[last]
+    state = partial.state
+    C = boards_by_corners(fit.observed.part(last), state.camera, whole.board_poses[last], state.shape)
+    pairs = all_pairs(H, C)
+    indices = [fit.views.views[i].index for i in last]
+    note = f"fit on {len(first)} views, all {len(pairs)} pairs inside the other {HELD_OUT} scored"
+    return score_holdout(partial.state.X, pairs, indices, len(first), note)
+
+
+def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Remark, ...]:
+    found, arm = fit.estimate, solution.arm
+    suspects = ", ".join(f"{index + 1} (P(outlier) {p:.2f})" for index, p in solution.suspects.items())
+    offered = arm is not None and arm.result is not None and arm.result.offered
+    systematic = (
+        f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm or mrad in the arm's "
+        "kinematic table, or a bracket that bends. "
+    ) + ("Use the corrected table." if offered else "Have the arm calibrated, and stiffen the bracket.")
+    as_recorded = session.reading is Reading.AS_RECORDED
+    said = (
+        (not as_recorded, session.reading.value, explain_text(session, fit.views)),
+        (bool(suspects), "suspect-views", f"Suspect views, down-weighted: {suspects}. Retake them."),
+        (not found.converged, "not-converged", f"Not converged after {found.steps} iterations."),
+        (
+            not fit.observed.has_pixels,
+            "no-corners",
+            "No corners were recorded: board poses count as exact, all error is the robot's.",
+        ),
+        (
+            arm is not None and not arm.arm_known,
+            "arm-not-modelled",
+            "The arm's model is unknown: errors of its kinematic table are not in the stated error.",
+        ),
+        (arm is not None and arm.detected, "arm-systematics", systematic),
+    )
+    return tuple(Remark(code, text) for true, code, text in said if true)
 
 
 def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     """Run the paper's experiment: consecutive pairs (eq. 21), the last 6 of them to score (eqs. 24-26)."""
-    watch = Stopwatch()
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = consecutive_pairs(H, C)
     held = HELD_OUT if options.holdout and len(pairs) >= HELD_OUT + 3 else 0
     fit = pairs.select(slice(0, len(pairs) - held))
     require_motion(fit)
     result = solve_paper(fit, options.seed)
-    watch.lap("evolution")
     X, indices = result.X, [view.index for view in views]
     covariance = pair_covariance(result.objective, fit, X)
     distance = options.working_distance_m or median_distance_m(C)
@@ -122,7 +298,6 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     spread_m, spread_rad = board_spread(H, C, X)
     fitted = len(fit) + 1
     note = f"pairs {len(fit)} and {len(fit) + 1} share a pose, as in the paper"
-    watch.lap("assess")
     return Solution(
         mount=views.mount,
         profile="paper",
@@ -146,8 +321,6 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
         board_spread_rad=spread_rad,
         on_box=result.on_box,
         warnings=_paper_warnings(result.on_box, held, certificate),
-        stage_ms=watch.stage_ms,
-        solve_ms=watch.total_ms,
         seed=options.seed,
     )
 
@@ -163,7 +336,7 @@ def _of_returned(objective: QuadraticObjective, X: Array, pairs: int) -> Certifi
     proof = certify(objective, problem).certificate
     value = objective.value(X)
     gap = max(0.0, value - proof.lower_bound) / max(value, proof.floor)
-    return replace(proof, objective=value, relative_gap=gap, certified=gap <= proof.tolerance)
+    return replace(proof, objective=value, relative_gap=gap, certified=gap <= TOLERANCE)
 
 
 def _paper_warnings(on_box: tuple[str, ...], held: int, proof: Certificate) -> tuple[Remark, ...]:

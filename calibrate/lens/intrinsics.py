@@ -17,11 +17,10 @@ import numpy as np
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.corners import CornerBlocks, corner_residuals, linearise_corners
-from calibrate.handeye.observations import Observations, observe_views
 from calibrate.handeye.priors import LensPrior
 from calibrate.lens.pnp import planar_tilts
-from calibrate.projection import camera_matrix, intrinsics_names, intrinsics_vector, with_intrinsics_vector
-from calibrate.views import ViewSet
+from calibrate.projection import camera_matrix, intrinsics_vector, with_intrinsics_vector
+from calibrate.views import ViewSet, observe_views
 from recordings.schema.messages import CameraModel
 
 LensModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
@@ -32,15 +31,11 @@ _FISHEYE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-9)
 
 @dataclass(frozen=True, eq=False)
 class Intrinsics:
-    """Estimated intrinsics and their errors."""
+    """Estimated intrinsics."""
 
     camera: CameraModel
     rms_px: float
     """RMS of the corners' distances from where the lens shows them; without dropped views."""
-    view_rms_px: dict[int, float]
-    """Pose number → rms over its corners."""
-    sigma: dict[str, float]
-    """1σ of each parameter by the images alone: fx fy cx cy in pixels, the others plain."""
     dropped: dict[int, str] = field(default_factory=dict)
     """Pose number → why its corners were left out of the fit."""
 
@@ -61,7 +56,7 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     used = views
     while True:
         try:
-            fit = _fit(used, model)
+            lens, view_rms_px = _fit(used, model)
         except (cv2.error, np.linalg.LinAlgError) as problem:
             reason = problem.err if isinstance(problem, cv2.error) else problem
             raise BadViewsError(
@@ -69,44 +64,35 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
                 code="intrinsics-open",
                 remedy="Check the board's size.",
             ) from None
-        limit = max(4 * float(np.median(fit.view_rms_px)), 0.5)
-        good = [k for k in range(len(used)) if fit.view_rms_px[k] <= limit]
+        median_px = float(np.median(view_rms_px))
+        good = np.flatnonzero(view_rms_px <= max(4 * median_px, 0.5)).tolist()
         if len(good) == len(used) or len(good) < FEWEST_VIEWS:
             break
         for k in set(range(len(used))) - set(good):
-            dropped[used.views[k].index] = (
-                f"its corners fit the lens to {fit.view_rms_px[k]:.2f} px, the median is "
-                f"{float(np.median(fit.view_rms_px)):.2f} px"
-            )
+            fits = f"its corners fit the lens to {view_rms_px[k]:.2f} px, the median is {median_px:.2f} px"
+            dropped[used.views[k].index] = fits
         used = used.select(good)
-    size, K = (views.camera.width, views.camera.height), camera_matrix(fit.camera)
-    if not (0.2 * max(size) < K[0, 0] < 100 * max(size) and fit.rms_px <= 0.01 * max(size)):
+    side, K = max(views.camera.width, views.camera.height), camera_matrix(lens)
+    rms_px = float(np.sqrt(np.average(view_rms_px**2, weights=[len(view.pixels) for view in used])))
+    if not (0.2 * side < K[0, 0] < 100 * side and rms_px <= 0.01 * side):
         raise BadViewsError(
-            f"No lens explains the corners (focal length {K[0, 0]:.0f} px, rms {fit.rms_px:.1f} px).",
+            f"No lens explains the corners (focal length {K[0, 0]:.0f} px, rms {rms_px:.1f} px).",
             code="no-lens-fits",
             remedy="Check the board's columns and rows, give the camera's matrix, or tilt views by 20°.",
             focal_px=float(K[0, 0]),
-            rms_px=fit.rms_px,
+            rms_px=rms_px,
         )
-    return Intrinsics(
-        fit.camera,
-        fit.rms_px,
-        {view.index: float(rms) for view, rms in zip(used, fit.view_rms_px, strict=True)},
-        dict(zip(intrinsics_names(fit.camera), np.sqrt(np.diag(fit.covariance)).tolist(), strict=True)),
-        dropped,
-    )
+    return Intrinsics(lens, rms_px, dropped)
 
 
-def _fit(views: ViewSet, model: LensModel) -> LensFit:
+def _fit(views: ViewSet, model: LensModel) -> tuple[CameraModel, Array]:
     if model == "equidistant":
         return fit_lens(views, _first_fisheye(views))
-    fit = fit_lens(views, initial_camera(views))
+    lens, view_rms_px = fit_lens(views, initial_camera(views))
     if model == "plumb_bob":
-        return fit
-    start = msgspec.structs.replace(
-        fit.camera, distortion=(*fit.camera.distortion, 0.0, 0.0, 0.0), distortion_model=model
-    )
-    return fit_lens(views, start)
+        return lens, view_rms_px
+    bent = (*lens.distortion, 0.0, 0.0, 0.0)
+    return fit_lens(views, msgspec.structs.replace(lens, distortion=bent, distortion_model=model))
 
 
 def _first_fisheye(views: ViewSet) -> CameraModel:
@@ -138,21 +124,11 @@ _CORNER_PX = 0.3
 """1σ of a corner against which the prior is weighed."""
 
 
-@dataclass(frozen=True, eq=False)
-class LensFit:
-    camera: CameraModel
-    camera_from_board: Array
-    """(n, 4, 4)"""
-    covariance: Array
-    """(p, p) of the parameters, by the scatter of the corners and the prior."""
-    rms_px: float
-    """RMS of the corners' distances."""
-    view_rms_px: Array
-    """(n,)"""
+def fit_lens(views: ViewSet, start: CameraModel) -> tuple[CameraModel, Array]:
+    """Fit from an initial lens: the lens, and the rms distance of each view's corners from it (n,), px.
 
-
-def fit_lens(views: ViewSet, start: CameraModel) -> LensFit:
-    """Fit from an initial lens. Raises BadViewsError or cv2.error where the corners allow no fit."""
+    Raises BadViewsError or cv2.error where the corners allow no fit.
+    """
     observed = observe_views(views)
     prior = LensPrior.unknown(start)
     camera, C = start, np.array([planar_tilts(view, start)[0] for view in views])
@@ -174,7 +150,8 @@ def fit_lens(views: ViewSet, start: CameraModel) -> LensFit:
         damping = max(damping / 10, _DAMPING)
         if before - cost <= _SETTLED * before:
             break
-    return _judged(observed, blocks, prior, camera, C)
+    square = (corner_residuals(observed, camera, C) ** 2).sum(axis=(1, 2))
+    return camera, np.sqrt(square / observed.present.sum(axis=1))
 
 
 def initial_camera(views: ViewSet) -> CameraModel:
@@ -189,38 +166,30 @@ def initial_camera(views: ViewSet) -> CameraModel:
     return CameraModel(*size, (*matrix, (0.0, 0.0, 1.0)), (0.0,) * 5)
 
 
-def _prior_terms(prior: LensPrior, camera: CameraModel) -> tuple[Array, Array, float]:
-    """Information (p, p), right-hand side (p,) and cost, all for corners of 1 px."""
-    miss = intrinsics_vector(camera) - prior.mean
-    precision = _CORNER_PX**2 * prior.sigma**-2.0
-    return np.diag(precision), -precision * miss, float((precision * miss**2).sum())
+def _prior_terms(prior: LensPrior, camera: CameraModel) -> tuple[Array, Array]:
+    """Distance (p,) from the prior's mean, and its precision (p,) for corners of 1 px."""
+    return intrinsics_vector(camera) - prior.mean, _CORNER_PX**2 * prior.sigma**-2.0
 
 
 def _cost(blocks: CornerBlocks, prior: LensPrior, camera: CameraModel) -> float:
-    return float(blocks.rr.sum()) + _prior_terms(prior, camera)[2]
-
-
-def _reduced(blocks: CornerBlocks, damping: float) -> tuple[Array, Array, Array, Array]:
-    """Damped information (p, p) and right-hand side (p,) of the lens, H (n, 6, 6), H·LG."""
-    LL, GG = blocks.LL.copy(), blocks.GG.sum(axis=0)
-    for block in (LL, GG):
-        diagonal = np.einsum("...ii->...i", block)
-        diagonal *= 1 + damping
-    H = np.asarray(np.linalg.inv(LL), dtype=float)
-    HLG = H @ blocks.LG
-    information = GG - np.einsum("nia,nib->ab", blocks.LG, HLG)
-    right = blocks.Gr.sum(axis=0) - np.einsum("nia,ni->a", HLG, blocks.Lr)
-    return information, right, H, HLG
+    miss, precision = _prior_terms(prior, camera)
+    return float(blocks.rr.sum()) + float((precision * miss**2).sum())
 
 
 def _moved(
     blocks: CornerBlocks, prior: LensPrior, camera: CameraModel, C: Array, damping: float
 ) -> tuple[CameraModel, Array] | None:
-    """After a damped step; None where there is no such camera."""
+    """After a damped step, the board poses eliminated; None where there is no such camera."""
+    miss, precision = _prior_terms(prior, camera)
+    LL, GG = blocks.LL.copy(), blocks.GG.sum(axis=0)
+    for block in (LL, GG):
+        np.einsum("...ii->...i", block)[:] *= 1 + damping
     try:
-        information, right, H, HLG = _reduced(blocks, damping)
-        prior_information, prior_right, _ = _prior_terms(prior, camera)
-        step = np.linalg.solve(information + prior_information, right + prior_right)
+        H = np.asarray(np.linalg.inv(LL), dtype=float)
+        HLG = H @ blocks.LG
+        information = GG - np.einsum("nia,nib->ab", blocks.LG, HLG) + np.diag(precision)
+        right = blocks.Gr.sum(axis=0) - np.einsum("nia,ni->a", HLG, blocks.Lr) - precision * miss
+        step = np.linalg.solve(information, right)
     except np.linalg.LinAlgError:
         return None
     by_view = np.einsum("nij,nj->ni", H, blocks.Lr) - HLG @ step
@@ -228,25 +197,3 @@ def _moved(
     if not (vector[:2] > 0).all() or not np.isfinite(by_view).all():
         return None
     return with_intrinsics_vector(camera, vector), perturb(C, by_view)
-
-
-def _judged(
-    observed: Observations, blocks: CornerBlocks, prior: LensPrior, camera: CameraModel, C: Array
-) -> LensFit:
-    square = (corner_residuals(observed, camera, C) ** 2).sum(axis=-1)
-    corners = observed.present.sum(axis=1)
-    information, *_ = _reduced(blocks, 0.0)
-    freedom = max(2 * float(corners.sum()) - len(information) - 6 * len(corners), 1.0)
-    total = information * freedom / max(float(square.sum()), 1e-12) + np.diag(prior.sigma**-2.0)
-    scale = 1 / np.sqrt(np.maximum(np.diag(total), 1e-300))
-    values, vectors = np.linalg.eigh(total * np.outer(scale, scale))
-    # What is not determined at all has a huge sigma, not an infinite one.
-    basis = vectors * scale[:, None]
-    covariance = (basis / np.maximum(values, 1e-16)) @ basis.T
-    return LensFit(
-        camera,
-        C,
-        covariance,
-        float(np.sqrt(square.sum() / corners.sum())),
-        np.sqrt(square.sum(axis=1) / corners),
-    )

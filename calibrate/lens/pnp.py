@@ -16,10 +16,8 @@ from calibrate.boards.model import board_from_turned, looks_same_turns
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, rotation_log, transform_points
 from calibrate.handeye.corners import corner_residuals, linearise_corners
-from calibrate.handeye.observations import Observations, observe_views
-from calibrate.lens.model import project, undistort
-from calibrate.projection import camera_matrix
-from calibrate.views import BoardView, ViewSet
+from calibrate.projection import camera_matrix, project_at, undistort
+from calibrate.views import BoardView, Observations, ViewSet, observe_views
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 
 _STEPS = 20
@@ -167,7 +165,7 @@ def _squares(everything: Observations, camera: CameraModel, owner: NDArray[np.in
 
 def view_rms_px(view: BoardView, camera: CameraModel, camera_from_board: Array) -> float:
     """Compute the rms distance of the corners from where the pose shows them, px."""
-    miss = project(camera, camera_from_board, view.board_points) - view.pixels
+    miss = project_at(camera, camera_from_board, view.board_points) - view.pixels
     return float(np.sqrt(np.square(miss).sum(axis=1).mean()))
 
 

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, skew
-from calibrate.lens.model import undistort
-from calibrate.projection import camera_matrix, project
+from calibrate.projection import camera_matrix, project, undistort
 from recordings.schema.messages import CameraModel
 
 _COLUMNS, _ROWS = 33, 25
@@ -22,8 +21,6 @@ _COLUMNS, _ROWS = 33, 25
 @dataclass(frozen=True, eq=False)
 class LensUncertainty:
     camera: CameraModel
-    covariance: Array
-    """(p, p) of `projection.intrinsics_names`."""
     sigma_px: Array
     """(rows, columns) over the image, borders included: root of the mean squared shift, 1σ."""
 
@@ -51,7 +48,7 @@ def lens_uncertainty(camera: CameraModel, covariance: Array, seen: Array) -> Len
     by_lens, by_turn = _derivatives(camera, grid)
     shift = by_lens + by_turn @ best_turn
     square = np.einsum("nij,jk,nik->n", shift, covariance, shift)
-    return LensUncertainty(camera, covariance, np.sqrt(np.maximum(square, 0.0)).reshape(_ROWS, _COLUMNS))
+    return LensUncertainty(camera, np.sqrt(np.maximum(square, 0.0)).reshape(_ROWS, _COLUMNS))
 
 
 def _derivatives(camera: CameraModel, pixels: Array) -> tuple[Array, Array]:

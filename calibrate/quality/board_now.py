@@ -16,10 +16,9 @@ from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, inverse, perturb, transform_points
 from calibrate.handeye.corners import bent_points
-from calibrate.handeye.observations import observe_views
 from calibrate.lens.pnp import Candidate, candidate_poses
 from calibrate.quality.drift import Noise, pnp_covariance, with_found_shape
-from calibrate.views import BoardView, ViewSet
+from calibrate.views import BoardView, ViewSet, observe_views
 from recordings.schema.messages import BoardSpec
 
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.01, 0.03
@@ -38,7 +37,6 @@ class BoardNow:
     """(3,) unit normal in `board`, towards the camera."""
     moved_m: float
     """Distance of the board's origin from its pose in the calibration; eye-in-hand only, else 0."""
-    moved_rad: float
 
 
 def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) -> BoardNow:
@@ -49,7 +47,8 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
     readings = [_shaped(reading, view, calibration) for reading in candidate_poses(view, camera, board)]
     at = [E @ X @ r.camera_from_board if in_hand else X @ r.camera_from_board for r in readings]
     misses = [difference(each if in_hand else inverse(E) @ each, place) for each in at]
-    same = [k for k, miss in enumerate(misses) if _is_small(miss)]
+    near = (_SAME_PLACE_M, _SAME_PLACE_RAD)
+    same = [k for k, miss in enumerate(misses) if (np.linalg.norm(miss.reshape(2, 3), axis=1) < near).all()]
     if same and not in_hand:
         raise BadViewsError(
             "The board is still on the flange.",
@@ -71,7 +70,6 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
         seen,
         np.array([0.0, 0.0, towards_camera]),
         float(np.linalg.norm(misses[best][:3])) if in_hand else 0.0,
-        float(np.linalg.norm(misses[best][3:])) if in_hand else 0.0,
     )
 
 
@@ -90,12 +88,7 @@ def found_points(calibration: Calibration, board: BoardSpec) -> Array:
         return points
     whole = BoardView(0, "", np.eye(4), points, np.zeros((len(points), 2)))
     observed = observe_views(ViewSet(calibration.mount, (whole,), calibration.intrinsics.model))
-    shape = np.array([found.scale, found.anisotropy, *found.bend_m])
-    return np.asarray(bent_points(observed, shape)[0])
-
-
-def _is_small(miss: Array) -> bool:
-    return bool(np.linalg.norm(miss[:3]) < _SAME_PLACE_M and np.linalg.norm(miss[3:]) < _SAME_PLACE_RAD)
+    return np.asarray(bent_points(observed, found.numbers)[0])
 
 
 def offset_covariance(

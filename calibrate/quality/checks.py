@@ -11,9 +11,8 @@ import numpy as np
 from scipy import special
 
 from calibrate.errors import InstallError
+from calibrate.files.folders import calibrations_folder
 from calibrate.files.lines import append_line, read_lines
-from calibrate.files.loader import calibrations_folder
-from calibrate.quality.drift import DriftCheck
 from recordings.files import MAIN_CAMERA
 
 FILE = "checks.jsonl"
@@ -33,19 +32,6 @@ class CheckEntry(msgspec.Struct, frozen=True):
     """Covariance of `shift`, the installed calibration's own part included."""
     statistic: float
     threshold: float
-
-    @classmethod
-    def of(cls, check: DriftCheck, wall_s: float, generation: int, recording: str) -> CheckEntry:
-        return cls(
-            wall_s,
-            generation,
-            recording,
-            check.passed,
-            tuple(check.shift.tolist()),
-            tuple(tuple(row) for row in check.covariance.tolist()),
-            check.statistic,
-            check.threshold,
-        )
 
 
 def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN_CAMERA) -> None:

@@ -11,18 +11,19 @@ from bisect import bisect_left
 from dataclasses import dataclass, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy import special
 
 from calibrate.boards.model import board_points
-from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.errors import BadViewsError, TooFewViewsError, UsageError
 from calibrate.files.calibration import Calibration
-from calibrate.geometry import Array, difference, inverse, perturb
+from calibrate.geometry import Array, difference, perturb
+from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.corners import bent_points, boards_by_corners
-from calibrate.handeye.observations import extent_of, observe_views
-from calibrate.lens.model import project
-from calibrate.views import ViewSet, require_no_copies
-from recordings.schema.messages import CameraModel
+from calibrate.projection import project_at
+from calibrate.views import ViewSet, board_in_camera, extent_of, observe_views, require_no_copies
+from recordings.schema.messages import CameraModel, Mount, SessionInfo, Source
 
 FEWEST_VIEWS = 3
 FALSE_ALARM = 0.05
@@ -120,9 +121,8 @@ def with_found_shape(views: ViewSet, calibration: Calibration) -> ViewSet:
     if found is None:
         return views
     observed = replace(observe_views(views), extent=extent_of(board_points(calibration.board)))
-    shape = np.array([found.scale, found.anisotropy, *found.bend_m])
-    C = boards_by_corners(observed, views.camera, views.camera_from_board, shape)
-    points = bent_points(observed, shape)
+    C = boards_by_corners(observed, views.camera, views.camera_from_board, found.numbers)
+    points = bent_points(observed, found.numbers)
     shaped = [
         replace(view, board_points=points[i, : len(view.pixels)], camera_from_board=C[i])
         for i, view in enumerate(views)
@@ -143,22 +143,21 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
             views=len(views),
             needed=FEWEST_VIEWS,
         )
-    flanges, in_hand = views.base_from_flange, views.mount == "eye-in-hand"
-    seen = views.camera_from_board
+    flanges, seen = views.base_from_flange, views.camera_from_board
     pnp = np.array(
         [pnp_covariance(v.board_points, views.camera, c) for v, c in zip(views, seen, strict=True)]
     )
     pnp *= noise.corner_px**2
     robot = np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
     X = installed.copy()
-    P = (flanges[0] if in_hand else inverse(flanges[0])) @ installed @ seen[0]
+    P = mount_poses(flanges[0], views.mount) @ installed @ seen[0]
     for _ in range(_ITERATIONS):
-        information, gradient, misfit = _normal_equations(flanges, in_hand, seen, X, P, robot, pnp)
+        information, gradient, misfit = _normal_equations(views.mount, flanges, seen, X, P, robot, pnp)
         fitted_all = _inverse(information)
         step = -fitted_all @ gradient
         fitted = fitted_all[:6, :6]
         X, P = perturb(X, step[:6]), perturb(P, step[6:])
-    _, _, misfit = _normal_equations(flanges, in_hand, seen, X, P, robot, pnp)
+    _, _, misfit = _normal_equations(views.mount, flanges, seen, X, P, robot, pnp)
     shift = difference(X, installed)
     total = fitted + covariance
     statistic = float(shift @ np.linalg.solve(total, shift))
@@ -220,7 +219,7 @@ def _views_needed(fitted: Array, installed: Array, views: int, nu: float) -> int
 
 
 def _normal_equations(
-    flanges: Array, in_hand: bool, seen: Array, X: Array, P: Array, robot: Array, pnp: Array
+    mount: Mount, flanges: Array, seen: Array, X: Array, P: Array, robot: Array, pnp: Array
 ) -> tuple[Array, Array, float]:
     """(12, 12) information of [δX, δP], (12,) gradient, and the misfit r'Wr.
 
@@ -230,8 +229,7 @@ def _normal_equations(
     steps = _STEP * np.eye(6)[:, None]
 
     def miss(F: Array, X: Array, P: Array) -> Array:
-        H = F if in_hand else inverse(F)
-        return difference(seen, inverse(H @ X) @ P)
+        return difference(seen, board_in_camera(mount, F, X, P))
 
     def slope(moved: Array, r: Array) -> Array:
         """(6, n, 6) misses after each step → (n, 6, 6) Jacobians."""
@@ -250,7 +248,56 @@ def _normal_equations(
 
 def pnp_covariance(points: Array, camera: CameraModel, camera_from_board: Array) -> Array:
     """(6, 6) of the board's pose in `camera`, of its points (n, 3): (JᵀJ)⁻¹, for noise of 1 px per axis."""
-    base = project(camera, camera_from_board, points)
+    base = project_at(camera, camera_from_board, points)
     moved = perturb(camera_from_board, _STEP * np.eye(6))
-    J = np.stack([(project(camera, m, points) - base).ravel() / _STEP for m in moved], axis=1)
+    J = np.stack([(project_at(camera, m, points) - base).ravel() / _STEP for m in moved], axis=1)
     return np.asarray(np.linalg.inv(J.T @ J))
+
+
+class OtherCellError(UsageError):
+    """The views are of another cell, robot or camera than the calibration."""
+
+    code = "other-cell"
+
+    @property
+    def device(self) -> str:
+        """robot or camera; empty when more than that differs."""
+        differs = str(self.values.get("differs", ""))
+        return differs if differs in ("robot", "camera") else ""
+
+
+class CellIdentity(msgspec.Struct, frozen=True):
+    """Facts of a cell that its images state."""
+
+    mount: Mount
+    source: Source
+    robot_serial: str
+    camera_serial: str
+
+    @classmethod
+    def of(cls, info: SessionInfo) -> CellIdentity:
+        """Read the facts of a recording."""
+        return cls(info.mount, info.source, info.robot.serial, info.camera_identity.serial)
+
+
+def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) -> None:
+    """Raise OtherCellError for pictures of another mounting, source, robot or camera."""
+    simulated = calibration.source == "simulated"
+    for name, new, known, same in (
+        ("mounting", seen.mount, calibration.mount, seen.mount == calibration.mount),
+        ("source", seen.source, calibration.source, (seen.source == "simulated") == simulated),
+        ("robot", *_serials(seen.robot_serial, calibration.robot.serial)),
+        ("camera", *_serials(seen.camera_serial, calibration.camera.serial)),
+    ):
+        if not same:
+            raise OtherCellError(
+                f"{where} has {name} {new}, the calibration {known}: that is no drift.",
+                remedy="Check with images of the calibrated cell, or calibrate this one.",
+                differs=name,
+                found=str(new),
+                calibrated=str(known),
+            )
+
+
+def _serials(new: str, known: str) -> tuple[str, str, bool]:
+    return new, known, not new or not known or new == known

@@ -28,6 +28,7 @@ from calibrate.geometry import Array, inverse, pose_from_rotvec, rotation_angle
 from calibrate.lens.pnp import candidate_poses
 from calibrate.views import BoardView, ViewSet
 from recordings.errors import BadImageError
+from recordings.images import viewable
 from recordings.reader import Recording
 from recordings.schema.frame_time import derived_again
 from recordings.schema.messages import CameraModel, Image, TimeSource
@@ -212,7 +213,7 @@ def _seen(recording: Recording, camera: CameraModel, lost: list[str]) -> Iterato
         if isinstance(picture, BadImageError):
             lost.append(str(picture))
             continue
-        found = detect(picture.viewable(), board, thorough=False)
+        found = detect(viewable(picture.pixels, picture.pixel_format), board, thorough=False)
         if not found.found:
             continue
         view = BoardView(

@@ -12,24 +12,29 @@ import numpy as np
 
 from calibrate.boards.corners import to_grey
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import Touch, source_stamp
+from calibrate.files.calibration import source_stamp
 from calibrate.files.formatting import (
     PEER_HEAD,
     arm_sentences,
     cell_sentences,
+    error_text,
+    figures,
+    noise_text,
     peer_cells,
     pose_text,
+    shares_text,
     verdict_text,
 )
-from calibrate.files.verification import agrees, touch_text
+from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.geometry import Array, difference
 from calibrate.handeye.corners import bent_points
-from calibrate.handeye.observations import SHAPE, observe_views
-from calibrate.lens.model import project
+from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import solve_pnp
-from calibrate.pipeline import SolvedRecording
+from calibrate.projection import project_at
 from calibrate.report import html, plots
-from calibrate.results import PeerResult
+from calibrate.results import SHAPE, PeerResult
+from calibrate.views import observe_views
+from recordings.images import viewable
 
 _PICTURES_LIMIT = 60
 _WIDTHS_PX = ((12, 480), (30, 320), (_PICTURES_LIMIT, 240))
@@ -45,15 +50,14 @@ def report_page(
     """The whole page. `history`: rows (version, time, action, change); `touches`: touch tests since."""
     name = job.recording.info.name
     calibration = job.calibration
-    passed = len(job.gates) - len(calibration.quality.failed)
     result = calibration.result
+    told = figures(calibration)
     modelled = _modelled_pixels(job)
-    views = f"{len(job.solution.used)} used, {len(calibration.views.rejected)} rejected"
     return html.page(
         f"Calibration of {name}",
         [
             *_verdict(job, touches),
-            html.folded("Gates", _gates(job), aside=f"{passed} of {len(job.gates)} passed", printed=True),
+            html.folded("Gates", _gates(job), aside=f"{told['gates'].value} passed", printed=True),
             html.folded(
                 "Camera pose",
                 _result(job),
@@ -69,7 +73,7 @@ def report_page(
             html.folded("Arm", _arm(job)),
             html.folded("All methods on the same views", _methods(peers)),
             html.folded("Intrinsics", _lens(job)),
-            html.folded("Views", _views(job, modelled), aside=views),
+            html.folded("Views", _views(job, modelled), aside=f"{told['views'].value} {told['views'].about}"),
             html.folded("Installed versions", _history(history)),
             html.folded("Provenance", _provenance(job), printed=True),
         ],
@@ -87,15 +91,13 @@ def _verdict(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[str]:
     """All that one screen holds: the verdict, and the figures it stands on."""
     calibration = job.calibration
     good, quality = calibration.verdict != "FAIL", calibration.quality
-    if stamp := source_stamp(calibration):
+    if stamp := source_stamp(calibration.source):
         yield html.stamp(f"{stamp}. It is not installed on a real cell.")
     yield html.paragraph(rehearsal_text(job))
-    expected = " ".join(gate.text for gate in quality.failed)
-    if good and quality.predicted_error_mm is not None and quality.working_distance_m is not None:
-        distance_mm = quality.working_distance_m * 1000
-        expected = f"Predicted error at {distance_mm:.0f} mm: {quality.predicted_error_mm:.2f} mm (1σ)."
+    expected = error_text(calibration) if good else " ".join(gate.text for gate in quality.failed)
     yield html.verdict(_KINDS[calibration.verdict], verdict_text(calibration), expected)
-    yield html.cards(_figures(job, touches))
+    told = figures(calibration, touches).values()
+    yield html.cards([(figure.value, f"{figure.label} {figure.about}") for figure in told])
     for warning in quality.warnings:
         yield html.paragraph(warning, "warning")
 
@@ -119,21 +121,6 @@ def rehearsal_text(job: SolvedRecording) -> str:
         f"Rehearsal of {about['configuration']}. The real run should reach {reached}, if its arm repeats to "
         f"{repeats}. The simulated run was off by {1000 * np.linalg.norm(off[:3]):.2f} mm and {off_deg:.3f}°."
     )
-
-
-def _figures(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[tuple[str, str]]:
-    quality, score = job.calibration.quality, job.solution.holdout
-    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
-        yield (
-            f"± {quality.predicted_error_mm:.2f} mm",
-            f"predicted error (1σ) of a point {1000 * quality.working_distance_m:.0f} mm away",
-        )
-    if score is not None:
-        yield f"{1000 * score.e_t_m:.2f} mm", f"held-out error over {len(score.pairs)} samples"
-    yield f"{len(job.gates) - len(quality.failed)} of {len(job.gates)}", "quality gates passed"
-    yield f"{len(job.solution.used)} views", f"used, {len(job.calibration.views.rejected)} rejected"
-    if touches:
-        yield f"{sum(map(agrees, touches))} of {len(touches)}", "corners as predicted in the touch test"
 
 
 def _result(job: SolvedRecording) -> Iterator[str]:
@@ -181,14 +168,9 @@ def _error(job: SolvedRecording) -> Iterator[str]:
     quality = job.calibration.quality
     if quality.error_shares:
         shares = {name: share for name, share in quality.error_shares.items() if share > 0.001}
-        listed = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares.items())
+        listed = shares_text(job.calibration)
         yield html.figure(plots.error_shares(shares), f"Shares of the variance of X by source: {listed}.")
-    noise = quality.noise
-    if noise:
-        yield html.paragraph(
-            f"Measurement noise (1σ): corners {noise['corner_px']:.3f} px, robot {noise['robot_mm']:.3f} mm "
-            f"and {noise['robot_deg']:.4f}°."
-        )
+    yield html.paragraph(noise_text(job.calibration))
     yield html.paragraph(f"Least known: {quality.weakest}." if quality.weakest else "")
     for sentence in cell_sentences(job.calibration):
         yield html.paragraph(sentence)
@@ -205,12 +187,13 @@ def _modelled_pixels(job: SolvedRecording) -> ModelledPixels:
     refitted = solve_pnp(replace(job.views, camera=camera))
     kept = {view.index: view for view in job.solution.kept}
     views = replace(refitted, views=tuple(kept.get(view.index, view) for view in refitted))
-    shape = (
-        np.zeros(len(SHAPE)) if board is None else np.array([board.scale, board.anisotropy, *board.bend_m])
-    )
+    shape = np.zeros(len(SHAPE)) if board is None else board.numbers
     points = bent_points(observe_views(views), shape)
     return {
-        view.index: (view.pixels, project(camera, view.camera_from_board, points[i, : len(view.pixels)]))
+        view.index: (
+            view.pixels,
+            project_at(camera, view.camera_from_board, points[i, : len(view.pixels)]),
+        )
         for i, view in enumerate(views)
         if view.camera_from_board is not None
     }
@@ -351,7 +334,8 @@ def _views(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
             continue
         found = detection.pixels
         ours = modelled.get(view.index, (found, None))[1]
-        jpeg = drawn_view(job.recording.image(view).viewable(), found, ours, width_px)
+        image = job.recording.image(view)
+        jpeg = drawn_view(viewable(image.pixels, image.pixel_format), found, ours, width_px)
         px = job.solution.residual_px.get(view.index)
         name = "" if view.name == str(view.index) else f": {view.name}"
         caption = f"pose {view.index + 1}{name}" + (f", {px:.2f} px" if px is not None else "")

@@ -14,9 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from calibrate.geometry import Array
-from calibrate.lens.model import undistort
 from calibrate.lens.uncertainty import LensUncertainty
-from calibrate.projection import camera_matrix
+from calibrate.projection import camera_matrix, undistort
 from calibrate.views import ViewSet
 from recordings.schema.messages import CameraModel
 

@@ -109,13 +109,13 @@ async def photograph(cameras: list[Camera], socket: Path) -> None:
             await camera.picture(name)
 
     def state(*wanted: StationState) -> Callable[[], bool]:
-        return lambda: first.app.status is not None and first.app.status.state in wanted
+        return lambda: first.app.known.status is not None and first.app.known.status.state in wanted
 
     await first.until(state(StationState.IDLE))
-    await everywhere("connect", "1", ready=lambda camera: camera.app.checks)
+    await everywhere("connect", "1", ready=lambda camera: camera.app.known.checks)
     await first.pilot.press("2", "n")
-    await first.until(lambda: first.app.status and len(first.app.status.session.poses) == 25)
-    await first.until(lambda: not first.app.busy)
+    await first.until(lambda: first.app.known.status and len(first.app.known.status.session.poses) == 25)
+    await first.until(lambda: not first.app.known.busy)
     for camera in cameras:
         await camera.pilot.press("2", "f5")
         await camera.until(lambda camera=camera: camera.app.screen.query("#confirm-body"))  # type: ignore[misc]
@@ -128,7 +128,7 @@ async def photograph(cameras: list[Camera], socket: Path) -> None:
     await cameras[-1].pilot.press("3", "tab", "enter")
     for camera in cameras:
         await camera.pilot.press("3")
-    await drive(cameras[-1], lambda: first.app.status.session.captured >= 13)
+    await drive(cameras[-1], lambda: first.app.known.status.session.captured >= 13)
     await everywhere("capture", "3")
     await everywhere("plan", "2", "down", "down", "down")
     await first.pilot.press("f12")
@@ -137,16 +137,20 @@ async def photograph(cameras: list[Camera], socket: Path) -> None:
     await first.pilot.press("f8")
     await first.until(state(StationState.PAUSED))
     driver = cameras[-1]
-    await drive(driver, lambda: first.app.status.session.recording)
+    await drive(driver, lambda: first.app.known.status.session.recording)
     await driver.pilot.press("f9")
-    await driver.until(lambda: driver.app.result and isinstance(driver.app.screen, SolveScreen))
-    await everywhere("solve", "4", ready=lambda camera: camera.app.result)
+    await driver.until(lambda: driver.app.known.result and isinstance(driver.app.screen, SolveScreen))
+    await everywhere("solve", "4", ready=lambda camera: camera.app.known.result)
     await everywhere("verify", "5")
     await driver.pilot.press("6", "i")
     await driver.until(lambda: driver.app.screen.query("#confirm-body"))
     await driver.pilot.press("tab", "enter")
-    await driver.until(lambda: driver.app.result and driver.app.result.installed)
-    await everywhere("install", "6", ready=lambda camera: camera.app.result and camera.app.result.installed)
+
+    def installed(camera: Camera) -> bool:
+        return camera.app.known.result is not None and camera.app.known.result.installed
+
+    await driver.until(lambda: installed(driver))
+    await everywhere("install", "6", ready=installed)
     await everywhere("sessions", "7")
     await everywhere("log", "8")
     await everywhere("help", "3", "f1")
@@ -156,12 +160,12 @@ async def drive(camera: Camera, done: Callable[[], object]) -> None:
     """Approves again whenever a busy computer made the session pause."""
     app = camera.app
     while not done():
-        state = None if app.status is None else app.status.state
+        state = None if app.known.status is None else app.known.status.state
         if state in (StationState.FAULT, StationState.STOPPED):
             await camera.pilot.press("f8")
         elif app.screen.query("#motion"):
             await camera.pilot.press("tab", "enter")
-        elif state is StationState.PAUSED and not app.busy:
+        elif state is StationState.PAUSED and not app.known.busy:
             await camera.pilot.press("f5")
         await camera.pilot.pause(1.0)
 

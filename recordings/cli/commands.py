@@ -58,7 +58,7 @@ def excerpt_command(
 ) -> None:
     """Write a smaller recording that solves like the whole.
 
-    Images become lossless PNG; robot states stay only around the images.
+    Raw images become lossless PNG; robot states stay only around the images.
     """
     from recordings.exporters.excerpt import write_excerpt
 

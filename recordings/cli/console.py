@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import msgspec
@@ -28,6 +29,18 @@ def plain_console(**settings: Any) -> Console:
     console = Console(**{"highlight": False, "markup": False, "emoji": False, **settings})
     console.push_render_hook(_Hook())
     return console
+
+
+@contextmanager
+def progress_bar(label: str, console: Console) -> Iterator[Callable[[int, int, str], None]]:
+    """A bar that is gone at the end; called with done, total and what is done."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    texts = TextColumn(label), TextColumn("{task.description}", markup=False)
+    columns = (texts[0], BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), texts[1])
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=name)
 
 
 class _Hook(RenderHook):

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import typer
 
-from recordings.cli.console import AsJson, plain_console, print_json
+from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.importers.bag import PAIR_WITHIN_S, BagPlan, import_bag
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE
 from recordings.importers.folder import import_folder
@@ -63,7 +62,9 @@ def import_command(
     if output is None and not dry_run:
         raise typer.BadParameter("name the recording to write with -o, or ask with --dry-run")
     target = None if dry_run else output
-    with _progress(not as_json) as progress:
+    console = plain_console(stderr=True)
+    shown = console.is_terminal and not as_json
+    with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
         if (source / DATASET_FILE).is_file() and (source / POSES_FILE).is_file():
             done = import_folder(source, target, progress)
             facts = ImportJson(str(target or ""), done.images, done.size_bytes)
@@ -104,17 +105,3 @@ def _print_import(facts: ImportJson) -> None:
         return
     print(plain_text(f"{facts.recording}: {facts.views} views, {facts.bytes / 1e6:.1f} MB"))
     print(plain_text(f"next: calibrate solve {shlex.quote(facts.recording)}"))
-
-
-@contextmanager
-def _progress(shown: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar on stderr, where it is a terminal."""
-    console = plain_console(stderr=True)
-    if not shown or not console.is_terminal:
-        yield lambda text, done, total: None
-        return
-    from rich.progress import Progress
-
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda text, done, total: bar.update(task, description=text, completed=done, total=total)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 import msgspec
 
 from recordings.reader import Recording
-from recordings.schema.messages import RobotState
+from recordings.schema.messages import Image, RobotState, View
 from recordings.schema.topics import Topic
-from recordings.writer import derived_recording
+from recordings.writer import RecordingWriter, derived_recording
 
 _NS = 1_000_000_000
 _SHOWN = (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM, Topic.ANNOTATIONS)
@@ -18,7 +19,7 @@ _SHOWN = (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM, Topic.ANNOTATIONS)
 
 
 def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> Path:
-    """Writes `output` (.mcap) with lossless PNG images; it solves like the whole. RecordingError.
+    """Writes `output` (.mcap), raw images as lossless PNG; it solves like the whole. RecordingError.
 
     Robot states stay when they lie within `window_s` of a view by the host's monotonic clock.
     """
@@ -29,23 +30,42 @@ def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> 
     note = " ".join([*filter(None, [said]), note, *recording.losses])
     info = msgspec.structs.replace(recording.info, part=1, note=note)
     with derived_recording(output, info, lossless_png=True) as writer:
-        for name, content in recording.attachments().items():
-            writer.attach(name, recording.media_types()[name], content)
-        for state in recording.robot_states():
-            if _near(state, kept_ns, window_s):
-                writer.robot_state(state)
         for segment in recording.segments:
-            for reading in segment.clock_readings():
-                writer.clock_reading(reading)
             for topic in _SHOWN:
                 for message in segment.stored(topic):
                     writer.shown(topic, message)
-        for sequence, (view, image) in enumerate(recording.images()):
-            writer.image(msgspec.structs.replace(image, sequence=sequence))
-            writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
-        for event in recording.events():
-            writer.event(event)
+        for _ in copied(recording, writer, keeps=lambda state: _near(state, kept_ns, window_s)):
+            pass
         return writer.finish()
+
+
+def copied(
+    recording: Recording,
+    writer: RecordingWriter,
+    replaced: Collection[str] = (),
+    keeps: Callable[[RobotState], bool] = lambda state: True,
+) -> Iterator[tuple[View, Image]]:
+    """Write all that was recorded: the views that count, numbered anew, each of which is yielded after it.
+
+    `replaced`: attachments to leave out. What viewers are shown beside it is the caller's.
+    """
+    kinds = recording.media_types()
+    for name, content in recording.attachments().items():
+        if name not in replaced:
+            writer.attach(name, kinds[name], content)
+    for state in filter(keeps, recording.robot_states()):
+        writer.robot_state(state)
+    for segment in recording.segments:
+        for reading in segment.clock_readings():
+            writer.clock_reading(reading)
+    for event in recording.events():
+        writer.event(event)
+    for sequence, (view, image) in enumerate(recording.images()):
+        stored = recording.stored_image(view)
+        image = msgspec.structs.replace(image, sequence=sequence)
+        writer.image(image, stored[1] if stored else None)
+        writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
+        yield view, image
 
 
 def _near(state: RobotState, kept_ns: list[int], window_s: float) -> bool:

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import astuple
 
 from recordings.errors import disk_error, exists_error
 from recordings.exporters import Target
 from recordings.files import sync_folder
-from recordings.images import encode_png, mosaic_encoding
+from recordings.images import encode_png, mosaic_encoding, viewable
 from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE
 from recordings.reader import Recording
 from recordings.schema.messages import ClockReading, Stamps, View
@@ -28,12 +29,12 @@ _STAMPS = list(Stamps.__struct_fields__)
 def export_recording(recording: Recording, output: Path, target: Target) -> Path:
     """Writes the folder `output`, which must not exist; nothing is left when it fails. RecordingError."""
     with _new_folder(output) as folder:
-        if target is Target.ROS2:
+        if target == "ros2":
             from recordings.exporters.ros2 import write_ros2
 
             write_ros2(recording, folder)
         else:
-            (_write_folder if target is Target.FOLDER else _write_tables)(recording, folder)
+            (_write_folder if target == "folder" else _write_tables)(recording, folder)
     return output
 
 
@@ -81,7 +82,7 @@ def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
     image = recording.image(view)
     stored = recording.stored_image(view)
     if stored is None or mosaic_encoding(image.pixel_format):
-        stored = "png", encode_png(image.viewable())
+        stored = "png", encode_png(viewable(image.pixels, image.pixel_format))
     extension, data = stored
     name = f"images/{view.index:03d}.{_EXTENSIONS.get(extension, extension)}"
     (folder / name).write_bytes(data)
@@ -94,7 +95,7 @@ def _write_tables(recording: Recording, folder: Path) -> None:
     modes = ["robot_mode", "safety_mode", "speed_scaling"]
     states = (
         [
-            *_values(state.stamps),
+            *astuple(state.stamps),
             *(*state.joints_rad, *state.joint_speeds_rad_s, *state.tcp_pose),
             *(getattr(state, name) for name in modes),
         ]
@@ -109,19 +110,17 @@ def _write_tables(recording: Recording, folder: Path) -> None:
     told = ["middle_host_monotonic_ns", "time_bound_s", "time_source"]
     rows = (
         [
-            *_values(fact.stamps),
+            *astuple(fact.stamps),
             *(getattr(fact, column) for column in columns),
-            *([""] * len(told) if fact.time is None else msgspec.structs.astuple(fact.time)),
+            *([""] * len(told) if fact.time is None else astuple(fact.time)),
         ]
         for fact in facts
     )
     _write_csv(folder / "pictures.csv", [*_STAMPS, *columns, *told], rows)
-    readings = (
-        list(msgspec.structs.astuple(r)) for segment in recording.segments for r in segment.clock_readings()
-    )
+    readings = (list(astuple(r)) for segment in recording.segments for r in segment.clock_readings())
     _write_csv(folder / "camera_clock.csv", list(ClockReading.__struct_fields__), readings)
     _write_views(recording, folder)
-    events = ([*_values(e.stamps), e.level, e.kind, e.pose_index, e.detail] for e in recording.events())
+    events = ([*astuple(e.stamps), e.level, e.kind, e.pose_index, e.detail] for e in recording.events())
     _write_csv(folder / "events.csv", [*_STAMPS, "level", "kind", "pose_index", "detail"], events)
 
 
@@ -135,12 +134,8 @@ def _write_views(recording: Recording, folder: Path) -> None:
         T = view.base_from_flange
         pose = [T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]
         values = [getattr(view, name) for name in place]
-        rows.append([*values, *pose, *_values(view.stamps), view.time_bound_s, int(view in counted)])
+        rows.append([*values, *pose, *astuple(view.stamps), view.time_bound_s, int(view in counted)])
     _write_csv(folder / "views.csv", header, rows)
-
-
-def _values(stamps: Stamps) -> list[Any]:
-    return [getattr(stamps, name) for name in _STAMPS]
 
 
 def _write_csv(path: Path, header: list[str], rows: Iterable[list[Any]]) -> None:

@@ -15,11 +15,18 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.images import mosaic_encoding, raw_encoding
+from recordings.importers.messages import ros_types
 from recordings.reader import Recording
 from recordings.schema.definitions import PictureFacts
 from recordings.schema.messages import CameraModel, Matrix4, View
 from recordings.schema.topics import Topic
-from recordings.schema.viewing import CAMERA_FRAME, JOINT_NAMES, base_from_flange, quaternion_xyzw
+from recordings.schema.viewing import (
+    CAMERA_FRAME,
+    JOINT_NAMES,
+    base_from_flange,
+    camera_matrix,
+    quaternion_xyzw,
+)
 from recordings.segment import RecordingSegment
 
 FRAME_PERIOD_NS = 10_000_000
@@ -38,12 +45,9 @@ class _Entry(NamedTuple):
 
 def write_ros2(recording: Recording, folder: Path) -> None:
     """Fills the folder with `NAME.mcap` and `metadata.yaml`. Wall time is the bag's time. RecordingError."""
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-    except ImportError as error:
-        text, remedy = "ROS 2 bags need the package rosbags", "pip install 'calibration-station[ros]'"
-        raise RecordingError(text, code="missing-package", remedy=remedy) from error
     messages = _Messages()
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
     inner = folder / recording.info.name
     with Writer(inner, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
@@ -160,9 +164,7 @@ class _Messages:
     """ROS 2's messages, made by the names of their types."""
 
     def __init__(self) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self.store = get_typestore(Stores.ROS2_HUMBLE)
+        self.store = ros_types()
 
     def make(self, kind: str, *fields: Any) -> Any:
         return self.store.types[kind](*fields)
@@ -171,22 +173,11 @@ class _Messages:
         """A late listener still gets the fixed frames."""
         if topic != "/tf_static":
             return []
-        from rosbags.interfaces import (
-            Qos,
-            QosDurability,
-            QosHistory,
-            QosLiveliness,
-            QosReliability,
-            QosTime,
-        )  # fmt: skip
+        from rosbags import interfaces as ros
 
-        never = QosTime(2147483647, 4294967295)
-        return [
-            Qos(
-                QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
-                never, never, QosLiveliness.AUTOMATIC, never, False,
-            )
-        ]  # fmt: skip
+        never, kept = ros.QosTime(2147483647, 4294967295), (ros.QosHistory.KEEP_LAST, 1)
+        sent = ros.QosReliability.RELIABLE, ros.QosDurability.TRANSIENT_LOCAL
+        return [ros.Qos(*kept, *sent, never, never, ros.QosLiveliness.AUTOMATIC, never, False)]
 
     def header(self, time_ns: int, frame: str) -> Any:
         seconds, nanoseconds = divmod(time_ns, _NS)
@@ -215,8 +206,7 @@ class _Messages:
         return self.make("tf2_msgs/msg/TFMessage", [self.transform(parent, child, T, time_ns)])
 
     def camera_info(self, camera: CameraModel, time_ns: int) -> Any:
-        """A camera that nobody calibrated has a K of zeros, as ROS expects."""
-        K = [number for row in camera.matrix for number in row] if camera.matrix else [0.0] * 9
+        K = camera_matrix(camera)
         count = max(_DISTORTION_COUNT[camera.distortion_model], len(camera.distortion))
         D = [*camera.distortion, *[0.0] * count][:count] if camera.matrix else []
         return self.make(
@@ -226,9 +216,9 @@ class _Messages:
             camera.width,
             camera.distortion_model,
             np.array(D, float),
-            np.array(K, float),
+            K.ravel(),
             np.eye(3).ravel(),
-            np.array([*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0], float),
+            np.column_stack([K, np.zeros(3)]).ravel(),
             0,
             0,
             self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False),

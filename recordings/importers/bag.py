@@ -72,7 +72,7 @@ def import_bag(
     wanted: Wanted = Wanted(),  # noqa: B008 - frozen
     limits: StandstillLimits = StandstillLimits(),  # noqa: B008 - frozen
     pair_within_s: float = PAIR_WITHIN_S,
-    progress: Progress = lambda text, done, total: None,
+    progress: Progress = lambda done, total, text: None,
 ) -> BagPlan:
     """`output` None: says what would be taken and writes nothing. Raises ImportSourceError or RecordingError.
 
@@ -86,7 +86,17 @@ def import_bag(
         joints = chosen.joints
         speeds = (joints.stamps_ns, joints.fastest_rad_s) if joints and joints.has_speeds else None
         stops, passed = find_stops(chosen.track, images_ns, speeds, limits, pair_within_s)
-        plan = _plan(bag, chosen, described, len(images_ns), stops, passed)
+        plan = BagPlan(
+            image_topic=chosen.image.name,
+            images=len(images_ns),
+            poses_from=chosen.poses_from,
+            joints_from=joints.topic if joints else "",
+            camera=_camera_text(described, chosen),
+            stops=len(stops),
+            passed_over=passed,
+            bound_ms=1e3 * max((stop.bound_s for stop in stops), default=0.0),
+            other_topics=bag.others,
+        )
         if output is None:
             return plan
         if len(stops) < STOPS_LEAST:
@@ -99,10 +109,16 @@ def import_bag(
                 limit=STOPS_LEAST,
             )
         assert described is not None
-        size = _write(
-            bag, chosen, stops, described, description_bytes, source, output, plan, pair_within_s, progress
-        )
-        return replace(plan, bytes_written=size)
+        images = bag.images(chosen.image.name, sorted(stop.place for stop in stops))
+        first = next(images)
+        camera = _camera(described, chosen.camera, *_size(first))
+        note = f"imported from {source.name}: {plan.image_topic}, {plan.poses_from}"
+        info = described.session(source, camera, max(0, min(stop.stamp_ns for stop in stops)), note)
+        with derived_recording(output, info) as writer:
+            writer.attach(DATASET_FILE, "application/yaml", description_bytes)
+            writer.attach("import.json", "application/json", msgspec.json.encode(asdict(plan)))
+            _write(writer, bag, chosen, stops, chain([first], images), pair_within_s, progress)
+            return replace(plan, bytes_written=writer.finish().stat().st_size)
     finally:
         bag.close()
 
@@ -121,67 +137,37 @@ def _description(source: Path, given: Path | None, needed: bool) -> tuple[Datase
     return None, b""
 
 
-def _plan(
-    bag: Bag,
-    chosen: Selection,
-    described: Dataset | None,
-    images: int,
-    stops: list[Standstill],
-    passed: dict[str, int],
-) -> BagPlan:
-    given = described is not None and described.camera is not None
-    camera = "of the description" if given else "size of the images, intrinsics to be estimated"
-    if not given and chosen.camera is not None and chosen.camera.matrix is not None:
-        camera = "intrinsics of the bag"
-    return BagPlan(
-        image_topic=chosen.image.name,
-        images=images,
-        poses_from=chosen.poses_from,
-        joints_from=chosen.joints.topic if chosen.joints else "",
-        camera=camera,
-        stops=len(stops),
-        passed_over=passed,
-        bound_ms=1e3 * max((stop.bound_s for stop in stops), default=0.0),
-        other_topics=bag.others,
-    )
+def _camera_text(described: Dataset | None, chosen: Selection) -> str:
+    if described is not None and described.camera is not None:
+        return "of the description"
+    known = chosen.camera is not None and chosen.camera.matrix is not None
+    return "intrinsics of the bag" if known else "size of the images, intrinsics to be estimated"
 
 
 def _write(
+    writer: RecordingWriter,
     bag: Bag,
     chosen: Selection,
     stops: list[Standstill],
-    described: Dataset,
-    description_bytes: bytes,
-    source: Path,
-    output: Path,
-    plan: BagPlan,
+    images: Iterator[ImageMessage],
     pair_within_s: float,
     progress: Progress,
-) -> int:
-    in_file_order = sorted(stops, key=lambda stop: stop.place)
+) -> None:
+    """`images`: of the stops, in the order of the file."""
     index = {stop.place: number for number, stop in enumerate(stops)}
-    images = bag.images(chosen.image.name, [stop.place for stop in in_file_order])
-    first = next(images)
-    width, height = _size(first)
-    camera = _camera(described, chosen.camera, width, height)
-    note = f"imported from {source.name}: {plan.image_topic}, {plan.poses_from}"
-    info = described.session(source, camera, max(0, min(stop.stamp_ns for stop in stops)), note)
-    with derived_recording(output, info) as writer:
-        writer.attach(DATASET_FILE, "application/yaml", description_bytes)
-        writer.attach("import.json", "application/json", msgspec.json.encode(asdict(plan)))
-        states = _states(bag, chosen)
-        last, waiting = None, next(states, None)
-        for done, (stop, image) in enumerate(zip(in_file_order, chain([first], images), strict=True)):
-            while waiting is not None and waiting.stamps.host_wall_ns <= stop.stamp_ns:
-                writer.robot_state(waiting)
-                last, waiting = waiting, next(states, None)
-            joints_rad = _joints_at(stop.stamp_ns, last, waiting, pair_within_s)
-            _write_view(writer, index[stop.place], stop, image, joints_rad)
-            progress("importing", done + 1, len(stops))
-        while waiting is not None:
+    states = _states(bag, chosen)
+    last, waiting = None, next(states, None)
+    in_file_order = sorted(stops, key=lambda stop: stop.place)
+    for done, (stop, image) in enumerate(zip(in_file_order, images, strict=True), 1):
+        while waiting is not None and waiting.stamps.host_wall_ns <= stop.stamp_ns:
             writer.robot_state(waiting)
-            waiting = next(states, None)
-        return writer.finish().stat().st_size
+            last, waiting = waiting, next(states, None)
+        joints_rad = _joints_at(stop.stamp_ns, last, waiting, pair_within_s)
+        _write_view(writer, index[stop.place], stop, image, joints_rad)
+        progress(done, len(stops), "importing")
+    while waiting is not None:
+        writer.robot_state(waiting)
+        waiting = next(states, None)
 
 
 def _camera(described: Dataset, found: CameraModel | None, width: int, height: int) -> CameraModel:

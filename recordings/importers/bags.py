@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from recordings.errors import ImportSourceError
+from recordings.files import open_file
 from recordings.importers.messages import (
     CDR,
     STAMP_BYTES,
@@ -23,7 +24,7 @@ from recordings.importers.messages import (
     ros_types,
 )
 from recordings.mcap.contents import Contents
-from recordings.mcap.scan import open_file, scan_file
+from recordings.mcap.scan import scan_file
 from recordings.mcap.source import Source
 from recordings.schema.definitions import SESSION_RECORDS
 
@@ -89,7 +90,7 @@ class Bag:
             yield message
             self._done += 1
             if self._done <= self._total and self._done % _SHOWN_EVERY == 0:
-                self._progress("reading the bag", self._done, self._total)
+                self._progress(self._done, self._total, "reading the bag")
 
     def values(self, topic: str) -> Iterator[Value]:
         """Yield the values in the order of the file. Raises ImportSourceError."""
@@ -114,7 +115,7 @@ class Bag:
             yield image
 
 
-def open_bag(path: Path, progress: Progress = lambda text, done, total: None) -> Bag:
+def open_bag(path: Path, progress: Progress = lambda done, total, text: None) -> Bag:
     """A bag's folder, or one file; MCAP is proven first. Raises ImportSourceError or RecordingError."""
     if path.suffix == ".bag":
         remedy = f"Convert it first: rosbags-convert --src {path} --dst BAG"
@@ -137,18 +138,19 @@ class _McapBag:
     """One or several MCAP files, with ROS 2 messages, foxglove's, or both."""
 
     def __init__(self, paths: list[Path], progress: Progress) -> None:
+        self._descriptors: list[int] = []
         self._files: list[tuple[Contents, Source]] = []
         self.declared: list[tuple[str, str, str, int]] = []
         done, total = 0, sum(path.stat().st_size for path in paths)
         try:
             for path in paths:
-                self._files.append((Contents(), Source(open_file(path))))
+                self._descriptors.append(open_file(path))
 
                 def scanned(bytes_done: int, before: int = done) -> None:
-                    progress("checking the bag", before + bytes_done, total)
+                    progress(before + bytes_done, total, "checking the bag")
 
-                contents, source, _ = scan_file(self._files[-1][1].descriptor, path, _RESCUE, scanned)
-                self._files[-1] = (contents, source)
+                contents, source, _ = scan_file(self._descriptors[-1], path, _RESCUE, scanned)
+                self._files.append((contents, source))
                 done += source.size_bytes
                 if SESSION_RECORDS[0] in contents.metadata:
                     remedy = f"Solve it: calibrate solve {path}"
@@ -166,9 +168,8 @@ class _McapBag:
             raise
 
     def close(self) -> None:
-        for _, source in self._files:
-            os.close(source.descriptor)
-        self._files = []
+        while self._descriptors:
+            os.close(self._descriptors.pop())
 
     def read(self, topic: str, places: list[int] | None, limit_bytes: int | None) -> _Messages:
         first, wanted = 0, None if places is None else list(places)

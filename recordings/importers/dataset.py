@@ -138,11 +138,8 @@ def _camera_problem(camera: CameraModel | None) -> tuple[str, str] | None:
     if not all(map(math.isfinite, camera.distortion)):
         return "camera.distortion", "a number is not finite"
     if camera.matrix is None:
-        return (
-            ("camera.matrix", "distortion without matrix; give both or neither")
-            if camera.distortion
-            else None
-        )
+        wrong = "camera.matrix", "distortion without matrix; give both or neither"
+        return wrong if camera.distortion else None
     K = np.array(camera.matrix)
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
         return "camera.matrix", "it must be 3×3 with positive focal lengths"

@@ -12,7 +12,7 @@ from recordings.images import (
     IMAGE_LIMIT_BYTES,
     KEPT_FORMATS,
     ImageError,
-    ImageHeader,
+    Pixels,
     decode_image,
     encode_png,
     pixel_format_of,
@@ -30,7 +30,6 @@ from recordings.importers.messages import Progress
 from recordings.schema.messages import (
     ARM_KINEMATICS_NAME,
     UR_KINEMATICS_NAME,
-    CameraModel,
     CaptureEvent,
     Image,
     Stamps,
@@ -54,7 +53,7 @@ class Imported:
 
 
 def import_folder(
-    folder: Path, output: Path | None, progress: Progress = lambda text, done, total: None
+    folder: Path, output: Path | None, progress: Progress = lambda done, total, text: None
 ) -> Imported:
     """Reads `dataset.yaml`, `poses.csv` and the images, writes `output` (.mcap), which must not exist.
 
@@ -76,8 +75,9 @@ def import_folder(
         for name in _OF_ARM
         if (folder / name).exists()
     }
+    size = camera.width, camera.height
     for row in rows:
-        _check_image(folder, row, camera)
+        _beginning(folder, row, size, _HEADER_BYTES)
     if output is None:
         return Imported(folder, len(rows), 0)
     with derived_recording(output, dataset.session(folder, camera)) as writer:
@@ -86,15 +86,26 @@ def import_folder(
         for name, content in arm.items():
             writer.attach(name, _OF_ARM[name], content)
         for index, row in enumerate(rows):
-            _write_view(writer, folder, index, row, camera)
-            progress("importing", index + 1, len(rows))
+            _write_view(writer, folder, index, row, size)
+            progress(index + 1, len(rows), "importing")
         stamps = Stamps(host_wall_ns=writer.info.created_wall_ns)
         writer.event(CaptureEvent(stamps, "imported", detail=f"{len(rows)} views"))
         path = writer.finish()
         return Imported(path, len(rows), path.stat().st_size)
 
 
-def _check_image(folder: Path, row: PoseRow, camera: CameraModel) -> ImageHeader:
+def read_image(folder: Path, row: PoseRow, size: tuple[int, int]) -> tuple[str, bytes, Pixels]:
+    """Format, bytes and pixels of a row's image of this size. Raises ImportSourceError with file and line."""
+    file_format, data = _beginning(folder, row, size, IMAGE_LIMIT_BYTES + 1)
+    try:
+        if len(data) > IMAGE_LIMIT_BYTES:
+            raise ImageError(f"is larger than {IMAGE_LIMIT_BYTES >> 20} MiB")
+        return file_format, data, decode_image(data, *size)
+    except ImageError as error:
+        raise _wrong(folder, row, str(error), "bad-image") from error
+
+
+def _beginning(folder: Path, row: PoseRow, size: tuple[int, int], limit_bytes: int) -> tuple[str, bytes]:
     path = folder / row.image
     try:
         if path.exists() and not path.is_file():  # a pipe would never be read to its end
@@ -102,32 +113,25 @@ def _check_image(folder: Path, row: PoseRow, camera: CameraModel) -> ImageHeader
         if not Path(os.path.realpath(path)).is_relative_to(folder.resolve()):
             raise _wrong(folder, row, "lies outside the folder", "outside", "Copy it inside.")
         with path.open("rb") as file:
-            header = read_header(file.read(_HEADER_BYTES))
+            data = file.read(limit_bytes)
+        header = read_header(data)
     except OSError as error:
         raise _wrong(folder, row, f"cannot be read ({error.strerror})", "unreadable") from error
     except ImageError as error:
         raise _wrong(folder, row, f"is no usable image: {error}", "bad-image", "Save it as PNG.") from error
-    if (header.width, header.height) != (camera.width, camera.height):
-        text = f"is {header.width}×{header.height}, {DATASET_FILE} says {camera.width}×{camera.height}"
+    if (header.width, header.height) != size:
+        text = f"is {header.width}×{header.height}, the camera {size[0]}×{size[1]}"
         remedy = "All images must come from one camera in one setting."
         raise _wrong(folder, row, text, "image-size", remedy)
-    return header
+    return header.format, data
 
 
-def _write_view(writer: RecordingWriter, folder: Path, index: int, row: PoseRow, camera: CameraModel) -> None:
-    header = _check_image(folder, row, camera)
-    try:
-        with (folder / row.image).open("rb") as file:
-            data = file.read(IMAGE_LIMIT_BYTES + 1)
-        if len(data) > IMAGE_LIMIT_BYTES:
-            raise ImageError(f"is larger than {IMAGE_LIMIT_BYTES >> 20} MiB")
-        pixels = decode_image(data, header.width, header.height)
-    except OSError as error:
-        raise _wrong(folder, row, f"cannot be read ({error.strerror})", "unreadable") from error
-    except ImageError as error:
-        raise _wrong(folder, row, str(error), "bad-image") from error
+def _write_view(
+    writer: RecordingWriter, folder: Path, index: int, row: PoseRow, size: tuple[int, int]
+) -> None:
+    file_format, data, pixels = read_image(folder, row, size)
     image = Image(pixels, Stamps(), index, index, pixel_format=pixel_format_of(pixels))
-    writer.image(image, encoded=data if header.format in KEPT_FORMATS else encode_png(pixels))
+    writer.image(image, encoded=data if file_format in KEPT_FORMATS else encode_png(pixels))
     writer.view(
         View(
             index=index,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from recordings.errors import ImportSourceError
 from recordings.importers.messages import Array, FrameMessage
@@ -133,7 +134,7 @@ class _Link:
             a, b = self.table[after - 1], self.table[after].copy()
             b[:, 3:] *= np.where((a[:, 3:] * b[:, 3:]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
             row = (1 - share) * a + share * b
-        position, R = row[:, :3], rotations(row[:, 3:])
+        position, R = row[:, :3], Rotation.from_quat(row[:, 3:]).as_matrix()
         if self.forward:
             return position, R
         R = np.swapaxes(R, 1, 2)
@@ -171,16 +172,3 @@ class Track:
                 near = link.stamps_ns[max(0, after - 1) : after + 1]
                 worst = max(worst, float(np.abs(near - time_ns).min()) / 1e9)
         return worst
-
-
-def rotations(q: Array) -> Array:
-    """Quaternions x y z w (n, 4), of any length → (n, 3, 3)."""
-    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
-            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
-            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        axis=1,
-    )

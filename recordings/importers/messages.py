@@ -30,8 +30,8 @@ from recordings.schema.messages import CameraModel
 from recordings.schema.viewing import camera_model_of, intrinsics
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
-"""Is told what is being done, how much of it is, and of how much."""
+Progress = Callable[[int, int, str], None]
+"""Is told how much is done, of how much, and what is being done."""
 
 
 class Kind(Enum):
@@ -47,7 +47,6 @@ class Kind(Enum):
 @dataclass(frozen=True, eq=False)
 class ImageMessage:
     stamp_ns: int
-    frame: str
     width: int
     """0 for a PNG or JPEG file, like height and step."""
     height: int
@@ -56,12 +55,6 @@ class ImageMessage:
     step: int
     """Bytes of a row."""
     data: bytes
-
-
-@dataclass(frozen=True)
-class CameraMessage:
-    frame: str
-    model: CameraModel
 
 
 @dataclass(frozen=True)
@@ -83,7 +76,7 @@ class FrameMessage:
     rotation_xyzw: tuple[float, float, float, float]
 
 
-Value = ImageMessage | CameraMessage | Joints | list[FrameMessage]
+Value = ImageMessage | CameraModel | Joints | list[FrameMessage]
 
 
 CDR, PROTOBUF, JSON = "cdr", "protobuf", "json"
@@ -178,11 +171,11 @@ def _from_foxglove(schema: str, message: Any, time_ns: int) -> Value:
     stamp_ns, frame = _foxglove_stamp(message, time_ns), getattr(message, "frame_id", "")
     if schema == "foxglove.RawImage":
         size = (message.width, message.height)
-        return ImageMessage(stamp_ns, frame, *size, message.encoding, message.step, message.data)
+        return ImageMessage(stamp_ns, *size, message.encoding, message.step, message.data)
     if schema == "foxglove.CompressedImage":
-        return ImageMessage(stamp_ns, frame, 0, 0, "", 0, message.data)
+        return ImageMessage(stamp_ns, 0, 0, "", 0, message.data)
     if schema == "foxglove.CameraCalibration":
-        return CameraMessage(frame, camera_model_of(message))
+        return camera_model_of(message)
     if schema == "foxglove.JointStates":
         joints = message.joints
         speeds = tuple(j.velocity for j in joints) if all(j.HasField("velocity") for j in joints) else ()
@@ -213,15 +206,15 @@ def _from_ros(schema: str, message: Any, time_ns: int) -> Value:
                 remedy="Record them little-endian.",
             )
         size = (message.width, message.height)
-        return ImageMessage(stamp_ns, frame, *size, message.encoding, message.step, message.data.tobytes())
+        return ImageMessage(stamp_ns, *size, message.encoding, message.step, message.data.tobytes())
     if schema == "sensor_msgs/msg/CompressedImage":
         encoding = message.format.partition(";")[
             0
         ]  # "bayer_rggb8; png compressed", as image_transport writes
-        return ImageMessage(stamp_ns, frame, 0, 0, encoding, 0, message.data.tobytes())
+        return ImageMessage(stamp_ns, 0, 0, encoding, 0, message.data.tobytes())
     if schema == "sensor_msgs/msg/CameraInfo":
         size = (message.width, message.height)
-        return CameraMessage(frame, intrinsics(*size, message.k, message.d, message.distortion_model))
+        return intrinsics(*size, message.k, message.d, message.distortion_model)
     if schema == "sensor_msgs/msg/JointState":
         speeds = tuple(map(float, message.velocity))
         return Joints(stamp_ns, tuple(message.name), tuple(map(float, message.position)), speeds)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from recordings.errors import ImportSourceError
 from recordings.importers.bags import Bag, BagTopic
 from recordings.importers.frames import FrameTree, Track
-from recordings.importers.messages import Array, CameraMessage, FrameMessage, Joints, Kind
+from recordings.importers.messages import Array, FrameMessage, Joints, Kind
 from recordings.schema.messages import CameraModel, Vector6
 
 _UR_ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -132,8 +132,8 @@ def _camera(bag: Bag, image: BagTopic) -> CameraModel | None:
         return None  # another camera's, for all that is known
     last = None
     for value in bag.values(nearest.name):
-        assert isinstance(value, CameraMessage)
-        last = value.model
+        assert isinstance(value, CameraModel)
+        last = value
     return last
 
 

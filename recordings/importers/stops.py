@@ -68,7 +68,12 @@ def find_stops(
             passed["no pose near"] += 1
             continue
         still = _stillness(track, stamps, speeds, time_ns, window_s)
-        if still is None or not _rests(still, limits):
+        if (
+            still is None
+            or still.max_joint_speed_rad_s > JOINT_SPEED_RAD_S
+            or still.position_scatter_m > limits.position_m
+            or still.rotation_scatter_rad > limits.rotation_rad
+        ):
             passed["moving"] += 1
             moved = True
             continue
@@ -104,14 +109,6 @@ def _stillness(
         max_joint_speed_rad_s=fastest,
         position_scatter_m=position_m,
         rotation_scatter_rad=rotation_rad,
-    )
-
-
-def _rests(still: Stillness, limits: StandstillLimits) -> bool:
-    return (
-        still.max_joint_speed_rad_s <= JOINT_SPEED_RAD_S
-        and still.position_scatter_m <= limits.position_m
-        and still.rotation_scatter_rad <= limits.rotation_rad
     )
 
 

@@ -20,6 +20,8 @@ FOOTER = struct.Struct("<QQI")
 _CHUNK_HEAD = struct.Struct("<QQQI")
 FOOTER_BYTES = RECORD_HEAD.size + FOOTER.size
 
+Piece = bytes | bytearray | memoryview
+
 
 class Opcode(IntEnum):
     HEADER = 0x01
@@ -63,8 +65,6 @@ class Channel(NamedTuple):
 
 
 class ChunkHead(NamedTuple):
-    start_ns: int
-    end_ns: int
     uncompressed_size: int
     crc: int
     compression: str
@@ -167,13 +167,13 @@ def parse_channel(content: memoryview) -> Channel:
 def parse_chunk_head(content: memoryview) -> ChunkHead:
     """Everything before the records; they must fill the rest of the content exactly."""
     cursor = Cursor(content)
-    start, end, size, crc = _CHUNK_HEAD.unpack(cursor.bytes(_CHUNK_HEAD.size))
+    _, _, size, crc = _CHUNK_HEAD.unpack(cursor.bytes(_CHUNK_HEAD.size))
     compression = cursor.text()
     stored = cursor.uint(8)
     offset = cursor.position
     cursor.bytes(stored)
     cursor.end()
-    return ChunkHead(start, end, size, crc, compression, offset)
+    return ChunkHead(size, crc, compression, offset)
 
 
 def parse_attachment(content: memoryview, exact: bool = False) -> Attachment:

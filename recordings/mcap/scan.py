@@ -10,18 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-import stat
 from array import array
 from collections.abc import Callable
 from pathlib import Path
 
-from recordings.errors import (
-    CorruptRecordingError,
-    RecordingError,
-    UnfinishedRecordingError,
-    disk_error,
-    recover_line,
-)
+from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError, recover_line
 from recordings.mcap import checksum
 from recordings.mcap.contents import Contents
 from recordings.mcap.records import (
@@ -69,18 +62,6 @@ def scan_file(
         raise CorruptRecordingError(
             text, code="changed-while-read", remedy="Try again afterwards."
         ) from error
-
-
-def open_file(path: Path) -> int:
-    """Descriptor for reading. RecordingError when it is no readable file."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    except OSError as error:
-        raise disk_error("open", path, error) from error
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise RecordingError(f"{path} is not a file", code="no-file")
-    return descriptor
 
 
 class _Scan:
@@ -219,7 +200,9 @@ class _Scan:
         if opcode == Opcode.CHUNK:
             self._chunk(at, end, content)
         elif opcode == Opcode.MESSAGE:
-            self._message(at, length)
+            if length < MESSAGE_HEAD.size:
+                raise BadRecordError(f"a message of {length} bytes has no head")
+            self._places.append(at)
         elif opcode == Opcode.SCHEMA:
             self.contents.add_schema(content)
         elif opcode == Opcode.CHANNEL:
@@ -231,11 +214,6 @@ class _Scan:
         elif opcode in _FORBIDDEN or opcode == 0:
             raise BadRecordError(f"a record of kind 0x{opcode:02x} does not belong here")
         return position + RECORD_HEAD.size + int(length)
-
-    def _message(self, at: int, length: int) -> None:
-        if length < MESSAGE_HEAD.size:
-            raise BadRecordError(f"a message of {length} bytes has no head")
-        self._places.append(at)
 
     def _chunk(self, at: int, end: int, content: memoryview) -> None:
         self.contents.chunks += 1

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from recordings.files import create_exclusively
 from recordings.mcap import checksum
-from recordings.mcap.records import FOOTER, MAGIC, MESSAGE_HEAD, RECORD_HEAD, Opcode, Statistics
+from recordings.mcap.records import FOOTER, MAGIC, MESSAGE_HEAD, RECORD_HEAD, Opcode, Piece, Statistics
 
 CHUNK_BYTES = 1024 * 1024
 DECLARE_AGAIN_BYTES = 16 * 1024 * 1024
@@ -29,7 +29,6 @@ _MESSAGE_INDEX = struct.Struct("<BQHI")
 _PLACE = struct.Struct("<HQ")
 _MESSAGE_OPCODE, _CHUNK_OPCODE = int(Opcode.MESSAGE), int(Opcode.CHUNK)
 _MESSAGE_INDEX_OPCODE = int(Opcode.MESSAGE_INDEX)
-Piece = bytes | bytearray | memoryview
 
 
 class McapFile:

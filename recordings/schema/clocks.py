@@ -54,7 +54,6 @@ class ClockFit:
     """Host seconds per device second, minus 1."""
     drift_uncertainty: float
     latency_s: float
-    samples: int
     residual_s: float = 0.0
     """The shortest delay of each tenth of the window lies within this above the line."""
     span_s: float = 0.0
@@ -153,7 +152,7 @@ class ClockEstimator:
             if len(self._bins) < LEAST_BINS or self._is_fresh(self._fit):
                 return self._fit
             points, newest_s, samples = np.array(self._bins), self._newest_s, self._samples
-        fit = _estimate(points, newest_s, samples, self.latency_s)
+        fit = _estimate(points, newest_s, self.latency_s)
         with self._lock:
             if self._bins and self._samples >= samples:  # not forgotten meanwhile
                 self._fit = fit
@@ -163,7 +162,7 @@ class ClockEstimator:
         return fit is not None and self._newest_s - fit.reference_s < min(REFIT_S, REFIT_SHARE * fit.span_s)
 
 
-def _estimate(points: Array, newest_s: float, samples: int, latency_s: float) -> ClockFit:
+def _estimate(points: Array, newest_s: float, latency_s: float) -> ClockFit:
     """points: (n, 2), device time [s] and smallest host − device [ns] of each bin, oldest first."""
     device_s, gaps_ns = points.T
     span_s = float(device_s[-1] - device_s[0])
@@ -181,7 +180,6 @@ def _estimate(points: Array, newest_s: float, samples: int, latency_s: float) ->
             UNFITTED_DRIFT if span_s < DRIFT_SPAN_S else min(UNFITTED_DRIFT, residual_s / span_s)
         ),
         latency_s=latency_s,
-        samples=samples,
         span_s=span_s,
     )
 
@@ -191,8 +189,11 @@ def _supporting_line(points: Array) -> tuple[float, int]:
     hull: list[int] = []
     rows = points.tolist()  # Python's floats: the chain is a loop
     for i, row in enumerate(rows):
-        while len(hull) >= 2 and _turns_right(rows[hull[-2]], rows[hull[-1]], row):
-            hull.pop()
+        while len(hull) >= 2:
+            (x0, y0), (x1, y1) = rows[hull[-2]], rows[hull[-1]]
+            if (y1 - y0) * (row[0] - x0) < (row[1] - y0) * (x1 - x0):
+                break
+            hull.pop()  # on or above the line from the one before to this
         hull.append(i)
     right = max(1, int(np.searchsorted(points[hull, 0], points[:, 0].mean())))
     (d0, g0), (d1, g1) = rows[hull[right - 1]], rows[hull[right]]
@@ -208,8 +209,3 @@ def _worst_best(above_ns: Array, device_s: Array) -> float:
     edges_s = np.linspace(begin_s, end_s, STRETCHES, endpoint=False)
     starts = np.unique(np.searchsorted(device_s, edges_s))
     return float(np.minimum.reduceat(above_ns, starts).max())
-
-
-def _turns_right(a: list[float], b: list[float], c: list[float]) -> bool:
-    """b lies on or above the line a–c, so that it is not part of the lower hull."""
-    return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])

@@ -159,11 +159,10 @@ def _content(value: msgspec.Struct) -> dict[str, Any]:
     return content
 
 
-def _flat(matrix: Any) -> list[float]:
-    return [number for row in matrix for number in row]
-
-
-_CONVERTED: dict[str, Callable[[Any], Any]] = {"message": _content, "matrix": _flat}
+_CONVERTED: dict[str, Callable[[Any], Any]] = {
+    "message": _content,
+    "matrix": lambda rows: [number for row in rows for number in row],
+}
 _CONVERSIONS = {
     struct: [(field.name, _CONVERTED[field.kind]) for field in fields if field.kind in _CONVERTED]
     for struct, fields in _PLAN.items()

@@ -89,7 +89,7 @@ def _by_round_trips(readings: list[_Reading]) -> ClockFit:
     drift, doubt = _drift(readings)
     now_s = readings[-1].device_s
     best = min(readings, key=lambda r: r.half_s + doubt * (now_s - r.device_s))
-    return ClockFit(best.device_s, best.offset_ns, drift, doubt, best.half_s, len(readings))
+    return ClockFit(best.device_s, best.offset_ns, drift, doubt, best.half_s)
 
 
 def _drift(readings: list[_Reading]) -> tuple[float, float]:
@@ -127,7 +127,7 @@ def _synchronized(readings: list[_Reading]) -> ClockFit | None:
             wall_ahead_ns = newest.host_wall_ns - newest.answered_monotonic_ns
             offset_ns = -float(wall_ahead_ns + whole_s * 1_000_000_000)
             bound_s = max(high_s - whole_s, whole_s - low_s)
-            return ClockFit(readings[-1].device_s, offset_ns, 0.0, 0.0, bound_s, len(readings))
+            return ClockFit(readings[-1].device_s, offset_ns, 0.0, 0.0, bound_s)
     return None
 
 

@@ -14,8 +14,6 @@ if TYPE_CHECKING:  # commands that only ask the daemon do not load numpy
     import numpy as np
     from numpy.typing import NDArray
 
-    from recordings.images import Pixels
-
 Mount = Literal["eye-in-hand", "eye-to-hand"]
 Source = Literal["real", "simulated", "playback", "imported"]
 """Origin of images and poses; anything but `real` never installs on a real cell."""
@@ -228,12 +226,6 @@ class Image(msgspec.Struct, frozen=True, eq=False):
     """Middle of the exposure; every camera gives it. None: recorded before there was such a thing."""
     clock_readings: tuple[ClockReading, ...] = ()
     """Readings of the camera's clock since the frame before; empty when read from a recording."""
-
-    def viewable(self) -> Pixels:
-        """Convert for people and detectors: a colour mosaic interpolated to BGR, else `pixels`."""
-        from recordings.images import viewable
-
-        return viewable(self.pixels, self.pixel_format)
 
 
 class Stillness(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -21,7 +21,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
 
 from recordings.images import Pixels, raw_encoding
-from recordings.mcap.writer import Piece
+from recordings.mcap.records import Piece
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
@@ -85,7 +85,7 @@ def _with_data(message: Any, data: Piece) -> list[Piece]:
 
 
 def camera_calibration(model: CameraModel, time_ns: int) -> Any:
-    """Intrinsics; a camera that is not calibrated has an all-zero K, as viewers expect."""
+    """The intrinsics as a message."""
     message = CameraCalibration(
         frame_id=CAMERA_FRAME,
         width=model.width,
@@ -93,12 +93,17 @@ def camera_calibration(model: CameraModel, time_ns: int) -> Any:
         distortion_model=_FISHEYE.get(model.distortion_model, model.distortion_model),
         D=model.distortion,
     )
-    K = [number for row in model.matrix for number in row] if model.matrix else [0.0] * 9
-    message.K.extend(K)
+    K = camera_matrix(model)
+    message.K.extend(K.ravel())
     message.R.extend(np.eye(3).ravel())
-    message.P.extend([*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0])
+    message.P.extend(np.column_stack([K, np.zeros(3)]).ravel())
     _stamp(message, time_ns)
     return message
+
+
+def camera_matrix(model: CameraModel) -> NDArray[np.float64]:
+    """(3, 3), all zero of a camera that nobody calibrated: so Foxglove and ROS expect it."""
+    return np.array(model.matrix or np.zeros((3, 3)), float)
 
 
 def camera_model_of(message: Any) -> CameraModel:

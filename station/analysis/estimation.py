@@ -6,27 +6,28 @@ import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
 
+from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose
-from calibrate.handeye.information import prior_information, view_information
+from calibrate.handeye.information import USUAL_NOISE, prior_information, sigma_of, view_information
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.views import BoardView, ViewSet
+from recordings.errors import RecordingError
+from recordings.images import viewable
+from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.worker import CapturedView
 from station.cell.config import StationConfig, matrix4
-from station.cell.errors import StationError
-from station.cell.scene import scene_of
 from station.cell.status import EstimateStatus
-from station.plan.choose import USUAL_NOISE, sigma_of
-from station.plan.predict import Advice, advise
 from station.plan.visibility import count_in_parts
 
 FEWEST_VIEWS = 4
@@ -67,34 +68,6 @@ def running_estimate(
         if sigma_m <= goal_m
         else "continue: every pose still helps",
     )
-
-
-def next_best(
-    config: StationConfig,
-    base_from_flange: Array,
-    joints_now_rad: Sequence[float],
-    onward_rad: Sequence[float] | None,
-) -> Advice:
-    """Find the pose that would help most after those captured (n, 4, 4), whether or not these are enough.
-
-    Free to reach from here, and from it the pose that is next (`onward_rad`). By forecast from the configured
-    guesses; ConfigError where these are missing.
-    """
-    return advise(scene_of(config), base_from_flange, 0.0, joints_now_rad, onward_rad)
-
-
-def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:
-    """Say which pose would help most, how many are missing for `capture.goal_m`; empty when none is, or none
-    helps, or the guesses are missing."""
-    goal_m = config.capture.goal_m
-    try:
-        advice = advise(scene_of(config), base_from_flange, goal_m, joints_now_rad)
-    except StationError:
-        return ""
-    if advice.next_pose is None:
-        return ""
-    missing = f"at best {advice.poses_missing} more" if advice.poses_missing else "many more poses"
-    return f"{missing} for {1000 * goal_m:.2g} mm; the next best: {advice.next_pose.why}"
 
 
 def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[int, ...], ...]:
@@ -147,3 +120,19 @@ def quick_sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens:
     each = view_information(views.mount, views.camera, flange, X, Y, points, USUAL_NOISE)
     prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
     return sigma_of(each.sum(axis=0), prior)
+
+
+def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:
+    """The views of a recording that show the board; an image that cannot be read shows none.
+
+    RecordingError for a recording that cannot be read.
+    """
+    recording, seen = open_recording(path), []
+    for view in recording.views():
+        with contextlib.suppress(RecordingError):
+            image = recording.image(view)
+            found = detect(viewable(image.pixels, image.pixel_format), board)
+            if found.found:
+                flange = np.array(view.base_from_flange)
+                seen.append(CapturedView(view.index, flange, found.indices, found.pixels))
+    return seen

@@ -16,6 +16,7 @@ import numpy as np
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, difference, perturb
+from calibrate.handeye.information import sigma_of
 from calibrate.projection import project
 from station.analysis.estimation import FEWEST_FOR_LENS, quick_sigma, solve_quickly
 from station.analysis.worker import CapturedView
@@ -33,7 +34,7 @@ from station.cell.scene import (
     guess_matrix,
     scene_of,
 )
-from station.plan.choose import informations, objective_for, sigma_of
+from station.plan.choose import informations, objective_for
 from station.plan.planner import PlanOptions, plan_scene
 from station.plan.visibility import outline, visible
 

@@ -7,12 +7,12 @@ Plain functions of plain data, so that they cross a process border; the daemon's
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import multiprocessing
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,16 +21,19 @@ from numpy.typing import NDArray
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from recordings.errors import RecordingError
-from recordings.images import Pixels
-from recordings.reader import open_recording
-from recordings.schema.messages import BoardSpec, CameraModel, Vector6
+from recordings.images import Pixels, eight_bits, viewable
+from recordings.schema.messages import BoardSpec, CameraModel, Image, Vector6
 from station.cell.config import StationConfig
 from station.cell.limits import PlanCheck, check_plan
 from station.cell.plan import ExpectedView, Plan
 from station.cell.process import die_with_parent
 from station.cell.scene import geometry_from
 from station.cell.status import DetectionStatus
+from station.protocol.verbs import PreviewImage
+
+JPEG_LIMIT_BYTES = 40_000
+"""In base64 it must fit into one line of the protocol."""
+_QUALITIES = (75, 50, 30, 15)
 
 WIDTH_PX = 640
 """Images are made this small first: it averages their noise, and takes a few milliseconds."""
@@ -116,21 +119,6 @@ def sight(
         advice=advice,
     )
     return BoardDetection(status, found.indices, found.pixels)
-
-
-def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:
-    """The views of a recording that show the board; an image that cannot be read shows none.
-
-    RecordingError for a recording that cannot be read.
-    """
-    recording, seen = open_recording(path), []
-    for view in recording.views():
-        with contextlib.suppress(RecordingError):
-            found = detect(recording.image(view).viewable(), board)
-            if found.found:
-                flange = np.array(view.base_from_flange)
-                seen.append(CapturedView(view.index, flange, found.indices, found.pixels))
-    return seen
 
 
 def _distance_and_tilt(
@@ -304,3 +292,23 @@ def _reduced(image: Pixels, box: Box | None) -> NDArray[np.float32]:
     scale = min(1.0, WIDTH_PX / width)
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return np.asarray(small, dtype=np.float32)
+
+
+def preview_image(taken: Image, corners: Array, width: int, height: int, sequence: int) -> PreviewImage:
+    """A JPEG that fits into width × height, px; empty where none is small enough.
+
+    `corners`: (n, 2) of the image, px. `sequence`: another number for another image.
+    """
+    image = eight_bits(viewable(taken.pixels, taken.pixel_format), taken.pixel_format)
+    sides = image.shape[1::-1]
+    scale = min(width / sides[0], height / sides[1], 1.0)
+    size = max(1, round(sides[0] * scale)), max(1, round(sides[1] * scale))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    shares = (corners.reshape(-1, 2) + 0.5) / np.array(sides)
+    for quality in _QUALITIES:
+        ok, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        if ok and len(jpeg) <= JPEG_LIMIT_BYTES:
+            data = base64.b64encode(jpeg.tobytes()).decode()
+            found = tuple((float(x), float(y)) for x, y in shares.round(4))
+            return PreviewImage(data, *size, found, sequence)
+    return PreviewImage()

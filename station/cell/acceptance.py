@@ -15,6 +15,10 @@ from station.cell.status import MotionPreview
 
 ACCEPTANCE_NAME = "acceptance.json"
 """Below the daemon's root."""
+STOP_TESTED = "stop-tested"
+"""Cause of the state after a move of the test, however it ended."""
+STOP_GIVEN = "stop-given"
+"""Code of the event that tells when: `moment_ns`, host monotonic."""
 PAYLOAD_TOLERANCE = 0.005
 """kg, and m of its centre: less is rounding on the way through RTDE."""
 

@@ -17,6 +17,8 @@ from recordings.schema.messages import Mount
 from station.cell.config import Capsule, LimitsConfig, vector3
 
 ARM_BODIES = ("base column", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3")
+SPACING_M = 0.01
+"""No modelled point moves further between two checked samples; margins are reduced by half of it."""
 _SELF_PAIRS = (
     *((0, b) for b in (3, 4, 5, 6)),
     *((1, b) for b in (3, 4, 5, 6)),

@@ -86,8 +86,7 @@ class CameraConfig(Section, frozen=True):
     """Name among the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""
     driver: Literal["aravis", "webcam", "playback", "rendered"] = "aravis"
     device: str = ""
-    """aravis: serial, IP address or name. webcam: its number or device file. playback: a folder, video or
-    recording."""
+    """aravis: serial, IP address or name. webcam: its number or device file. playback: the recording."""
     trigger: Literal["software", "hardware", "free-running"] = "software"
     pixel_format: str = "Mono8"
     frame_rate_hz: float | None = None
@@ -116,7 +115,7 @@ class CameraConfig(Section, frozen=True):
     time_offset: TimeCorrection | None = None
     """Offset from a sweep (`calibrate sweep -o`), added to the frames' times of the same source."""
     playback_pace: float = 0.0
-    """playback: 0 = as fast as asked, 1 = at its own pace."""
+    """Has no effect."""
     model: CameraModel | None = None
     """Known intrinsics; None = found from the session's images."""
     model_is_rough: bool = False
@@ -145,6 +144,10 @@ class Plane(Section, frozen=True):
     name: str
     point_m: Vector3
     normal: Vector3
+
+
+SPEED_CAP_M_S = 0.25
+"""Of any modelled point, in code: no configuration raises it."""
 
 
 class LimitsConfig(Section, frozen=True):

@@ -17,9 +17,8 @@ from recordings import strict_yaml
 from recordings.files import is_session_name
 from recordings.schema.messages import BoardSpec
 from recordings.strict_yaml import YamlProblem
-from station.cell.config import REAL_DRIVERS, CameraConfig, Plane, PoseGuess, StationConfig
+from station.cell.config import REAL_DRIVERS, SPEED_CAP_M_S, CameraConfig, Plane, PoseGuess, StationConfig
 from station.cell.errors import ConfigError
-from station.cell.limits import SPEED_CAP_M_S
 
 LARGEST_SQUARE_M, LARGEST_REACH_M = 0.5, 5.0
 """Beyond these somebody wrote millimetres."""

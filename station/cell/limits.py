@@ -15,17 +15,14 @@ from numpy.typing import ArrayLike
 
 from calibrate.geometry import Array, difference
 from calibrate.kinematics import JOINT_NAMES, forward
-from station.cell.collision import CellGeometry, Contact, margins, moving_points, surface_speeds
-from station.cell.config import LimitsConfig
+from station.cell.collision import SPACING_M, CellGeometry, Contact, margins, moving_points, surface_speeds
+from station.cell.config import SPEED_CAP_M_S, LimitsConfig
 from station.cell.plan import Plan, PlannedPose
 
-SPEED_CAP_M_S = 0.25
 JOINT_SPEED_CAP_RAD_S = 1.05
 JOINT_ACCELERATION_CAP_RAD_S2 = 1.4
 _SPEED_RESERVE = 0.97
 """Between samples a point may be a little faster than at them."""
-SPACING_M = 0.01
-"""No modelled point moves further between two checked samples; margins are reduced by half of it."""
 _TURN_RAD = 0.05
 """No joint turns further between two of them: surfaces are fast where centre lines hardly move."""
 _PIECES = 48

@@ -21,8 +21,9 @@ from calibrate.geometry import (
 )
 from calibrate.kinematics import MODELS, RobotModel, forward
 from calibrate.projection import camera_matrix
+from calibrate.views import board_in_camera, implied_flange
 from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
-from station.cell.collision import CellGeometry, gap_to_arm, plate
+from station.cell.collision import SPACING_M, CellGeometry, gap_to_arm, plate
 from station.cell.config import (
     Capsule,
     PoseGuess,
@@ -34,7 +35,6 @@ from station.cell.config import (
     vector6,
 )
 from station.cell.errors import ConfigError, LimitError
-from station.cell.limits import SPACING_M
 from station.cell.plan import Plan, PlannedPose
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
@@ -64,24 +64,15 @@ class Scene:
 
     def camera_from_board(self, base_from_flange: Array) -> Array:
         """(..., 4, 4) → (..., 4, 4)"""
-        return camera_from_board(self.mount, base_from_flange, self.X, self.Y)
+        return board_in_camera(self.mount, base_from_flange, self.X, self.Y)
 
     def base_from_flange(self, camera_from_board: Array) -> Array:
         """The flange pose that shows the board so."""
-        if self.mount == "eye-in-hand":
-            return np.asarray(self.Y @ inverse(self.X @ camera_from_board))
-        return np.asarray(self.X @ camera_from_board @ inverse(self.Y))
+        return implied_flange(self.mount, self.X, self.Y, camera_from_board)
 
     def seen(self, base_from_flange: Array, points: Array) -> Array:
         """Board points (k, 3) in `camera`, (n, k, 3)."""
         return transform_points(self.camera_from_board(base_from_flange), points)
-
-
-def camera_from_board(mount: Mount, base_from_flange: Array, X: Array, Y: Array) -> Array:
-    """Place the board in the camera from flange poses (..., 4, 4); camera and board at X and Y (`Scene`)."""
-    if mount == "eye-in-hand":
-        return np.asarray(inverse(base_from_flange @ X) @ Y)
-    return np.asarray(inverse(X) @ base_from_flange @ Y)
 
 
 def board_place(mount: Mount, base_from_flange: Array, X: Array, camera_from_board: Array) -> Array:

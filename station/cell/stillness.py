@@ -10,7 +10,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -31,13 +30,6 @@ FIND_SHAKE = "Find what shakes the arm or the camera, or retake the pose later."
 UNSEEN = "image motion unknown, no images"
 CHECK_CAMERA = "Check the camera's cable and power, or retake the pose later."
 KEPT_SAMPLES = 4096
-
-
-@dataclass(frozen=True)
-class ImageMotion:
-    """Motion between images, px; None where it cannot be measured."""
-
-    motion_px: float | None
 
 
 class NotStillError(StationError):
@@ -122,12 +114,13 @@ class StillnessMonitor:
     async def settle(
         self,
         alive: Callable[[], object],
-        look: Callable[[int], ImageMotion | None] = lambda since_ns: ImageMotion(None),
+        look: Callable[[int], float | None] = lambda since_ns: math.nan,
         now_s: Callable[[], float] = time.monotonic,
     ) -> Stillness:
         """Returns as soon as everything is at rest. `alive` raises when the robot is lost; False: old news.
 
-        `look`: at images exposed since this host time, when the joints came to rest; None = not yet.
+        `look`: motion (px) in images exposed since this host time, when the joints came to rest; NaN where it
+        cannot be measured, None = not yet.
         NotStillError after the configured time-out, with what still moved.
         """
         give_up_s = now_s() + self._limits.timeout_s
@@ -140,12 +133,14 @@ class StillnessMonitor:
             if found is None or unrest:
                 resting_since_ns = None
             else:
-                resting_since_ns = resting_since_ns or self._window_begin_ns(found)
+                newest_ns = self._states[-1].stamps.host_monotonic_ns
+                resting_since_ns = resting_since_ns or newest_ns - round(found.window_s * 1e9)
                 seen = look(resting_since_ns)
                 if seen is None:
                     unrest, remedy = UNSEEN, CHECK_CAMERA
                 else:
-                    found = msgspec.structs.replace(found, image_motion_px=seen.motion_px)
+                    motion_px = None if math.isnan(seen) else seen
+                    found = msgspec.structs.replace(found, image_motion_px=motion_px)
                     unrest = self.unrest(found)
                     if not unrest:
                         return found
@@ -171,10 +166,6 @@ class StillnessMonitor:
                 speed_rad_s=float(speeds[joint]),
                 limit_rad_s=limit,
             )
-
-    def _window_begin_ns(self, found: Stillness) -> int:
-        """Host monotonic time."""
-        return self._states[-1].stamps.host_monotonic_ns - round(found.window_s * 1e9)
 
 
 class RestingCheck:

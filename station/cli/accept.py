@@ -16,7 +16,6 @@ from calibrate.report import html, plots
 from recordings.files import write_atomically
 from station.cell.acceptance import Acceptance, Figure, StopWay, write_acceptance
 from station.cell.errors import RefusedError
-from station.cell.socket_folder import default_socket
 from station.cell.status import MotionPreview
 from station.cli.attended import Attended, attended, confirmed, no_terminal
 from station.cli.console import AsJson, Socket, err, out, print_json
@@ -67,7 +66,7 @@ async def _accept(socket: Path | None, joint: int, fastest_m_s: float, quiet: bo
     # Reading the arm beside the daemon is this command's alone: the flow knows it as a `StateRecorder`.
     from station.devices.ur_state import TraceRecorder
 
-    async with attended(socket or default_socket(), quiet=quiet) as shell:
+    async with attended(socket, headless=quiet) as shell:
         status = await shell.status()
         if status.playback:
             raise RefusedError("A played-back arm has no ways to stop.", code="playback")
@@ -80,11 +79,10 @@ async def _accept(socket: Path | None, joint: int, fastest_m_s: float, quiet: bo
         try:
             acceptance = await test.run()
         except BaseException:
-            if test.stops and shell.client.root is not None:  # what was measured is not lost
+            if test.stops:  # what was measured is not lost
                 _keep(shell.client.root, test.outcome(False), test.stops)
             raise
-        if shell.client.root is not None:
-            acceptance = _keep(shell.client.root, acceptance, test.stops)
+        acceptance = _keep(shell.client.root, acceptance, test.stops)
         if not quiet:
             words, style = ("ACCEPTED", "green") if acceptance.accepted else ("NOT ACCEPTED", "bold red")
             err.print(words, style=style)
@@ -153,13 +151,7 @@ class _SimulatedTester(_ShellTester):
         self._admin, self.quiet = AdminClient(host), quiet
 
     async def holds_emergency_stop(self) -> bool:
-        return self.quiet or not self._shell.interactive or await super().holds_emergency_stop()
-
-    async def approves(self, preview: MotionPreview) -> bool:
-        if self.quiet:
-            self._shell.moving = True
-            return True
-        return await super().approves(preview)
+        return not self._shell.interactive or await super().holds_emergency_stop()
 
     async def before(self, way: StopWay) -> None:
         if way is StopWay.SLIDER:

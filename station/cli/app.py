@@ -9,7 +9,7 @@ _APPROVED = {"--go": "--approve"}
 STATION = LazyGroup(
     {
         "tui": LazyCommand(
-            "station.cli.screen:tui_command", ("station tui", "station tui --replay session.mcap")
+            "station.cli.daemon:tui_command", ("station tui", "station tui --replay session.mcap")
         ),
         "demo": LazyCommand(
             "station.cli.demo:demo_command",

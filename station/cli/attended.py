@@ -1,4 +1,4 @@
-"""A session attended from a shell: who approves it, what is shown meanwhile, and what Ctrl-C does."""
+"""A session attended from a shell: who approves it, its progress, and what Ctrl-C does."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ import signal
 import sys
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
+from types import TracebackType
 
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from station.cell.errors import RefusedError, StationError
 from station.cell.socket_folder import default_socket
-from station.cell.status import MotionPreview, StationStatus
+from station.cell.status import Event, MotionPreview, StationStatus
 from station.cli.console import err
-from station.cli.progress import SessionProgress
 from station.operate.motion import (
     HASH_DIGITS,
-    SessionOutcome,
     carry_out,
     motion_facts,
     not_approved,
@@ -82,7 +84,7 @@ class Attended:
             text = "Nothing moved: --json prompts nobody, and is for simulated cells only."
             raise RefusedError(text, code="no-person")
 
-    async def carry_out(self, purpose: Purpose) -> SessionOutcome:
+    async def carry_out(self, purpose: Purpose) -> StationStatus:
         """One session, until it rests."""
         self.progress.skip(await self.status())
         # One pose more never ends a session that has others left.
@@ -98,7 +100,7 @@ class Attended:
                 plans_here=self.plans_here if self.interactive else None,
             )
 
-    async def watch(self, started: object) -> SessionOutcome:
+    async def watch(self, started: object) -> StationStatus:
         """A session that was just started, until it rests. RefusedError when it was not `started`."""
         if not started:
             raise not_approved()
@@ -168,3 +170,71 @@ def ctrl_c_at_once() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+class SessionProgress:
+    """Context manager; call it with every status. Silent when `quiet`.
+
+    The bar appears with the first status, so that a question before the go has the terminal to itself.
+    """
+
+    def __init__(self, console: Console, quiet: bool) -> None:
+        self._quiet = quiet
+        self._bar = Progress(
+            TextColumn("{task.description:<34}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            disable=quiet,
+        )
+        self._task: TaskID | None = None
+        self._last: Event | None = None
+
+    def __enter__(self) -> SessionProgress:
+        return self
+
+    def say(self, text: str) -> None:
+        """One line about what is going on outside a session."""
+        if not self._quiet:
+            self._bar.console.print(Text(text, "dim"))
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def skip(self, status: StationStatus) -> None:
+        """Skip the events of this status: they happened before."""
+        if status.events:
+            self._last = status.events[-1]
+
+    def __call__(self, status: StationStatus) -> None:
+        if self._quiet:
+            return
+        session = status.session
+        if self._task is None:
+            self._bar.start()
+            self._task = self._bar.add_task("", total=len(session.poses))
+        where = f"pose {session.current + 1} " if session.current is not None else ""
+        self._bar.update(
+            self._task,
+            description=f"{where}{status.state.value}",
+            total=len(session.poses),
+            completed=session.captured,
+        )
+        for event in self._new(status):
+            number = f"pose {event.pose_index + 1:>2}  " if event.pose_index is not None else ""
+            style = {"warning": "yellow", "error": "red"}.get(event.level, "dim")
+            self._bar.console.print(Text(f"{number}{event.text}", style))
+
+    def _new(self, status: StationStatus) -> list[Event]:
+        events = list(status.events)
+        if self._last in events:
+            events = events[events.index(self._last) + 1 :]
+        if status.events:
+            self._last = status.events[-1]
+        return events

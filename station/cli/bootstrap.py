@@ -29,8 +29,7 @@ from station.cell.socket_folder import default_socket
 from station.cli.console import Headless, Socket, err, out
 from station.cli.session import joints_of, load_into, session
 from station.operate.motion import wait_until_idle
-from station.plan.belief import BootstrapView, believe, improved_config
-from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
+from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, BootstrapView, believe, improved_config, next_move
 from station.protocol.client import Client
 from station.protocol.verbs import Purpose
 
@@ -153,19 +152,19 @@ def _take(
     outcome = asyncio.run(
         session(socket, Purpose.RUN, headless, before=lambda client: load_into(client, plan))
     )
-    if not outcome.recording or not outcome.captured:
-        reason = (outcome.status.reason or outcome.status.state.value).rstrip(".")
+    if not outcome.session.recording or not outcome.session.captured:
+        reason = (outcome.reason or outcome.state.value).rstrip(".")
         raise BootstrapError(
             f"{move.name}: no image was saved ({reason}).",
             code="no-image",
             remedy="Then `station finish` closes what is open; start over from a view of the whole board.",
         )
-    recording = open_recording(Path(outcome.recording))
+    recording = open_recording(Path(outcome.session.recording))
     require_same_cell(cell, config_sha256, recording.info)
     loaded = load_views(recording, cell.board, cell.camera.model, fewest=1).views
     [view] = recording.views()
     if view.joints_rad is None or view.name != move.name:
-        raise BootstrapError(f"{outcome.recording} does not hold {move.name}.", code="other-recording")
+        raise BootstrapError(f"{recording.path} does not hold {move.name}.", code="other-recording")
     if before is None:
         return np.array(view.joints_rad), loaded
     # All views together decide which way round a symmetric board lies.

@@ -1,10 +1,9 @@
-"""The daemon of a command: the one that serves already, or one that the command starts."""
+"""The operator screen (`station tui`), and the daemon of a command: one that serves already, or a new one."""
 
 from __future__ import annotations
 
 import os
 import select
-import struct
 import subprocess
 import sys
 import tempfile
@@ -12,11 +11,16 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from socket import AF_UNIX, SO_PEERCRED, SOL_SOCKET
+from socket import AF_UNIX
 from socket import socket as connection
+from typing import Annotated
+
+import typer
 
 from recordings.files import state_root
 from station.cell.errors import StationError
+from station.cell.socket_folder import default_socket, peer_of
+from station.cli.console import Socket
 from station.protocol.client import DaemonGoneError, ask
 from station.protocol.verbs import GetPlan
 
@@ -111,8 +115,7 @@ def tell_what_goes_on(socket: Path) -> None:
             link.connect(str(socket))
         except OSError:
             return
-        credentials = link.getsockopt(SOL_SOCKET, SO_PEERCRED, struct.calcsize("3i"))
-    pid, user, _ = struct.unpack("3i", credentials)
+        pid, user, _ = peer_of(link)
     own = pid and user == os.getuid()
     ends = f"; `kill {pid}` ends it: the arm stops first, and the recording is finished" if own else ""
     print(f"The station goes on without this screen. `station` opens it again{ends}.")
@@ -121,8 +124,32 @@ def tell_what_goes_on(socket: Path) -> None:
 def answers(socket: Path) -> bool:
     try:
         ask(socket, GetPlan())
-    except DaemonGoneError:
-        return False
-    except StationError:
-        return True
+    except StationError as problem:
+        return not isinstance(problem, DaemonGoneError)
     return True
+
+
+def tui_command(
+    socket: Socket = None,
+    replay: Annotated[Path | None, typer.Option(help="Play this recording on the live screen")] = None,
+) -> None:
+    """Open the operator screen; start a daemon if none runs.
+
+    The daemon gets a simulated cell where there is no configuration. With --socket none is started: the
+    screen waits for the one that serves there.
+    """
+    if not sys.stdout.isatty() or not sys.stdin.isatty():
+        raise StationError(
+            "The operator screen needs a terminal",
+            code="no-terminal",
+            remedy="Without one use `station capture` or `station demo`.",
+        )
+    from station.tui.app import run, run_replay
+
+    if replay is not None:
+        run_replay(replay)
+        return
+    # A socket that is named belongs to somebody: on a cell's console a second daemon would be a wrong one.
+    served = socket or ensure_daemon(default_socket())
+    run(served)
+    tell_what_goes_on(served)

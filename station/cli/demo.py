@@ -18,23 +18,24 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from calibrate.cli.contracts import HoldoutJson, SolveJson
+from calibrate.cli.contracts import SolveJson
 from calibrate.files.calibration import Sigma, read_calibration
 from calibrate.files.formatting import arm_sentences
 from calibrate.geometry import difference
+from calibrate.results import HoldoutScore
 from recordings.errors import ErrorReport
 from recordings.files import state_root
 from recordings.reader import open_recording
 from recordings.schema.messages import Matrix4, Mount
 from station.cell.errors import ConfigError, StationError
 from station.cell.session_folder import CALIBRATION_FILE
-from station.cell.status import MotionPreview
+from station.cell.status import MotionPreview, StationStatus
+from station.cli.attended import SessionProgress
 from station.cli.console import AsJson, Headless, err, out, print_json
 from station.cli.daemon import own_daemon
-from station.cli.progress import SessionProgress
 from station.cli.session import PosesJson
-from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
-from station.operate.motion import SessionOutcome, carry_out, wait_until_idle
+from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
+from station.operate.motion import carry_out, wait_until_idle
 from station.plan.choose import Aim
 from station.protocol.client import Client
 from station.protocol.verbs import Lease, MakePlan, Purpose
@@ -70,7 +71,7 @@ class DemoJson(msgspec.Struct, frozen=True):
     recording: str
     calibration: str
     report: str
-    holdout: HoldoutJson | None
+    holdout: HoldoutScore | None
     gates_passed: bool
     arm: DemoArmJson
 
@@ -101,7 +102,6 @@ def demo_command(
 
     Exit codes: 0 done, 1 failed, 3 poses missing, 4 a gate failed.
     """
-    require_choices(scene=scene, noise=noise, mount=mount, control=control)
     if output is not None and output.exists() and not output.is_dir():
         raise ConfigError(f"--out {output} is a file.", code="not-a-folder", remedy="Name a folder.")
     if gige and not is_isolated():
@@ -154,9 +154,9 @@ def _run(
     aim: Aim = "arm" if "high" in arguments else "camera"
     with simulated_daemon(folder, arguments) as socket:
         outcome = asyncio.run(_captured(socket, MakePlan(poses, seed, aim=aim), progress))
-    if not outcome.recording:
-        raise DemoError(f"No recording: {outcome.status.reason or outcome.status.state.value}")
-    recording, session = Path(outcome.recording), Path(outcome.status.session.folder)
+    if not outcome.session.recording:
+        raise DemoError(f"No recording: {outcome.reason or outcome.state.value}")
+    recording, session = Path(outcome.session.recording), Path(outcome.session.folder)
     calibration, report = session / CALIBRATION_FILE, session / "report.html"
     progress.say("solving the recording, in a process of its own")
     solved = _solve(recording, calibration, report)
@@ -169,7 +169,7 @@ def _run(
         **cell,
         truth_error=ErrorJson(*truth_error(recording, own.matrix)),
         sigma=sigma,
-        poses=PosesJson(outcome.planned, outcome.captured),
+        poses=PosesJson(len(outcome.session.poses), outcome.session.captured),
         recording=str(recording),
         calibration=str(calibration),
         report=str(report),
@@ -184,7 +184,7 @@ def _run(
     )
 
 
-async def _captured(socket: Path, plan: MakePlan, progress: SessionProgress) -> SessionOutcome:
+async def _captured(socket: Path, plan: MakePlan, progress: SessionProgress) -> StationStatus:
     async with await Client.connect(socket, "the demo") as client:
         await wait_until_idle(client)
         await client.call(Lease("take"))

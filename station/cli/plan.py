@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -27,12 +28,14 @@ from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
 from station.cell.socket_folder import default_socket
 from station.cli.console import AsJson, Socket, err, out, print_json
 from station.operate.motion import status_now
-from station.plan.choose import CRITERIA, WITH_TABLE, Criterion
+from station.plan.choose import CRITERIA, WITH_TABLE, Aim, Criterion
 from station.plan.files import import_list, load_plan, save_plan, taught_plan
 from station.plan.planner import make_plan
 from station.plan.predict import ArmForecast, forecast_arm, with_forecast
 from station.plan.preview import save_picture, save_scene, sketch
 
+SceneName = Literal["paper", "blog", "paper-binned"]
+"""Of `station.simulation.cell`, which is loaded only where it is wanted."""
 _ASK_S = 3.0
 """A daemon that serves answers within milliseconds, on a busy computer within a second."""
 _NOTHING_KNOWN_M = 0.05
@@ -55,11 +58,10 @@ def plan_command(
     ] = None,
     poses: Annotated[int, typer.Option(min=3, max=200, help="Poses to plan")] = 25,
     seed: Annotated[int, typer.Option(help="The same seed gives the same plan")] = 0,
-    scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog")] = "paper",
+    scene: Annotated[SceneName, typer.Option(help="Simulated cell")] = "paper",
     socket: Socket = None,
     purpose: Annotated[
-        str,
-        typer.Option("--for", help="camera, arm (its table too) or both (board and lens too)"),
+        Aim, typer.Option("--for", help="arm: its table too; both: board and lens too")
     ] = "camera",
     d_optimal: Annotated[
         bool, typer.Option("--d-optimal", help="Minimize the error ellipsoid instead of the error")
@@ -82,7 +84,11 @@ def plan_command(
         standing = asked_standing(cell, socket or default_socket())
     criterion = _criterion(purpose, d_optimal)
     plan = _given(cell, standing, check, from_list, taught)
-    plan = plan or _made(cell, standing, poses, seed, criterion, quiet=as_json)
+    if plan is None:
+        with _progress(quiet=as_json) as report:
+            plan = make_plan(
+                cell, start_joints_rad=standing, seed=seed, count=poses, criterion=criterion, progress=report
+            )
     geometry = cell_geometry(cell) if standing is None else geometry_from(cell, standing)
     outcome = check_plan(plan, standing, geometry)
     shown = _scene(cell, needed=picture is not None or foxglove is not None)
@@ -109,12 +115,8 @@ def plan_command(
         raise typer.Exit(LimitError.exit_code)
 
 
-def _criterion(purpose: str, d_optimal: bool) -> Criterion:
-    criterion = CRITERIA.get(purpose)  # type: ignore[call-overload]
-    if criterion is None:
-        raise ConfigError(
-            f"--for {purpose} is no aim of a plan.", code="usage", remedy="Give camera, arm or both."
-        )
+def _criterion(purpose: Aim, d_optimal: bool) -> Criterion:
+    criterion = CRITERIA[purpose]
     if d_optimal and criterion != "A":
         raise ConfigError(
             f"--d-optimal is for the camera, not for --for {purpose}.", code="usage", remedy="Leave it out."
@@ -147,7 +149,9 @@ def _require_replaceable(output: Path) -> None:
             ) from None
 
 
-def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationConfig, list[float] | None]:
+def _cell(
+    config: Path | None, scene: SceneName, start: str | None
+) -> tuple[StationConfig, list[float] | None]:
     """The cell to plan for, and where its arm stands."""
     standing = _joints(start) if start is not None else None
     if config is not None:
@@ -155,7 +159,7 @@ def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationCo
     # Simulation is loaded only where it is wanted.
     from station.simulation.scenes import cell_config, make_cell
 
-    truth = make_cell(scene, 0, "low", "eye-in-hand")  # type: ignore[arg-type]
+    truth = make_cell(scene, 0, "low", "eye-in-hand")
     return cell_config(truth), standing or list(truth.start_joints_rad)
 
 
@@ -237,25 +241,14 @@ def _given(
     return None if taught is None else taught_plan(taught, cell.robot.model, cell.mount)
 
 
-def _made(
-    cell: StationConfig,
-    standing: list[float] | None,
-    poses: int,
-    seed: int,
-    criterion: Criterion,
-    quiet: bool,
-) -> Plan:
+@contextlib.contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     with Progress(
         TextColumn("{task.description}"), BarColumn(), console=err, transient=True, disable=quiet
     ) as bar:
         task = bar.add_task("planning", total=1.0)
 
-        def report(text: str, done: float) -> None:
-            bar.update(task, description=text, completed=done)
-
-        return make_plan(
-            cell, start_joints_rad=standing, seed=seed, count=poses, criterion=criterion, progress=report
-        )
+        yield lambda text, done: bar.update(task, description=text, completed=done)
 
 
 class PlanJson(msgspec.Struct, frozen=True):

@@ -17,7 +17,7 @@ from recordings.files import state_root
 from station.cell.errors import ConfigError
 from station.cell.process import DAEMON_NICENESS, go_before_others
 from station.cell.socket_folder import default_socket
-from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
+from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
 from station.devices.cell import Cell
 
 
@@ -40,7 +40,6 @@ def serve_command(
     hardware_trigger: Annotated[
         bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera")
     ] = False,
-    frame_rate_hz: Annotated[float, typer.Option(hidden=True)] = 0.0,
     control: Control = None,
     robot: Annotated[str, typer.Option(hidden=True)] = "UR10",
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
@@ -64,7 +63,6 @@ def serve_command(
         raise ConfigError(
             "--rehearse needs the cell to rehearse.", code="usage", remedy="Give --config FILE too."
         )
-    require_choices(scene=scene, noise=noise, mount=mount, control=control)
     log_to_stderr()
     place = state_root(root)
     # What only one kind of cell needs is loaded only for it.
@@ -84,16 +82,7 @@ def serve_command(
         from station.simulation.launch_cell import SimulationOptions, simulated_cell
 
         options = SimulationOptions(
-            scene,  # type: ignore[arg-type]
-            seed,
-            noise,  # type: ignore[arg-type]
-            mount,  # type: ignore[arg-type]
-            time_scale,
-            gige,
-            hardware_trigger,
-            frame_rate_hz,
-            control,  # type: ignore[arg-type]
-            robot,
+            scene, seed, noise, mount, time_scale, gige, hardware_trigger, control, robot
         )
         cell = simulated_cell(options, place / "simulation")
     asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))

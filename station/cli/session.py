@@ -23,7 +23,7 @@ from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, Socket, err, out, print_json
 from station.operate.drift_check import POSES, check_arguments, judged, start_drift_check
 from station.operate.ending import after_capture
-from station.operate.motion import SessionOutcome, wait_until_idle
+from station.operate.motion import wait_until_idle
 from station.plan.files import load_plan, sweep_plan
 from station.protocol.client import Client
 from station.protocol.verbs import LoadPlan, Purpose
@@ -91,9 +91,9 @@ def next_pose_command(headless: Headless = False, socket: Socket = None) -> None
     Exit codes: 0 captured, 1 not captured.
     """
     outcome = asyncio.run(session(socket, Purpose.NEXT_POSE, headless))
-    added = max(outcome.status.session.poses, key=lambda pose: pose.index)
+    added = max(outcome.session.poses, key=lambda pose: pose.index)
     out.print(f"pose {added.index + 1}: {added.state}{f', {added.reason}' if added.reason else ''}")
-    _say_state(outcome.status, outcome.status.reason or outcome.recording)
+    _say_state(outcome, outcome.reason or outcome.session.recording)
     raise typer.Exit(0 if added.state == "done" else 1)
 
 
@@ -111,7 +111,7 @@ def drift_check_command(
     Exit codes: 0 PASS, 4 FAIL, 1 no recording or nothing installed, 2 usage.
     """
 
-    async def captured() -> tuple[SessionOutcome, str]:
+    async def captured() -> tuple[StationStatus, str]:
         async with attended(socket, headless, approve) as shell:
             standing = await shell.status()
             shell.progress.skip(standing)
@@ -121,11 +121,11 @@ def drift_check_command(
             return await shell.watch(started), shell.client.camera
 
     outcome, camera = asyncio.run(captured())
-    if not outcome.recording:
+    if not outcome.session.recording:
         _finish(outcome, False)
-    what = check_arguments(outcome.recording, outcome.status.session.folder)
+    what = check_arguments(outcome.session.recording, outcome.session.folder)
     done = subprocess.run([sys.executable, "-m", "calibrate.cli", *what])
-    if (end := judged(outcome.status.session.folder, camera)) is not None:
+    if (end := judged(outcome.session.folder, camera)) is not None:
         out.print(str(end))
     raise typer.Exit(done.returncode)
 
@@ -156,7 +156,7 @@ async def session(
     approved: str = "",
     quiet: bool = False,
     before: Callable[[Client], Awaitable[None]] | None = None,
-) -> SessionOutcome:
+) -> StationStatus:
     """One session, approved by a person here or by the hash of what was approved."""
     async with attended(socket, headless, approved, quiet) as shell:
         if before is not None:
@@ -177,18 +177,19 @@ class SessionJson(msgspec.Struct, frozen=True):
     recording: str
 
 
-def _finish(outcome: SessionOutcome, as_json: bool, judge: str = "solve") -> None:
+def _finish(outcome: StationStatus, as_json: bool, judge: str = "solve") -> None:
+    session = outcome.session
     if as_json:
-        poses = PosesJson(outcome.planned, outcome.captured)
-        print_json(SessionJson(outcome.status.state, poses, outcome.recording))
-    elif outcome.recording:
-        out.print(f"{outcome.captured} of {outcome.planned} poses, finished: {outcome.recording}")
-        out.print(str(after_capture(outcome.status.session)))
-        if not outcome.status.session.check:
-            out.print(f"Next: calibrate {judge} {shlex.quote(outcome.recording)}", soft_wrap=True)
+        poses = PosesJson(len(session.poses), session.captured)
+        print_json(SessionJson(outcome.state, poses, session.recording))
+    elif session.recording:
+        out.print(f"{session.captured} of {len(session.poses)} poses, finished: {session.recording}")
+        out.print(str(after_capture(session)))
+        if not session.check:
+            out.print(f"Next: calibrate {judge} {shlex.quote(session.recording)}", soft_wrap=True)
     else:
-        _say_state(outcome.status, outcome.status.reason)
-    raise typer.Exit(outcome.exit_code)
+        _say_state(outcome, outcome.reason)
+    raise typer.Exit(1 if not session.recording else 3 if session.captured < len(session.poses) else 0)
 
 
 def _say_state(status: StationStatus, why: str) -> None:

@@ -13,13 +13,13 @@ from rich.text import Text
 
 from calibrate.boards.model import outer_corners
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Touch, read_calibration
+from calibrate.files.calibration import read_calibration
 from calibrate.files.install import installed_calibration
-from calibrate.files.verification import touch_text
+from calibrate.files.touch import Touch, touch_text
 from recordings.schema.messages import BoardSpec
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview
-from station.cli.attended import Attended, ask_person, attended, ctrl_c_at_once
+from station.cli.attended import Attended, attended, ctrl_c_at_once
 from station.cli.console import AsJson, Socket, err, out
 from station.operate.touch_test import (
     STANDOFF_M,
@@ -58,33 +58,25 @@ def touch_test_command(
 
     Exit codes: 0 all corners visited, 3 some left out, 1 none.
     """
-    pointer_m = None if pointer_mm is None else pointer_mm / 1000
-    visit = asyncio.run(_visit(socket, calibration, corner, standoff_mm / 1000, pointer_m, as_json))
+
+    async def visited() -> _ShellToucher:
+        async with attended(socket, headless=as_json) as shell:
+            if as_json:
+                shell.require_simulated()
+            root, camera = shell.client.root, shell.client.camera
+            found = read_calibration(calibration) if calibration else installed_calibration(root, camera)
+            visit = _ShellToucher(shell, found.board, corner, pointer_mm, as_json)
+            try:
+                await touch_test(shell.client, visit, calibration, standoff_mm / 1000)
+            finally:
+                visit.write(root, calibration, camera)
+        return visit
+
+    visit = asyncio.run(visited())
     if as_json:
         print(json.dumps({"calibration": str(calibration or "installed"), "corners": visit.rows}))
     if len(visit.rows) < visit.wanted:
         raise typer.Exit(3 if visit.rows else 1)
-
-
-async def _visit(
-    socket: Path | None,
-    file: Path | None,
-    corners: list[int] | None,
-    standoff_m: float,
-    pointer_m: float | None,
-    quiet: bool,
-) -> _ShellToucher:
-    async with attended(socket) as shell:
-        if quiet:
-            shell.require_simulated()
-        root, camera = shell.client.root, shell.client.camera
-        found = read_calibration(file) if file else installed_calibration(root, camera)
-        visit = _ShellToucher(shell, found.board, corners, pointer_m, quiet)
-        try:
-            await touch_test(shell.client, visit, file, standoff_m)
-        finally:
-            visit.write(root, file, camera)
-    return visit
 
 
 class _ShellToucher:
@@ -95,10 +87,10 @@ class _ShellToucher:
         shell: Attended,
         board: BoardSpec,
         corners: list[int] | None,
-        pointer_m: float | None,
+        pointer_mm: float | None,
         quiet: bool,
     ) -> None:
-        self._shell, self._board, self._pointer_m, self._quiet = shell, board, pointer_m, quiet
+        self._shell, self._board, self._pointer_mm, self._quiet = shell, board, pointer_mm, quiet
         self._left = list(corners or outer_corners(board))
         self.wanted = len(self._left)
         self.rows: list[dict[str, object]] = []
@@ -108,15 +100,12 @@ class _ShellToucher:
         return self._left.pop(0) if self._left else None
 
     def pointer_m(self) -> float | None:
-        return self._pointer_m
+        return None if self._pointer_mm is None else self._pointer_mm / 1000
 
     async def approves(self, preview: MotionPreview) -> bool:
-        yes = self._quiet or ask_person(preview)
-        await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the approval is sent
-        if not yes:
+        if not (yes := await self._shell.approves(preview)):
             err.print("Nothing moved.")
             self._left.clear()
-        self._shell.moving = yes
         return yes
 
     def refused(self, corner: int, problem: StationError) -> None:

@@ -14,8 +14,17 @@ from station.cell.errors import RefusedError, RobotError
 from station.cli.attended import ctrl_c_at_once, no_terminal
 from station.cli.console import AsJson, err, out, print_json
 from station.devices.ur_probe import RobotLock, lock_name, probe
-from station.devices.ur_trace_scenarios import Scenario, ScenarioRecorder, scenarios
-from station.devices.ur_traces import SHIPPED, Difference, TraceFile, compare, read_traces, write_traces
+from station.devices.ur_trace_scenarios import (
+    SHIPPED,
+    Difference,
+    Scenario,
+    ScenarioRecorder,
+    TraceFile,
+    compare,
+    read_traces,
+    scenarios,
+    write_traces,
+)
 
 
 def trace_command(
@@ -44,7 +53,8 @@ def trace_command(
         _record(subject, output, [s for s in _chosen(only) if not (still and s.moves)])
         return
     theirs = read_traces(Path(subject))
-    differences = compare(read_traces(other or _shipped(theirs)), theirs)
+    shipped = SHIPPED[500 if theirs.rate_hz > 125 else 125]
+    differences = compare(read_traces(other or shipped), theirs)
     if as_json:
         print_json(differences)
     else:
@@ -59,10 +69,6 @@ def _chosen(only: list[str] | None) -> list[Scenario]:
         text = f"No scenario is called {', '.join(sorted(unknown))}."
         raise RefusedError(text, code="no-scenario")
     return found
-
-
-def _shipped(theirs: TraceFile) -> Path:
-    return SHIPPED[500 if theirs.rate_hz > 125 else 125]
 
 
 def _record(host: str, output: Path, chosen: list[Scenario]) -> None:

@@ -12,10 +12,10 @@ from typing import Annotated
 
 import typer
 
-from calibrate.cli.drift_check import CellIdentity, require_same_cell
 from calibrate.cli.files import read_board
 from calibrate.cli.watch import AsLines, Watched, WatchSource, WatchSourceError, watch_pictures
 from calibrate.files.calibration import Calibration
+from calibrate.quality.drift import CellIdentity, require_same_cell
 from calibrate.quality.movement.log import WatchEntry
 from recordings.schema.messages import BoardSpec
 from station.cell.errors import StationError

@@ -182,7 +182,4 @@ class Trigger(Protocol):
 
     async def fire(self) -> TriggerPulse: ...
 
-    async def light(self, level: float) -> None:
-        """0 = off, 1 = full."""
-
     async def close(self) -> None: ...

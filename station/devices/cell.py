@@ -11,8 +11,7 @@ import msgspec
 
 from recordings.schema.messages import CameraModel, Source
 from station.cell.acceptance import ArmSubject, not_accepted, read_acceptance
-from station.cell.config import StationConfig
-from station.cell.limits import SPEED_CAP_M_S
+from station.cell.config import SPEED_CAP_M_S, StationConfig
 from station.cell.plan import Plan
 from station.devices.base import Camera, Robot, Trigger
 

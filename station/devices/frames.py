@@ -165,7 +165,6 @@ class FrameTiming(msgspec.Struct, frozen=True):
 
 class TriggerPulse(msgspec.Struct, frozen=True):
     count: int
-    device_us: int
     host_monotonic_ns: int
     bound_s: float = 0.0
     """The pulse began within this of `host_monotonic_ns`"""

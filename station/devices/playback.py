@@ -1,4 +1,4 @@
-"""Plays images as a camera, and a recording as camera and robot together.
+"""Plays a recording as camera and robot together.
 
 Nothing played is ever taken for real: its driver is `playback`, and so is the source of what is recorded.
 """
@@ -6,20 +6,18 @@ Nothing played is ever taken for real: its driver is `playback`, and so is the s
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
 
-import cv2
 import msgspec
 import numpy as np
 
 from calibrate.geometry import interpolate, pose_from_rotvec
 from recordings import strict_yaml
 from recordings.errors import RecordingError
-from recordings.images import Pixels
 from recordings.reader import Recording, open_recording
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import (
@@ -33,7 +31,7 @@ from recordings.schema.messages import (
     View,
 )
 from station.cell.acceptance import StopWay
-from station.cell.config import CameraConfig, StationConfig, vector6
+from station.cell.config import StationConfig, vector6
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import pose_vector
@@ -52,205 +50,58 @@ _HOST_CLOCK = ClockFit(
     residual_s=0.0,
     drift_uncertainty=0.0,
     latency_s=_STAMP_BOUND_S,
-    samples=1,
     span_s=0.0,
 )
 """Played images are stamped by the host's own clock."""
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
-VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".mpg", ".mpeg")
-FOLDER_RATE_HZ = 10.0
-"""A folder's own pace: its files say nothing of time."""
 CONFIG_NAME = "config.yaml"
 
 
-class Played(NamedTuple):
-    picture: Image
-    at_s: float
-    """When it was taken, counted from the first."""
-
-
-class PlayedSource(NamedTuple):
-    name: str
-    identity: CameraIdentity
-    frames: Iterator[Played]
-    """In order; raises CameraError at an image that cannot be read."""
-
-
-def open_source(path: Path) -> PlayedSource:
-    """Raises CameraError with the remedy."""
-    if not path.exists():
-        raise CameraError(
-            f"nothing to play at {path}",
-            code="nothing-to-play",
-            remedy="Name a folder, a video or a recording in camera.device.",
-        )
-    if path.is_dir() and not any(path.glob("*.mcap")):
-        files = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
-        if not files:
-            raise CameraError(f"no images in {path} ({', '.join(PICTURE_SUFFIXES)})", code="nothing-to-play")
-        return PlayedSource(path.name, _identity("folder", path), _folder(files))
-    if path.suffix.lower() in VIDEO_SUFFIXES:
-        capture = cv2.VideoCapture(str(path))
-        if not capture.isOpened():
-            raise CameraError(f"{path} is not a video that OpenCV can read", code="unreadable-video")
-        return PlayedSource(path.name, _identity("video", path), _video(path, capture))
-    return _recording(path)
-
-
-def _identity(kind: str, path: Path) -> CameraIdentity:
-    return CameraIdentity(vendor="playback", model=kind, serial=path.name, driver="playback")
-
-
-def _folder(files: list[Path]) -> Iterator[Played]:
-    for number, file in enumerate(files):
-        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise CameraError(
-                f"{file} is not an image that OpenCV can read",
-                code="unreadable-image",
-                remedy="Repair or remove it.",
-            )
-        if image.ndim == 3 and image.shape[2] == 4:
-            image = cv2.cvtColor(image, cv2.COLOR_BGRA2BGR)
-        wide = "Mono16" if image.dtype.itemsize == 2 else "Mono8"
-        pixel_format = "BGR8" if image.ndim == 3 else wide
-        pixels = cast(Pixels, image)
-        yield Played(Image(pixels, Stamps(), 0, number, pixel_format=pixel_format), number / FOLDER_RATE_HZ)
-
-
-def _video(path: Path, capture: cv2.VideoCapture) -> Iterator[Played]:
-    rate_hz = capture.get(cv2.CAP_PROP_FPS) or FOLDER_RATE_HZ
-    number = 0
-    try:
-        while True:
-            good, image = capture.read()
-            if not good:
-                break
-            pixels = np.asarray(image, np.uint8)
-            yield Played(Image(pixels, Stamps(), 0, number, pixel_format="BGR8"), number / rate_hz)
-            number += 1
-    finally:
-        capture.release()
-    if number == 0:
-        raise CameraError(f"{path} has no readable frame", code="unreadable-video")
-
-
-def _recording(path: Path) -> PlayedSource:
-    try:
-        recording = open_recording(path)
-        info = recording.info
-    except RecordingError as error:
-        raise CameraError(f"{path} cannot be played: {error}", code="unreadable-recording") from error
-
-    def frames() -> Iterator[Played]:
-        first_ns: int | None = None
-        try:
-            for _, picture in recording.images():
-                taken_ns = picture.stamps.host_monotonic_ns
-                first_ns = taken_ns if first_ns is None else first_ns
-                yield Played(picture, max(0.0, (taken_ns - first_ns) / 1e9))
-        except RecordingError as error:
-            raise CameraError(
-                f"{path} cannot be played further: {error}", code="unreadable-recording"
-            ) from error
-
-    camera = info.camera_identity
-    identity = CameraIdentity(camera.vendor, camera.model, camera.serial, "playback")
-    return PlayedSource(info.name, identity, frames())
-
-
 class PlaybackCamera:
-    """`station.devices.base.Camera` over `config.device`; with a robot, it shows what that robot looks at.
+    """`station.devices.base.Camera` that shows what a played robot looks at."""
 
-    `config.playback_pace`: 0 = as fast as asked, 1 = at its own pace, 2 = twice as fast.
-    """
-
-    def __init__(self, config: CameraConfig, robot: PlaybackRobot | None = None) -> None:
-        self._config = config
+    def __init__(self, robot: PlaybackRobot) -> None:
+        recorded = robot.camera
         self._robot = robot
-        self._source: PlayedSource | None = None
-        self._newest: Image | None = None
-        self._frame_id = 0
         self._taken = 0
-        self._start_s: float | None = None
-        self._busy = asyncio.Lock()
-        self.identity = CameraIdentity(driver="playback")
+        self._playing = False
+        self.identity = CameraIdentity(recorded.vendor, recorded.model, recorded.serial, "playback")
         self.timing = FrameTiming("latched", _STAMP_BOUND_S, _HOST_CLOCK)
 
     def counts(self) -> CameraCounts:
         return CameraCounts(frames=self._taken)
 
     async def open(self) -> CameraIdentity:
-        self._source = await asyncio.to_thread(open_source, Path(self._config.device))
-        self.identity = self._source.identity
-        self._start_s = None
+        self._playing = True
         return self.identity
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        """The next image; CameraError at the end, or when it is not due within `timeout_s`."""
-        async with self._busy:
-            if self._source is None:
-                raise CameraError("nothing is being played", code="not-open", remedy="Open the camera first.")
-            if self._robot is not None:
-                picture = await asyncio.to_thread(self._robot.picture)
-            else:
-                played = await asyncio.to_thread(next, self._source.frames, None)
-                if played is None:
-                    raise CameraError(
-                        f"'{self._source.name}' is at its end after {self._taken} images",
-                        code="played-out",
-                        remedy="Open it again.",
-                        images=self._taken,
-                    )
-                await self._wait_for(played, timeout_s)
-                picture = played.picture
-            self._frame_id += 1
-            now_ns = time.monotonic_ns()
-            self._newest = msgspec.structs.replace(
-                picture,
-                stamps=Stamps(host_monotonic_ns=now_ns, host_wall_ns=time.time_ns(), device_ns=now_ns),
-                frame_id=self._frame_id,
-                sequence=self._taken,
-                time=FrameTime(now_ns, _STAMP_BOUND_S, "latched"),
-            )
-            self._taken += 1
-            return self._newest
+        if not self._playing:
+            raise CameraError("nothing is being played", code="not-open", remedy="Open the camera first.")
+        picture = await asyncio.to_thread(self._robot.picture)
+        self._taken += 1
+        now_ns = time.monotonic_ns()
+        return msgspec.structs.replace(
+            picture,
+            stamps=Stamps(host_monotonic_ns=now_ns, host_wall_ns=time.time_ns(), device_ns=now_ns),
+            frame_id=self._taken,
+            sequence=self._taken - 1,
+            time=FrameTime(now_ns, _STAMP_BOUND_S, "latched"),
+        )
 
     async def settings(self) -> dict[str, object]:
-        return {"device": self._config.device, "pace": self._config.playback_pace}
+        return {"device": str(self._robot.path)}
 
     async def glimpse(self) -> Image | None:
         """None: a played image was taken once, how it moved then cannot be seen in it."""
         return None
 
     async def preview(self) -> Image | None:
-        """The newest image; with a robot, what it looks at now."""
-        if self._robot is not None and self._source is not None:
-            try:
-                return await asyncio.to_thread(self._robot.picture)
-            except CameraError:
-                return None
-        return self._newest
+        with contextlib.suppress(CameraError):
+            return await asyncio.to_thread(self._robot.picture) if self._playing else None
+        return None
 
     async def close(self) -> None:
-        self._source = None
-
-    async def _wait_for(self, played: Played, timeout_s: float) -> None:
-        if self._config.playback_pace <= 0:
-            return
-        now_s = time.monotonic()
-        self._start_s = now_s if self._start_s is None else self._start_s
-        left_s = self._start_s + played.at_s / self._config.playback_pace - now_s
-        if left_s > timeout_s:
-            await asyncio.sleep(timeout_s)
-            raise CameraError(
-                f"the next image was taken {left_s:.0f} s later",
-                code="no-image",
-                remedy="Raise camera.playback_pace.",
-                left_s=left_s,
-                limit_s=timeout_s,
-            )
-        await asyncio.sleep(max(0.0, left_s))
+        self._playing = False
 
 
 class PlaybackRobot:
@@ -261,6 +112,7 @@ class PlaybackRobot:
 
     def __init__(self, recording: Path) -> None:
         """Raises RobotError for a recording that cannot be read or has no joints."""
+        self.path = recording
         try:
             self._recording: Recording = open_recording(recording)
             self.views: list[View] = self._recording.views()
@@ -268,7 +120,7 @@ class PlaybackRobot:
             raise RobotError(f"{recording} cannot be played: {error}", code="unreadable-recording") from error
         if not self.views or any(v.joints_rad is None for v in self.views):
             raise RobotError(
-                f"{recording} has no joints for every view: it plays as a camera only", code="no-joints"
+                f"{recording} has no joints for every view: no arm can be played", code="no-joints"
             )
         self._lock = threading.Lock()
         self._from = self._to = self.views[0]
@@ -278,7 +130,7 @@ class PlaybackRobot:
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self.control = False
-        self.identity = self._recording.info.robot
+        self.identity, self.camera = self._recording.info.robot, self._recording.info.camera_identity
         self.control_path, self.notice, self.remote, self.kinematics = "", "", None, None
         self.payload: tuple[float, ...] = ()
 
@@ -419,7 +271,7 @@ def playback_cell(recording: Path) -> Cell:
             remedy="`calibrate solve` and Foxglove need none.",
         ) from error
     camera = msgspec.structs.replace(
-        recorded.camera, driver="playback", device=str(recording), trigger="software", playback_pace=0.0
+        recorded.camera, driver="playback", device=str(recording), trigger="software"
     )
     config = msgspec.structs.replace(
         recorded,
@@ -431,7 +283,7 @@ def playback_cell(recording: Path) -> Cell:
     return Cell(
         config=config,
         robot=robot,
-        camera=PlaybackCamera(camera, robot),
+        camera=PlaybackCamera(robot),
         source="playback",
         plan=robot.plan(),
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import termios
 import time
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import reduce
 from typing import Any
 
 from station.cell.config import TriggerConfig
@@ -97,14 +97,6 @@ class SerialTrigger:
     async def fire(self) -> TriggerPulse:
         return await self._worker.run(self._fire if self._config.mode == "box" else self._pulse_line)
 
-    async def light(self, level: float) -> None:
-        """0 = off, 1 = full. TriggerError where there is no light. Opening sets `config.light_level`."""
-        if self._config.mode != "box":
-            raise TriggerError(
-                f"trigger.mode '{self._config.mode}' has no light; it needs a trigger box", code="no-light"
-            )
-        await self._worker.run(partial(self._set_light, level))
-
     async def close(self) -> None:
         self._opened = False
         await self._worker.close(self._disconnect)
@@ -126,8 +118,8 @@ class SerialTrigger:
             return f"{self._config.mode.upper()} of {self._config.port}"
         try:
             identity = self._handshake()
-            if self._config.light_level is not None:
-                self._set_light(self._config.light_level)
+            if (level := self._config.light_level) is not None:  # 0 = off, 1 = full
+                self._ask(f"LIGHT {round(1000 * min(max(level, 0.0), 1.0))}", "LIGHT", 1)
         except TriggerError:
             self._disconnect()
             raise
@@ -154,24 +146,20 @@ class SerialTrigger:
                 code="no-trigger-box",
                 remedy="Check trigger.port.",
             )
-        self._boot_id, count, _ = self._status()
+        self._boot_id, count = self._status()
         self._count = self._first_count = count
         return f"{product} {serial}"
-
-    def _set_light(self, level: float) -> None:
-        permille = round(1000 * min(max(level, 0.0), 1.0))
-        self._ask(f"LIGHT {permille}", "LIGHT", 1)
 
     def _fire(self) -> TriggerPulse:
         if self._port is None and self._opened:
             self._connect()  # it was lost; the next go begins with a new count
         asked_ns = time.monotonic_ns()
         try:
-            boot_id, count, device_us = self._ask(f"FIRE {self._config.pulse_us}", "FIRED", 3)
+            boot_id, count, _ = self._ask(f"FIRE {self._config.pulse_us}", "FIRED", 3)
         except _BoxSilentError:
             # Whether the camera was triggered decides what its next frame belongs to: ask.
             before = self._count
-            self._settle_count(*self._status()[:2])
+            self._settle_count(*self._status())
             if (self._count - before) != 1:
                 raise TriggerError(
                     "the trigger box did not confirm a pulse",
@@ -179,12 +167,10 @@ class SerialTrigger:
                     remedy="Retake this pose.",
                 ) from None
             bound_s = (time.monotonic_ns() - asked_ns) / 2e9
-            return TriggerPulse(self._count, 0, asked_ns + round(bound_s * 1e9), bound_s)
+            return TriggerPulse(self._count, asked_ns + round(bound_s * 1e9), bound_s)
         answered_ns = time.monotonic_ns()
         self._settle_count(boot_id, _number(count))
-        return TriggerPulse(
-            self._count, _number(device_us), (asked_ns + answered_ns) // 2, (answered_ns - asked_ns) / 2e9
-        )
+        return TriggerPulse(self._count, (asked_ns + answered_ns) // 2, (answered_ns - asked_ns) / 2e9)
 
     def _settle_count(self, boot_id: str, count: int) -> None:
         if boot_id != self._boot_id:
@@ -196,13 +182,13 @@ class SerialTrigger:
             )
         self._count += (count - self._count) % _COUNTS
 
-    def _status(self) -> tuple[str, int, int]:
-        """Boot id, pulses so far, light in permille."""
+    def _status(self) -> tuple[str, int]:
+        """Boot id, pulses so far."""
         try:
-            boot_id, count, light = self._ask("STATUS?", "STATUS", 3)
+            boot_id, count, _ = self._ask("STATUS?", "STATUS", 3)
         except _BoxSilentError as error:
             raise TriggerError(f"trigger box lost: {error}", code="trigger-lost") from error
-        return boot_id, _number(count), _number(light)
+        return boot_id, _number(count)
 
     def _ask(self, request: str, answer: str, fields: int, timeout_s: float = ANSWER_TIMEOUT_S) -> list[str]:
         """The answer's fields. Lines that are no answer to this are skipped; garbage is counted."""
@@ -252,7 +238,7 @@ class SerialTrigger:
                 f"the adapter on {self._config.port} is gone ({error})", code="trigger-lost"
             ) from error
         self._count += 1
-        return TriggerPulse(self._count, fired_ns // 1000, fired_ns + half_ns, half_ns / 1e9)
+        return TriggerPulse(self._count, fired_ns + half_ns, half_ns / 1e9)
 
     def _require_port(self) -> Any:
         if self._port is None:

@@ -13,7 +13,7 @@ import os
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Coroutine, Sequence
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +23,7 @@ from station.cell.acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.rtde import RuntimeState
-from station.devices.ur_child import REFUSALS, ControlChild
+from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import (
     APPROVE_AGAIN,
     STALE_S,
@@ -34,6 +34,7 @@ from station.devices.ur_condition import (
     safety_stop,
     watchdog_cause,
 )
+from station.devices.ur_control import LIBRARY_REMEDY
 from station.devices.ur_dashboard import STOP, Dashboard, came
 from station.devices.ur_link import UrLink, link_lost
 from station.devices.ur_moves import MoveWatch, check_goal
@@ -56,19 +57,6 @@ CLOSE_WAIT_S = 0.5
 KEPT = 64
 
 
-class HeartbeatMonitor:
-    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._now_s = now_s
-        self._beats_s: deque[float] = deque(maxlen=KEPT)
-
-    def beat(self) -> None:
-        self._beats_s.append(self._now_s())
-
-    def worst_s(self, since_s: float) -> float:
-        """Longest pause that began after `since_s` (host monotonic), ended or not; 0 when there is none."""
-        return longest_gap_s([*self._beats_s, self._now_s()], since_s)
-
-
 def longest_gap_s(moments_s: Sequence[float], since_s: float) -> float:
     """Longest time between neighbours that began after `since_s`; 0 when there is none."""
     return max((b - a for a, b in pairwise(moments_s) if a > since_s), default=0.0)
@@ -86,7 +74,7 @@ def library_installed() -> bool:
 def control_trouble(path: str) -> tuple[str, str]:
     """Say what speaks against driving an arm that way, and what to do; empty: nothing."""
     if path == "ur_rtde" and not library_installed():
-        return "ur_rtde is not installed", REFUSALS["ur-rtde-missing"][1]
+        return "ur_rtde is not installed", LIBRARY_REMEDY
     return "", ""
 
 
@@ -103,7 +91,7 @@ class UrRobot(UrLink):
         """The control program runs and obeys us."""
         self._moving = False
         self._stop_reason = self._link_loss = ""
-        self._heart = HeartbeatMonitor()
+        self._beats_s: deque[float] = deque(maxlen=KEPT)
         self._one_way_s: float | None = None
         """When a stop test gave its one way (host monotonic); until then, and afterwards, None."""
         self._played_s = 0.0
@@ -162,14 +150,14 @@ class UrRobot(UrLink):
         state = await self.fresh()
         if self.remote is False:
             raise _local_control()
-        self.program = await fresh.ask("programState")
-        trouble = safety_stop(state) or not_powered(state) or foreign_program(state, self.program)
+        program = await fresh.ask("programState")
+        trouble = safety_stop(state) or not_powered(state) or foreign_program(state, program)
         if trouble is not None:
             raise trouble
 
     def heartbeat(self) -> None:
         """Called by the session loop at least every 50 ms while control lives; without it the arm stops."""
-        self._heart.beat()
+        self._beats_s.append(time.monotonic())
         if self._child is not None:
             self._child.beat()
 
@@ -249,7 +237,7 @@ class UrRobot(UrLink):
         if reader is None or state is None:
             return error
         if reader.ended is not None or isinstance(error, StaleStateError):
-            pause_s = self._heart.worst_s(time.monotonic() - self.age_s() - OUTLIVED_S[self.control_path])
+            pause_s = self._pause_s(time.monotonic() - self.age_s() - OUTLIVED_S[self.control_path])
             busy = watchdog_cause(pause_s, 0.0) if reader.ended is None else None
             return busy or self.stale(self.age_s())
         refused = child.kicks_refused and state.runtime_state == RuntimeState.PLAYING  # it tells no more yet
@@ -257,7 +245,7 @@ class UrRobot(UrLink):
             return error
         since_s = self._played_s - OUTLIVED_S[self.control_path]
         arrivals_s = [s.stamps.host_monotonic_ns / 1e9 for s in reader.history.copy()]
-        cause = watchdog_cause(self._heart.worst_s(since_s), longest_gap_s(arrivals_s, since_s))
+        cause = watchdog_cause(self._pause_s(since_s), longest_gap_s(arrivals_s, since_s))
         if cause is not None:
             return cause
         if refused:
@@ -268,13 +256,18 @@ class UrRobot(UrLink):
             return trouble
         return error
 
+    def _pause_s(self, since_s: float) -> float:
+        """Longest pause of the heartbeat that began after `since_s` (host monotonic), ended or not."""
+        return longest_gap_s([*self._beats_s, time.monotonic()], since_s)
+
     async def _look_again(self, error: BaseException) -> BaseException:
         """A program that just stopped was stopped by something that state and dashboard may tell only now:
         a safety stop, the arm's power, the switch to local control."""
         if not isinstance(error, RobotError) or isinstance(error, SafetyStopError):
             return error
         now_ns = time.monotonic_ns()
-        if error.code == "program-ended" and (state := await self._state_after(now_ns, NEWS_WAIT_NS)):
+        unsure = error.code in ("program-ended", "watchdog")
+        if unsure and (state := await self._state_after(now_ns, NEWS_WAIT_NS)):
             error = safety_stop(state) or not_powered(state) or error
         if self.remote and self.dashboard is not None:
             with contextlib.suppress(RobotError, TimeoutError):

@@ -18,6 +18,7 @@ from typing import BinaryIO
 
 import msgspec
 
+from recordings.errors import ErrorData
 from station.cell.config import ControlPath
 from station.cell.errors import RobotError
 from station.devices.ur_condition import APPROVE_AGAIN
@@ -35,37 +36,12 @@ LOG_LIMIT_BYTES = 1_000_000
 STOP_DECELERATION = 2.0
 """The script reads it as m/s² of the tool for an asynchronous stop (see docs/operator/safety.md)."""
 
-REFUSALS = {
-    "registers-in-use": (
-        "another program controls the robot (its RTDE registers are in use)",
-        "Close that program, or the field bus on the pendant, then try again.",
-    ),
-    "local-control": (
-        "the robot is in local control",
-        "Switch the pendant to Remote (top right), then try again.",
-    ),
-    "script-not-started": (
-        "the control program did not start",
-        "Power on, release the brakes, clear the pendant's messages.",
-    ),
-    "program-playing": (
-        "another program is playing on the robot",
-        "Stop it on the pendant, then try again.",
-    ),
-    "ur-rtde-missing": (
-        "the library ur_rtde is not installed (it exists for Python 3.10 to 3.12 on x86-64)",
-        "Install it, or set robot.control: script in the configuration.",
-    ),
-}
-"""By the code of the control process's refusal: what it is, what a person can do."""
-
 
 class _Answer(msgspec.Struct):
     """A message of the control process (`ur_control`), or that it died."""
 
     tcp: tuple[float, ...] | None = None
-    refused: str | None = None
-    code: str = "control"
+    refused: ErrorData | None = None
     beat: int | None = None
     kicked: bool = False
     lost: bool = False
@@ -149,10 +125,11 @@ class ControlChild:
         if answer.refused is not None or answer.died:
             self.kill()
             await self.reap()
-            if answer.died:
-                raise self._death()
-            text, remedy = REFUSALS.get(answer.code, (f"control could not start: {answer.refused}", ""))
-            raise RobotError(text + self.exit_description(), code=answer.code, remedy=remedy)
+        if answer.died:
+            raise self._death()
+        if (told := answer.refused) is not None:
+            text = told.text + self.exit_description()
+            raise RobotError(text, code=told.code, remedy=told.remedy, **told.values)
         return answer.tcp or None
 
     async def heard(self) -> None:

@@ -8,7 +8,7 @@ Requests: {"do": "beat", "ns": N}   N = host monotonic time of the session loop;
           {"do": "move", "id": I, "joints": [6], "speed": rad/s, "acceleration": rad/s²}
           {"do": "stop", "deceleration": …}
           {"do": "end"}
-Answers:  {"ready": true, "tcp": [6] | null} · {"refused": text, "code": see `ur_child`}
+Answers:  {"ready": true, "tcp": [6] | null} · {"refused": an `ErrorData`}
           {"beat": N, "kicked": bool, "lost": bool}   kicked: the beat was fresh and the script took the kick
           {"id": I, "ok": bool, "error": text} · {"stopped": true}
 """
@@ -22,6 +22,7 @@ import signal
 import socket
 import sys
 import time
+from dataclasses import asdict
 from typing import Any, NoReturn
 
 from station.cell.errors import RobotError
@@ -32,11 +33,24 @@ WATCHDOG_HZ = 5.0
 """The controller stops the script after 1/5 s without a kick."""
 MESSAGE_LIMIT = 4096
 LIBRARY_WORDS = {
-    "in use": "registers-in-use",
-    "remote control": "local-control",
-    "start control script": "script-not-started",
+    "in use": (
+        "registers-in-use",
+        "another program controls the robot (its RTDE registers are in use)",
+        "Close that program, or the field bus on the pendant, then try again.",
+    ),
+    "remote control": (
+        "local-control",
+        "the robot is in local control",
+        "Switch the pendant to Remote (top right), then try again.",
+    ),
+    "start control script": (
+        "script-not-started",
+        "the control program did not start",
+        "Power on, release the brakes, clear the pendant's messages.",
+    ),
 }
-"""Words of ur_rtde's refusals, in small letters; it has no codes."""
+"""Words of ur_rtde's refusals, in small letters, as it has no codes: code, what it is, what to do."""
+LIBRARY_REMEDY = "Install it, or set robot.control: script in the configuration."
 
 
 class MotionServer:
@@ -113,17 +127,15 @@ def open_control(path: str, host: str) -> Any:
     try:
         from rtde_control import RTDEControlInterface
     except ImportError as error:
-        raise RobotError(
-            f"ur_rtde cannot be imported ({error})",
-            code="ur-rtde-missing",
-            remedy="Install it, or set robot.control: script in the configuration.",
-        ) from None
+        text = f"ur_rtde, for Python 3.10 to 3.12 on x86-64, is not installed ({error})"
+        raise RobotError(text, code="ur-rtde-missing", remedy=LIBRARY_REMEDY) from None
     try:
         return RTDEControlInterface(host)
     except RuntimeError as error:
         words = str(error).lower()
-        code = next((code for said, code in LIBRARY_WORDS.items() if said in words), "control")
-        raise RobotError(str(error), code=code) from None
+        known = (what for said, what in LIBRARY_WORDS.items() if said in words)
+        code, text, remedy = next(known, ("control", f"control could not start: {error}", ""))
+        raise RobotError(text, code=code, remedy=remedy) from None
 
 
 def main(path: str, host: str, descriptor: int, parent_pid: int) -> NoReturn:
@@ -135,8 +147,9 @@ def main(path: str, host: str, descriptor: int, parent_pid: int) -> NoReturn:
     try:
         control = open_control(path, host)
     except (RobotError, OSError) as error:
-        code = error.code if isinstance(error, RobotError) else "control"
-        channel.send(json.dumps({"refused": str(error), "code": code}).encode())
+        if not isinstance(error, RobotError):
+            error = RobotError(f"control could not start: {error}", code="control")
+        channel.send(json.dumps({"refused": asdict(error.data)}).encode())
         os._exit(1)
     server = MotionServer(control, channel)
     try:

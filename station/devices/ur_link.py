@@ -39,8 +39,6 @@ class UrLink:
         self.model = arm_model(config)
         self.remote: bool | None = None
         """Remote control is on; None where there is no such switch (CB3)."""
-        self.program = ""
-        """The dashboard's words about the program, as of connect or the last question."""
         self.reader: StateReader | None = None
         """The state stream's counters; another object after a lost connection."""
         self.dashboard: Dashboard | None = None
@@ -127,7 +125,7 @@ class UrLink:
                 code="robot-exchanged",
                 remedy="Finish this session, then restart the daemon.",
             )
-        self.remote, self.program = found.remote, found.program
+        self.remote = found.remote
 
     def _adopt(
         self, found: ProbeResult, first: Sample, reader: StateReader, installation: Installation

@@ -26,7 +26,6 @@ class ProbeResult:
     serial: str = ""
     version: tuple[int, ...] = ()
     remote: bool | None = None
-    program: str = ""
     problems: tuple[str, ...] = field(default=())
     """Problems, each with its remedy; empty = reachable and complete."""
     answers: bool = True
@@ -55,7 +54,6 @@ async def identify(dashboard: Dashboard) -> ProbeResult:
         serial=serial if serial.isdigit() else "",  # CB3 before 3.12 does not know the question
         version=version,
         remote=await dashboard.remote(),
-        program=(await dashboard.ask("programState")).strip(),
     )
 
 

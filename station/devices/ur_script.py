@@ -19,8 +19,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from station.cell.errors import RobotError
-from station.devices.rtde import PORT, PacketType, RtdeError, RuntimeState
-from station.devices.rtde_link import HANDSHAKE_S, RtdeLink
+from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, RtdeError, RtdeLink, RuntimeState
 from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
 
 SCRIPT_PORT = 30002
@@ -241,7 +240,7 @@ class ScriptControl:
             raise RtdeError(f"no robot state came within {HANDSHAKE_S:g} s", code="no-state")
         if self._told.program not in (RuntimeState.STOPPED, RuntimeState.STOPPING):
             raise RobotError(
-                "a program is playing on the robot",
+                "another program is playing on the robot",
                 code="program-playing",
                 remedy="Stop it on the pendant, then try again.",
             )
@@ -250,7 +249,7 @@ class ScriptControl:
             # Open until the script answers: closed with unread data, it could take the text with it.
             if not self._wait(lambda: self._plays() and self._told.answer == sequence, START_S):
                 raise RobotError(
-                    "the control script did not start",
+                    "the control program did not start",
                     code="script-not-started",
                     remedy="Power on, release the brakes, clear the pendant's messages.",
                 )

@@ -29,8 +29,7 @@ from recordings.schema.messages import RobotState, Stamps, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError, StaleStateError
 from station.cell.scene import pose_vector
-from station.devices.rtde import PORT, PacketType, Recipe, RtdeError
-from station.devices.rtde_link import HANDSHAKE_S, RtdeLink
+from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, Recipe, RtdeError, RtdeLink
 from station.devices.ur_dashboard import connect_trouble
 
 log = logging.getLogger(__name__)
@@ -86,7 +85,6 @@ class StateReader(threading.Thread):
         self.newest: Sample | None = None
         self.history: deque[RobotState] = deque(maxlen=1)
         self.clock = ClockEstimator()
-        self.samples = 0
         self.lost = 0
         """Samples that the controller made and that never came."""
         self.frozen = 0
@@ -133,7 +131,8 @@ class StateReader(threading.Thread):
 
     def close(self) -> None:
         """Ends the thread; returns when it has ended (milliseconds, or the connect timeout)."""
-        self.request_end()
+        with contextlib.suppress(OSError):
+            self._stop_write.close()
         self.join(HANDSHAKE_S + 1.0)
 
     def waits_unread(self) -> bool:
@@ -143,10 +142,6 @@ class StateReader(threading.Thread):
             if link is not None and link.fileno() >= 0:
                 return bool(select.select([link], [], [], 0)[0])
         return False
-
-    def request_end(self) -> None:
-        with contextlib.suppress(OSError):
-            self._stop_write.close()
 
     def _handshake(self, link: RtdeLink) -> Recipe:
         begun = time.perf_counter()
@@ -214,7 +209,6 @@ class StateReader(threading.Thread):
             speed_scaling=v[30],
             target_speed_fraction=v[31],
         )
-        self.samples += 1
         self.stands_still = False
         self.clock.add(controller_s, monotonic_ns)
         self.history.append(state)
@@ -331,8 +325,7 @@ class TraceRecorder:
     async def _close(self) -> None:
         reader, self._reader = self._reader, None
         if reader is not None:
-            reader.request_end()
-            await asyncio.to_thread(reader.join, 3.0)
+            await asyncio.to_thread(reader.close)
 
     async def _keep(self) -> None:
         """A lost connection is opened again until it comes."""

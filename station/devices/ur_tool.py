@@ -168,7 +168,7 @@ class TcpCheck:
         self._stated = installation.tcp_offset
         if not calibrated and installation.dh is not None and self._stated is not None:
             theta, a, d, alpha = installation.dh
-            stated = replace(model, theta_offset_rad=theta, a_m=a, d_m=d, alpha_rad=alpha)
+            stated = replace(model, theta_rad=theta, a_m=a, d_m=d, alpha_rad=alpha)
             self._try_controllers_model(stated, first)
         self._first = _flange_from_tcp(self._model, first)
         length_m = float(np.linalg.norm(self._first[:3, 3]))
@@ -207,7 +207,7 @@ class TcpCheck:
         m = self._model
         if self._source is None:
             return None
-        numbers = (vector6(column) for column in (m.a_m, m.d_m, m.alpha_rad, m.theta_offset_rad))
+        numbers = (vector6(column) for column in (m.a_m, m.d_m, m.alpha_rad, m.theta_rad))
         return ArmKinematics(m.name, self._source, *numbers)
 
     @property

@@ -14,7 +14,15 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import BY_PERSON, Acceptance, ArmSubject, StopResult, StopWay
+from station.cell.acceptance import (
+    BY_PERSON,
+    STOP_GIVEN,
+    STOP_TESTED,
+    Acceptance,
+    ArmSubject,
+    StopResult,
+    StopWay,
+)
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview, StationState
 from station.operate.motion import Link, approved_motion
@@ -34,7 +42,6 @@ PREPARE_S = 60.0
 END_S = 40.0
 BACK_S = 120.0
 """A person has this long to plug the cable in again, or to raise the slider."""
-STOP_TESTED, STOP_GIVEN = "stop-tested", "stop-given"
 TRIES = 3
 BUSY = frozenset({"watchdog-computer", "no-heartbeat", "move-refused"})
 """Causes that end a move when this computer is too busy."""
@@ -83,22 +90,6 @@ class JudgedStop:
     result: StopResult
     move: StopMove
     states: Sequence[RobotState]
-
-
-@dataclass(frozen=True)
-class _MoveEnd:
-    rests: bool
-    """The station is idle again: nothing holds the arm."""
-    ended_by: str | None
-    """Code of what ended the move; empty: it arrived; None: it never began."""
-    moment_ns: int | None
-    """When the stop was given, host monotonic."""
-
-    def measured(self, way: StopWay) -> bool:
-        """Tell whether it was measured: what holds the arm always is, and so is every stop that was given."""
-        if not self.rests or self.moment_ns is not None:
-            return True
-        return way in (StopWay.ARRIVE, *BY_PERSON) and self.ended_by not in (None, *BUSY)
 
 
 @dataclass
@@ -183,32 +174,36 @@ class AcceptanceTest:
         if not await approved_motion(self.link, offer.go, approves):
             return False
         try:
-            end = await self._watched(way)
+            measured, moment_ns = await self._watched(way)
         finally:
             states = await self.recorder.end()
-        if not end.measured(way):
+        if not measured:
             self._forward = not self._forward
             return None
-        move = StopMove(way, offer.joint, offer.target_rad, offer.speed_rad_s, end.moment_ns)
+        move = StopMove(way, offer.joint, offer.target_rad, offer.speed_rad_s, moment_ns)
         result = StopResult(way, offer.go.top_speed_m_s, judge(states, move), tries)
         stop = JudgedStop(result, move, states)
         self.stops.append(stop)
         self.person.judged(stop)
         return not stop.result.failed
 
-    async def _watched(self, way: StopWay) -> _MoveEnd:
-        """Wait for the station's account of the move's end, once the arm was watched at rest."""
+    async def _watched(self, way: StopWay) -> tuple[bool, int | None]:
+        """As `_ended`, once the arm was watched at rest."""
         begun_ns = time.time_ns()
         if way is StopWay.NETWORK:
             await self.person.meanwhile(way)
-        end = await self._ended(begun_ns)
+        end = await self._ended(way, begun_ns)
         if way in BY_PERSON:
             await self.person.afterwards(way)
             await self._back(way)
         await asyncio.sleep(AFTER_S)
         return end
 
-    async def _ended(self, begun_ns: int) -> _MoveEnd:
+    async def _ended(self, way: StopWay, begun_ns: int) -> tuple[bool, int | None]:
+        """By the station's account: whether it was measured, and when the stop was given (host monotonic).
+
+        What holds the arm is always measured, and so is every stop that was given.
+        """
         moment_ns: int | None = None
         try:
             async with asyncio.timeout(END_S):
@@ -218,8 +213,10 @@ class AcceptanceTest:
                             moment_ns = int(event.values["moment_ns"])  # type: ignore[arg-type]
                     if status.state not in RUNNING:
                         mine = [e for e in status.events if e.code == STOP_TESTED and e.wall_ns >= begun_ns]
-                        ended_by = str(mine[-1].values["ended_by"]) if mine else None
-                        return _MoveEnd(status.state is StationState.IDLE, ended_by, moment_ns)
+                        if status.state is not StationState.IDLE or moment_ns is not None:
+                            return True, moment_ns
+                        ended = bool(mine) and mine[-1].values["ended_by"] not in BUSY
+                        return ended and way in (StopWay.ARRIVE, *BY_PERSON), None
         except TimeoutError:
             raise StationError(
                 "The move did not end.", code="no-end", remedy="Press the emergency stop.", limit_s=END_S
@@ -244,7 +241,6 @@ class AcceptanceTest:
         )
 
     async def _connected(self) -> bool:
-        self.link.outdate()
         async for status in self.link.statuses():
             return status.state is StationState.IDLE and status.robot.connected
         return False

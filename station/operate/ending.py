@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from calibrate.files.calibration import Calibration, Touch
-from calibrate.files.verification import agrees, touch_sigmas
+from calibrate.files.calibration import Calibration
+from calibrate.files.touch import Touch, agrees, touch_sigmas
 from calibrate.quality.checks import CheckEntry
 from station.cell.status import SessionStatus
 

@@ -6,7 +6,6 @@ import contextlib
 import math
 from asyncio import timeout
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -46,37 +45,7 @@ class Link(Protocol):
         """The verb's result. RefusedError with the daemon's code; StationError when it is gone."""
 
     def statuses(self) -> AsyncIterator[StationStatus]:
-        """The full status now and at every change; ends when the daemon is gone."""
-
-    def outdate(self) -> None:
-        """Forget the known status, which is older than the last call: `statuses` begins with the next one."""
-
-
-@dataclass(frozen=True)
-class SessionOutcome:
-    """The end of a session, or its standstill."""
-
-    status: StationStatus
-
-    @property
-    def recording(self) -> str:
-        """Path of the finished recording; empty while there is none."""
-        return self.status.session.recording
-
-    @property
-    def planned(self) -> int:
-        return len(self.status.session.poses)
-
-    @property
-    def captured(self) -> int:
-        return self.status.session.captured
-
-    @property
-    def exit_code(self) -> int:
-        """0 finished with all poses, 3 finished with fewer, 1 not finished."""
-        if not self.recording:
-            return 1
-        return 0 if self.captured == self.planned else 3
+        """The full status, never older than the last call, and at every change; ends with the daemon."""
 
 
 async def status_now(socket: Path) -> StationStatus:
@@ -141,7 +110,6 @@ async def approved_motion(
     if not await approve(preview):
         return False
     await link.call(Go(preview.token, preview.plan_sha256, headless))
-    link.outdate()  # it would show the session before, finished and at rest
     return True
 
 
@@ -169,7 +137,7 @@ async def carry_out(
     finish_with_loss: bool = False,
     headless: bool = False,
     plans_here: PlansHere | None = None,
-) -> SessionOutcome:
+) -> StationStatus:
     """One session from its approval until it rests. RefusedError when the daemon or the person says no."""
     if not await prepared_motion(link, purpose, approve, headless=headless, plans_here=plans_here):
         raise not_approved()
@@ -180,14 +148,13 @@ def not_approved() -> RefusedError:
     return RefusedError("Nothing moved: the motion was not approved.", code="not-approved")
 
 
-async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> SessionOutcome:
+async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> StationStatus:
     """Watch a session until it rests; `finish_with_loss`: finish it although poses failed."""
     status = await _until_rest(link, watch)
     if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
         await link.call(Finish())
-        link.outdate()
         status = await _until_rest(link, watch)
-    return SessionOutcome(status)
+    return status
 
 
 async def _until_rest(link: Link, watch: Watcher) -> StationStatus:

@@ -15,10 +15,9 @@ import numpy as np
 
 from calibrate.boards.model import outer_corners
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Touch
 from calibrate.files.install import installed_calibration
-from calibrate.files.verification import note_in_file, note_installed
-from calibrate.files.versions import same_solve
+from calibrate.files.touch import Touch
+from calibrate.files.versions import note_in_file, note_installed, same_solve
 from calibrate.geometry import Array, inverse, transform_points
 from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec, Matrix4
@@ -138,8 +137,8 @@ def touch_told(hovering: Hovering, said: str, status: StationStatus | None) -> T
 
     `status`: as the arm stands now; None: not known. Raises RefusedError.
     """
-    if said:
-        return touch_of(hovering, told_offset_mm(hovering, two_lengths_mm(said)), "told by a person")
+    if said:  # the offset seen when the tip came down straight, less what the arm knows it stood beside
+        return touch_of(hovering, two_lengths_mm(said) - hovering.beside_mm, "told by a person")
     if status is None or status.robot.base_from_flange is None:
         raise RefusedError(
             "The robot's position is not known now.",
@@ -177,11 +176,6 @@ def tip_on_board_m(offer: HoverOffer, base_from_flange: Matrix4 | Array) -> Arra
     """(3,) in `board`."""
     tip = transform_points(np.array(base_from_flange), np.array(offer.tip_m))
     return transform_points(inverse(np.array(offer.base_from_board)), tip)
-
-
-def told_offset_mm(hovering: Hovering, told_mm: Array) -> Array:
-    """(2,) the offset seen when the tip came down straight, less what the arm knows it stood beside."""
-    return np.asarray(told_mm - hovering.beside_mm)
 
 
 def read_offset_mm(offer: HoverOffer, touching_m: Array) -> Array:

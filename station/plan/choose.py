@@ -11,7 +11,13 @@ import numpy as np
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
 from calibrate.handeye.arm import RELATIVE_SIGMA, by_parameters
-from calibrate.handeye.information import MeasurementNoise, covariance_of, prior_information, view_information
+from calibrate.handeye.information import (
+    USUAL_NOISE,
+    MeasurementNoise,
+    covariance_of,
+    prior_information,
+    view_information,
+)
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import with_near_axes
@@ -27,7 +33,6 @@ CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm", "both": "all"}
 """Aims of a plan, for people → criterion."""
 _LENS_SHARE = {"A": 0.02, "D": 0.2, "arm": 0.0, "all": 0.0}
 """Weight of the lens, so that the image is covered."""
-USUAL_NOISE = MeasurementNoise()
 TABLE_MM = 0.3
 """1σ of the errors of an arm's table that a plan expects, mm and mrad."""
 _ENOUGH_TO_RANK, _SHORTLIST = 8, 60
@@ -167,9 +172,3 @@ def _best_addition(pool: Array, total: Array, taken: list[int], objective: Objec
     scores = objective(total + pool[open_places])
     best = int(np.argmin(scores))
     return int(open_places[best]), float(scores[best])
-
-
-def sigma_of(information: Array, prior: Array) -> tuple[float, float]:
-    """1σ of X from a sum of informations: translation (m, root of the summed variances), rotation (rad)."""
-    diagonal = np.diag(covariance_of(information, prior))
-    return float(np.sqrt(diagonal[:3].sum())), float(np.sqrt(diagonal[3:6].sum()))

@@ -244,18 +244,13 @@ def _plan(config: StationConfig, model: RobotModel, corner: int, high: Array, lo
     )
 
 
-@dataclass(frozen=True, eq=False)
-class HoverAnswer:
-    hover: HoverPath
-    offset_covariance: Array
-    """(3, 3) of tip minus corner in `board`, m²."""
-    board_moved_m: float
-
-
 def answer_hover(
     config: StationConfig, calibration: Calibration, view: BoardView, question: HoverQuestion
-) -> HoverAnswer:
-    """Answers with a checked path, from one image of the board. LimitError, BadViewsError."""
+) -> tuple[HoverPath, Array, float]:
+    """A checked path, from one image of the board. LimitError, BadViewsError.
+
+    With the covariance (3, 3) of tip minus corner in `board`, m², and how far the board was moved, m.
+    """
     now = locate_board(calibration, view, config.board)
     points = found_points(calibration, config.board)
     tip = np.array(question.pointer.tip_m)
@@ -267,4 +262,4 @@ def answer_hover(
     doubt_m = _DOUBT_SIGMAS * float(np.sqrt(worst)) + question.model_miss_m
     X = calibration.transform.matrix
     hover = plan_hover(config, X, now.base_from_board, now.outward, question, doubt_m)
-    return HoverAnswer(hover, covariance, now.moved_m)
+    return hover, covariance, now.moved_m

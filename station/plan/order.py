@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array
-from station.cell.collision import CellGeometry, margins, moving_points, surface_speeds
-from station.cell.limits import SPACING_M, leading_speed, leaving, trapezoid
+from station.cell.collision import SPACING_M, CellGeometry, margins, moving_points, surface_speeds
+from station.cell.limits import leading_speed, leaving, trapezoid
 
 _SAMPLES = (9, 33, 129)
 """Along one move: few at first."""

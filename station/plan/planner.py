@@ -11,7 +11,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
-from calibrate.handeye.information import MeasurementNoise
+from calibrate.handeye.information import USUAL_NOISE, MeasurementNoise, sigma_of
 from calibrate.kinematics import forward
 from station.cell.collision import margins
 from station.cell.config import StationConfig
@@ -27,16 +27,7 @@ from station.plan.candidates import (
     best_group,
     find_candidates,
 )
-from station.plan.choose import (
-    USUAL_NOISE,
-    WITH_TABLE,
-    Criterion,
-    Objective,
-    choose,
-    informations,
-    objective_for,
-    sigma_of,
-)
+from station.plan.choose import WITH_TABLE, Criterion, Objective, choose, informations, objective_for
 from station.plan.order import BLOCKED, move_times, short_order, time_matrix
 from station.plan.visibility import ViewRange, blind_share, expected_view, planned_pose, view_range, visible
 

@@ -12,13 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
 from calibrate.handeye.arm import PARAMETERS
-from calibrate.handeye.information import MeasurementNoise, covariance_of
+from calibrate.handeye.information import USUAL_NOISE, MeasurementNoise, covariance_of, sigma_of
 from calibrate.handeye.solution import MEASURED
+from station.cell.config import StationConfig
+from station.cell.errors import StationError
 from station.cell.limits import check_path
 from station.cell.plan import Plan, PlannedPose
-from station.cell.scene import Scene, flange_poses
+from station.cell.scene import Scene, flange_poses, scene_of
 from station.plan.candidates import find_candidates
-from station.plan.choose import TABLE_MM, USUAL_NOISE, Objective, informations, objective_for, sigma_of
+from station.plan.choose import TABLE_MM, Objective, informations, objective_for
 from station.plan.visibility import planned_pose, view_range, visible
 
 _FURTHER_POSES = 60
@@ -164,3 +166,31 @@ def _missing(known: Array, gains: Array, goal_m: float, objective: Objective) ->
         if sigma_of(total, objective.prior)[0] <= goal_m:
             return count
     return None
+
+
+def next_best(
+    config: StationConfig,
+    base_from_flange: Array,
+    joints_now_rad: Sequence[float],
+    onward_rad: Sequence[float] | None,
+) -> Advice:
+    """Find the pose that would help most after those captured (n, 4, 4), whether or not these are enough.
+
+    Free to reach from here, and from it the pose that is next (`onward_rad`). By forecast from the configured
+    guesses; ConfigError where these are missing.
+    """
+    return advise(scene_of(config), base_from_flange, 0.0, joints_now_rad, onward_rad)
+
+
+def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:
+    """Say which pose would help most, how many are missing for `capture.goal_m`; empty when none is, or none
+    helps, or the guesses are missing."""
+    goal_m = config.capture.goal_m
+    try:
+        advice = advise(scene_of(config), base_from_flange, goal_m, joints_now_rad)
+    except StationError:
+        return ""
+    if advice.next_pose is None:
+        return ""
+    missing = f"at best {advice.poses_missing} more" if advice.poses_missing else "many more poses"
+    return f"{missing} for {1000 * goal_m:.2g} mm; the next best: {advice.next_pose.why}"

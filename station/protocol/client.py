@@ -80,10 +80,9 @@ class Client:
         self._next_id = 1
         self._waiting: dict[int, asyncio.Future[_Incoming]] = {}
         self._plain_status: dict[str, object] | None = None
-        self._outdated = False
         self._fresh = asyncio.Event()
         self._gone = False
-        self.root: Path | None = None
+        self.root = Path()
         """Below which the daemon keeps sessions and what is installed."""
         self.camera = MAIN_CAMERA
         self.max_age_days: float | None = None
@@ -178,22 +177,20 @@ class Client:
             return await self.request("whole", timeout_s=timeout_s)
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
-        """The status now and after every change (slow readers see the newest only)."""
+        """The status now and after every change (slow readers see the newest only).
+
+        Never one from before the last answer: the daemon tells the changes first.
+        """
         await self.request("watch")
-        if self._plain_status is not None and not self._outdated:
+        if self._plain_status is not None:
             self._fresh.set()  # watched before: what is known is the start
         while True:
             await self._fresh.wait()
             self._fresh.clear()
-            if self._plain_status is not None and not self._outdated:
+            if self._plain_status is not None:
                 yield msgspec.convert(self._plain_status, StationStatus)
             if self._gone:
                 return
-
-    def outdate(self) -> None:
-        """Drops what is known, older than what was just asked: `statuses` begins with the next change."""
-        self._outdated = True
-        self._fresh.clear()
 
     async def close(self) -> None:
         self._task.cancel()
@@ -233,7 +230,6 @@ class Client:
             self._plain_status = message.status
         elif message.changes is not None and self._plain_status is not None:
             self._plain_status = self._plain_status | message.changes
-        self._outdated = False
         self._fresh.set()
 
     def _gone_error(self) -> DaemonGoneError:

@@ -80,8 +80,10 @@ def open_page(path: Path, owners: set[int]) -> int:
     return descriptor
 
 
-def read_page(descriptor: int) -> Page | None:
-    """None when it is not (yet) a whole page."""
+def read_page(descriptor: int | None) -> Page | None:
+    """None when there is none, or it is not (yet) a whole one."""
+    if descriptor is None:
+        return None
     raw = os.pread(descriptor, _LAYOUT.size, 0)
     if len(raw) != _LAYOUT.size or raw != os.pread(descriptor, _LAYOUT.size, 0):  # just being written
         return None
@@ -159,7 +161,7 @@ def stop(control: Path) -> tuple[Outcome, str]:
 
 def _stop(control: Path, page: int | None) -> Outcome:
     give_up_s = time.monotonic() + HEARD_S
-    before = _page(page)
+    before = read_page(page)
     try:
         with _link(control) as link, contextlib.suppress(BlockingIOError):
             # A full queue is full of STOPs: the daemon stops the arm all the same.
@@ -186,10 +188,6 @@ def _link(control: Path) -> socket.socket:
         link.close()
         raise
     return link
-
-
-def _page(descriptor: int | None) -> Page | None:
-    return read_page(descriptor) if descriptor is not None else None
 
 
 def _until_rest(page: int) -> Outcome:

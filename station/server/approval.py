@@ -50,18 +50,24 @@ def _terminal_name(number: int) -> str:
 
 
 @dataclass
-class Applicant:
-    """A client, and what is known of it when it asks for motion."""
+class Peer:
+    """Process at the other end, by the kernel's word, and what is known of it when it asks for motion."""
 
     client_id: int
+    """0: it sent STOP without a connection."""
     pid: int
     uid: int
-    who: str
-    """Its name in log, status and recording."""
+    told: str = ""
+    """Name that it gave."""
     user: str = ""
     """The user's name, once that was looked up."""
     began_ticks: int | None = None
     """Start of the process that made the connection; None: not known."""
+
+    @property
+    def who(self) -> str:
+        """Its name in log, status and recording."""
+        return f"{self.told or f'uid {self.uid}'} (pid {self.pid})"
 
 
 class ApprovalRule:
@@ -72,7 +78,7 @@ class ApprovalRule:
     ) -> None:
         self._config, self._simulated, self._see = config, simulated, see
 
-    def by_person(self, asks: Applicant, what: str) -> str:
+    def by_person(self, asks: Peer, what: str) -> str:
         """Returns how a person approves, for the log. RefusedError unless a person may approve it there."""
         if self._simulated:
             return "a simulated cell"
@@ -85,7 +91,7 @@ class ApprovalRule:
             remedy="A person must review and approve it there (docs: Safety).",
         )
 
-    def approve(self, asks: Applicant, plan_sha256: str, offered_sha256: str) -> str:
+    def approve(self, asks: Peer, plan_sha256: str, offered_sha256: str) -> str:
         """Like `by_person`; a service named in the configuration may approve the plan whose hash it knows."""
         if plan_sha256 and offered_sha256 and plan_sha256 != offered_sha256:
             raise RefusedError("The approved plan is not the one that is loaded.", code="other-plan")
@@ -102,13 +108,13 @@ class ApprovalRule:
             raise RefusedError(text, code="no-plan-named")
         return "as a service, by the plan's hash"
 
-    def _terminal(self, asks: Applicant) -> str:
+    def _terminal(self, asks: Peer) -> str:
         seen = self._see(asks.pid)
         if seen is None or seen.user != asks.uid or seen.began_ticks != asks.began_ticks:
             return ""
         return seen.terminal
 
-    def _require_permitted(self, asks: Applicant) -> None:
+    def _require_permitted(self, asks: Peer) -> None:
         if self._config.persons and asks.user not in self._config.persons:
             text = f"{asks.user} is not in approval.persons."
             raise RefusedError(text, code="not-permitted", remedy="Ask one of approval.persons to approve.")

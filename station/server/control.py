@@ -13,7 +13,6 @@ import os
 import socket
 from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -33,6 +32,7 @@ from station.protocol.messages import (
     Request,
 )
 from station.protocol.verbs import VERBS
+from station.server.approval import Peer
 
 log = logging.getLogger(__name__)
 UNSENT_LIMIT_BYTES = 4 * 1024 * 1024
@@ -43,16 +43,6 @@ ACCEPT_PAUSE_S = 0.01
 """Between batches: a flood of connections costs the working loop no more than that."""
 NEW_PER_S = 200
 """Connections that one user may open within a second."""
-
-
-@dataclass(frozen=True)
-class Peer:
-    """Process at the other end, by the kernel's word."""
-
-    client_id: int
-    """0: it sent STOP without a connection."""
-    pid: int
-    uid: int
 
 
 class Handler(Protocol):
@@ -142,7 +132,8 @@ class ControlServer:
                 log.warning("a client could not be let in: %s", error)
                 break
             link.setblocking(False)
-            peer = _peer_of(link, self._next_client_id)
+            pid, uid, _ = peer_of(link)
+            peer = Peer(self._next_client_id, pid, uid)
             if (full := self._full_for(peer.uid)) is not None:
                 with link, contextlib.suppress(OSError):
                     link.send(msgspec.json.encode(Reply.refused(0, full)) + b"\n")
@@ -172,7 +163,7 @@ class ControlServer:
         protocol = asyncio.StreamReaderProtocol(reader)
         transport, _ = await loop.connect_accepted_socket(lambda: protocol, link)
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
-        connection = _Connection(peer, reader, writer, self._handler, self._full_status)
+        connection = _Connection(peer, reader, writer, self._handler, self._publish_newest)
         self._connections.add(connection)
         try:
             await connection.run()
@@ -180,10 +171,9 @@ class ControlServer:
             self._connections.discard(connection)
             self._handler.gone(peer)
 
-    def _full_status(self) -> bytes:
-        # Published first, so that the next changes start from exactly what this watcher was told.
+    def _publish_newest(self) -> StationStatus:
         self.publish(self._newest())
-        return msgspec.json.encode(Notice(status=self._status)) + b"\n"
+        return self._status
 
 
 class _Connection:
@@ -195,12 +185,13 @@ class _Connection:
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
         handler: Handler,
-        full_status: Callable[[], bytes],
+        publish: Callable[[], StationStatus],
     ) -> None:
+        """`publish`: tells every watcher what changed; returns the newest status."""
         self.peer = peer
         self.watching = False
         self._reader, self._writer, self._handler = reader, writer, handler
-        self._full_status = full_status
+        self._publish = publish
         self._tasks: set[asyncio.Task[None]] = set()
         self._pieces = bytearray()
         """Pieces of a request that is longer than a line."""
@@ -266,14 +257,16 @@ class _Connection:
     async def _answer_stop(self, request_id: int, stopping: Awaitable[object] | None) -> None:
         if stopping is not None:
             await stopping
+        self._publish()
         self.reply(Reply(request_id, True, {}))
 
     async def _answer(self, request: Request) -> None:
         try:
             result = await self._handler.handle(self.peer, request.verb, request.args)
+            status = self._publish()  # who was answered knows what came of it, and nothing older
             self.reply(Reply(request.id, True, result))
             if request.verb == "watch" and not self.watching:
-                self.send(self._full_status())
+                self.send(msgspec.json.encode(Notice(status=status)) + b"\n")
                 self.watching = True
         except CodedError as error:
             self.refuse(request.id, error)
@@ -313,12 +306,6 @@ def _full(text: str, limit: int) -> RefusedError:
     return RefusedError(
         text, code="house-full", remedy="Close one, or wait a moment; `station stop` needs none.", limit=limit
     )
-
-
-def _peer_of(link: socket.socket, client_id: int) -> Peer:
-    pid, uid, gid = peer_of(link)
-    log.debug("client %d: pid %d, uid %d, gid %d", client_id, pid, uid, gid)
-    return Peer(client_id, pid, uid)
 
 
 def _remove_stale(path: Path) -> None:

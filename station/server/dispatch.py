@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Awaitable, Callable, Coroutine
+from operator import methodcaller
 
 import msgspec
 
@@ -15,9 +16,8 @@ from station.cell.session_folder import SessionSummary, list_sessions
 from station.cell.socket_folder import user_name
 from station.cell.status import HoverOffer, LeaseStatus, MotionPreview
 from station.protocol import verbs
-from station.protocol.verbs import VERBS, Purpose
-from station.server.approval import Applicant, ApprovalRule, Process, process
-from station.server.control import Peer
+from station.protocol.verbs import VERBS, Purpose, Verb
+from station.server.approval import ApprovalRule, Peer, Process, process
 from station.session.checklist import checklist
 from station.session.recording import software
 from station.session.session import Session
@@ -34,7 +34,7 @@ class SessionDispatcher:
         self._session, self._see = session, see
         cell = session.context.cell
         self._rule = ApprovalRule(cell.config.approval, cell.simulated, see)
-        self._callers: dict[int, Applicant] = {}
+        self._callers: dict[int, Peer] = {}
         self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
         """Users by their number, once they were looked up."""
@@ -42,9 +42,7 @@ class SessionDispatcher:
 
     def stop_now(self, peer: Peer) -> Awaitable[object]:
         """STOP is on its way to the arm before anything else is looked at."""
-        # The house may be full: nobody is kept.
-        caller = self._callers.get(peer.client_id) or _applicant(peer)
-        return self._to_the_end(self._session.stop(caller.who))
+        return self._to_the_end(self._session.stop(peer.who))
 
     def stop_from(self, sender: Peer) -> None:
         """STOP without a connection; who has one as well is known by what was said there."""
@@ -87,42 +85,41 @@ class SessionDispatcher:
         result = await self._methods[verb](self._caller(peer), request)
         return msgspec.to_builtins(verbs.Done() if result is None else result)
 
-    def _caller(self, peer: Peer) -> Applicant:
+    def _caller(self, peer: Peer) -> Peer:
         if peer.client_id not in self._callers:
-            caller = self._callers[peer.client_id] = _applicant(peer)
+            self._callers[peer.client_id] = peer
             seen = self._see(peer.pid)
-            caller.began_ticks = seen.began_ticks if seen else None
-        return self._callers[peer.client_id]
+            peer.began_ticks = seen.began_ticks if seen else None
+        return peer
 
-    async def _hello(self, caller: Applicant, args: verbs.Hello) -> verbs.Welcome:
+    async def _hello(self, caller: Peer, args: verbs.Hello) -> verbs.Welcome:
         user = caller.user = await self._name(caller.uid)  # the kernel's word; the place is the client's
         said = "".join(c for c in args.who if c.isprintable())[:_WHO_LIMIT] or user
-        told = said if said.split(" ")[0] == user else f"{user} ({said})"
-        caller.who = f"{told} (pid {caller.pid})"
+        caller.told = said if said.split(" ")[0] == user else f"{user} ({said})"
         context = self._session.context
         config, version = context.cell.config, software()["calibration-station"]
         rule_days = config.validity.max_age_days
         return verbs.Welcome(version, os.getpid(), str(context.root), config.camera.name, rule_days)
 
-    async def _lease(self, caller: Applicant, args: verbs.Lease) -> LeaseStatus:
+    async def _lease(self, caller: Peer, args: verbs.Lease) -> LeaseStatus:
         if args.action == "take":
             return self._session.take_lease(caller.client_id, caller.who)
         ending = self._session.release_lease if args.action == "release" else self._session.lease_lost
         await self._to_the_end(ending(caller.client_id))
         return self._session.leases.lease
 
-    async def _acknowledge(self, caller: Applicant, args: verbs.Acknowledge) -> None:
+    async def _acknowledge(self, caller: Peer, args: verbs.Acknowledge) -> None:
         self._session.acknowledge(caller.who)
 
-    async def _plan(self, caller: Applicant, args: verbs.GetPlan) -> verbs.LoadedPlan:
+    async def _plan(self, caller: Peer, args: verbs.GetPlan) -> verbs.LoadedPlan:
         queue = self._session.context.queue
         return verbs.LoadedPlan() if queue is None else verbs.LoadedPlan(queue.plan, queue.sha256)
 
-    async def _load_plan(self, caller: Applicant, args: verbs.LoadPlan) -> verbs.PlanFacts:
+    async def _load_plan(self, caller: Peer, args: verbs.LoadPlan) -> verbs.PlanFacts:
         self._session.load_plan(caller.client_id, args.plan)
         return self._plan_facts()
 
-    async def _make_plan(self, caller: Applicant, args: verbs.MakePlan) -> verbs.PlanFacts:
+    async def _make_plan(self, caller: Peer, args: verbs.MakePlan) -> verbs.PlanFacts:
         await self._session.make_plan(caller.client_id, args.poses, args.seed, args.lens_known, args.aim)
         return self._plan_facts()
 
@@ -130,20 +127,20 @@ class SessionDispatcher:
         queue = self._session.context.require_queue()
         return verbs.PlanFacts(len(queue.statuses), queue.sha256)
 
-    async def _prepare(self, caller: Applicant, args: verbs.Prepare) -> MotionPreview:
+    async def _prepare(self, caller: Peer, args: verbs.Prepare) -> MotionPreview:
         if args.purpose in (Purpose.REPLAN, Purpose.NEXT_POSE):
             self._rule.by_person(await self._asks(caller), "A changed plan")
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
 
-    async def _hover(self, caller: Applicant, args: verbs.Hover) -> HoverOffer:
+    async def _hover(self, caller: Peer, args: verbs.Hover) -> HoverOffer:
         self._rule.by_person(await self._asks(caller), "A move over the board")
         return await self._session.prepare_hover(caller.client_id, args)
 
-    async def _stop_test(self, caller: Applicant, args: verbs.StopTest) -> StopTestOffer:
+    async def _stop_test(self, caller: Peer, args: verbs.StopTest) -> StopTestOffer:
         self._rule.by_person(await self._asks(caller), "A stop test")
         return await self._session.prepare_stop_test(caller.client_id, args)
 
-    async def _go(self, caller: Applicant, args: verbs.Go) -> None:
+    async def _go(self, caller: Peer, args: verbs.Go) -> None:
         asks, waiting = await self._asks(caller), self._session.approvals.waiting
         if waiting is not None and waiting.beside is not None:
             how = self._rule.by_person(asks, "This move")
@@ -152,55 +149,42 @@ class SessionDispatcher:
         approval = f"motion approved by {caller.who}, {how}"
         self._session.go(caller.client_id, args.token, approval, again=args.headless)
 
-    async def _asks(self, caller: Applicant) -> Applicant:
+    async def _asks(self, caller: Peer) -> Peer:
         caller.user = await self._name(caller.uid)
         return caller
 
-    async def _pause(self, caller: Applicant, args: verbs.Pause) -> None:
+    async def _pause(self, caller: Peer, args: verbs.Pause) -> None:
         self._session.pause(caller.who)
 
-    async def _finish(self, caller: Applicant, args: verbs.Finish) -> None:
+    async def _finish(self, caller: Peer, args: verbs.Finish) -> None:
         await self._to_the_end(self._session.finish(caller.client_id))
 
-    async def _retake(self, caller: Applicant, args: verbs.Retake) -> None:
-        await self._session.edit(verbs.Retake, caller.client_id, lambda queue: queue.retake(args.index))
+    async def _edit(self, caller: Peer, args: Verb[object]) -> verbs.PoseNumber | None:
+        """A change of the poses: the queue has a method with the verb's name and arguments."""
+        change = methodcaller(args.verb(), *msgspec.structs.astuple(args))
+        index: int | None = await self._session.edit(type(args), caller.client_id, change)
+        return None if index is None else verbs.PoseNumber(index)
 
-    async def _skip(self, caller: Applicant, args: verbs.Skip) -> None:
-        await self._session.edit(verbs.Skip, caller.client_id, lambda queue: queue.skip(args.index))
+    _retake = _skip = _reorder = _add = _drop = _edit
 
-    async def _reorder(self, caller: Applicant, args: verbs.Reorder) -> None:
-        await self._session.edit(verbs.Reorder, caller.client_id, lambda queue: queue.reorder(args.order))
-
-    async def _add(self, caller: Applicant, args: verbs.Add) -> verbs.PoseNumber:
-        return verbs.PoseNumber(
-            await self._session.edit(verbs.Add, caller.client_id, lambda queue: queue.add(args.pose))
-        )
-
-    async def _drop(self, caller: Applicant, args: verbs.Drop) -> None:
-        await self._session.edit(verbs.Drop, caller.client_id, lambda queue: queue.drop(args.index))
-
-    async def _free_drive(self, caller: Applicant, args: verbs.Freedrive) -> None:
+    async def _free_drive(self, caller: Peer, args: verbs.Freedrive) -> None:
         await self._to_the_end(self._session.switch_free_drive(caller.client_id, args.on, args.auto))
 
-    async def _record(self, caller: Applicant, args: verbs.Record) -> verbs.PoseNumber:
+    async def _record(self, caller: Peer, args: verbs.Record) -> verbs.PoseNumber:
         return verbs.PoseNumber(await self._session.record(caller.client_id))
 
-    async def _preview(self, caller: Applicant, args: verbs.Preview) -> verbs.PreviewImage:
+    async def _preview(self, caller: Peer, args: verbs.Preview) -> verbs.PreviewImage:
         return await self._session.previews.preview(args.width, args.height)
 
-    async def _observe(self, caller: Applicant, args: verbs.Observe) -> verbs.Observation:
+    async def _observe(self, caller: Peer, args: verbs.Observe) -> verbs.Observation:
         return await self._session.previews.observe(args.tag)
 
-    async def _doctor(self, caller: Applicant, args: verbs.Doctor) -> list[verbs.Check]:
+    async def _doctor(self, caller: Peer, args: verbs.Doctor) -> list[verbs.Check]:
         return await checklist(self._session.context, self._session.devices.troubles)
 
-    async def _configuration(self, caller: Applicant, args: verbs.Configuration) -> StationConfig:
+    async def _configuration(self, caller: Peer, args: verbs.Configuration) -> StationConfig:
         return self._session.context.cell.config
 
-    async def _sessions(self, caller: Applicant, args: verbs.Sessions) -> list[SessionSummary]:
+    async def _sessions(self, caller: Peer, args: verbs.Sessions) -> list[SessionSummary]:
         # In a thread: hundreds of files are read, and the arm's heartbeat does not wait.
         return await asyncio.to_thread(list_sessions, self._session.context.root)
-
-
-def _applicant(peer: Peer) -> Applicant:
-    return Applicant(peer.client_id, peer.pid, peer.uid, f"uid {peer.uid} (pid {peer.pid})")

@@ -20,7 +20,7 @@ from pathlib import Path
 from station.cell.errors import StationError
 from station.cell.socket_folder import make_folder, motion_page, stop_socket
 from station.protocol.stop_client import Motion, Page, create_page, write_page
-from station.server.control import Peer
+from station.server.approval import Peer
 
 log = logging.getLogger(__name__)
 

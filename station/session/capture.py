@@ -5,21 +5,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import time
 from collections import deque
 
 import msgspec
 import numpy as np
 
-from recordings.images import Pixels
-from recordings.schema.messages import Image, RobotState, Stamps, Stillness, View
+from recordings.images import Pixels, viewable
+from recordings.schema.messages import Image, RobotState, Stamps, View
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.scene import flange_pose
 from station.cell.status import PoseState, StationState
-from station.cell.stillness import ImageMotion, RestingCheck
+from station.cell.stillness import RestingCheck
 from station.session.context import SessionContext
 from station.session.recording import to_the_end
 
@@ -54,7 +55,23 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
     image = context.require_recording().number(await take_image(context, index))
     show_frame(context, image)
     state, bound_s = await at_exposure(context, resting, image)
-    view = _view(context, index, attempt, image, state, still, bound_s)
+    stamps = Stamps(
+        host_monotonic_ns=state.stamps.host_monotonic_ns,
+        host_wall_ns=state.stamps.host_wall_ns,
+        controller_s=state.stamps.controller_s,
+        device_ns=image.stamps.device_ns + round(image.exposure_us * 500),
+    )
+    view = View(
+        index=index,
+        name=context.require_queue().pose(index).name,
+        picture_sequence=image.sequence,
+        base_from_flange=matrix4(flange_pose(state, context.cell.robot.identity.tcp_offset)),
+        joints_rad=state.joints_rad,
+        attempt=attempt,
+        stamps=stamps,
+        time_bound_s=bound_s,
+        stillness=still,
+    )
     _phase(context, index, StationState.WRITING, "writing")
     await to_the_end(_write(context, index, image, view))
 
@@ -134,34 +151,6 @@ async def at_exposure(
     return state, bound_s
 
 
-def _view(
-    context: SessionContext,
-    index: int,
-    attempt: int,
-    image: Image,
-    state: RobotState,
-    still: Stillness,
-    bound_s: float,
-) -> View:
-    exposure_ns = state.stamps.host_monotonic_ns
-    return View(
-        index=index,
-        name=context.require_queue().pose(index).name,
-        picture_sequence=image.sequence,
-        base_from_flange=matrix4(flange_pose(state, context.cell.robot.identity.tcp_offset)),
-        joints_rad=state.joints_rad,
-        attempt=attempt,
-        stamps=Stamps(
-            host_monotonic_ns=exposure_ns,
-            host_wall_ns=state.stamps.host_wall_ns,
-            controller_s=state.stamps.controller_s,
-            device_ns=image.stamps.device_ns + round(image.exposure_us * 500),
-        ),
-        time_bound_s=bound_s,
-        stillness=still,
-    )
-
-
 async def _write(context: SessionContext, index: int, image: Image, view: View) -> None:
     """Disk and detection side by side; the view is written, and the pose counted, only with a board in it."""
     recording, queue = context.require_recording(), context.require_queue()
@@ -169,11 +158,11 @@ async def _write(context: SessionContext, index: int, image: Image, view: View) 
     sighting = await _sighting(context, image, index)
     unusable = _unusable(sighting) if sighting is not None else None
     if sighting is not None and len(sighting.pixels):
-        recording.corners(image.sequence, sighting.pixels)
+        recording.require_open().corners(image.sequence, sighting.pixels)
     if unusable is not None:
         await recording.sync()
         raise unusable
-    recording.view(view)
+    recording.require_open().view(view)
     await recording.sync()
     if sighting is not None:
         queue.note(index, corners=sighting.status.corners, coverage=sighting.status.coverage)
@@ -224,7 +213,7 @@ class ImageWatch:
     def __init__(self, context: SessionContext, index: int) -> None:
         self._context, self._index = context, index
         self._images: deque[tuple[int, Pixels]] = deque(maxlen=IMAGES)
-        self._found: tuple[int, ImageMotion] | None = None
+        self._found: tuple[int, float] | None = None
         """With the time before which none of its images began."""
         self._blind = False
         self._again = asyncio.Event()
@@ -237,10 +226,10 @@ class ImageWatch:
         fixed = context.cell.config.mount == "eye-to-hand" and model is not None
         self._box = board_box(view, model.width, model.height) if fixed and model is not None else None
 
-    def look(self, since_ns: int) -> ImageMotion | None:
-        """The motion in images exposed after this host time; None: not yet, ask again."""
+    def look(self, since_ns: int) -> float | None:
+        """Motion (px) in images exposed after this host time; NaN: not to be measured, None: not yet."""
         if self._blind:
-            return ImageMotion(None)
+            return math.nan
         self._again.set()
         if self._found is None or self._found[0] < since_ns:
             return None
@@ -286,7 +275,7 @@ class ImageWatch:
                     raise
                 continue
             if image is not None:
-                self._images.append((asked_ns, image.viewable()))
+                self._images.append((asked_ns, viewable(image.pixels, image.pixel_format)))
             return image is not None
         return False
 
@@ -295,4 +284,4 @@ class ImageWatch:
         motion_px = await self._context.workers.call(
             image_motion, images, self._width, self._box, timeout_s=WORKER_TIMEOUT_S
         )
-        self._found = (self._images[0][0], ImageMotion(motion_px))
+        self._found = self._images[0][0], math.nan if motion_px is None else motion_px

@@ -15,15 +15,16 @@ import numpy as np
 from calibrate.geometry import difference
 from calibrate.kinematics import forward
 from recordings.errors import CodedError, RecordingError, Value
+from recordings.images import viewable
 from recordings.recorder import Recorder
 from recordings.recover import recover_recording
-from recordings.schema.messages import CameraModel, Image, RobotState, Vector6
+from recordings.schema.messages import CameraModel, CaptureEvent, Image, RobotState, Stamps, Vector6
 from station.analysis.pool import Workers
 from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.collision import CellGeometry
 from station.cell.errors import RefusedError
 from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
-from station.cell.stillness import StillnessMonitor
+from station.cell.stillness import RestingCheck, StillnessMonitor
 from station.devices.cell import Cell
 from station.protocol.states import check_transition
 from station.session.queue import PoseQueue
@@ -85,6 +86,11 @@ class SessionContext:
         assert self.recording is not None
         return self.recording
 
+    async def arm(self) -> RobotState:
+        """The arm's state, fresh and good; news that are late are waited for. Raises RobotError."""
+        await RestingCheck(self.cell.robot.check).news()
+        return self.cell.robot.latest()
+
     @property
     def recorder(self) -> Recorder | None:
         """The writer of the open file. From any thread."""
@@ -97,9 +103,11 @@ class SessionContext:
             recorder.robot_state(state)
 
     def record_event(self, event: Event) -> None:
-        if self.recording is not None:
+        """Keeps what people were told; a failing disk is reported elsewhere."""
+        if (recorder := self.recorder) is not None and recorder.error is None:
+            stamps = Stamps(host_monotonic_ns=time.monotonic_ns(), host_wall_ns=event.wall_ns)
             with contextlib.suppress(RecordingError):
-                self.recording.event(event)
+                recorder.event(CaptureEvent(stamps, "station", event.pose_index, event.text, event.level))
 
     async def open_recording(self, queue: PoseQueue, check: bool = False) -> None:
         """Opens the session's next file where none is open; begins a session where there is none.
@@ -133,8 +141,9 @@ class SessionContext:
     async def look_at(self, image: Image, lens: CameraModel | None = None) -> BoardDetection:
         """The board in an image, by the configured lens where no other is given. Raises WorkerError."""
         config = self.cell.config
+        pixels = viewable(image.pixels, image.pixel_format)
         return await self.workers.call(
-            sight, image.viewable(), config.board, lens or config.camera.model, timeout_s=_LOOK_S
+            sight, pixels, config.board, lens or config.camera.model, timeout_s=_LOOK_S
         )
 
     def forget_session(self, check: bool = False) -> None:
@@ -182,7 +191,8 @@ class StatusStore:
         self.entered = 0
         """States entered so far: one that was left and entered again is another."""
         self._watchers: list[Callable[[], None]] = []
-        self._listeners: list[Callable[[Event], None]] = []
+        self.recorded: Callable[[Event], None] = lambda event: None
+        """The recording keeps what people are told."""
 
     @property
     def state(self) -> StationState:
@@ -197,10 +207,6 @@ class StatusStore:
                 self._watchers.remove(changed)
 
         return end
-
-    def on_event(self, listener: Callable[[Event], None]) -> None:
-        """The recording keeps what people are told."""
-        self._listeners.append(listener)
 
     def update(self, **sections: object) -> None:
         changed = {k: v for k, v in sections.items() if getattr(self.status, k) != v}
@@ -233,8 +239,7 @@ class StatusStore:
         pose = f"pose {pose_index + 1}: " if pose_index is not None else ""
         log.log(getattr(logging, level.upper()), "%s%s", pose, text)
         self.update(events=(*self.status.events, event)[-EVENTS_KEPT:])
-        for listener in self._listeners:
-            listener(event)
+        self.recorded(event)
 
     def problem(
         self, error: Exception, level: Level = "warning", pose_index: int | None = None, said: str = "{}"

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from recordings.errors import Value
 from recordings.schema.messages import Vector6
-from station.cell.acceptance import StopWay
-from station.cell.collision import CellGeometry
 from station.cell.errors import RefusedError
-from station.cell.limits import MoveCheck
 from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus, MotionPreview
-from station.plan.hover import HoverPath
 from station.protocol.verbs import Purpose
 from station.session.queue import PlanRevision
 
@@ -56,16 +52,6 @@ class LeaseManager:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class StopTestMove:
-    """The checked move of an acceptance test, and what ends it."""
-
-    way: StopWay
-    target_rad: Vector6
-    check: MoveCheck
-    geometry: CellGeometry
-
-
 @dataclass(frozen=True)
 class MotionApproval:
     """A permission to move, as it was asked for."""
@@ -78,8 +64,8 @@ class MotionApproval:
     """None: a touch test, or a stop test."""
     replanned: PlanRevision | None = None
     """Poses that take the place of the session's with this approval."""
-    beside: HoverPath | StopTestMove | None = None
-    """Driven instead of poses of the plan; nothing is recorded then."""
+    beside: Drive | None = None
+    """Drives a checked motion instead of poses of the plan; nothing is recorded then."""
     expires_s: float = 0.0
     again: bool = False
     """Nobody is there to be asked: poses that do not settle are tried once more at the end."""
@@ -97,6 +83,10 @@ class MotionApproval:
         return f"{self.approval}: {self.summary.purpose}, plan {self.summary.plan_sha256[:12]}"
 
 
+Drive = Callable[[MotionApproval], Coroutine[object, object, None]]
+"""Carries out a motion that was approved."""
+
+
 class ApprovalManager:
     """At most one approval waits for a person; redeeming or voiding destroys it."""
 
@@ -106,20 +96,13 @@ class ApprovalManager:
         self.voids = 0
         """Counts voided ones: a check that was under way meanwhile offers none."""
 
-    @staticmethod
-    def new_token() -> str:
-        return secrets.token_urlsafe(16)
-
-    def offer(self, asked: MotionApproval) -> MotionApproval:
+    def offer(self, asked: MotionApproval) -> None:
         """Let this one wait for a person, for two minutes. An older one is void."""
         self.waiting = replace(asked, expires_s=self._clock() + APPROVAL_LIFETIME_S)
-        return self.waiting
 
-    def void(self) -> bool:
-        """True when there was one."""
+    def void(self) -> None:
         self.voids += 1
-        was, self.waiting = self.waiting, None
-        return was is not None
+        self.waiting = None
 
     def redeem(
         self,

@@ -15,14 +15,14 @@ import numpy as np
 
 from calibrate.boards.detect import detect
 from calibrate.boards.model import check_board
+from recordings.images import viewable
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import BoardSpec, Image, RobotState
 from station.analysis.pool import WorkerError
-from station.analysis.preview import preview_image
-from station.analysis.worker import BoardDetection, sight
-from station.cell.config import matrix4
+from station.analysis.worker import BoardDetection, preview_image, sight
+from station.cell.config import SPEED_CAP_M_S, matrix4
 from station.cell.errors import CameraError, RefusedError, RobotError, StationError
-from station.cell.limits import SPEED_CAP_M_S, point_speed_m_s
+from station.cell.limits import point_speed_m_s
 from station.cell.scene import flange_pose
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import (
@@ -130,15 +130,12 @@ class Monitor:
             mode=mode_word(state),
             held="" if context.cell.source == "playback" else what_holds(state),
             program=program_word(state),
-            speed_m_s=round(self._speed_m_s(state), 3),
+            speed_m_s=round(point_speed_m_s(context.geometry, state.joints_rad, state.joint_speeds_rad_s), 3),
             slider=round(state.target_speed_fraction, 3),
             joints_rad=state.joints_rad,
             base_from_flange=matrix4(flange_pose(state, identity.tcp_offset)),
             still=context.stillness.at_rest,
         )
-
-    def _speed_m_s(self, state: RobotState) -> float:
-        return point_speed_m_s(self._context.geometry, state.joints_rad, state.joint_speeds_rad_s)
 
     def _rate_hz(self) -> float:
         """Over the last round trip of at least a second."""
@@ -344,7 +341,7 @@ class Previewer:
             state, _ = await at_exposure(context, resting, image)
             _require_between_sessions(context)
             found = await context.workers.call(
-                detect, image.viewable(), tag, False, False, timeout_s=_OBSERVE_S
+                detect, viewable(image.pixels, image.pixel_format), tag, False, False, timeout_s=_OBSERVE_S
             )
         return Observation(
             mount=context.cell.config.mount,
@@ -375,8 +372,9 @@ class Previewer:
         config = context.cell.config
         try:
             exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None
+            pixels = viewable(image.pixels, image.pixel_format)
             sighting = await context.workers.call(
-                sight, image.viewable(), config.board, config.camera.model, False, exposure, timeout_s=5.0
+                sight, pixels, config.board, config.camera.model, False, exposure, timeout_s=5.0
             )
         except WorkerError:
             sighting = None

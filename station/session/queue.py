@@ -13,7 +13,6 @@ from station.cell.plan import Plan, PlannedPose, plan_sha256
 from station.cell.status import PoseState, PoseStatus
 from station.protocol.verbs import Purpose
 
-OPEN: frozenset[PoseState] = frozenset({"planned"})
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
 POSE_LIMIT = 2000
 TAKE_AGAIN = "to be captured again"
@@ -46,7 +45,8 @@ class PoseQueue:
             known = [_fresh(index, pose) for index, pose in enumerate(plan.poses)]
         self._poses = {status.index: pose for status, pose in zip(known, plan.poses, strict=True)}
         self._status = {status.index: status for status in known}
-        self._next_index = max(self._poses, default=-1) + 1
+        self.next_index = max(self._poses, default=-1) + 1
+        """The number that a further pose will have."""
 
     @property
     def plan(self) -> Plan:
@@ -65,17 +65,12 @@ class PoseQueue:
     @property
     def open(self) -> tuple[int, ...]:
         """Poses still to be driven to, in order."""
-        return tuple(i for i in self._poses if self._status[i].state in OPEN)
+        return tuple(i for i in self._poses if self._status[i].state == "planned")
 
     @property
     def fresh(self) -> tuple[int, ...]:
         """Poses that are open and were never tried, in order."""
         return tuple(i for i in self.open if not self._status[i].attempt)
-
-    @property
-    def next_index(self) -> int:
-        """The number that a further pose will have."""
-        return self._next_index
 
     @property
     def done(self) -> int:
@@ -181,7 +176,7 @@ class PoseQueue:
             raise RefusedError(f"There is already a pose named '{pose.name}'.", code="pose-name")
         if len(self._poses) >= POSE_LIMIT:
             raise RefusedError(f"A session has at most {POSE_LIMIT} poses.", code="too-many-poses")
-        index, self._next_index = self._next_index, self._next_index + 1
+        index, self.next_index = self.next_index, self.next_index + 1
         self._poses[index] = pose
         self._status[index] = _fresh(index, pose)
         return index

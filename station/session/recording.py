@@ -16,7 +16,6 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from calibrate.geometry import Array
 from recordings.errors import RecordingError
 from recordings.files import EMPTY_SUFFIX, MAIN_CAMERA, PART_SUFFIX, require_free_space
 from recordings.manifest import enter_part, read_manifest
@@ -29,7 +28,6 @@ from recordings.schema.messages import (
     Matrix4,
     SessionInfo,
     Stamps,
-    View,
 )
 from station.cell.config import matrix4
 from station.cell.errors import CameraError
@@ -43,7 +41,7 @@ from station.cell.session_folder import (
     segment_path,
     write_state,
 )
-from station.cell.status import Event, Level
+from station.cell.status import Level
 from station.devices.cell import Cell
 from station.session.queue import PoseQueue
 
@@ -218,12 +216,6 @@ class SessionRecording:
         rough = self._cell.config.camera.model
         return CameraModel(width=rough.width if rough else 0, height=rough.height if rough else 0)
 
-    def event(self, event: Event) -> None:
-        """Keeps what people were told; a failing disk is reported elsewhere."""
-        if self.recorder is not None and self.recorder.error is None:
-            stamps = Stamps(host_monotonic_ns=time.monotonic_ns(), host_wall_ns=event.wall_ns)
-            self.recorder.event(CaptureEvent(stamps, "station", event.pose_index, event.text, event.level))
-
     def number(self, image: Image) -> Image:
         """The same image with its number in this session, and pixels that no camera overwrites."""
         pixels = np.array(image.pixels, copy=True)
@@ -237,27 +229,20 @@ class SessionRecording:
         JSON: writing YAML would hold the loop up for longer than STOP may wait.
         """
         self._plans += 1
-        self._require().attach(f"plan-{self._plans}.json", "application/json", msgspec.json.encode(plan))
+        self.require_open().attach(f"plan-{self._plans}.json", "application/json", msgspec.json.encode(plan))
 
     def image(self, image: Image) -> None:
         """Hands it to the writer. Raises RecordingError when the disk cannot keep up or has failed."""
-        recorder = self._require()
+        recorder = self.require_open()
         if not recorder.image(image):
             text = "The disk cannot keep up: an image was dropped."
             raise recorder.error or RecordingError(text, code="disk-too-slow")
-
-    def view(self, view: View) -> None:
-        self._require().view(view)
-
-    def corners(self, sequence: int, pixels: Array) -> None:
-        """The board's in a recorded image, (n, 2) px; for whoever looks at the recording."""
-        self._require().corners(sequence, pixels)
 
     async def sync(self) -> None:
         """Returns when all of the above is on the disk (fdatasync). Raises RecordingError."""
         try:
             async with asyncio.timeout(SYNC_TIMEOUT_S):
-                await asyncio.shield(asyncio.wrap_future(self._require().sync()))
+                await asyncio.shield(asyncio.wrap_future(self.require_open().sync()))
         except TimeoutError as error:
             raise RecordingError(
                 f"The disk did not take the data of {self.folder} within {SYNC_TIMEOUT_S:.0f} s.",
@@ -303,7 +288,7 @@ class SessionRecording:
     async def seal(self, queue: PoseQueue) -> Path:
         """Finishes the file; returns the recording: the file, or the folder of several."""
         # Shielded: a cancelled waiter must not cancel what the writer's thread is doing.
-        await asyncio.shield(asyncio.wrap_future(self._require().finish()))
+        await asyncio.shield(asyncio.wrap_future(self.require_open().finish()))
         self.recorder = None
         await self.save_state(queue, self.whole)
         return self.whole
@@ -324,7 +309,8 @@ class SessionRecording:
             await asyncio.to_thread(self._closing.join)
             self._closing = None
 
-    def _require(self) -> Recorder:
+    def require_open(self) -> Recorder:
+        """RecordingError when it is not open."""
         if self.recorder is None:
             raise RecordingError(f"The recording in {self.folder} is not open.", code="not-open")
         return self.recorder

@@ -15,14 +15,12 @@ import msgspec
 import numpy as np
 
 from recordings.errors import RecordingError
-from station.analysis.estimation import next_best, next_best_text, running_estimate
+from station.analysis.estimation import running_estimate, seen_before
 from station.analysis.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement, improve
 from station.analysis.pool import WorkerError
-from station.analysis.worker import seen_before
 from station.cell.errors import RefusedError
 from station.cell.status import EstimateStatus
-from station.cell.stillness import RestingCheck
-from station.plan.predict import Advice
+from station.plan.predict import Advice, next_best, next_best_text
 from station.protocol.verbs import Purpose
 from station.session.context import SessionContext
 from station.session.queue import PlanRevision, PoseQueue
@@ -83,7 +81,7 @@ class Replanner:
                 remedy="Continue with the plan as it is (`station resume`), and ask again after "
                 f"{FEWEST_VIEWS} more.",
             )
-        await RestingCheck(context.cell.robot.check).news()
+        await context.arm()
         return await (
             self._anew(context.queue) if purpose is Purpose.REPLAN else self._one_more(context.queue)
         )

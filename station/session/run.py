@@ -7,12 +7,12 @@ import logging
 import threading
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.schema.messages import Image, Vector6
+from station.cell.collision import CellGeometry
 from station.cell.errors import (
     CameraError,
     LimitError,
@@ -24,7 +24,7 @@ from station.cell.errors import (
 from station.cell.limits import check_path, with_plan_speeds
 from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
-from station.cell.stillness import JOGGED_RAD, NotStillError, RestingCheck
+from station.cell.stillness import JOGGED_RAD, NotStillError
 from station.devices.base import StreamingCamera
 from station.session.capture import PoseFailedError, show_frame, take_image, take_pose
 from station.session.context import RunRequests, SessionContext
@@ -46,14 +46,16 @@ SHOW_PERIOD_S = 0.1
 class Run:
     """The owner calls `drive` as a task; cancelling it ends it where it is, after the disk has its data."""
 
-    def __init__(self, context: SessionContext, go: MotionApproval) -> None:
+    def __init__(
+        self, context: SessionContext, go: MotionApproval, geometry: CellGeometry | None = None
+    ) -> None:
+        """`geometry`: what a motion beside the plan was checked in; None: the cell, from where it stands."""
         self._context = context
         self._go = go
-        if go.beside is not None:
-            self._geometry = go.beside.geometry
-        else:
+        if geometry is None:
             geometry = geometry_from(context.cell.config, go.start_joints_rad)
-            self._geometry = with_plan_speeds(geometry, context.require_queue().plan)
+            geometry = with_plan_speeds(geometry, context.require_queue().plan)
+        self._geometry = geometry
         self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
         """Poses where something still moved."""
@@ -145,7 +147,10 @@ class Run:
             context.require_recording().require_space()
             await self._pose(index)
             taken += 1
-            self._show_times((time.monotonic() - started_s) / taken * len(todo))
+            # By this run's average; elapsed: the session's runs before this one included.
+            remaining_s = round((time.monotonic() - started_s) / taken * len(todo), 1)
+            elapsed_s = round(context.require_recording().elapsed_s, 1)
+            context.store.update_session(elapsed_s=elapsed_s, remaining_s=remaining_s)
 
     def _once_more(self) -> list[int]:
         """Poses that did not settle, once, under the same approval, where nobody can be asked.
@@ -185,9 +190,8 @@ class Run:
     async def _move_to(self, index: int) -> None:
         """Move from where the arm really is. LimitError when that path is not free."""
         context = self._context
-        robot, queue = context.cell.robot, context.require_queue()
-        await RestingCheck(robot.check).news()
-        here, target = robot.latest().joints_rad, queue.pose(index).joints_rad
+        queue = context.require_queue()
+        here, target = (await context.arm()).joints_rad, queue.pose(index).joints_rad
         queue.mark(index, "moving")
         context.store.enter(StationState.MOVING)
         context.show_poses(index)
@@ -197,22 +201,16 @@ class Run:
 
     async def _drive(self, here: Vector6, target: Vector6, name: str) -> None:
         """LimitError when the path from `here`, where the arm stands, is not free."""
-        robot = self._context.cell.robot
         # In a thread: neither the heartbeat nor STOP waits for it.
         check = await asyncio.to_thread(check_path, self._geometry, here, target, name)
         if check.problems:
             raise LimitError("; ".join(map(str, check.problems)), code="path")
-        await RestingCheck(robot.check).news()
-        moved_rad = float(np.abs(np.subtract(robot.latest().joints_rad, here)).max())
+        now = (await self._context.arm()).joints_rad
+        moved_rad = float(np.abs(np.subtract(now, here)).max())
         if moved_rad > JOGGED_RAD:  # after a swing it may settle by less than that
             text = f"The arm moved by {np.rad2deg(moved_rad):.1f}° while its path was checked."
             raise LimitError(text, code="arm-moved", moved_rad=moved_rad, limit_rad=JOGGED_RAD)
-        await robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
-
-    def _show_times(self, remaining_s: float) -> None:
-        """Elapsed, the session's runs before this one included; remaining, by this one's average."""
-        elapsed_s = round(self._context.require_recording().elapsed_s, 1)
-        self._context.store.update_session(elapsed_s=elapsed_s, remaining_s=round(remaining_s, 1))
+        await self._context.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 
     async def _rest(self) -> None:
         """Enter the state in which the session stands when its approval is used up."""
@@ -261,7 +259,7 @@ def internal_error(error: Exception) -> StationError:
 
 
 async def seal(context: SessionContext) -> None:
-    """Finishes the recording: sealing → idle. A failing disk leaves a fault and the `.part` file."""
+    """Finishes the recording, an interrupted one too: sealing → idle. Raises RecordingError, StationError."""
     context.store.enter(StationState.SEALING)
     context.show_poses()
     context.requests = RunRequests(halt=context.requests.halt)
@@ -269,12 +267,13 @@ async def seal(context: SessionContext) -> None:
 
 
 async def _seal(context: SessionContext) -> None:
-    sealed(context, await context.require_recording().seal(context.require_queue()))
-
-
-def sealed(context: SessionContext, path: Path) -> None:
-    """The session is whole. A STOP meanwhile stays latched; was it acknowledged, nothing is left paused."""
-    queue = context.require_queue()
+    """A STOP meanwhile stays latched; was it acknowledged, nothing is left paused."""
+    recording, queue = context.require_recording(), context.require_queue()
+    if recording.recorder is None:  # nothing was added since the crash
+        await context.recover_segments(recording)
+        await recording.save_state(queue, path := recording.whole)
+    else:
+        path = await recording.seal(queue)
     context.recording = None
     context.store.update_session(recording=str(path), remaining_s=0.0)
     # What matters first: a narrow screen cuts the end.
@@ -311,25 +310,15 @@ def unmark_busy(context: SessionContext) -> None:
 
 
 async def close_or_seal(context: SessionContext) -> None:
-    """Finishes: of an open recording the end is written, an interrupted one is made whole."""
+    """Finishes what rests. A failing disk leaves a fault and the `.part` file."""
     recording = context.require_recording()
     try:
-        if recording.recorder is None:  # nothing was added since the crash
-            context.store.enter(StationState.SEALING)
-            await to_the_end(_make_whole(context, recording))
-        else:
-            await seal(context)
+        await seal(context)
     except (RecordingError, StationError) as error:
         recording.abandon()
         context.store.problem(error, "error", said="not finished: {}")
         if context.store.state is not StationState.STOPPED:
             context.store.enter(StationState.FAULT, f"Recording: {error}", error.code)
-
-
-async def _make_whole(context: SessionContext, recording: SessionRecording) -> None:
-    await context.recover_segments(recording)
-    await recording.save_state(context.require_queue(), recording.whole)
-    sealed(context, recording.whole)
 
 
 class SweepRun(Run):
@@ -359,7 +348,7 @@ class SweepRun(Run):
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._take_pictures())
                 try:
-                    await self._swings()
+                    await super()._all_poses()
                 finally:
                     self._ended.set()  # a camera may swallow being cancelled, just when its image comes
         except ExceptionGroup as failed:
@@ -368,26 +357,20 @@ class SweepRun(Run):
             taken = self._taken
             self._context.store.event("swept", f"{taken} images while the arm moved", images=taken)
 
-    async def _swings(self) -> None:
+    async def _pose(self, index: int) -> None:
         context, queue = self._context, self._context.require_queue()
-        for index in self._go.poses:
-            if context.requests.halt or self._wants_rest() or self._failures >= FAILURES_IN_A_ROW:
-                return
-            if index not in queue.open:
-                continue  # skipped or dropped since the approval
-            context.require_recording().require_space()
-            queue.start_attempt(index)
-            try:
-                await self._move_to(index)
-            except LimitError as error:
-                self._give_up(error)
-                queue.mark(index, "failed", error)
-                return
-            context.store.enter(StationState.SETTLING)
-            await context.require_recording().sync()
-            queue.mark(index, "done")
-            await context.require_recording().save_state(queue)
-            context.show_poses(index)
+        queue.start_attempt(index)
+        try:
+            await self._move_to(index)
+        except LimitError as error:
+            self._give_up(error)
+            queue.mark(index, "failed", error)
+            return
+        context.store.enter(StationState.SETTLING)
+        await context.require_recording().sync()
+        queue.mark(index, "done")
+        await context.require_recording().save_state(queue)
+        context.show_poses(index)
 
     async def _take_pictures(self) -> None:
         """Until the arm rests, or the camera failed several times in a row."""

@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,6 @@ from station.cell.status import HoverOffer, LeaseStatus, MotionPreview, StationS
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
 from station.plan.choose import CRITERIA, Aim
-from station.plan.hover import HoverPath
 from station.plan.planner import make_plan
 from station.protocol import verbs
 from station.protocol.states import RUNNING
@@ -42,10 +41,10 @@ from station.session.queue import PoseQueue
 from station.session.recording import Logbook, SessionRecording
 from station.session.replan import Estimator, Replanner
 from station.session.run import Run, SweepRun, close_or_seal, unmark_busy
-from station.session.stop_test import StopTestRun, prepare_stop_test
+from station.session.stop_test import prepare_stop_test
 from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.session.supervisor import SessionSupervisor
-from station.session.touch_test import HoverRun, TouchTestPlanner
+from station.session.touch_test import TouchTestPlanner
 
 R = TypeVar("R")
 END_RUN_S = 10.0
@@ -57,14 +56,7 @@ PLAN_TIMEOUT_S = 180.0
 class Session:
     """Knows devices through `cell`, and nothing of sockets and screens."""
 
-    def __init__(
-        self,
-        cell: Cell,
-        root: Path,
-        ticked: Callable[[], None] = lambda: None,
-        first: Callable[[], None] = lambda: None,
-    ) -> None:
-        """`first`, `ticked`: before and after everything else in each round of the working loop."""
+    def __init__(self, cell: Cell, root: Path) -> None:
         config, playback = cell.config, cell.source == "playback"
         geometry = cell_geometry(config)
         self.store = StatusStore(
@@ -76,7 +68,7 @@ class Session:
         )
         self.leases = LeaseManager()
         self.approvals = ApprovalManager(time.monotonic)
-        self.supervisor = SessionSupervisor(self.context, self._jogged, ticked, self._void, first)
+        self.supervisor = SessionSupervisor(self.context, self._jogged, self._void)
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context)
@@ -88,7 +80,7 @@ class Session:
         self._notes: tuple[str, ...] = ()
         cell.robot.subscribe(monitor.add)
         cell.robot.subscribe(self.context.record_state)
-        self.store.on_event(self.context.record_event)
+        self.store.recorded = self.context.record_event
         self.store.watch(self._estimator.poke)
         self._logbook = Logbook(lambda: self.context.recorder)
 
@@ -172,24 +164,23 @@ class Session:
         """Checks the whole path from where the arm is and offers a one-use approval for it."""
         offer = await self._begin_offer(verbs.Prepare, client_id)
         found = await self._replanner.replan(purpose) or begun_anew(self.context, purpose)
-        poses = found.poses if found else poses_to_drive(self.context, purpose, index)
-        queue, changes = (found.queue, found.changes) if found else (self.context.require_queue(), ())
-        summary = await summarise(self.context, purpose, queue, poses, self._notes, changes)
-        offer(MotionApproval(summary, client_id, poses, purpose, found))
+        offered = found or poses_to_drive(self.context, purpose, index)
+        summary = await summarise(self.context, offered, self._notes)
+        offer(MotionApproval(summary, client_id, offered.poses, purpose, found))
         return summary
 
     async def prepare_hover(self, client_id: int, request: verbs.Hover) -> HoverOffer:
         """Offers a one-use approval for a slow path to a place over a corner of the board."""
         offer = await self._begin_offer(verbs.Hover, client_id)
-        hover, found = await self._touch_tests.prepare(request)
-        offer(MotionApproval(found.go, client_id, beside=hover))
+        drive, found = await self._touch_tests.prepare(request)
+        offer(MotionApproval(found.go, client_id, beside=drive))
         return found
 
     async def prepare_stop_test(self, client_id: int, request: verbs.StopTest) -> StopTestOffer:
         """Offers a one-use approval for a short move that is ended in one way."""
         offer = await self._begin_offer(verbs.StopTest, client_id)
-        move, found = await prepare_stop_test(self.context, request)
-        offer(MotionApproval(found.go, client_id, beside=move))
+        drive, found = await prepare_stop_test(self.context, request)
+        offer(MotionApproval(found.go, client_id, beside=drive))
         return found
 
     async def _begin_offer(
@@ -236,18 +227,14 @@ class Session:
             context.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
         if go.replanned is not None:
             self._replanner.adopt(go.replanned)
-        run = self._run_for(go)
+        drive = (go.beside or self._drive_poses)(go)
         self.store.enter(StationState.CHECKING)
         self.store.event("approved", go.said, plan_sha256=go.summary.plan_sha256)
-        self._run = asyncio.create_task(run.drive())
+        self._run = asyncio.create_task(drive)
 
-    def _run_for(self, go: MotionApproval) -> Run:
-        if isinstance(go.beside, HoverPath):
-            return HoverRun(self.context, go, go.beside)
-        if go.beside is not None:
-            return StopTestRun(self.context, go, go.beside)
+    def _drive_poses(self, go: MotionApproval) -> Coroutine[object, object, None]:
         sweeps = self.context.require_queue().plan.motion == "sweep"
-        return (SweepRun if sweeps else Run)(self.context, go)
+        return (SweepRun if sweeps else Run)(self.context, go).drive()
 
     def pause(self, who: str) -> None:
         """After this pose. Anyone may: it only ever makes the arm do less."""

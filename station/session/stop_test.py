@@ -14,7 +14,7 @@ import numpy as np
 
 from calibrate.kinematics import JOINT_NAMES
 from recordings.schema.messages import Vector6
-from station.cell.acceptance import StopTestOffer, StopWay
+from station.cell.acceptance import STOP_GIVEN, STOP_TESTED, StopTestOffer, StopWay
 from station.cell.collision import CellGeometry
 from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError, RobotError, SafetyStopError, StaleStateError
@@ -22,17 +22,12 @@ from station.cell.limits import PlanCheck, check_path, check_plan, slower
 from station.cell.plan import Plan, plan_sha256
 from station.cell.scene import geometry_from, pose_at
 from station.cell.status import StationState
-from station.cell.stillness import RestingCheck
 from station.protocol import verbs
 from station.session.context import SessionContext, displacement
-from station.session.lease import MotionApproval, StopTestMove
+from station.session.lease import Drive, MotionApproval
 from station.session.run import Run
 from station.session.summary import motion_preview, motion_warnings
 
-STOP_TESTED = "stop-tested"
-"""Cause of the state after such a move, however it ended."""
-STOP_GIVEN = "stop-given"
-"""Code of the event that tells when: `moment_ns`, host monotonic."""
 ACCELERATION_RAD_S2 = 1.4
 LONGEST_TURN_RAD = 0.4
 _PROBE_RAD = 0.05
@@ -53,13 +48,9 @@ _WORDS = {
 }
 
 
-async def prepare_stop_test(
-    context: SessionContext, request: verbs.StopTest
-) -> tuple[StopTestMove, StopTestOffer]:
+async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) -> tuple[Drive, StopTestOffer]:
     """RefusedError, LimitError and RobotError say what is in the way. Nothing moves."""
-    robot = context.cell.robot
-    await RestingCheck(robot.check).news()
-    state = robot.latest()
+    state = await context.arm()
     _require_slider(request.way, state.target_speed_fraction)
     start = state.joints_rad
     target, check, geometry, plan = await asyncio.to_thread(_free_move, context, request, start)
@@ -77,7 +68,7 @@ async def prepare_stop_test(
     offer = StopTestOffer(
         preview, context.cell.subject, request.joint, target[request.joint], move.joint_speed_rad_s
     )
-    return StopTestMove(request.way, target, move, geometry), offer
+    return lambda go: StopTestRun(context, go, geometry, request.way, target).drive(), offer
 
 
 def _require_slider(way: StopWay, fraction: float) -> None:
@@ -142,15 +133,22 @@ def _turns(geometry: CellGeometry, request: verbs.StopTest, start: Vector6) -> I
 class StopTestRun(Run):
     """Carries out one approved stop test: one move, no image, nothing recorded."""
 
-    def __init__(self, context: SessionContext, go: MotionApproval, test: StopTestMove) -> None:
-        super().__init__(context, go)
-        self._test = test
+    def __init__(
+        self,
+        context: SessionContext,
+        go: MotionApproval,
+        geometry: CellGeometry,
+        way: StopWay,
+        target_rad: Vector6,
+    ) -> None:
+        super().__init__(context, go, geometry)
+        self._way, self._target_rad = way, target_rad
 
     async def _poses(self) -> None:
-        context, robot, test = self._context, self._context.cell.robot, self._test
-        await RestingCheck(robot.check).news()
+        context, robot = self._context, self._context.cell.robot
+        here = (await context.arm()).joints_rad
         context.store.enter(StationState.MOVING)
-        driving = asyncio.create_task(self._drive(robot.latest().joints_rad, test.target_rad, "stop test"))
+        driving = asyncio.create_task(self._drive(here, self._target_rad, "stop test"))
         try:
             await self._give_stop(driving)
             await driving
@@ -170,9 +168,8 @@ class StopTestRun(Run):
 
     async def _give_stop(self, driving: asyncio.Task[None]) -> None:
         """Give the stop in mid-move, timed to the microsecond. RobotError where a way is not there."""
-        robot, test = self._context.cell.robot, self._test
-        start, target = (np.array(q) for q in (self._go.start_joints_rad, test.target_rad))
-        way = test.way
+        robot, way = self._context.cell.robot, self._way
+        start, target = (np.array(q) for q in (self._go.start_joints_rad, self._target_rad))
         if way in (StopWay.ARRIVE, StopWay.NETWORK, StopWay.SLIDER):
             return
         while not driving.done():

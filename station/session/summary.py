@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import secrets
 import shlex
 from typing import Any
 
@@ -16,10 +17,8 @@ from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import PlanCheck
 from station.cell.plan import Plan
 from station.cell.status import MotionPreview
-from station.cell.stillness import RestingCheck
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext, displacement
-from station.session.lease import ApprovalManager
 from station.session.queue import PlanRevision, PoseQueue
 
 POSE_OVERHEAD_S = 0.8
@@ -37,8 +36,8 @@ def begun_anew(context: SessionContext, purpose: Purpose) -> PlanRevision | None
     return PlanRevision(purpose, again, _open(again), queue.sha256, ())
 
 
-def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None) -> tuple[int, ...]:
-    """The poses an approval for this purpose covers. RefusedError when there are none."""
+def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None) -> PlanRevision:
+    """The session's poses that an approval for this purpose covers. RefusedError when there are none."""
     queue = context.loaded()
     if purpose in (Purpose.RETAKE, Purpose.RESUME) and context.recording is None:
         raise RefusedError("No session is open.", code="no-session", remedy="Run the plan to begin one.")
@@ -49,10 +48,10 @@ def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None)
             )
         if queue.status(index).state != "planned":
             queue.retake(index)
-        return (index,)
+        return PlanRevision(purpose, queue, (index,), queue.sha256, ())
     if purpose is Purpose.DRIFT_CHECK and context.recording is not None:
         raise RefusedError("A session is open.", code="session-open", remedy="Finish it first, then check.")
-    return _open(queue)
+    return PlanRevision(purpose, queue, _open(queue), queue.sha256, ())
 
 
 def _open(queue: PoseQueue) -> tuple[int, ...]:
@@ -61,22 +60,14 @@ def _open(queue: PoseQueue) -> tuple[int, ...]:
     return queue.open
 
 
-async def summarise(
-    context: SessionContext,
-    purpose: Purpose,
-    queue: PoseQueue,
-    poses: tuple[int, ...],
-    notes: tuple[str, ...],
-    changes: tuple[str, ...] = (),
-) -> MotionPreview:
+async def summarise(context: SessionContext, offered: PlanRevision, notes: tuple[str, ...]) -> MotionPreview:
     """Checks the whole path in the worker. LimitError: it is not free; RobotError: what the arm lacks."""
-    robot = context.cell.robot
     try:
         require_free_space(context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
         raise RefusedError(f"{full} Nothing moved.", code="disk-full") from None
-    await RestingCheck(robot.check).news()
-    start = robot.latest().joints_rad
+    start = (await context.arm()).joints_rad
+    queue, poses = offered.queue, offered.poses
     plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
     check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
     if check.problems:
@@ -86,11 +77,11 @@ async def summarise(
         check,
         start,
         overhead_s=POSE_OVERHEAD_S * len(poses),
-        purpose=_purpose_words(context, purpose, poses),
+        purpose=_purpose_words(context, offered.purpose, poses),
         plan_sha256=queue.sha256,
         poses=len(poses),
         first_move=f"{displacement(context, start, first)} to pose {poses[0] + 1}",
-        changes=changes,
+        changes=offered.changes,
         warnings=(*notes, *motion_warnings(context)),
     )
 
@@ -100,7 +91,7 @@ def motion_preview(
 ) -> MotionPreview:
     """The figures of a checked path with the words said of it, and a new token."""
     return MotionPreview(
-        token=ApprovalManager.new_token(),
+        token=secrets.token_urlsafe(16),
         path_m=round(check.path_m, 3),
         largest_step_rad=round(check.largest_step_rad, 4),
         top_speed_m_s=round(check.top_speed_m_s, 3),

@@ -34,18 +34,16 @@ LAGS_KEPT = 3000
 
 class SessionSupervisor:
     def __init__(
-        self,
-        context: SessionContext,
-        jogged: Callable[[str], None],
-        ticked: Callable[[], None],
-        lost: Callable[[], None],
-        first: Callable[[], None] = lambda: None,
+        self, context: SessionContext, jogged: Callable[[str], None], lost: Callable[[], None]
     ) -> None:
-        """`jogged`: the resting arm was moved by somebody, in words. `ticked`: after every round. `lost`: the
-        resting robot was silent for too long. `first`: before anything else in every round."""
+        """`jogged`: the resting arm was moved, in words. `lost`: the resting robot was silent too long."""
         self._context = context
         self._monitor = Monitor(context)
-        self._jogged, self._ticked, self._lost, self._first = jogged, ticked, lost, first
+        self._jogged, self._lost = jogged, lost
+        self.first: Callable[[], None] = lambda: None
+        """Before anything else in every round."""
+        self.ticked: Callable[[], None] = lambda: None
+        """After every round."""
         self._failure = ""
         self._rest: tuple[int, Vector6] | None = None
         """Which pause it is, of `store.entered`, and the joints at rest in it."""
@@ -65,12 +63,12 @@ class SessionSupervisor:
             await asyncio.sleep(max(0.0, due_s - time.monotonic()))
 
     def _round(self, number: int) -> None:
-        self._first()
+        self.first()
         if self._context.store.state in RUNNING:
             self._context.cell.robot.heartbeat()
         if number % STATUS_TICKS == 0:
             self._look()
-        self._ticked()
+        self.ticked()
 
     def _look(self) -> None:
         """Refreshes the status. What fails here must not end the heartbeat; a person is told."""

@@ -16,7 +16,7 @@ from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
 from calibrate.files.install import installed_calibration
-from calibrate.geometry import pose_from_rotvec
+from calibrate.geometry import Array, pose_from_rotvec
 from calibrate.kinematics import forward
 from calibrate.views import BoardView
 from recordings.schema.messages import Vector6
@@ -24,12 +24,12 @@ from station.cell.config import PointerConfig, matrix4
 from station.cell.errors import LimitError, RefusedError, RobotError
 from station.cell.plan import plan_sha256
 from station.cell.scene import flange_pose
-from station.cell.status import HoverOffer, MotionPreview, StationState
+from station.cell.status import HoverOffer, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError, RestingCheck
-from station.plan.hover import HoverAnswer, HoverPath, HoverQuestion, answer_hover, least_standoff_m
+from station.plan.hover import HoverPath, HoverQuestion, answer_hover, least_standoff_m
 from station.protocol import verbs
 from station.session.context import SessionContext, displacement
-from station.session.lease import MotionApproval
+from station.session.lease import Drive, MotionApproval
 from station.session.run import Run
 from station.session.summary import motion_preview, motion_warnings
 
@@ -59,7 +59,7 @@ class TouchTestPlanner:
         self._context = context
         self._board: _BoardSeen | None = None
 
-    async def prepare(self, request: verbs.Hover) -> tuple[HoverPath, HoverOffer]:
+    async def prepare(self, request: verbs.Hover) -> tuple[Drive, HoverOffer]:
         """RefusedError, LimitError, RobotError and CameraError say what is in the way. Nothing moves."""
         context = self._context
         robot, config = context.cell.robot, context.cell.config
@@ -82,13 +82,13 @@ class TouchTestPlanner:
         start = robot.latest().joints_rad
         question = HoverQuestion(request.corner, request.standoff_m, pointer, start, self._model_miss_m())
         try:
-            answer = await context.workers.call(
+            hover, covariance, moved_m = await context.workers.call(
                 answer_hover, config, calibration, seen.view, question, timeout_s=_PLAN_S
             )
         except CalibrationError as error:
             raise _refused(error) from error
-        summary = self._summary(answer, start, seen, words)
-        return answer.hover, _offer(answer, summary, context, pointer, words)
+        offer = self._offer(hover, covariance, moved_m, start, seen, pointer, words)
+        return lambda go: HoverRun(context, go, hover).drive(), offer
 
     def _calibration(self, request: verbs.Hover) -> Calibration:
         """A passed calibration of this very cell: a wrong one would put the board somewhere else."""
@@ -153,8 +153,7 @@ class TouchTestPlanner:
         self._board = None
         before = context.cell.robot.latest().joints_rad
         image = await context.cell.camera.capture()
-        await RestingCheck(context.cell.robot.check).news()
-        state = context.cell.robot.latest()
+        state = await context.arm()
         if np.abs(np.subtract(state.joints_rad, before)).max() > _SAME_PLACE_RAD:
             text = "The arm was moved while the image was taken."
             raise RefusedError(text, code="arm-moved", remedy="Leave it at rest, then retry.")
@@ -177,26 +176,44 @@ class TouchTestPlanner:
         modelled = forward(context.geometry.model, state.joints_rad)
         return float(np.linalg.norm(told[:3, 3] - modelled[:3, 3]))
 
-    def _summary(self, answer: HoverAnswer, start: Vector6, board: _BoardSeen, words: str) -> MotionPreview:
-        context, hover = self._context, answer.hover
-        warnings = [words]
-        age_s = time.monotonic() - board.at_s
-        if age_s > 5:
+    def _offer(
+        self,
+        hover: HoverPath,
+        offset_covariance: Array,
+        moved_m: float,
+        start: Vector6,
+        board: _BoardSeen,
+        pointer: PointerConfig,
+        words: str,
+    ) -> HoverOffer:
+        context, warnings = self._context, [words]
+        if (age_s := time.monotonic() - board.at_s) > 5:
             warnings.append(f"the board was seen {age_s:.0f} s ago: it must not have been moved since")
-        if answer.board_moved_m > 0.01:
-            moved_mm = 1000 * answer.board_moved_m
-            warnings.append(f"the board lies {moved_mm:.0f} mm from where it was calibrated")
-        x, y = 1000 * board_points(context.cell.config.board)[hover.corner][:2]
+        if moved_m > 0.01:
+            warnings.append(f"the board lies {1000 * moved_m:.0f} mm from where it was calibrated")
+        x, y = (float(v) for v in board_points(context.cell.config.board)[hover.corner][:2])
         first = hover.plan.poses[0].joints_rad
-        return motion_preview(
+        summary = motion_preview(
             hover.check,
             start,
             purpose=f"put the tip {1000 * hover.standoff_m:.0f} mm above corner {hover.corner} "
-            f"(x {x:.0f}, y {y:.0f} mm on the board)",
+            f"(x {1000 * x:.0f}, y {1000 * y:.0f} mm on the board)",
             plan_sha256=plan_sha256(hover.plan),
             poses=len(hover.plan.poses),
             first_move=f"{displacement(context, start, first)}, high over the corner",
             warnings=(*warnings, *motion_warnings(context)),
+        )
+        sigma = np.sqrt(np.diag(offset_covariance))
+        return HoverOffer(
+            go=summary,
+            corner=hover.corner,
+            corner_m=(x, y),
+            standoff_m=hover.standoff_m,
+            tip_m=pointer.tip_m,
+            base_from_board=matrix4(hover.base_from_board),
+            sigma_m=(float(sigma[0]), float(sigma[1])),
+            board_moved_m=moved_m,
+            pointer=words,
         )
 
 
@@ -204,38 +221,20 @@ def _mm(point: tuple[float, float, float]) -> str:
     return ", ".join(f"{1000 * v:.1f}" for v in point)
 
 
-def _offer(
-    answer: HoverAnswer, summary: MotionPreview, context: SessionContext, pointer: PointerConfig, words: str
-) -> HoverOffer:
-    hover, sigma = answer.hover, np.sqrt(np.diag(answer.offset_covariance))
-    x, y = (float(v) for v in board_points(context.cell.config.board)[hover.corner][:2])
-    return HoverOffer(
-        go=summary,
-        corner=hover.corner,
-        corner_m=(x, y),
-        standoff_m=hover.standoff_m,
-        tip_m=pointer.tip_m,
-        base_from_board=matrix4(hover.base_from_board),
-        sigma_m=(float(sigma[0]), float(sigma[1])),
-        board_moved_m=answer.board_moved_m,
-        pointer=words,
-    )
-
-
 class HoverRun(Run):
     """Carries out one approval over a corner: two moves, no image, nothing recorded."""
 
     def __init__(self, context: SessionContext, go: MotionApproval, hover: HoverPath) -> None:
-        super().__init__(context, go)
+        super().__init__(context, go, hover.geometry)
         self._hover = hover
 
     async def _poses(self) -> None:
         context, robot = self._context, self._context.cell.robot
         for planned in self._hover.plan.poses:
-            await RestingCheck(robot.check).news()
+            here = (await context.arm()).joints_rad
             context.store.enter(StationState.MOVING)
             try:
-                await self._drive(robot.latest().joints_rad, planned.joints_rad, planned.name)
+                await self._drive(here, planned.joints_rad, planned.name)
             except LimitError as error:
                 context.store.enter(StationState.IDLE, error)
                 return
@@ -249,8 +248,7 @@ class HoverRun(Run):
                 return
         with contextlib.suppress(NotStillError):  # what is read next is the place where it rests
             await context.stillness.settle(RestingCheck(robot.check))
-        await RestingCheck(robot.check).news()
-        there = robot.latest().joints_rad
+        there = (await context.arm()).joints_rad
         if context.requests.halt:
             return
         reason = (

@@ -6,8 +6,10 @@ board. Markers are laid out by OpenCV's own board classes, so that its detectors
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import cv2
 import numpy as np
@@ -17,6 +19,10 @@ from calibrate.boards.model import APRIL_DICTIONARY, dictionary_id
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 Floats = NDArray[np.float32]
+Ink = Callable[[Floats, Floats], NDArray[np.bool_]]
+"""Places (any equal shapes), metres → where it is black."""
+Markers = Sequence[tuple[float, float, float, NDArray[np.bool_]]]
+"""x, y of the corner and side, metres; black cells (n, n), border included"""
 
 BLACK, WHITE = 0.05, 0.85
 APRIL_GRID_BORDER_BITS = 1
@@ -28,82 +34,56 @@ class BoardPrint:
 
     sheet_m: tuple[float, float, float, float]
     """x0, y0, x1, y1 of the white sheet"""
-    ink: _Ink
+    black: Ink
 
     def albedo(self, x_m: Floats, y_m: Floats, around: float) -> Floats:
         """Reflectance at places (any equal shapes); `around` beyond the sheet."""
         x0, y0, x1, y1 = self.sheet_m
-        value = np.where(self.ink.black(x_m, y_m), np.float32(BLACK), np.float32(WHITE))
+        value = np.where(self.black(x_m, y_m), np.float32(BLACK), np.float32(WHITE))
         on_sheet = (x_m >= x0) & (x_m <= x1) & (y_m >= y0) & (y_m <= y1)
         return np.where(on_sheet, value, np.float32(around))
 
 
-class _Ink:
-    """Print of a board, by where it is black."""
+def _squares(columns: int, rows: int, square_m: float, first_white: bool = False) -> Ink:
+    """Chequered squares; the first (top left) one begins a square before the frame, and is black."""
 
-    def black(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class _Squares(_Ink):
-    """Chequered squares; the first (top left) one is black, unless `first_white`."""
-
-    columns: int
-    rows: int
-    square_m: float
-    origin_m: float
-    """Both coordinates of the outer corner of the first square."""
-    first_white: bool = False
-
-    def black(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
-        i = np.floor((x_m - np.float32(self.origin_m)) * np.float32(1 / self.square_m))
-        j = np.floor((y_m - np.float32(self.origin_m)) * np.float32(1 / self.square_m))
-        inside = (i >= 0) & (i < self.columns) & (j >= 0) & (j < self.rows)
+    def black(x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
+        i = np.floor((x_m + np.float32(square_m)) * np.float32(1 / square_m))
+        j = np.floor((y_m + np.float32(square_m)) * np.float32(1 / square_m))
+        inside = (i >= 0) & (i < columns) & (j >= 0) & (j < rows)
         half = (i + j) * np.float32(0.5)
         even = half == np.floor(half)
-        return np.asarray(inside & (even != self.first_white))
+        return np.asarray(inside & (even != first_white))
+
+    return black
 
 
-@dataclass(frozen=True, eq=False)
-class _Dots(_Ink):
-    centres_m: NDArray[np.float32]
-    """(n, 2)"""
-    radius_m: float
+def _dots(centres_m: NDArray[np.float32], radius_m: float) -> Ink:
+    """centres_m: (n, 2)."""
 
-    def black(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
+    def black(x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
         inked = np.zeros(x_m.shape, dtype=bool)
-        for cx, cy in self.centres_m:
-            inked |= (x_m - cx) ** 2 + (y_m - cy) ** 2 < np.float32(self.radius_m**2)
+        for cx, cy in centres_m:
+            inked |= (x_m - cx) ** 2 + (y_m - cy) ** 2 < np.float32(radius_m**2)
         return inked
 
-
-@dataclass(frozen=True, eq=False)
-class _Marker:
-    x_m: float
-    y_m: float
-    side_m: float
-    black_cells: NDArray[np.bool_]
-    """(n, n), border included"""
+    return black
 
 
-@dataclass(frozen=True, eq=False)
-class _Markers(_Ink):
+def _markers(markers: Markers, beneath: Ink | None = None) -> Ink:
     """Square markers over what lies beneath."""
 
-    beneath: _Ink
-    markers: tuple[_Marker, ...]
-
-    def black(self, x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
-        inked = self.beneath.black(x_m, y_m)
-        for m in self.markers:
-            inside = (x_m >= m.x_m) & (x_m < m.x_m + m.side_m) & (y_m >= m.y_m) & (y_m < m.y_m + m.side_m)
-            cell = len(m.black_cells) / m.side_m
-            column = ((x_m[inside] - np.float32(m.x_m)) * np.float32(cell)).astype(int)
-            row = ((y_m[inside] - np.float32(m.y_m)) * np.float32(cell)).astype(int)
-            last = len(m.black_cells) - 1
-            inked[inside] = m.black_cells[np.clip(row, 0, last), np.clip(column, 0, last)]
+    def black(x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
+        inked = np.zeros(x_m.shape, dtype=bool) if beneath is None else beneath(x_m, y_m)
+        for x, y, side, cells in markers:
+            inside = (x_m >= x) & (x_m < x + side) & (y_m >= y) & (y_m < y + side)
+            per_m, last = len(cells) / side, len(cells) - 1
+            column = ((x_m[inside] - np.float32(x)) * np.float32(per_m)).astype(int)
+            row = ((y_m[inside] - np.float32(y)) * np.float32(per_m)).astype(int)
+            inked[inside] = cells[np.clip(row, 0, last), np.clip(column, 0, last)]
         return inked
+
+    return black
 
 
 @lru_cache(maxsize=8)
@@ -111,20 +91,17 @@ def board_print(board: BoardSpec) -> BoardPrint:
     """The print of a board with a white margin of at least half a square around it."""
     columns, rows, s = board.columns, board.rows, board.square_m
     if board.kind is BoardKind.CHESSBOARD:
-        ink: _Ink = _Squares(columns + 1, rows + 1, s, origin_m=-s)
-        return BoardPrint((-1.5 * s, -1.5 * s, (columns + 0.5) * s, (rows + 0.5) * s), ink)
+        sheet = (-1.5 * s, -1.5 * s, (columns + 0.5) * s, (rows + 0.5) * s)
+        return BoardPrint(sheet, _squares(columns + 1, rows + 1, s))
     if board.kind in (BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES):
         centres = _circle_centres(board)
         right, bottom = centres.max(axis=0)
-        return BoardPrint(
-            (-1.5 * s, -1.5 * s, float(right) + 1.5 * s, float(bottom) + 1.5 * s), _Dots(centres, 0.3 * s)
-        )
+        sheet = (-1.5 * s, -1.5 * s, float(right) + 1.5 * s, float(bottom) + 1.5 * s)
+        return BoardPrint(sheet, _dots(centres, 0.3 * s))
     if board.kind is BoardKind.CHARUCO:
-        first_white = board.legacy and rows % 2 == 0
-        squares = _Squares(columns, rows, s, origin_m=-s, first_white=first_white)
-        markers = _charuco_markers(board)
+        squares = _squares(columns, rows, s, first_white=board.legacy and rows % 2 == 0)
         sheet = (-1.5 * s, -1.5 * s, (columns - 0.5) * s, (rows - 0.5) * s)
-        return BoardPrint(sheet, _Markers(squares, markers))
+        return BoardPrint(sheet, _markers(_charuco_markers(board), squares))
     if board.kind in SINGLE_TAGS:
         return _single_tag(board)
     return _april_grid(board)
@@ -143,33 +120,29 @@ def _dictionary(board: BoardSpec, default: str) -> cv2.aruco.Dictionary:
 
 def _marker(
     dictionary: cv2.aruco.Dictionary, number: int, border: int, corners_m: NDArray[np.float32]
-) -> _Marker:
+) -> tuple[float, float, float, NDArray[np.bool_]]:
     cells = dictionary.markerSize + 2 * border
     picture = cv2.aruco.generateImageMarker(dictionary, number, cells, borderBits=border)
     (x0, y0), (x1, _) = corners_m.min(axis=0)[:2], corners_m.max(axis=0)[:2]
-    return _Marker(float(x0), float(y0), float(x1 - x0), np.asarray(picture < 128))
+    return float(x0), float(y0), float(x1 - x0), np.asarray(picture < 128)
 
 
-def _charuco_markers(board: BoardSpec) -> tuple[_Marker, ...]:
+def _charuco_markers(board: BoardSpec) -> Markers:
     """OpenCV counts from the outer corner of the first square, the board's frame from the first inner one."""
     dictionary = _dictionary(board, "DICT_4X4_250")
     marker_m = board.marker_m or 0.75 * board.square_m
     layout = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, marker_m, dictionary)
     layout.setLegacyPattern(board.legacy)
-    return tuple(
-        _marker(
-            dictionary, int(number), 1, np.asarray(corners, dtype=np.float32) - np.float32(board.square_m)
-        )
-        for number, corners in zip(np.asarray(layout.getIds()).ravel(), layout.getObjPoints(), strict=True)
-    )
+    numbered = zip(np.asarray(layout.getIds()).ravel(), layout.getObjPoints(), strict=True)
+    shift = np.float32(board.square_m)
+    return [_marker(dictionary, int(n), 1, np.asarray(c, dtype=np.float32) - shift) for n, c in numbered]
 
 
 def _single_tag(board: BoardSpec) -> BoardPrint:
     dictionary, side = _dictionary(board, APRIL_DICTIONARY), board.square_m
     corners = np.array([[0.0, 0.0], [side, side]], dtype=np.float32)
     tag = _marker(dictionary, board.tag_id, 1, corners)
-    blank = _Dots(np.zeros((0, 2), np.float32), 0.0)
-    return BoardPrint((-side / 4, -side / 4, 1.25 * side, 1.25 * side), _Markers(blank, (tag,)))
+    return BoardPrint((-side / 4, -side / 4, 1.25 * side, 1.25 * side), _markers([tag]))
 
 
 def _april_grid(board: BoardSpec) -> BoardPrint:
@@ -184,15 +157,10 @@ def _april_grid(board: BoardSpec) -> BoardPrint:
     for number in range(board.columns * board.rows):
         row, column = divmod(number, board.columns)
         low = np.array([column * pitch, -row * pitch - side])
-        tags.append(
-            _marker(dictionary, number, APRIL_GRID_BORDER_BITS, np.array([low, low + side], dtype=np.float32))
-        )
+        corners = np.array([low, low + side], dtype=np.float32)
+        tags.append(_marker(dictionary, number, APRIL_GRID_BORDER_BITS, corners))
     full = np.ones((1, 1), dtype=bool)
-    crossings = [
-        _Marker(column * pitch - gap, -row * pitch, gap, full)
-        for column in range(board.columns + 1)
-        for row in range(board.rows + 1)
-    ]
+    places = product(range(board.columns + 1), range(board.rows + 1))
+    crossings = [(column * pitch - gap, -row * pitch, gap, full) for column, row in places]
     width, height = board.columns * pitch, board.rows * pitch
-    blank = _Dots(np.zeros((0, 2), np.float32), 0.0)
-    return BoardPrint((-2 * gap, -height - gap, width + gap, 2 * gap), _Markers(blank, (*tags, *crossings)))
+    return BoardPrint((-2 * gap, -height - gap, width + gap, 2 * gap), _markers([*tags, *crossings]))

@@ -106,8 +106,9 @@ class RenderedCamera:
         """One trigger, one frame; a frame that was there before the trigger is an error, not the answer."""
         async with self._asking:
             await self._read_clock()
-            if not self._frames.empty():
-                raise self.counter.surplus(self._drain())
+            if surplus := self._frames.qsize():
+                self._frames = asyncio.Queue()
+                raise self.counter.surplus(surplus)
             pulse: TriggerPulse | None = None
             asked_ns = time.monotonic_ns()
             if self._trigger is None:
@@ -178,13 +179,6 @@ class RenderedCamera:
                 f"{self._exposure_us:g} µs at {self._gain_db:g} dB; something else changes its settings",
                 code="settings-changed",
             )
-
-    def _drain(self) -> int:
-        count = 0
-        while not self._frames.empty():
-            self._frames.get_nowait()
-            count += 1
-        return count
 
     async def _read_clock(self) -> None:
         asked_ns = time.monotonic_ns()

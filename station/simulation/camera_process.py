@@ -10,8 +10,7 @@ import json
 import math
 import sys
 import time
-from collections import Counter
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, get_type_hints
 
 import cv2
 import msgspec
@@ -34,9 +33,8 @@ PREVIEW_SCALE = 0.5
 
 
 Message = tuple[Json, NDArray[np.uint8] | None]
-ONE_SHOT = ("missed-trigger", "lost-frame", "double-frame")
-"""value: how often, 1 if none is given"""
-LASTING = ("illumination", "exposure", "clock-step", "stamp-error", "cover", "board", "ringing", "knock")
+ADDING = ("missed-trigger", "lost-frame", "double-frame", "clock-step")
+"""Faults that come to those there are; without a value, one more."""
 
 
 class Ringing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -45,7 +43,7 @@ class Ringing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     amplitude_rad: float
     frequency_hz: float = 7.0
     decay_s: float = math.inf
-    begun_ns: int = 0
+    begun_ns: int = msgspec.field(default_factory=time.monotonic_ns)
 
     def angle_rad(self, host_monotonic_ns: int) -> float:
         elapsed_s = (host_monotonic_ns - self.begun_ns) / 1e9
@@ -53,66 +51,49 @@ class Ringing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.amplitude_rad * swing * math.exp(-max(elapsed_s, 0.0) / self.decay_s)
 
 
-class CameraFaults:
-    """Armed faults. One-shot ones are used up by triggers, the others last until set again."""
+class CameraFaults(msgspec.Struct):
+    """Faults by their names. Counts are used up by triggers, the others last until set again."""
 
-    def __init__(self) -> None:
-        self._armed: Counter[str] = Counter()
-        self.illumination = 1.0
-        """Factor on the light"""
-        self.exposure_us: float | None = None
-        """The camera's exposure changed by itself"""
-        self.clock_step_ns = 0
-        self.stamp_error_ns = 0
-        """Added to the frames' stamps, not to the clock that is read"""
-        self.board: BoardSpec | None = None
-        """Another board lies there"""
-        self._covered = 0.0
-        self._ringing: Ringing | None = None
-        self._knock_m = (0.0, 0.0, 0.0)
-        """Shift of the camera, in its own frame"""
+    missed_trigger: int = 0
+    lost_frame: int = 0
+    double_frame: int = 0
+    clock_step: int = 0
+    """ns"""
+    stamp_error: int = 0
+    """Added to the frames' stamps, not to the clock that is read; ns"""
+    illumination: float = 1.0
+    """Factor on the light"""
+    exposure: float | None = None
+    """The camera's exposure changed by itself; µs"""
+    board: BoardSpec | None = None
+    """Another board lies there"""
+    cover: float = 0.0
+    """Share of the image, from the left, over which something dark lies"""
+    ringing: Ringing | None = None
+    knock: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Shift of the camera, in its own frame; m"""
 
     def inject(self, name: str, value: Any = None) -> None:
         """ValueError for an unknown name."""
-        if name in ONE_SHOT:
-            self._armed[name] += 1 if value is None else int(value)
-        elif name == "illumination":
-            self.illumination = float(value)
-        elif name == "exposure":
-            self.exposure_us = None if value is None else float(value)
-        elif name == "clock-step":
-            self.clock_step_ns += int(value)
-        elif name == "stamp-error":
-            self.stamp_error_ns = int(value)
-        elif name == "cover":
-            self._covered = float(value)
-        elif name == "board":
-            self.board = None if value is None else msgspec.convert(value, BoardSpec)
-        elif name == "ringing":
-            ringing = None if value is None else msgspec.convert(value, Ringing)
-            begun_ns = time.monotonic_ns()
-            self._ringing = ringing and msgspec.structs.replace(ringing, begun_ns=begun_ns)
-        elif name == "knock":
-            self._knock_m = msgspec.convert(value, tuple[float, float, float])
-        else:
-            known = ", ".join((*ONE_SHOT, *LASTING, "unplugged"))
+        field = name.replace("-", "_")
+        if field not in self.__struct_fields__:
+            known = ", ".join((*self.__struct_fields__, "unplugged")).replace("_", "-")
             raise ValueError(f"no camera fault '{name}'; there are {known}")
+        if name in ADDING:
+            value = getattr(self, field) + (1 if value is None else value)
+        setattr(self, field, msgspec.convert(value, get_type_hints(CameraFaults)[field]))
 
-    def take(self, name: str) -> bool:
+    def take(self, field: str) -> bool:
         """Tell whether this fault is due now; uses it up."""
-        due = self._armed[name] > 0
-        self._armed[name] -= due
-        return due
+        due: int = getattr(self, field)
+        setattr(self, field, max(0, due - 1))
+        return due > 0
 
     def bracket(self, host_monotonic_ns: int) -> Array:
         """Transform (4, 4) of the camera as it is now from the camera as it should be."""
-        angle_rad = self._ringing.angle_rad(host_monotonic_ns) if self._ringing is not None else 0.0
-        x, y, z = self._knock_m
+        angle_rad = self.ringing.angle_rad(host_monotonic_ns) if self.ringing is not None else 0.0
+        x, y, z = self.knock
         return pose_from_rotvec((-x, -y, -z), (angle_rad, 0.0, 0.0))
-
-    def cover(self, picture: NDArray[np.uint8]) -> None:
-        """Something dark lies over the left share of the image, in place."""
-        picture[:, : round(self._covered * picture.shape[1])] = 20
 
 
 class CameraProcess:
@@ -137,13 +118,8 @@ class CameraProcess:
 
     def device_ns(self, host_monotonic_ns: int) -> int:
         """The camera's own clock."""
-        drift_ns = host_monotonic_ns * self.truth.camera_clock_drift_ppm * 1e-6
-        return (
-            host_monotonic_ns
-            + round(drift_ns)
-            + self.truth.camera_clock_offset_ns
-            + self.faults.clock_step_ns
-        )
+        drift_ns = round(host_monotonic_ns * self.truth.camera_clock_drift_ppm * 1e-6)
+        return host_monotonic_ns + drift_ns + self.truth.camera_clock_offset_ns + self.faults.clock_step
 
     def answer(self, request: Json) -> list[Message]:
         """Messages to send back, each with its pixels or None. Raises RobotError without a controller."""
@@ -161,26 +137,26 @@ class CameraProcess:
         raise ValueError(f"unknown command {request['cmd']!r}")
 
     def _trigger(self) -> list[Message]:
-        if self.faults.take("missed-trigger"):
+        if self.faults.take("missed_trigger"):
             return []
         frames: list[Message] = []
-        for _ in range(2 if self.faults.take("double-frame") else 1):
+        for _ in range(2 if self.faults.take("double_frame") else 1):
             start_ns = time.monotonic_ns() + TRIGGER_LATENCY_NS
             frames.append(self._frame("frame", start_ns, self.truth.camera, self._frame_id))
             self._frame_id = self._frame_id % 65_535 + 1
-        return [] if self.faults.take("lost-frame") else frames
+        return [] if self.faults.take("lost_frame") else frames
 
     def _frame(
         self, kind: str, start_ns: int, camera: CameraModel, frame_id: int
     ) -> tuple[Json, NDArray[np.uint8]]:
-        exposure_us = self.faults.exposure_us or self.exposure_us
+        exposure_us = self.faults.exposure or self.exposure_us
         picture = self.picture(start_ns, camera)
         arrival_ns = start_ns + round(exposure_us * 1000) + READOUT_NS
         _sleep_until(arrival_ns)
         header = {
             "kind": kind,
             "frame_id": frame_id,
-            "device_ns": self.device_ns(start_ns) + self.faults.stamp_error_ns,
+            "device_ns": self.device_ns(start_ns) + self.faults.stamp_error,
             "arrival_monotonic_ns": arrival_ns,
             "exposure_us": exposure_us,
             "gain_db": self.gain_db,
@@ -189,7 +165,7 @@ class CameraProcess:
 
     def picture(self, start_ns: int, camera: CameraModel) -> NDArray[np.uint8]:
         """Exposed from the host time `start_ns` on; returns after the exposure."""
-        exposure_us = self.faults.exposure_us or self.exposure_us
+        exposure_us = self.faults.exposure or self.exposure_us
         middle_ns = start_ns + round(exposure_us * 500)
         camera_from_board = self.faults.bracket(middle_ns) @ self.camera_from_board(
             self._flange_at(middle_ns)
@@ -203,7 +179,7 @@ class CameraProcess:
         )
         board = self.faults.board or self.truth.board
         picture = render(camera, board, camera_from_board, light, self._rng)
-        self.faults.cover(picture)
+        picture[:, : round(self.faults.cover * picture.shape[1])] = 20
         return picture
 
     def camera_from_board(self, base_from_flange: Array) -> Array:

@@ -1,41 +1,54 @@
 """A GigE Vision camera in a process of its own: Aravis's fake camera, fed with rendered images.
 
-It speaks the real control and stream protocols over loopback. Run it only in a network namespace that has
-nothing but `lo`, for discovery broadcasts. Faults are JSON lines on standard input, as for the rendered
-camera, with `packet-loss` (share of packets) besides. It ends with its input.
+Its features are those of `genicam.xml`. It speaks the real control and stream protocols over loopback: run it
+only in a network namespace that has nothing but `lo`, for discovery broadcasts. Faults are JSON lines on
+standard input, as for the rendered camera, with `packet-loss` (share of packets) besides. It ends with its
+input.
 """
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import json
-import os
 import socket
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from calibrate.kinematics import MODELS, forward
 from station.cell.errors import CameraError, RobotError
 from station.devices.pixels import encode
-from station.simulation import genicam
 from station.simulation.camera_process import CameraProcess
-from station.simulation.cell import CellTruth, read_truth
-from station.simulation.renderer import render
+from station.simulation.cell import read_truth
 from station.simulation.scenes import make_cell
 
 LIBRARY = "libaravis-0.8.so.0"
 CONTROL_PORT = 3956
+DESCRIPTION = Path(__file__).with_name("genicam.xml")
+_GENICAM = {"": "http://www.genicam.org/GenApi/Version_1_1"}
+_ROOT = ElementTree.parse(DESCRIPTION).getroot()
+ADDRESSES = {
+    node.attrib["Name"].removesuffix("Register"): int(node.findtext("Address", "", _GENICAM), 16)
+    for node in _ROOT.iterfind("*[Address]", _GENICAM)
+}
+"""Of each feature's register."""
+PIXEL_FORMATS = {
+    entry.attrib["Name"]: int(entry.findtext("Value", "", _GENICAM))
+    for entry in _ROOT.iterfind("Enumeration[@Name='PixelFormat']/EnumEntry", _GENICAM)
+}
+OWN_MEMORY = 0xA000
+"""Registers from here on mean nothing to Aravis."""
+FAKE_TRIGGER_SOURCE, FAKE_TRIGGER_SOFTWARE = 0x304, 1
+"""The only source Aravis's fake camera reacts to: pulses on a line are written to TriggerSoftware, too."""
+GAIN_STEPS_PER_DB = 10
 _LATCH_POLL_S = 0.001
 _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
@@ -51,12 +64,9 @@ class GigeCamera:
         self._source = source
         self._lib = _library()
         _require_free(address)
-        with tempfile.NamedTemporaryFile("w", suffix=".xml", encoding="utf-8") as description:
-            description.write(genicam.genicam_xml())
-            description.flush()
-            self._server = self._lib.arv_gv_fake_camera_new_full(
-                address.encode(), serial.encode(), description.name.encode()
-            )
+        self._server = self._lib.arv_gv_fake_camera_new_full(
+            address.encode(), serial.encode(), str(DESCRIPTION).encode()
+        )
         if not self._server or not self._lib.arv_gv_fake_camera_is_running(self._server):
             raise CameraError(f"the GigE simulator did not start on {address}", code="simulation-not-started")
         self._camera = self._lib.arv_gv_fake_camera_get_fake_camera(self._server)
@@ -65,9 +75,9 @@ class GigeCamera:
         self._fill = _FILL(self._fill_buffer)  # must outlive the camera: C keeps only the pointer
         self._lib.arv_fake_camera_set_fill_pattern(self._camera, self._fill, None)
 
-    def register(self, address: int) -> int:
+    def register(self, name: str) -> int:
         value = ctypes.c_uint32()
-        self._lib.arv_fake_camera_read_register(self._camera, address, ctypes.byref(value))
+        self._lib.arv_fake_camera_read_register(self._camera, ADDRESSES[name], ctypes.byref(value))
         return value.value
 
     def set_register(self, address: int, value: int) -> None:
@@ -85,42 +95,37 @@ class GigeCamera:
 
         def watch() -> None:
             while True:
-                if self.register(genicam.TIMESTAMP_LATCH):
-                    self._write(genicam.TIMESTAMP_VALUE, device_ns().to_bytes(8, "big"))
-                    self.set_register(genicam.TIMESTAMP_LATCH, 0)
+                if self.register("GevTimestampControlLatch"):
+                    self._write("GevTimestampValue", device_ns().to_bytes(8, "big"))
+                    self.set_register(ADDRESSES["GevTimestampControlLatch"], 0)
                 time.sleep(_LATCH_POLL_S)
 
         threading.Thread(target=watch, name="timestamp latch", daemon=True).start()
 
     def _describe(self, width: int, height: int, serial: str) -> None:
-        for address, text in (
-            (genicam.VENDOR_ADDRESS, genicam.VENDOR),
-            (genicam.MODEL_ADDRESS, genicam.MODEL),
-            (genicam.VERSION_ADDRESS, "simulated"),
-            (genicam.INFO_ADDRESS, "simulated by the calibration station"),
-            (genicam.SERIAL_ADDRESS, serial),
+        for name, text in (
+            ("DeviceVendorName", _ROOT.attrib["VendorName"]),
+            ("DeviceModelName", _ROOT.attrib["ModelName"]),
+            ("DeviceVersion", "simulated"),
+            ("DeviceManufacturerInfo", "simulated by the calibration station"),
+            ("DeviceID", serial),
+            ("GevTimestampValue", "\0" * 7),
         ):
-            self._write(address, text.encode() + b"\0")
-        for address, value in (
-            (genicam.SENSOR_WIDTH, width),
-            (genicam.SENSOR_HEIGHT, height),
-            (genicam.WIDTH, width),
-            (genicam.HEIGHT, height),
-            (genicam.PIXEL_FORMAT, genicam.PIXEL_FORMATS["Mono8"]),
-            (genicam.EXPOSURE, 10_000),
-            (genicam.GAIN, 0),
-            (genicam.FAKE_TRIGGER_SOURCE, genicam.FAKE_TRIGGER_SOFTWARE),
-            *((address, 0) for address in range(genicam.TIMESTAMP_LATCH, genicam.FIRST_FREE, 4)),
-        ):
-            self.set_register(address, value)
+            self._write(name, text.encode() + b"\0")
+        values = {"SensorWidth": width, "SensorHeight": height, "Width": width, "Height": height}
+        values |= {"PixelFormat": PIXEL_FORMATS["Mono8"], "ExposureTime": 10_000, "Gain": 0}
+        for name, address in ADDRESSES.items():
+            if name in values or address >= OWN_MEMORY:
+                self.set_register(address, values.get(name, 0))
+        self.set_register(FAKE_TRIGGER_SOURCE, FAKE_TRIGGER_SOFTWARE)
 
-    def _write(self, address: int, data: bytes) -> None:
-        self._lib.arv_fake_camera_write_memory(self._camera, address, len(data), data)
+    def _write(self, name: str, data: bytes) -> None:
+        self._lib.arv_fake_camera_write_memory(self._camera, ADDRESSES[name], len(data), data)
 
     def _fill_buffer(self, buffer: int, _: int, exposure_us: int, gain: int, pixel_format: int) -> None:
-        names = {value: name for name, value in genicam.PIXEL_FORMATS.items()}
-        width, height = self.register(genicam.WIDTH), self.register(genicam.HEIGHT)
-        grey, device_ns = self._source(width, height, float(exposure_us), gain / genicam.GAIN_STEPS_PER_DB)
+        names = {value: name for name, value in PIXEL_FORMATS.items()}
+        width, height = self.register("Width"), self.register("Height")
+        grey, device_ns = self._source(width, height, float(exposure_us), gain / GAIN_STEPS_PER_DB)
         # The size it reports is not set yet; the buffer holds width × height pixels of this format.
         target = self._lib.arv_buffer_get_data(buffer, ctypes.byref(ctypes.c_size_t()))
         if names[pixel_format] == "Mono8":
@@ -183,108 +188,45 @@ def rendered_source(camera: CameraProcess) -> Source:
     return source
 
 
-class NumberedSource:
-    """Source for throughput: frame n is `numbered_picture(n)`, nearly free. `clock`: the device's, ns."""
-
-    def __init__(self, clock: Callable[[], int], still: NDArray[np.uint8] | None = None) -> None:
-        self.next_number = 0
-        self._clock = clock
-        self._still = still
-
-    def __call__(
-        self, width: int, height: int, exposure_us: float, gain_db: float
-    ) -> tuple[NDArray[np.uint8], int]:
-        self.next_number += 1
-        begun_ns = self._clock()
-        time.sleep(exposure_us / 1e6)
-        return numbered_picture(self.next_number - 1, width, height, self._still), begun_ns
-
-
-_noise: dict[tuple[int, int], NDArray[np.uint8]] = {}
-
-
-def numbered_picture(
-    number: int, width: int, height: int, still: NDArray[np.uint8] | None = None
-) -> NDArray[np.uint8]:
-    """Noise that moves with the number, and the number itself in the first eight bytes.
-
-    `still`: (height, width), shown below the noise, which then has three bits.
-    """
-    if (width, height) not in _noise:
-        _noise[width, height] = np.random.default_rng(0).integers(0, 256, (height + 64, width), np.uint8)
-    shift = number % 64
-    picture = _noise[width, height][shift : shift + height].copy()
-    if still is not None:
-        picture = (still[:height, :width] & np.uint8(0xF8)) | (picture >> np.uint8(5))
-    picture.reshape(-1)[:8] = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
-    return picture
-
-
-def still_picture(truth: CellTruth) -> NDArray[np.uint8]:
-    """Image from where the arm starts, without noise: the same bits every time."""
-    camera = CameraProcess(truth, "", truth.exposure_us, truth.gain_db)
-    flange = forward(MODELS[truth.robot_model], truth.start_joints_rad)
-    return render(truth.camera, truth.board, camera.camera_from_board(flange))
-
-
-def _be_hardware() -> None:
-    """Keeps its pace whatever this computer does besides, where that is permitted: a camera would, too."""
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-
-
 def main(
     controller_host: Annotated[str, typer.Option(help="Whose arm the camera looks at.")] = "",
     truth: Annotated[Path | None, typer.Option(help="File of the simulated cell.")] = None,
     address: Annotated[str, typer.Option(help="Loopback address of the camera.")] = "127.0.0.1",
     serial: Annotated[str, typer.Option(help="As the camera reports it.")] = "SIM00000",
-    numbered: Annotated[
-        bool, typer.Option(help="Numbered test pictures, over what the start shows if there is a truth.")
-    ] = False,
 ) -> None:
     """Serves until standard input ends; prints one JSON line when it listens."""
-    cv2.setNumThreads(1)
-    if numbered:
-        _be_hardware()
-    cell: CellTruth = make_cell() if truth is None else read_truth(truth)
+    cell = make_cell() if truth is None else read_truth(truth)
     rendered = CameraProcess(cell, controller_host, cell.exposure_us, cell.gain_db)
-    if not numbered:
-        rendered.warm_up()
+    rendered.warm_up()
+    serve(rendered_source(rendered), rendered, address, serial, rendered.faults.inject)
 
-    def clock() -> int:
-        return rendered.device_ns(time.monotonic_ns())
 
-    numbers = NumberedSource(clock, None if truth is None or not numbered else still_picture(cell))
-    source = numbers if numbered else rendered_source(rendered)
+def serve(
+    source: Source, rendered: CameraProcess, address: str, serial: str, inject: Callable[[str, Any], None]
+) -> None:
+    """`rendered`: whose size and clock the camera has. `inject`: carries out what is no fault of GigE."""
+    cv2.setNumThreads(1)
+    model = rendered.truth.camera
     try:
-        camera = GigeCamera(source, cell.camera.width, cell.camera.height, address, serial)
+        camera = GigeCamera(source, model.width, model.height, address, serial)
     except CameraError as error:
         print(error, file=sys.stderr)
         raise SystemExit(1) from error
-    camera.watch_latch(clock)
+    camera.watch_latch(lambda: rendered.device_ns(time.monotonic_ns()))
     print(json.dumps({"ready": True, "address": address, "serial": serial}), flush=True)
     for line in sys.stdin:
         request = json.loads(line)
-        _carry_out(request["name"], request.get("value"), camera, numbers, rendered)
-        print(json.dumps({"done": request["name"], "number": numbers.next_number}), flush=True)
-
-
-def _carry_out(
-    name: str, value: Any, camera: GigeCamera, numbers: NumberedSource, rendered: CameraProcess
-) -> None:
-    match name:
-        case "packet-loss":
-            camera.set_packet_loss(float(value))
-        case "number":
-            numbers.next_number = int(value)
-        case "sent":
-            pass  # every answer says it
-        case "pulse":
-            camera.set_register(genicam.TRIGGER_PULSE, 1)
-        case "register":
-            camera.set_register(*value)
-        case _:
-            rendered.faults.inject(name, value)
+        name, value = request["name"], request.get("value")
+        match name:
+            case "packet-loss":
+                camera.set_packet_loss(float(value))
+            case "pulse":
+                camera.set_register(ADDRESSES["TriggerSoftware"], 1)
+            case "register":
+                camera.set_register(*value)
+            case _:
+                inject(name, value)
+        print(json.dumps({"done": name}), flush=True)
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ def place_fixed_camera(board: BoardSpec, camera: CameraModel, rng: np.random.Gen
             turn,
             np.array([*rng.uniform(-0.01, 0.01, 2), rng.uniform(0.03, 0.06)]) - turn @ board_centre(board),
         )
-        flange = pose(_random_turn(rng), _shell_point(rng))
+        flange = pose(rotation_exp(rng.normal(size=3) * 2.0), _shell_point(rng))
         look = rotation_exp([*rng.uniform(-0.2, 0.2, 2), rng.uniform(-np.pi, np.pi)])
         X = flange @ Y @ inverse(seen_from(board, rng.uniform(0.48, 0.55), look))
         if X[2, 3] < 0.1 or np.hypot(X[0, 3], X[1, 3]) < 0.4:
@@ -126,10 +126,6 @@ def _shell_point(rng: np.random.Generator) -> Array:
     """A point within the arm's comfortable reach, in `base`."""
     radius, around = rng.uniform(0.45, 0.85), rng.uniform(-np.pi, np.pi)
     return np.array([radius * np.cos(around), radius * np.sin(around), rng.uniform(0.45, 0.9)])
-
-
-def _random_turn(rng: np.random.Generator) -> Array:
-    return rotation_exp(rng.normal(size=3) * 2.0)
 
 
 def _exact_scene(mount: Mount, camera: CameraModel, board: BoardSpec, X: Array, Y: Array) -> Scene:

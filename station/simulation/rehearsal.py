@@ -20,8 +20,8 @@ from station.cell.scene import guess_matrix, require_kept_clear, scene_of
 from station.devices.cell import Cell
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import CellTruth, write_truth
-from station.simulation.launch import start_controller
+from station.simulation.cell import CellTruth
+from station.simulation.launch_cell import start_cell
 
 FOLDER = "rehearsal"
 """Below the state folder: nothing of a rehearsal lies beside what is real."""
@@ -44,14 +44,9 @@ def rehearsed_cell(config: StationConfig, path: str, folder: Path, seed: int = 0
     from station.devices.ur import UrRobot
 
     truth = truth_within(config, seed)
-    folder.mkdir(parents=True, exist_ok=True)
-    truth_file = folder / "truth.json"
-    write_truth(truth, truth_file)
     ends = ExitStack()
-    controller = ends.enter_context(
-        start_controller(truth.robot_model, truth=truth_file, log=folder / "controller.log")
-    )
-    simulated = without_devices(config, controller.host)
+    host, attachments = start_cell(truth, folder, ends)
+    simulated = without_devices(config, host)
     about = {
         "configuration": Path(path).name,
         "robot_sigma_mm": 1e3 * REPEATABILITY_M,
@@ -60,10 +55,10 @@ def rehearsed_cell(config: StationConfig, path: str, folder: Path, seed: int = 0
     return Cell(
         config=simulated,
         robot=UrRobot(simulated.robot, folder),
-        camera=RenderedCamera(truth, controller.host, simulated.camera),
+        camera=RenderedCamera(truth, host, simulated.camera),
         source="simulated",
         config_path=path,
-        attachments={"truth.json": truth_file.read_bytes(), ATTACHMENT: json.dumps(about).encode()},
+        attachments=attachments | {ATTACHMENT: json.dumps(about).encode()},
         ended=ends.close,
     )
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -99,13 +100,8 @@ def scaled(camera: CameraModel, factor: float) -> CameraModel:
         (0.0, fy * factor, (cy + 0.5) * factor - 0.5),
         (0.0, 0.0, 1.0),
     )
-    return CameraModel(
-        width=round(camera.width * factor),
-        height=round(camera.height * factor),
-        matrix=matrix,
-        distortion=camera.distortion,
-        distortion_model=camera.distortion_model,
-    )
+    width, height = round(camera.width * factor), round(camera.height * factor)
+    return msgspec.structs.replace(camera, width=width, height=height, matrix=matrix)
 
 
 @lru_cache(maxsize=4)
@@ -131,18 +127,9 @@ def _window(
 ) -> tuple[slice, slice] | None:
     """Rows and columns that may show the sheet; None where it is out of the image."""
     x0, y0, x1, y1 = board_print(board).sheet_m
-    along = np.linspace(0.0, 1.0, 9)
-    x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
-    ones = np.ones_like(along)
-    outline = np.concatenate(
-        [
-            np.stack([x, y0 * ones], 1),
-            np.stack([x, y1 * ones], 1),
-            np.stack([x0 * ones, y], 1),
-            np.stack([x1 * ones, y], 1),
-        ]
-    )
-    points = np.column_stack([outline, np.zeros(len(outline))])
+    corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+    along = np.linspace(0.0, 1.0, 9)[:, None, None]
+    points = (corners + along * (np.roll(corners, -1, axis=0) - corners)).reshape(-1, 3)
     in_camera = points @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
     whole = (slice(0, camera.height), slice(0, camera.width))
     if (in_camera[:, 2] <= 0.01).all():

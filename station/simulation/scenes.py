@@ -74,9 +74,8 @@ def make_cell(
         raise ConfigError(
             f"no simulated cell '{scene}' with noise '{noise}' and mount '{mount}'",
             code="unknown-cell",
-            remedy=f"Scenes are {', '.join(scenes)}, noise levels {', '.join(_NOISE)}, mounts eye-in-hand "
-            "and "
-            "eye-to-hand.",
+            remedy=f"Scenes are {', '.join(scenes)}, noise levels {', '.join(_NOISE)}, "
+            "mounts eye-in-hand and eye-to-hand.",
         )
     rng = np.random.default_rng([2026, seed])
     published = scenes[scene]()
@@ -163,28 +162,22 @@ def _other_lens(camera: CameraModel, rng: np.random.Generator) -> CameraModel:
 def _with_noise(truth: CellTruth, level: _CellNoise, rng: np.random.Generator) -> CellTruth:
     spread = 1.0 if truth.seed == 0 else float(rng.uniform(0.8, 1.2))
 
-    def deltas(sigma: float) -> Vector6:
-        return vector6(rng.normal(0, sigma, 6) if sigma else np.zeros(6))
-
+    sigmas = (level.dh_sigma_m, level.dh_sigma_m, level.dh_sigma_rad, level.dh_sigma_rad)
+    deltas = [rng.normal(0, sigma, 6) if sigma else np.zeros(6) for sigma in sigmas]
     factory = np.zeros((4, 6))
     if level.factory_mm:
-        drawn = np.random.default_rng([1945, truth.seed])
-        factory = 1e-3 * level.factory_mm * drawn.normal(size=(4, 6))
+        factory = 1e-3 * level.factory_mm * np.random.default_rng([1945, truth.seed]).normal(size=(4, 6))
         # Axes that are nearly parallel have their common normal far off: so makers state them.
         factory[1, 1:4] += _FAR_M * np.array([1.0, -0.4, -0.6])
         factory[[0, 2], 5] = 0.0
+    tables: dict[str, Vector6] = {}
+    for i, column in enumerate(("a_m", "d_m", "alpha_rad", "theta_rad")):
+        tables |= {f"factory_{column}": vector6(factory[i]), f"dh_delta_{column}": vector6(deltas[i])}
     return msgspec.structs.replace(
         truth,
-        factory_a_m=vector6(factory[0]),
-        factory_d_m=vector6(factory[1]),
-        factory_alpha_rad=vector6(factory[2]),
-        factory_theta_rad=vector6(factory[3]),
+        **tables,
         robot_sigma_m=level.robot_sigma_m * spread,
         robot_sigma_rad=level.robot_sigma_rad * spread,
-        dh_delta_a_m=deltas(level.dh_sigma_m),
-        dh_delta_d_m=deltas(level.dh_sigma_m),
-        dh_delta_alpha_rad=deltas(level.dh_sigma_rad),
-        dh_delta_theta_rad=deltas(level.dh_sigma_rad),
         pixel_noise=level.pixel_noise * spread,
         blur_px=level.blur_px * spread,
         camera_clock_offset_ns=int(rng.integers(-(10**12), 10**12)),

@@ -11,62 +11,62 @@ import contextlib
 import gc
 import subprocess
 import sys
-import time
 from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-import msgspec
 from textual import events, work
 from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
-from textual.message import Message
+from textual.reactive import reactive
 from textual.screen import Screen
 
-from station.cell.errors import RefusedError, StationError
-from station.cell.status import StationState, StationStatus
+from calibrate.files.calibration import Calibration
+from station.cell.errors import StationError
+from station.cell.status import MotionPreview, SessionStatus, StationState
+from station.operate.motion import prepared_motion
+from station.protocol import verbs
 from station.protocol.client import Client
 from station.protocol.states import RUNNING
 from station.protocol.stop_client import send_stop
-from station.protocol.verbs import Configuration, Lease, Sessions, Watch
+from station.protocol.verbs import Purpose
 from station.tui.connect import ConnectScreen
-from station.tui.desk import ScreenLink
-from station.tui.dialogs import Help
-from station.tui.frame import Framed
-from station.tui.installed import LOOK_S
-from station.tui.live import LiveScreen, LogScreen
+from station.tui.desk import Connect, Desk, KnowingApp, ScreenLink, StatusChanged
+from station.tui.dialogs import Confirm, ConfirmMotion, Help
+from station.tui.frame import SESSION
+from station.tui.installed import LOOK_S, Marks, Result, marks, read_past, read_result, state_root
+from station.tui.live import PLAYER_KEYS, WATCHABLE, LiveScreen, LogScreen, ReplayScreen
 from station.tui.plan import PlanScreen
 from station.tui.replay import ReplayLink
-from station.tui.replay_screen import Player, ReplayScreen
 from station.tui.result import InstallScreen, SolveScreen, VerifyScreen
-from station.tui.results import ResultsDesk
-from station.tui.screen import StationScreen
-from station.tui.sessions import SessionsScreen
+from station.tui.results import (
+    check_drift,
+    check_session,
+    discard,
+    export_result,
+    install_result,
+    recover_session,
+    roll_back,
+    solve_session,
+)
+from station.tui.screen import Ask, StationScreen
+from station.tui.sessions import SessionsScreen, SessionWish
 from station.tui.task import DIGITS
+from station.tui.touch_test import run_touch_test
 from station.tui.widgets.graphics import detect
 from station.tui.widgets.preview import PreviewPane
 
-Connect = Callable[[], Awaitable[ScreenLink]]
-LISTEN_S = 0.5
-SILENT_S = 2.0
-"""A working daemon answers within milliseconds, on a busy computer within some hundred."""
-_PATIENT_S = 7 * 86400.0
 WHERE_IS_THE_CURSOR = "\x1b[6n"
 """ECMA-48's device status report: a terminal answers by itself, from where the person sits."""
 ASK_S = 3.0
 UNANSWERED = 5
 TERMINAL_SILENT = "Terminal silent {:.0f} s. The arm was stopped, control released."
 PREVIEW_PERIOD_S = 0.25
-STATUS_PERIOD_S = 0.25
-"""Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
 SETTLED_S = 2.0
-RECONNECT_S = 1.0
-GONE = "The daemon ended: the controller stops the arm. This screen goes on when a daemon serves again."
-SILENT = (
-    "Daemon not responding: the data below are old. The arm's watchdog stops it; if it moves, press the "
-    "emergency stop."
-)
+DECELERATES = "It decelerates at once, and the session pauses."
+ResultWork = Callable[[Desk, Result, Calibration], Awaitable[str | None]]
 
 
 def freeze_startup() -> None:
@@ -87,37 +87,11 @@ SCREENS: tuple[type[StationScreen], ...] = (
 )
 
 
-async def listen(link: ScreenLink, tell: Callable[[float | None], None]) -> None:
-    """Ask something small again and again; ends with the link. A daemon that hangs keeps its socket open.
+class StationApp(KnowingApp):
+    """One app, several screens; the same keys everywhere.
 
-    `tell` hears for how many seconds it has not answered, and None when it did.
+    The screens are drawn from `known` alone, and ask by messages and by the actions below.
     """
-    while True:
-        asked_s = time.monotonic()
-        answer = asyncio.ensure_future(link.call(Watch(), timeout_s=_PATIENT_S))
-        try:
-            while not (await asyncio.wait({answer}, timeout=LISTEN_S))[0]:
-                if (waited_s := time.monotonic() - asked_s) >= SILENT_S:
-                    tell(waited_s)
-            problem = answer.exception()
-        finally:
-            answer.cancel()
-        if problem is not None and not isinstance(problem, RefusedError):
-            return
-        tell(None)
-        await asyncio.sleep(LISTEN_S)
-
-
-class StatusChanged(Message):
-    """None: there is no daemon, and `why`."""
-
-    def __init__(self, status: StationStatus | None, why: str = "") -> None:
-        super().__init__()
-        self.status, self.why = status, why
-
-
-class StationApp(ResultsDesk):
-    """One app, several screens; the same keys everywhere."""
 
     TITLE = "Calibration station"
     CSS_PATH = "station.tcss"
@@ -125,14 +99,39 @@ class StationApp(ResultsDesk):
     DEFAULT_MODE = "capture"
     _unanswered: int | None = None
     """Questions since the last answer; None: there was none yet."""
+    result_path: reactive[str] = reactive("", repaint=False, always_update=True)
+    """The calibration file that the result screens show; empty: that of the session just captured."""
+    _marks: tuple[str, Marks] = ("", frozenset())
+    _looking = False
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", show=False, priority=True, id="stop", tooltip="Stop the arm now"),
         Binding(
             "f1", "help", "Help", show=False, id="help", tooltip="What this screen is for, and all its keys"
         ),
-        Binding("f5", "start('run')", "Run", id="run", tooltip="Check the path, show the motion, and ask"),
-        Binding("f6", "ask('pause')", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
-        Binding("f7", "finish", "Finish", id="finish", tooltip="Finish the recording with the poses so far"),
+        Binding(
+            "f5",
+            "start('run')",
+            "Run",
+            id="run",
+            group=SESSION,
+            tooltip="Check the path, show the motion, and ask",
+        ),
+        Binding(
+            "f6",
+            "ask('pause')",
+            "Pause",
+            id="pause",
+            group=SESSION,
+            tooltip="Stop after this pose; nothing is lost",
+        ),
+        Binding(
+            "f7",
+            "finish",
+            "Finish",
+            id="finish",
+            group=SESSION,
+            tooltip="Finish the recording with the poses so far",
+        ),
         Binding(
             "f8",
             "acknowledge",
@@ -142,9 +141,30 @@ class StationApp(ResultsDesk):
             id="acknowledge",
             tooltip="Leave STOPPED or FAULT after looking",
         ),
-        Binding("f9", "solve_newest", "Solve", id="solve", tooltip="Solve the session just recorded"),
-        Binding("f3", "freedrive", "Freedrive", id="freedrive", tooltip="Freedrive: move the arm by hand"),
-        Binding("f2", "ask('record')", "Image", id="record", tooltip="Capture an image here (freedrive)"),
+        Binding(
+            "f9",
+            "solve_newest",
+            "Solve",
+            id="solve",
+            group=SESSION,
+            tooltip="Solve the session just recorded",
+        ),
+        Binding(
+            "f3",
+            "freedrive",
+            "Freedrive",
+            id="freedrive",
+            group=SESSION,
+            tooltip="Freedrive: move the arm by hand",
+        ),
+        Binding(
+            "f2",
+            "ask('record')",
+            "Image",
+            id="record",
+            group=SESSION,
+            tooltip="Capture an image here (freedrive)",
+        ),
         Binding("f4", "release", "Release", show=False, id="release", tooltip="Release control of the arm"),
         *(
             Binding(DIGITS[s.MODE], f"open('{s.MODE}')", s.MODE.title(), show=False, id=s.MODE, tooltip=s.TIP)
@@ -157,24 +177,19 @@ class StationApp(ResultsDesk):
 
     def __init__(self, connect: Connect) -> None:
         super().__init__()
-        self._connect = connect
+        self.desk = Desk(self, connect)
         self._greeted = False
 
     def on_mount(self) -> None:
-        self.follow()
+        self.run_worker(self.desk.follow(), group="follow", exit_on_error=False)
         self.fetch_previews()
         self.set_timer(SETTLED_S, freeze_startup)
         self._ask_terminal()
         self.set_interval(ASK_S, self._look_for_terminal)
         self.set_interval(LOOK_S, self._look)
 
-    def _look(self) -> None:
-        """A daemon at work is left in peace."""
-        if self.status is None or self.status.state not in RUNNING:
-            self.look_at_results()
-
-    async def action_open(self, mode: str) -> None:
-        await self.switch_mode(mode)
+    def playing(self) -> bool:
+        return any(isinstance(screen, ReplayScreen) for screen in self.screen_stack)
 
     # --- the person: an ssh that dies silently leaves this screen alive, and with it control of the arm ---
 
@@ -188,122 +203,277 @@ class StationApp(ResultsDesk):
     async def _look_for_terminal(self) -> None:
         if self._unanswered is None:
             return
-        if self.status is None or self.status.state not in RUNNING or not self.has_control():
+        if not self.known.works or not self.desk.has_control():
             self._unanswered = 0
             return
         if self._unanswered >= UNANSWERED:
-            await self.ask(Lease("lost"))
+            await self.desk.ask(verbs.Lease("lost"))
             self._unanswered = 0
             self.notify(TERMINAL_SILENT.format(ASK_S * UNANSWERED), severity="error", timeout=3600)
             return
         self._unanswered += 1
         self._ask_terminal()
 
-    # --- the daemon → the screen ---
-
-    @work(exclusive=True, group="follow", exit_on_error=False)
-    async def follow(self) -> None:
-        """Stays connected for as long as the screen lives."""
-        while True:
-            why = GONE
-            try:
-                self.link = await self._connect()
-                self.run_worker(listen(self.link, self.hear), group="listen", exclusive=True)
-                async for status in self.link.statuses():
-                    self.tell_newest(status)
-                    await self._pace(status)
-                    self.post_message(StatusChanged(status))
-            except (OSError, StationError) as problem:
-                why = str(problem)
-            except msgspec.ValidationError as problem:
-                why = f"The daemon is of another version than this screen ({problem}): restart the older one."
-            gone, self.link = self.link, None
-            if gone is not None:
-                await gone.close()
-            self.post_message(StatusChanged(None, why))
-            await asyncio.sleep(RECONNECT_S)
-
-    def hear(self, silent_s: float | None) -> None:
-        """Hear for how long the daemon has not answered; None: it does."""
-        if silent_s is None and self.silent_s is None:
-            return
-        self.silent_s = silent_s
-        self._tell_trouble("" if silent_s is None else SILENT)
-
-    def _tell_trouble(self, trouble: str) -> None:
-        self.trouble = trouble
-        self._show()
-
-    def _show(self) -> None:
-        """Show the status on every screen and question that stands over another."""
-        known = self.known()
-        for screen in self.screen_stack:
-            # Closing, the app takes the screens' parts away before its workers end.
-            if isinstance(screen, Framed) and screen.is_mounted and self.is_running:
-                screen.show(known)
-
-    def playing(self) -> bool:
-        return any(isinstance(screen, ReplayScreen) for screen in self.screen_stack)
-
-    def tell_busy(self, words: str) -> None:
-        super().tell_busy(words)
-        self._show()
-
-    async def _pace(self, status: StationStatus) -> None:
-        """A new state or reason is shown at once; numbers that only flicker, a few times a second."""
-        known = self.status
-        if known is not None and (known.state, known.reason) == (status.state, status.reason):
-            await asyncio.sleep(STATUS_PERIOD_S)
+    # --- what is known ---
 
     @work(exclusive=True, group="preview", exit_on_error=False)
     async def fetch_previews(self) -> None:
         """Only for a screen that shows them, and only as large as it can show."""
         while True:
             await asyncio.sleep(PREVIEW_PERIOD_S)
-            screen = self.screen
-            link = screen.link if isinstance(screen, ReplayScreen) else self.link
-            if link is None:
+            if (link := self.shown_link) is None:
                 continue
-            for preview in screen.query(PreviewPane):
+            for preview in self.screen.query(PreviewPane):
                 with contextlib.suppress(OSError, StationError):
                     await preview.fetch(link)
 
+    @property
+    def shown_link(self) -> ScreenLink | None:
+        """What the screen shows: the daemon, or a recording."""
+        return self.screen.player if isinstance(self.screen, ReplayScreen) else self.desk.link
+
+    def action_play(self, what: str, by: float = 0.0) -> None:
+        """Steer the playback that is shown."""
+        if isinstance(player := self.shown_link, ReplayLink):
+            match what:
+                case "toggle":
+                    player.toggle()
+                case "step":
+                    player.step(int(by))
+                case "seek":
+                    player.seek(by)
+
     def on_status_changed(self, message: StatusChanged) -> None:
-        before, self.status = self.status, message.status
-        if message.status is None:
-            self.silent_s = None
-        elif before is None or before.session.calibration != message.status.session.calibration:
-            self.look_at_results()
-        elif before.session.name and not message.status.session.name:
+        before, status = self.known.live, message.status
+        if status is None:
+            self.known = replace(self.known, gone=message.why, silent_s=None)
+            return
+        self.known = replace(self.known, status=status, gone="")
+        if before is None or before.session.calibration != status.session.calibration:
+            self.action_look_at_results()
+        elif before.session.name and not status.session.name:
             self.result_path = ""  # another session begins: what was looked at is no part of it
-        if message.status is not None and not self._greeted:
+        if not self._greeted:
             self._greeted = True
-            self.greet(message.status)
-            self.learn_cell()
-        self._show()
-        if self.silent_s is None and self.trouble != message.why:
-            self._tell_trouble(message.why)
+            self.greet()
 
     @work(exit_on_error=False)
-    async def learn_cell(self) -> None:
-        """Learn the cell that the scenes are drawn from; an older daemon does not tell."""
-        if self.link is not None:
+    async def greet(self) -> None:
+        """Learn the cell, if the daemon tells it; show what is missing to who starts for the first time."""
+        status = self.known.shown
+        if self.desk.link is not None:
             with contextlib.suppress(OSError, StationError):
-                self.configuration = await self.link.call(Configuration())
-
-    @work(exit_on_error=False)
-    async def greet(self, status: StationStatus) -> None:
-        """Show what is missing to a person who starts for the first time, or without a robot."""
+                told = await self.desk.link.call(verbs.Configuration())
+                self.known = replace(self.known, configuration=told)
         if status.playback:
             return
         missing = status.state is StationState.DISCONNECTED
-        unused = not status.session.poses and await self.ask(Sessions()) == []
+        unused = not status.session.poses and await self.desk.ask(verbs.Sessions()) == []
         if (missing or unused) and self.current_mode == self.DEFAULT_MODE:
             await self.switch_mode("connect")
 
-    def common_actions(self) -> list[str]:
-        """Actions that have a key on every screen; a playback adds its own."""
-        return [binding.action for binding in StationApp.BINDINGS if isinstance(binding, Binding)]
+    @work(exclusive=True, group="checks", exit_on_error=False)
+    async def action_look_at_checks(self) -> None:
+        if (checks := await self.desk.ask(verbs.Doctor())) is not None:
+            self.known = replace(self.known, checks=tuple(checks))
+
+    @work(exclusive=True, group="sessions", exit_on_error=False)
+    async def action_look_at_sessions(self) -> None:
+        root, sessions = self.desk.root, await self.desk.ask(verbs.Sessions())
+        if sessions is None:
+            self._marks = ("", frozenset())  # why was said; what was known stays until the next look
+            return
+        past = await asyncio.to_thread(read_past, root, self.desk.camera, sessions)
+        self.known = replace(self.known, past=past)
+
+    def watch_result_path(self) -> None:
+        self.action_look_at_results()
+
+    def _look(self) -> None:
+        """Look whether another screen or a shell changed something; a daemon at work is left in peace."""
+        if not self.known.works:
+            self.action_look_at_results()
+
+    @work(group="look", exit_on_error=False)
+    async def action_look_at_results(self) -> None:
+        """Read the shown result, and the sessions where they are shown, if anything changed on the disk."""
+        if self._looking:
+            return  # what is under way comes to the newest, too
+        self._looking = True
+        try:
+            while (found := await self._found()) not in (None, self._marks):
+                assert found is not None
+                path, self._marks = found[0], found
+                result = await asyncio.to_thread(read_result, path) if path else None
+                self.known = replace(self.known, result=result)
+                if isinstance(self.screen, SessionsScreen):
+                    self.action_look_at_sessions()
+        finally:
+            self._looking = False
+
+    async def _found(self) -> tuple[str, Marks] | None:
+        """The shown file, and marks of all below the root; None without a root."""
+        live = self.known.live
+        path = self.result_path or ("" if live is None else live.session.calibration)
+        root = state_root(path) if path else self.desk.root
+        return None if root is None else (path, await asyncio.to_thread(marks, root))
+
+    # --- wishes of the screens ---
+
+    async def action_open(self, mode: str) -> None:
+        await self.switch_mode(mode)
+
+    async def show_result(self, calibration: str) -> None:
+        """Open a calibration file; empty: there is none any more."""
+        self.result_path = calibration
+        await self.switch_mode("solve" if calibration else "sessions")
+
+    def on_ask(self, wish: Ask) -> None:
+        self.run_worker(
+            self.desk.ask(wish.verb, timeout_s=wish.timeout_s), group="command", exit_on_error=False
+        )
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def on_session_wish(self, wish: SessionWish) -> None:
+        session, desk = wish.session, self.desk
+        match wish.what:
+            case "solve":
+                await self._solve(session.recording, session.folder)
+            case "show":
+                await self.show_result(session.calibration)
+            case "check":
+                await check_session(desk, session.recording, session.folder)
+            case "recover":
+                await recover_session(desk, session.folder)
+            case "play":
+                live = self.known.live
+                if live is not None and live.state not in WATCHABLE:
+                    state = live.state.value
+                    self.notify(f"The cell is {state}: finish that first, then look at old recordings.")
+                    return
+                player = await desk.attempt(asyncio.to_thread(ReplayLink, Path(session.folder)))
+                if player is not None:
+                    await self.push_screen(ReplayScreen(player))
+
+    async def _solve(self, recording: str, folder: str) -> None:
+        if path := await solve_session(self.desk, recording, folder):
+            await self.show_result(path)
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def action_solve_newest(self) -> None:
+        session = self.known.shown.session
+        if session.recording:
+            await self._solve(session.recording, session.folder)
+        else:
+            self.notify("Nothing is finished yet: F7 finishes a session; older ones are on 7.")
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def action_on_result(self, what: str) -> None:
+        """Do something with the shown result."""
+        result = self.known.result
+        if result is None or result.calibration is None:
+            self.notify(f"There is no result to {what}: F9 on 7 makes one.")
+            return
+        works: dict[str, ResultWork] = {
+            "install": install_result,
+            "touch test": self._touch_test,
+            "export": export_result,
+            "roll back": roll_back,
+            "discard": discard,
+        }
+        if (path := await works[what](self.desk, result, result.calibration)) is not None:
+            await self.show_result(path)
+
+    async def _touch_test(self, desk: Desk, result: Result, calibration: Calibration) -> str | None:
+        path = Path(result.path)
+        return result.path if await run_touch_test(desk, self.approves, path) else None
+
+    @work(exclusive=True, group="drift", exit_on_error=False)
+    async def action_drift_check(self) -> None:
+        await check_drift(self.desk, self.approves)
+
+    # --- keys ---
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        """The one question before anything moves."""
+        return await self.desk.question(ConfirmMotion(preview))
+
+    async def plans_here(self, refusal: StationError) -> bool:
+        """Offer to plan again from where the arm stands."""
+        return await self.desk.question(Confirm("Plan again from here?", refusal.text, yes="Plan"))
+
+    @work(group="stop", exit_on_error=False)
+    async def action_stop(self) -> None:
+        await self.desk.stop()
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_start(self, purpose: str) -> None:
+        """`run` goes on with a session that is paused."""
+        paused = self.known.live is not None and self.known.live.state is StationState.PAUSED
+        wanted = Purpose.RESUME if purpose == Purpose.RUN and paused else Purpose(purpose)
+        await self.desk.start(prepared_motion(self.desk, wanted, self.approves, plans_here=self.plans_here))
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_ask(self, verb: str) -> None:
+        """A verb without arguments."""
+        await self.desk.ask(verbs.VERBS[verb]())
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_finish(self) -> None:
+        if (
+            self.known.live is not None
+            and (refusal := verbs.Finish.refusal(self.known.live.state)) is not None
+        ):
+            self.notify(str(refusal), severity="warning")
+            return
+        session = SessionStatus() if self.known.live is None else self.known.live.session
+        captured = f"{session.captured} of {len(session.poses)} poses are captured."
+        body = f"{captured} The recording is closed; F9 then solves it."
+        if await self.desk.question(Confirm("Finish this session?", body, yes="Finish")):
+            await self.desk.ask(verbs.Finish())
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_freedrive(self) -> None:
+        """Capture by hand: the operator holds the pendant's freedrive button, the station only looks."""
+        if self.known.live is not None:
+            await self.desk.ask(verbs.Freedrive(self.known.live.state is not StationState.FREE_DRIVE))
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_acknowledge(self) -> None:
+        if await self.desk.ask(verbs.Acknowledge()) is not None:
+            self.clear_notifications()  # what they said of the stop is over
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_release(self) -> None:
+        """Another screen or a command may take control then."""
+        if self.known.live is None or not self.desk.has_control():
+            holder = "" if self.known.live is None else self.known.live.lease.holder
+            self.notify(f"This screen does not have control: {holder or 'nobody'} does.", markup=False)
+            return
+        body = f"The arm works. {DECELERATES}"
+        if self.known.live.state not in RUNNING or await self.desk.question(
+            Confirm("Release control?", body, yes="Release")
+        ):
+            await self.desk.ask(verbs.Lease("release"))
+            self.notify("Control released: another screen or command may take it.")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_leave(self) -> None:
+        state = None if self.known.live is None else self.known.live.state
+        if not self.known.shown.playback and state not in (
+            None,
+            StationState.IDLE,
+            StationState.DISCONNECTED,
+        ):
+            held = state in RUNNING and self.desk.has_control()
+            text = (
+                f"The arm works, commanded from here. {DECELERATES}"
+                if held
+                else "The daemon and its session stay as they are; `station` opens this screen again."
+            )
+            if not await self.desk.question(Confirm("Close the screen?", text, yes="Close")):
+                return
+        self.exit()
 
     def get_key_display(self, binding: Binding) -> str:
         """F5 as it is printed on the key, and as every text here calls it."""
@@ -315,9 +485,7 @@ class StationApp(ResultsDesk):
         screen = self.screen
         if isinstance(screen, StationScreen):
             own = screen.BINDINGS
-            ours = [kind for kind in type(self).__mro__ if kind.__module__.startswith("station.")]
-            common = [binding for kind in ours for binding in vars(kind).get("BINDINGS", [])]
-            self.push_screen(Help(screen.heading, screen.HELP or "", [*own, *common]))
+            self.push_screen(Help(screen.heading, screen.HELP or "", [*own, *self.BINDINGS]))
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_new_cell(self) -> None:
@@ -339,18 +507,10 @@ class StationApp(ResultsDesk):
                 )
 
 
-class ReplayApp(Player, StationApp):
-    """The same screens over a recording alone."""
+class ReplayApp(StationApp):
+    """The same screens over a recording alone: no station stands behind them."""
 
-    serves = False
-    BINDINGS: ClassVar[list[BindingType]] = [*Player.BINDINGS]
-
-    def __init__(self, link: ReplayLink) -> None:
-        async def connect() -> ScreenLink:
-            return link
-
-        super().__init__(connect)
-        self.player = link
+    BINDINGS: ClassVar[list[BindingType]] = [*PLAYER_KEYS, *StationApp.BINDINGS]
 
 
 def run(socket: Path, who: str = "") -> None:
@@ -360,13 +520,18 @@ def run(socket: Path, who: str = "") -> None:
         return await Client.connect(socket, who)
 
     app = StationApp(connect)
-    app.graphics = detect()
-    app.stop_unconnected = partial(send_stop, socket)
+    PreviewPane.graphics = detect()
+    app.desk.stop_unconnected = partial(send_stop, socket)
     app.run()
 
 
 def run_replay(recording: Path) -> None:
     """The live screen over a recording; no daemon is asked. StationError when it cannot be read."""
-    app = ReplayApp(ReplayLink(recording))
-    app.graphics = detect()
+    link = ReplayLink(recording)
+
+    async def connect() -> ScreenLink:
+        return link
+
+    app = ReplayApp(connect)
+    PreviewPane.graphics = detect()
     app.run()

@@ -1,37 +1,40 @@
-"""The screen's desk: what is asked of the daemon, what a person is asked first, what is said when refused."""
+"""The daemon as the screens ask it: connection, control, silence, and what is said when it refuses."""
 
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from textual import work
-from textual.content import Content
+import msgspec
+from textual.message import Message
 from textual.reactive import reactive
+from textual.screen import Screen
 
 from recordings.errors import CodedError
 from recordings.files import MAIN_CAMERA
-from station.cell.config import StationConfig
 from station.cell.errors import RefusedError, StationError
-from station.cell.status import MotionPreview, SessionStatus, StationState, StationStatus
+from station.cell.status import StationStatus
 from station.operate import motion
-from station.operate.motion import prepared_motion
 from station.protocol import verbs
 from station.protocol.client import ANSWER_S
-from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
-from station.tui.dialogs import Confirm, ConfirmMotion
 from station.tui.task import Known
 from station.tui.themes import ThemedApp
-from station.tui.widgets.graphics import Graphics
-from station.tui.widgets.scene import cell_scene, draw
 
 R = TypeVar("R")
+LISTEN_S = 0.5
+SILENT_S = 2.0
+"""A working daemon answers within milliseconds, on a busy computer within some hundred."""
+_PATIENT_S = 7 * 86400.0
+STATUS_PERIOD_S = 0.25
+"""Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
+RECONNECT_S = 1.0
+GONE = "The daemon ended: the controller stops the arm. This screen goes on when a daemon serves again."
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
-DECELERATES = "It decelerates at once, and the session pauses."
 REMEDIES = {
     "nothing-installed": "4 shows the newest result, i installs it.",
     "no-pointer": "Give its length (Tab in the list of corners), or set the tool on the pendant.",
@@ -53,73 +56,116 @@ class ScreenLink(motion.Link, Protocol):
     async def close(self) -> None: ...
 
 
-class Desk(ThemedApp[None]):
+Connect = Callable[[], Awaitable[ScreenLink]]
+
+
+class StatusChanged(Message):
+    """None: there is no daemon, and `why`."""
+
+    def __init__(self, status: StationStatus | None, why: str = "") -> None:
+        super().__init__()
+        self.status, self.why = status, why
+
+
+class KnowingApp(ThemedApp[None]):
+    """An app whose screens watch what is known."""
+
+    known: reactive[Known] = reactive(Known(), repaint=False)
+
+    def playing(self) -> bool:
+        """A recording is shown in place of the cell."""
+        return False
+
+
+class Desk:
     """Every wish goes through `call`; the daemon decides, nothing is decided here.
 
     For the flows of `station.operate` it is a link: it takes control where a verb needs it, and says on every
     screen what the daemon is at work on.
     """
 
-    status: reactive[StationStatus | None] = reactive(None, repaint=False)
-    serves = True
-    """A station stands behind this screen, not a recording alone."""
     link: ScreenLink | None = None
     """The connection while there is one."""
     stop_unconnected: Callable[[], bool] = staticmethod(lambda: False)
     """Sends STOP where there is no connection (`protocol.stop_client.send_stop`); False: nobody listens."""
-    silent_s: float | None = None
-    """Seconds without an answer from the daemon; None while it answers."""
-    trouble = ""
-    """Reason why the screen is old: no daemon, or one that does not answer."""
-    busy = ""
-    """Long work of the daemon for this screen, in words; empty: none."""
-    graphics: Graphics | None = None
-    """The terminal's own graphics; None: half blocks only."""
-    configuration: StationConfig | None = None
-    """Facts of the cell; None until the daemon told them."""
-    _own_id: int | None = None
+    own_id: int | None = None
     """The daemon's number of this connection, once it had control."""
-    _newest: StationStatus | None = None
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, app: KnowingApp, connect: Connect) -> None:
+        self.app, self._connect = app, connect
+        self._newest: StationStatus | None = None
         self._news = asyncio.Event()
         """Set, and replaced, with every new status."""
 
     @property
     def root(self) -> Path | None:
-        """Below which the daemon keeps sessions and what is installed."""
         return None if self.link is None else self.link.root
 
     @property
     def camera(self) -> str:
-        """Name of the daemon's camera."""
         return MAIN_CAMERA if self.link is None else self.link.camera
 
     @property
-    def max_age_days(self) -> float | None:
-        """Oldest proof of a calibration by the cell's rule."""
-        return None if self.link is None else self.link.max_age_days
-
     def known(self) -> Known:
-        """All that rail and next action are made of."""
-        return Known(self.status, silent_s=self.silent_s, busy=self.busy, trouble=self.trouble)
+        return self.app.known
 
-    def newest(self) -> Known:
-        """Return what is known, with the newest status there ever was; it outlives the daemon."""
-        return replace(self.known(), status=self._newest)
+    # --- the daemon → the screen ---
 
-    def common_actions(self) -> list[str]:
-        """Actions that have a key on every screen."""
-        return []
+    async def follow(self) -> None:
+        """Stay connected for as long as the screen lives."""
+        while True:
+            why = GONE
+            try:
+                self.link = await self._connect()
+                self.app.run_worker(self._listen(self.link), group="listen", exclusive=True)
+                async for status in self.link.statuses():
+                    self._newest = status
+                    self._news.set()
+                    self._news = asyncio.Event()
+                    await self._pace(status)
+                    self.app.post_message(StatusChanged(status))
+            except (OSError, StationError) as problem:
+                why = str(problem)
+            except msgspec.ValidationError as problem:
+                why = f"The daemon is of another version than this screen ({problem}): restart the older one."
+            gone, self.link = self.link, None
+            if gone is not None:
+                await gone.close()
+            self.app.post_message(StatusChanged(None, why))
+            await asyncio.sleep(RECONNECT_S)
 
-    def playing(self) -> bool:
-        """A recording is shown in place of the cell."""
-        return False
+    async def _pace(self, status: StationStatus) -> None:
+        """A new state or reason is shown at once; numbers that only flicker, a few times a second."""
+        shown = self.known.live
+        if shown is not None and (shown.state, shown.reason) == (status.state, status.reason):
+            await asyncio.sleep(STATUS_PERIOD_S)
+
+    async def _listen(self, link: ScreenLink) -> None:
+        """Ask something small until the link ends: a daemon that hangs keeps its socket open."""
+        while True:
+            asked_s = time.monotonic()
+            answer = asyncio.ensure_future(link.call(verbs.Watch(), timeout_s=_PATIENT_S))
+            try:
+                while not (await asyncio.wait({answer}, timeout=LISTEN_S))[0]:
+                    if (waited_s := time.monotonic() - asked_s) >= SILENT_S:
+                        self.hear(waited_s)
+                problem = answer.exception()
+            finally:
+                answer.cancel()
+            if problem is not None and not isinstance(problem, RefusedError):
+                return
+            self.hear(None)
+            await asyncio.sleep(LISTEN_S)
+
+    def hear(self, silent_s: float | None) -> None:
+        """Hear for how long the daemon has not answered; None: it does."""
+        self.app.known = replace(self.known, silent_s=silent_s)
+
+    # --- the screen → the daemon ---
 
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
         """The verb's result. Raises StationError, also where nothing is sent: in a playback, while silent."""
-        if self.playing():
+        if self.app.playing():
             raise RefusedError(
                 "This is the PLAYBACK of a recording.",
                 code="playback",
@@ -127,26 +173,23 @@ class Desk(ThemedApp[None]):
             )
         if self.link is None:
             raise StationError("No connection to the daemon: nothing was sent.", code="no-daemon")
-        if self.silent_s is not None:
+        if self.known.silent_s is not None:
             raise StationError("The station does not answer: nothing was sent.", code="no-answer")
         words = busy_words(verb)
-        if words and self.busy:
-            raise RefusedError(f"Busy: {self.busy}", code="busy", remedy="Wait until it is done.")
+        if words and self.known.busy:
+            raise RefusedError(f"Busy: {self.known.busy}", code="busy", remedy="Wait until it is done.")
         if words:
-            self.tell_busy(words)
+            self.app.known = replace(self.known, busy=words)
         try:
             if verb.control and not isinstance(verb, verbs.Go):  # who approves had it before
-                await self._take_control(self.link)
+                self.own_id = (await self.link.call(verbs.Lease("take"))).client_id
             return await self.link.call(verb, timeout_s=timeout_s)
         finally:
             if words:
-                self.tell_busy("")
-
-    async def _take_control(self, link: ScreenLink) -> None:
-        self._own_id = (await link.call(verbs.Lease("take"))).client_id
+                self.app.known = replace(self.known, busy="")
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
-        """Every new status from now on, slow readers the newest only."""
+        """Every new status from now on, before the screens' own slower pace; slow readers the newest only."""
         seen = self._newest
         while True:
             while self._newest is None or self._newest is seen:
@@ -154,147 +197,47 @@ class Desk(ThemedApp[None]):
             seen = self._newest
             yield seen
 
-    def tell_newest(self, status: StationStatus) -> None:
-        """Hand a status to `statuses`, before the screens' own slower pace."""
-        self._newest = status
-        self._news.set()
-        self._news = asyncio.Event()
-
-    def outdate(self) -> None:
-        if self.link is not None:
-            self.link.outdate()
-
     async def attempt(self, work: Awaitable[R]) -> R | None:
         """Its result, or None after a notice that says why not."""
         try:
             return await work
         except (CodedError, OSError) as problem:
             refused = isinstance(problem, RefusedError)
-            self.notify(told(problem), severity="warning" if refused else "error", timeout=10, markup=False)
+            self.app.notify(
+                told(problem), severity="warning" if refused else "error", timeout=10, markup=False
+            )
         return None
 
     async def ask(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R | None:
         """Call a verb; a notice takes the place of an error."""
         return await self.attempt(self.call(verb, timeout_s=timeout_s))
 
-    @work(group="command", exit_on_error=False)
-    async def send(self, verb: Verb[object]) -> None:
-        """A wish of one of the screens."""
-        await self.ask(verb)
-
-    def has_control(self) -> bool:
-        """Tell whether this screen has control."""
-        holder = None if self.status is None else self.status.lease.client_id
-        return holder is not None and holder == self._own_id
-
-    def tell_busy(self, words: str) -> None:
-        self.busy = words
-
-    async def approves(self, preview: MotionPreview) -> bool:
-        """The one question before anything moves."""
-
-        def drawn(width: int, height: int) -> Content:
-            status = self.status or StationStatus()
-            scene = cell_scene(self.configuration, status)
-            return Content() if scene is None else draw(scene, status, self._first(), width, height)
-
-        question: Confirm = ConfirmMotion(preview, drawn)
-        return await self.push_screen_wait(question)
-
-    async def plans_here(self, refusal: StationError) -> bool:
-        """Offer to plan again from where the arm stands."""
-        return await self.push_screen_wait(Confirm("Plan again from here?", refusal.text, yes="Plan"))
-
-    def _first(self) -> int | None:
-        """Place of the pose that comes next."""
-        poses = () if self.status is None else self.status.session.poses
-        return next((place for place, pose in enumerate(poses) if pose.state == "planned"), None)
+    async def question(self, screen: Screen[R]) -> R:
+        """Ask the person; only in a worker."""
+        return await self.app.push_screen_wait(screen)
 
     async def start(self, begun: Awaitable[R]) -> R | None:
         """A flow that begins with a motion; None when it did not come to that."""
         if started := await self.attempt(begun):
-            self.clear_notifications()  # they were of the time before
+            self.app.clear_notifications()  # they were of the time before
         return started
 
-    # --- keys ---
-
-    @work(group="stop", exit_on_error=False)
-    async def action_stop(self) -> None:
-        await self.stop()
+    def has_control(self) -> bool:
+        """Tell whether this screen has control."""
+        holder = None if self.known.live is None else self.known.live.lease.client_id
+        return holder is not None and holder == self.own_id
 
     async def stop(self) -> None:
         """STOP, whatever is shown, and also where nobody answers or no connection is left."""
         if self.link is None:
             if self.stop_unconnected():
-                self.notify("STOP was sent without a connection: look at the arm.", severity="warning")
+                self.app.notify("STOP was sent without a connection: look at the arm.", severity="warning")
             else:
-                self.notify("No connection to the daemon: nothing was sent.", severity="error")
+                self.app.notify("No connection to the daemon: nothing was sent.", severity="error")
             return
-        if self.silent_s is not None:
-            self.notify(STOP_UNHEARD, severity="error", timeout=10)
+        if self.known.silent_s is not None:
+            self.app.notify(STOP_UNHEARD, severity="error", timeout=10)
         await self.attempt(self.link.call(verbs.Stop()))
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_start(self, purpose: str) -> None:
-        """`run` goes on with a session that is paused."""
-        paused = self.status is not None and self.status.state is StationState.PAUSED
-        wanted = Purpose.RESUME if purpose == Purpose.RUN and paused else Purpose(purpose)
-        await self.start(prepared_motion(self, wanted, self.approves, plans_here=self.plans_here))
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_ask(self, verb: str) -> None:
-        """A verb without arguments."""
-        await self.ask(verbs.VERBS[verb]())
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_finish(self) -> None:
-        if self.status is not None and (refusal := verbs.Finish.refusal(self.status.state)) is not None:
-            self.notify(str(refusal), severity="warning")
-            return
-        session = SessionStatus() if self.status is None else self.status.session
-        captured = f"{session.captured} of {len(session.poses)} poses are captured."
-        body = f"{captured} The recording is closed; F9 then solves it."
-        if await self.push_screen_wait(Confirm("Finish this session?", body, yes="Finish")):
-            await self.ask(verbs.Finish())
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_freedrive(self) -> None:
-        """Capture by hand: the operator holds the pendant's freedrive button, the station only looks."""
-        if self.status is not None:
-            await self.ask(verbs.Freedrive(self.status.state is not StationState.FREE_DRIVE))
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_acknowledge(self) -> None:
-        if await self.ask(verbs.Acknowledge()) is not None:
-            self.clear_notifications()  # what they said of the stop is over
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_release(self) -> None:
-        """Another screen or a command may take control then."""
-        if self.status is None or not self.has_control():
-            holder = "" if self.status is None else self.status.lease.holder
-            self.notify(f"This screen does not have control: {holder or 'nobody'} does.", markup=False)
-            return
-        body = f"The arm works. {DECELERATES}"
-        if self.status.state not in RUNNING or await self.push_screen_wait(
-            Confirm("Release control?", body, yes="Release")
-        ):
-            await self.ask(verbs.Lease("release"))
-            self.notify("Control released: another screen or command may take it.")
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_leave(self) -> None:
-        state = None if self.status is None else self.status.state
-        if self.serves and state not in (None, StationState.IDLE, StationState.DISCONNECTED):
-            held = state in RUNNING and self.has_control()
-            text = (
-                f"The arm works, commanded from here. {DECELERATES}"
-                if held
-                else "The daemon and its session stay as they are; `station` opens this screen again."
-            )
-            if not await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):
-                return
-        self.exit()
 
 
 def told(problem: CodedError | OSError) -> str:

@@ -7,8 +7,8 @@ import os
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Sequence
-from typing import ClassVar, cast
+from collections.abc import Sequence
+from typing import ClassVar
 
 from rich.console import Group
 from rich.table import Table
@@ -25,9 +25,10 @@ from calibrate.files.exports import FORMATS
 from calibrate.files.install import reason_problem
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
-from station.tui.frame import Frame, Knowing, Question
+from station.tui.frame import Frame, Question
 from station.tui.task import Action, Known
-from station.tui.words import duration, limit_bar
+from station.tui.widgets.scene import cell_scene, draw
+from station.tui.words import duration, limit_bar, lines
 
 TERMINATE_S = 5.0
 WIDTH, INDENT = 54, 10
@@ -43,7 +44,7 @@ HELP_END = (
 class Confirm(Question[bool]):
     """A question with consequences. Enter presses the focused button, which is the harmless one."""
 
-    BOX = "confirm"
+    BOX, AUTO_FOCUS = "confirm", "#no"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("tab", "app.focus_next", "Other answer"),
         Binding("escape", "dismiss(False)", "No", tooltip="Close without doing anything"),
@@ -51,7 +52,7 @@ class Confirm(Question[bool]):
 
     def __init__(self, title: str, body: str, yes: str, no: str = "Cancel") -> None:
         super().__init__()
-        self._title, self._body, self._yes, self._no = title, body, yes, no
+        self.title, self._body, self._yes, self._no = title, body, yes, no
 
     def body(self) -> ComposeResult:
         yield Static(self._body, id="confirm-body", markup=False)
@@ -64,9 +65,7 @@ class Confirm(Question[bool]):
         yield Label(KEYS, id="confirm-keys")
 
     def on_mount(self) -> None:
-        self.titled(self._title)
         self.app.clear_notifications()  # they would stand before the words
-        self.query_one("#no", Button).focus()
 
     def on_button_pressed(self, event: Button.Pressed) -> None:
         self.dismiss(event.button.id == "yes")
@@ -77,10 +76,9 @@ class ConfirmMotion(Confirm):
 
     BOX = "motion"
 
-    def __init__(self, preview: MotionPreview, scene: Callable[[int, int], Content] | None = None) -> None:
-        """`scene`: the cell in so many cells and rows."""
+    def __init__(self, preview: MotionPreview) -> None:
         super().__init__("The arm will move", "", yes="Start motion", no="Do not move")
-        self._preview, self._scene = preview, scene
+        self._preview = preview
         self._until_s = time.monotonic() + APPROVAL_LIFETIME_S
 
     def body(self) -> ComposeResult:
@@ -91,20 +89,22 @@ class ConfirmMotion(Confirm):
         yield from self.buttons()
 
     def on_mount(self) -> None:
-        super().on_mount()
         self.call_after_refresh(self._draw)
         self.set_interval(1.0, self._count_down)
         self._count_down()
 
     def show(self, known: Known) -> None:
         super().show(known)
-        if known.status is not None and known.status.simulated:
-            self.titled("The arm will move", SIMULATED)
+        if known.shown.simulated:
+            self.query_one("#motion").border_subtitle = SIMULATED
 
     def _draw(self) -> None:
-        scene = self.query_one("#motion-scene", Static)
-        if self._scene is not None and scene.display and scene.size.width > 20:
-            scene.update(self._scene(scene.size.width, scene.size.height))
+        pane, status = self.query_one("#motion-scene", Static), self.known.shown
+        scene = cell_scene(self.known.configuration, status)
+        if scene is not None and pane.display and pane.size.width > 20:
+            poses = status.session.poses
+            first = next((place for place, pose in enumerate(poses) if pose.state == "planned"), None)
+            pane.update(draw(scene, status, first, *pane.size))
 
     def _count_down(self) -> None:
         left_s = max(0.0, self._until_s - time.monotonic())
@@ -131,21 +131,19 @@ def motion_text(preview: MotionPreview) -> Content:
         Content.styled("▲ Is everybody out of the arm's reach?", "bold $warn"),
         Content("The emergency stop on the pendant is the safety device. F12 stops too."),
     ]
-    return Content("\n").join(rows)
+    return lines(*rows)
 
 
 class ChooseFormat(Question[str | None]):
     """Choice of an export format."""
 
+    TITLE = "Export for"
     BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "dismiss(None)", "Cancel")]
 
     def body(self) -> ComposeResult:
         lines = [Option(f"{name:<20}  {kind.says}", id=name) for name, kind in FORMATS.items()]
         yield OptionList(*lines, id="formats", markup=False, compact=True)
         yield Label("Enter writes it beside the recording, Escape: no", id="dialog-keys")
-
-    def on_mount(self) -> None:
-        self.titled("Export for")
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         self.dismiss(event.option.id)
@@ -154,6 +152,7 @@ class ChooseFormat(Question[str | None]):
 class Reason(Question[str]):
     """A person's reason to install a calibration that is refused; empty: they do not."""
 
+    TITLE = "Not installed"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "dismiss('')", "Cancel", tooltip="Install nothing")
     ]
@@ -169,9 +168,6 @@ class Reason(Question[str]):
         yield Label(
             "Your name and the reason go into the file. Enter installs, Escape does not.", id="dialog-keys"
         )
-
-    def on_mount(self) -> None:
-        self.titled("Not installed")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         if problem := reason_problem(event.value):
@@ -190,7 +186,7 @@ class Help(Question[None]):
 
     def __init__(self, title: str, about: str, keys: Sequence[BindingType]) -> None:
         super().__init__()
-        self._title, self._about, self._keys = title, about, keys
+        self.title, self._about, self._keys = title, about, keys
 
     def body(self) -> ComposeResult:
         table = Table.grid(padding=(0, 2))
@@ -201,9 +197,6 @@ class Help(Question[None]):
                 table.add_row(key, f"{binding.description}: {binding.tooltip}")
         with VerticalScroll(id="help-lines"):
             yield Static(Group(Text(self._about + "\n", style="bold"), table, Text(HELP_END)))
-
-    def on_mount(self) -> None:
-        self.titled(self._title)
 
 
 READ = Action("", "Read the result", "It is done; Enter closes this window.", look=True)
@@ -272,7 +265,7 @@ class JobScreen(Question[int]):
             close.label = "Close"
             close.focus()
             self.query_one(Frame).question = READ
-            self.show(cast(Knowing, self.app).known())
+            self.show(self.known)
 
     async def action_cancel(self) -> None:
         if self._process is None or self._exit_code is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import groupby
-from typing import ClassVar, Protocol, TypeVar, cast
+from typing import ClassVar, TypeVar
 
 from textual import events
 from textual.app import ComposeResult
@@ -19,7 +19,7 @@ from textual.widgets import Static
 from station.cell.status import StationStatus
 from station.protocol.states import LATCHED
 from station.tui.task import STEPS, UNTOLD, Action, Known, Step, next_action, steps
-from station.tui.words import MARKS, UNKNOWN, duration, shortened, size, state_of
+from station.tui.words import MARKS, UNKNOWN, dim, duration, shortened, size, state_of
 
 R = TypeVar("R")
 STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
@@ -28,6 +28,8 @@ DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
 """Driver of the arm."""
 RAIL_WIDE = 96
 """Cells from which on a step has a second line of its own."""
+SESSION = Binding.Group("session")
+"""Keys of the app that act on the session, in a group of their own."""
 GO_TO = (("1-6", "step"), ("7", "sessions"), ("8", "log"))
 ANSWER = Action(
     "", "Answer the question", "Enter alone is no; Tab marks the other answer. F12 stops.", look=True
@@ -43,8 +45,8 @@ class StopBlock(Static):
         words = STOP_NARROW if self.size.width < 16 else STOP_WIDE
         return Content(words[self.latched])
 
-    def on_click(self) -> None:
-        cast(Knowing, self.app).action_stop()
+    async def on_click(self) -> None:
+        await self.app.run_action("stop")
 
 
 class Line(Static):
@@ -106,7 +108,7 @@ class Frame(Horizontal):
     def show(self, known: Known) -> None:
         for line in self.query(Line):
             line.show(known)
-        self.query_one(StopBlock).latched = known.status is not None and known.status.state in LATCHED
+        self.query_one(StopBlock).latched = known.live is not None and known.live.state in LATCHED
 
 
 def bar_line(known: Known, title: str, width: int) -> Content:
@@ -125,7 +127,7 @@ def fitting(parts: list[Content], width: int) -> Content:
 
 def _bar_parts(known: Known, title: str) -> Iterator[Content]:
     """Most important first."""
-    status = known.status
+    status = known.live
     yield Content.styled(f" {title} ", "bold $accent")
     if known.silent_s is not None:
         yield Content.styled(
@@ -134,15 +136,15 @@ def _bar_parts(known: Known, title: str) -> Iterator[Content]:
         return
     if status is None:
         yield Content.styled(" ▲ NO DAEMON ", "bold $onstop on $stop")
-        yield Content.styled("  to stop the arm use the pendant", "$dim")
+        yield dim("  to stop the arm use the pendant")
         return
     if status.playback:
         chip, style = state_of(status)
         yield Content.styled(" PLAYBACK, no live arm ", "bold $sim on $simbg")
-        yield Content.styled(f" {chip} ", "$dim")
+        yield dim(f" {chip} ")
         if status.simulated:
             yield Content.styled(" SIMULATED ", "bold $sim on $simbg")
-        yield Content.styled(f"  {status.robot.model}", "$dim")
+        yield dim(f"  {status.robot.model}")
         return
     chip, style = state_of(status)
     yield Content.styled(f" {chip} ", style)
@@ -165,15 +167,15 @@ def _robot_parts(status: StationStatus) -> Iterator[Content]:
     )
     yield Content.styled(f"  {robot.model or 'no robot'}", "bold $strong")
     if status.recorder.free_bytes is not None:
-        yield Content.styled(f"  {size(status.recorder.free_bytes)} free", "$dim")
+        yield dim(f"  {size(status.recorder.free_bytes)} free")
     if robot.remote is not None:
-        yield Content.styled(f"  {'remote' if robot.remote else 'LOCAL'}", "$dim")
+        yield dim(f"  {'remote' if robot.remote else 'LOCAL'}")
     if robot.control_path:
-        yield Content.styled(f"  {DRIVEN_BY[robot.control_path]}", "$dim")
+        yield dim(f"  {DRIVEN_BY[robot.control_path]}")
     if status.lease.holder:
-        yield Content.styled(f"  control: {status.lease.holder}", "$dim")
+        yield dim(f"  control: {status.lease.holder}")
     if status.session.elapsed_s:
-        yield Content.styled(f"  {duration(status.session.elapsed_s)}", "$dim")
+        yield dim(f"  {duration(status.session.elapsed_s)}")
 
 
 _BACK = {"now": "$strong on $accentbg", "stopped": "$strong on $badbg", "look": "$warn", "done": "$ok"}
@@ -233,8 +235,8 @@ class Keys(Static):
         if not self.app.screen_stack:  # between two modes, or while the app closes: it is asked for again
             return Content()
         shown = [active.binding for active in self.screen.active_bindings.values() if active.binding.show]
-        ours = [b for b in shown if b.action not in cast(Knowing, self.app).common_actions()]
-        common = [b for b in shown if b not in ours]
+        common = [b for b in shown if b.group is SESSION]
+        ours = [b for b in shown if b.group is not SESSION]
         display = self.app.get_key_display
         groups = [(self._own, _pairs(ours, display))]
         if not isinstance(self.screen, ModalScreen):
@@ -269,27 +271,16 @@ def _group(name: str, pairs: list[tuple[str, str]]) -> Content:
     return Content.assemble(*parts).rstrip()
 
 
-class Knowing(Protocol):
-    """The app, as frames see it."""
-
-    def known(self) -> Known: ...
-
-    def newest(self) -> Known:
-        """Return what is known, with the newest status there ever was; it outlives the daemon."""
-
-    def common_actions(self) -> list[str]: ...
-
-    def action_stop(self) -> object: ...
-
-
 BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]
 """Classes of a screen by its columns, and by its rows."""
 
 
 class Framed(Screen[R]):
-    """A screen or a question under the frame."""
+    """A screen or a question under the frame; drawn anew, while it stands there, when the app knows more."""
 
     AUTO_FOCUS = ""
+    known = Known()
+    """What the app knows."""
     HORIZONTAL_BREAKPOINTS, VERTICAL_BREAKPOINTS = BREAKPOINTS
 
     def show(self, known: Known) -> None:
@@ -297,10 +288,18 @@ class Framed(Screen[R]):
         for frame in self.query(Frame):
             frame.show(known)
 
-    def on_screen_resume(self) -> None:
-        app = cast(Knowing, self.app)
-        for known in (app.newest(), app.known()):  # it may be the first time, or long ago
-            self.show(known)
+    async def on_screen_resume(self) -> None:
+        self.watch(self.app, "known", self._hear)
+        self.show(self.known)
+
+    def _hear(self, known: Known) -> None:
+        self.known = known
+        self.call_next(self._show_known)
+
+    def _show_known(self) -> None:
+        # Closing, the app takes the screens' parts away before its workers end.
+        if self.is_mounted and self.app.is_running and self in self.app.screen_stack:
+            self.show(self.known)
 
 
 class Question(ModalScreen[R], Framed[R]):
@@ -320,7 +319,6 @@ class Question(ModalScreen[R], Framed[R]):
     def body(self) -> ComposeResult:
         yield from ()
 
-    def titled(self, title: str, below: str = "") -> None:
+    def on_mount(self) -> None:
         """Say in the window's border what it is about."""
-        box = self.query_one(f"#{self.BOX}")
-        box.border_title, box.border_subtitle = escape(title), escape(below)
+        self.query_one(f"#{self.BOX}").border_title = escape(self.title or "")

@@ -12,14 +12,15 @@ from pathlib import Path
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, Verdict, read_calibration
+from calibrate.files.folders import calibrations_folder, current_validity
 from calibrate.files.install import installed_calibration, objections_beside
-from calibrate.files.loader import calibrations_folder, current_validity
+from calibrate.files.touch import agrees
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
-from calibrate.files.verification import agrees
 from calibrate.files.versions import LogEntry, read_log, same_solve
 from calibrate.quality.checks import CheckEntry, read_checks
 from recordings.files import MAIN_CAMERA
+from station.cell.session_folder import SessionSummary
 
 LOOK_S = 2.0
 Marks = frozenset[tuple[str, int]]
@@ -71,11 +72,7 @@ def read_installed(root: Path, camera: str = MAIN_CAMERA) -> Installed:
         now = installed_calibration(root, camera)
         validity = current_validity(calibrations_folder(root, camera))
     ended: list[Ended] = []
-    try:
-        log = read_log(root, camera)
-    except OSError:
-        log = []
-    for before, entry in pairwise(log):
+    for before, entry in pairwise(_log(root, camera)):
         was = _generation(root, camera, before.generation)
         if was is None or entry.generation == before.generation or entry.action == "verify":
             continue  # a check by hand goes into a generation of its own, of the same solve
@@ -88,12 +85,17 @@ def read_installed(root: Path, camera: str = MAIN_CAMERA) -> Installed:
 def drift_history(root: Path, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
     """Drift checks of what is installed now, oldest first; its touch tests do not begin another history."""
     held: set[int] = set()
+    for entry in _log(root, camera):
+        held = {entry.generation} | (held if entry.action == "verify" else set())
+    return [check for check in read_checks(root, camera) if check.generation in held]
+
+
+def _log(root: Path, camera: str) -> list[LogEntry]:
+    """Empty where it cannot be read."""
     try:
-        for entry in read_log(root, camera):
-            held = {entry.generation} | (held if entry.action == "verify" else set())
+        return read_log(root, camera)
     except OSError:
         return []
-    return [check for check in read_checks(root, camera) if check.generation in held]
 
 
 def _generation(root: Path, camera: str, number: int) -> Calibration | None:
@@ -168,6 +170,10 @@ class Result:
     objections: tuple[str, ...] = ()
     """Reasons, other than gates, for which installing would ask a reason."""
     problem: str = ""
+    drift: tuple[CheckEntry, ...] = ()
+    """Drift checks of what is installed now, oldest first."""
+    log: tuple[LogEntry, ...] = ()
+    """Every installation, oldest first."""
 
     @property
     def installed(self) -> bool:
@@ -190,7 +196,46 @@ def read_result(path: str) -> Result:
     try:
         root = state_root(path)
         calibration = read_calibration(Path(path))
-        state = read_installed(root, calibration.camera_name)
-        return Result(path, calibration, state, tuple(objections_beside(calibration, root)))
+        camera = calibration.camera_name
+        objections = tuple(objections_beside(calibration, root))
     except CalibrationError as problem:
         return Result(path, problem=str(problem))
+    state, drift = read_installed(root, camera), tuple(drift_history(root, camera))
+    return Result(path, calibration, state, objections, drift=drift, log=tuple(_log(root, camera)))
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A recorded session and what became of it."""
+
+    session: SessionSummary
+    calibration: Calibration | None = None
+    """None: not solved, or damaged."""
+    word: str = ""
+    """Its calibration is or was installed; else empty."""
+    check: CheckEntry | None = None
+    """The verdict of the drift check that it was recorded for."""
+
+
+@dataclass(frozen=True)
+class Past:
+    """All sessions, newest first, and drift checks of what is installed now, oldest first."""
+
+    sessions: tuple[Kept, ...] = ()
+    drift: tuple[CheckEntry, ...] = ()
+
+
+def read_past(root: Path | None, camera: str, sessions: list[SessionSummary]) -> Past:
+    """Read what became of each session, for a thread."""
+    installed = Installed() if root is None else read_installed(root, camera)
+    judged = {} if root is None else {check.recording: check for check in read_checks(root, camera)}
+    kept = [
+        Kept(
+            session,
+            readable(Path(session.calibration)) if session.calibration else None,
+            installed.word(session.name),
+            judged.get(session.name),
+        )
+        for session in sessions
+    ]
+    return Past(tuple(kept), () if root is None else tuple(drift_history(root, camera)))

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 from rich.text import Text
+from textual import work
 from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.widgets import ProgressBar, RichLog, Static
@@ -16,12 +19,14 @@ from station.cell.config import CaptureConfig
 from station.cell.scene import Scene
 from station.cell.status import Event, PoseStatus, SessionStatus, StationState, StationStatus
 from station.protocol.states import LATCHED, RUNNING
+from station.tui.frame import Line
+from station.tui.replay import ReplayLink
 from station.tui.screen import Box, Panel, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
 from station.tui.widgets.preview import PreviewPane
 from station.tui.widgets.scene import cell_scene, fields_of
-from station.tui.words import UNKNOWN, clock, degrees, duration, facts, mark, mm
+from station.tui.words import UNKNOWN, clock, degrees, dim, duration, facts, lines, mark, mm
 
 CLOCKS_POOR_MS = 1000 * CaptureConfig().time_bound_s
 """Poses known worse than that are refused by default."""
@@ -50,27 +55,20 @@ def event_text(event: Event, width: int = 0) -> Content:
     return Content.assemble((when, "$faint"), "  ", (said, _LEVELS[event.level]))
 
 
-def lines(*parts: Content) -> Content:
-    return Content("\n").join(parts)
-
-
 def quality_line(status: StationStatus) -> Content:
     """The board in the newest image: each with a mark, a value and, where it is poor, a word."""
     seen = status.detection
     if not seen.found:
         advice = f"  {seen.advice}" if seen.advice else ""
-        return mark("look", seen.reason or "no board in view") + Content.styled(advice, "$dim")
-    whole, burnt = seen.corners == seen.expected, seen.saturated > BURNT
+        return mark("look", seen.reason or "no board in view") + dim(advice)
+    burnt = seen.saturated > BURNT
+    judged = (
+        ("corners", f"{seen.corners}/{seen.expected}", seen.corners == seen.expected),
+        ("sharp", f"{seen.sharpness:.2f}", burnt or not seen.advice),
+        ("saturated", f"{100 * seen.saturated:.1f} %", not burnt),
+    )
     parts = [
-        mark("done" if whole else "look")
-        + Content(" ")
-        + facts(("corners", f"{seen.corners}/{seen.expected}", "")),
-        mark("look" if seen.advice and not burnt else "done")
-        + Content(" ")
-        + facts(("sharp", f"{seen.sharpness:.2f}", "")),
-        mark("look" if burnt else "done")
-        + Content(" ")
-        + facts(("saturated", f"{100 * seen.saturated:.1f} %", "")),
+        mark("done" if good else "look") + " " + facts((name, value, "")) for name, value, good in judged
     ]
     if seen.tilt_rad is not None:
         parts.append(facts(("tilt", degrees(seen.tilt_rad, 0), "")))
@@ -111,20 +109,20 @@ def _under_way(status: StationStatus) -> PoseStatus | None:
 def counted_line(session: SessionStatus) -> Content:
     """Progress of a session while no pose is under way, and what comes next."""
     if not session.poses:
-        return Content.styled("No plan yet: 2, then n makes one.", "$dim")
+        return dim("No plan yet: 2, then n makes one.")
     if not session.name:
-        return Content.styled("Not begun: F5 shows the motion and asks first.", "$dim")
+        return dim("Not begun: F5 shows the motion and asks first.")
     again = sum(pose.kept for pose in session.poses)
     if session.calibration:
         return mark("done", "finished and solved: 4 shows the result")
     if session.recording:
         return mark("done", "finished: k on 7 judges it" if session.check else "finished: F9 solves it")
-    return Content.styled(f"{again} to be captured again" if again else "resting", "$dim")
+    return dim(f"{again} to be captured again" if again else "resting")
 
 
 def progress_lines(known: Known, width: int, height: int) -> Content:
     """Draw how many are saved, the steps of this pose, a chip a pose."""
-    status = known.status or StationStatus()
+    status = known.shown
     session, pose = status.session, _under_way(status)
     saved = sum(pose.counts for pose in session.poses)
     left = (
@@ -136,9 +134,7 @@ def progress_lines(known: Known, width: int, height: int) -> Content:
     if status.playback:
         head += Content.styled("   played, no arm moves", "$sim")
     why = "" if pose is None else f"{pose.name}: {pose.why}" if pose.why else pose.name
-    return lines(
-        head, pose_line(status), Content.styled(why, "$dim"), *chips(session, width, max(1, height - 3))
-    )
+    return lines(head, pose_line(status), dim(why), *chips(session, width, max(1, height - 3)))
 
 
 def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:
@@ -164,12 +160,12 @@ def _chip(pose: PoseStatus, current: bool, cells: int) -> Content:
 
 def error_lines(known: Known, width: int, height: int) -> Content:
     """The expected error as it falls towards its goal: measured solid, planned dotted."""
-    status = known.status or StationStatus()
+    status = known.shown
     estimate, poses = status.estimate, status.session.poses
     goal = estimate.goal_mm
     now = estimate.sigma_translation_mm
     if status.playback and estimate.advice:
-        return Content.styled(estimate.advice, "$dim")
+        return dim(estimate.advice)
     head = facts(("", f"± {now:.2f}" if now is not None else f"± {UNKNOWN}", "mm"))
     if goal:
         head += Content.assemble(("   goal ", "$dim"), (f"± {goal:.2f}", "$warn"))
@@ -184,9 +180,7 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     end = f"by the plan ± {planned[-1][1]:.2f} mm" if planned else ""
     rows = [head]
     if end and height > 6:
-        rows.append(
-            Content.styled(f"{end} after {len(poses)} poses" + _advice(estimate.advice, width), "$dim")
-        )
+        rows.append(dim(f"{end} after {len(poses)} poses" + _advice(estimate.advice, width)))
     rows.append(
         curve(
             [Series(planned, "$faint", dash=2), Series(measured, "$accent")],
@@ -208,10 +202,10 @@ _HEAT = ("$dim on $h0", "$foreground on $h1", "$strong on $h2", "$onaccent on $h
 
 def coverage_lines(known: Known, width: int, height: int, scene: Scene | None = None) -> Content:
     """The picture as a grid: in how many images each part showed the board, and which poses fill the rest."""
-    status = known.status or StationStatus()
+    status = known.shown
     views = status.estimate.image_views
     if not views:
-        return Content.styled("no image of the board yet", "$dim")
+        return dim("no image of the board yet")
     columns = len(views[0])
     cell = max(3, min(9, (width - 2) // columns - 1))
     most = max(1, max(max(row) for row in views))
@@ -242,18 +236,16 @@ def _empty_words(status: StationStatus, scene: Scene | None) -> Content:
         open_poses = [p for p in status.session.poses if p.state == "planned"]
         filling = [str(p.index + 1) for p in open_poses if (fields_of(scene, p, *empty.shape) & empty).any()]
         if filling:
-            return mark("look", said) + Content.styled(
-                f": pose {', '.join(filling[:6])} will show it there", "$dim"
-            )
+            return mark("look", said) + dim(f": pose {', '.join(filling[:6])} will show it there")
     return mark("look", said)
 
 
 def device_lines(known: Known, width: int, height: int) -> Content:
     """Each device with its rate; two a line."""
-    status = known.status or StationStatus()
+    status = known.shown
     robot, camera, recorder, bounds = status.robot, status.camera, status.recorder, status.clock
     if status.playback:
-        return Content.styled("robot not live   camera not live", "$dim")
+        return dim("robot not live   camera not live")
     parts = [
         _device("robot", robot.connected, f"{robot.rate_hz:.0f} Hz"),
         _device(
@@ -289,27 +281,21 @@ def device_lines(known: Known, width: int, height: int) -> Content:
 
 
 def _device(name: str, good: bool, text: str) -> Content:
-    return mark("done" if good else "failed", name) + Content.styled(f" {text}", "$dim")
+    return mark("done" if good else "failed", name) + dim(f" {text}")
 
 
-class Events(Panel):
+def newest_events(known: Known, width: int, height: int) -> Content:
     """The newest events, as many as fit."""
-
-    def __init__(self) -> None:
-        super().__init__("What happened", _newest, id="events", below="8 all")
-
-
-def _newest(known: Known, width: int, height: int) -> Content:
-    status = known.status or StationStatus()
-    return lines(*(event_text(event, width) for event in reversed(status.events[-max(1, height) :])))
+    shown = reversed(known.shown.events[-max(1, height) :])
+    return lines(*(event_text(event, width) for event in shown))
 
 
 class Stopped(Static):
     """Over the capture while STOP or a fault is latched: what happened, and the way on in three steps."""
 
     def show(self, known: Known) -> None:
-        status = known.status
-        latched = status is not None and status.state in LATCHED and known.silent_s is None
+        status = known.live
+        latched = status is not None and status.state in LATCHED and not known.old
         self.display = latched
         if status is None or not latched:
             return
@@ -366,8 +352,8 @@ class LiveScreen(StationScreen):
             with Vertical(id="live-left"):
                 with Box("Camera", id="picture", below="+ found corners"):
                     yield PreviewPane(id="preview")
-                    yield Static(id="quality")
-                yield Events()
+                    yield Line(lambda known, _: quality_line(known.shown), id="quality")
+                yield Panel("What happened", newest_events, id="events", below="8 all")
             with Vertical(id="live-right"):
                 with Box("Poses", id="progress"):
                     yield ProgressBar(id="bar-of-poses", show_eta=False, show_percentage=False)
@@ -383,8 +369,8 @@ class LiveScreen(StationScreen):
         yield Stopped(id="stopped")
 
     def _coverage(self, known: Known, width: int, height: int) -> Content:
-        status = known.status or StationStatus()
-        return coverage_lines(known, width, height, cell_scene(self.desk.configuration, status))
+        status = known.shown
+        return coverage_lines(known, width, height, cell_scene(known.configuration, status))
 
     def show(self, known: Known) -> None:
         super().show(known)
@@ -406,11 +392,65 @@ class LiveScreen(StationScreen):
         saved, total = float(sum(pose.counts for pose in session.poses)), float(len(session.poses) or 1)
         if (bar.progress, bar.total) != (saved, total):
             bar.update(total=total, progress=saved)
-        quality = quality_line(status)
-        if not quality.is_same(getattr(self, "_quality", Content("?"))):
-            self._quality = quality
-            self.query_one("#quality", Static).update(quality, layout=False)
+        self.query_one("#quality", Line).show(known)
         self.query_one("#live").set_class(status.state in LATCHED, "-dimmed")
+
+
+WATCHABLE = (StationState.IDLE, StationState.DISCONNECTED)
+"""A cell at rest: nobody looks at an old recording while the arm works or waits for an answer."""
+JUMP_S = 10.0
+PLAYER_KEYS: list[BindingType] = [
+    Binding("space", "app.play('toggle')", "Play/Pause", tooltip="Stop the playback here, or go on"),
+    Binding("left", "app.play('step', -1)", "Image back", tooltip="To the image before this one"),
+    Binding("right", "app.play('step', 1)", "Image on", tooltip="To the next image"),
+    Binding("pageup", f"app.play('seek', {-JUMP_S})", "10 s back", show=False, tooltip="Ten seconds back"),
+    Binding("pagedown", f"app.play('seek', {JUMP_S})", "10 s on", show=False, tooltip="Ten seconds on"),
+    Binding("home", "app.play('seek', -1e9)", "Start", show=False, tooltip="To the start of the recording"),
+]
+"""For a playback beside a cell, and for an app over a recording alone."""
+
+
+class ReplayScreen(LiveScreen):
+    """Shows `link`'s statuses in place of the daemon's. STOP still goes to the daemon."""
+
+    NAME = "Playback"
+    HELP = (
+        "PLAYBACK of a recording. Nothing can be commanded; F12 still stops this cell's arm. Escape leaves."
+    )
+    BINDINGS: ClassVar[list[BindingType]] = [
+        *PLAYER_KEYS,
+        Binding("escape", "close", "Back", tooltip="Leave the playback"),
+    ]
+
+    def __init__(self, link: ReplayLink) -> None:
+        super().__init__()
+        self.player = link
+        self._played: StationStatus | None = None
+
+    def on_mount(self) -> None:
+        self.follow()
+
+    def show(self, known: Known) -> None:
+        """The cell's own status shows nothing here, but its work ends the playback."""
+        status = known.live
+        if status is not None and status.state not in WATCHABLE:
+            self.notify(f"The playback was closed: the cell is {status.state.value}.", severity="warning")
+            self.action_close()
+            return
+        super().show(Known(self._played))
+
+    @work(exclusive=True, exit_on_error=False)
+    async def follow(self) -> None:
+        async for status in self.player.statuses():
+            self._played = status
+            super().show(Known(status))
+
+    async def on_unmount(self) -> None:
+        await self.player.close()
+
+    def action_close(self) -> None:
+        if self.is_attached:
+            self.dismiss()
 
 
 class LogScreen(StationScreen):
@@ -425,9 +465,6 @@ class LogScreen(StationScreen):
 
     def body(self) -> ComposeResult:
         yield RichLog(id="log", wrap=True, max_lines=2000)
-
-    def on_mount(self) -> None:
-        self.query_one("#log", RichLog).focus()
 
     def show(self, known: Known) -> None:
         super().show(known)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
-from rich.segment import Segment
-from rich.style import Style
 from rich.text import Text
 from textual import events, work
 from textual.app import ComposeResult
@@ -18,7 +17,6 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.reactive import reactive
-from textual.strip import Strip
 from textual.widgets import Footer, Input, OptionList, Static
 from textual.widgets.option_list import Option
 
@@ -26,7 +24,7 @@ from calibrate.boards.detect import Detection
 from calibrate.boards.model import board_points
 from recordings.errors import CodedError
 from recordings.schema.messages import BoardSpec, Image
-from station.analysis.preview import preview_image
+from station.analysis.worker import preview_image
 from station.cell.errors import StationError
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
@@ -36,37 +34,14 @@ from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_l
 from station.tui.new_cell_steps import DRAWINGS, SavePage, StepPage, pages
 from station.tui.task import Step
 from station.tui.themes import ThemedApp
-from station.tui.widgets.graphics import Graphics
 from station.tui.widgets.preview import PreviewPane
+from station.tui.words import dim
 
 Ending = Literal["", "serve", "rehearse"]
 """Next wish of the person: nothing, the cell itself, or its rehearsal."""
 ARM_PERIOD_S, CAMERA_PERIOD_S, LOOK_S = 0.1, 0.15, 1.0
 SHOWN_WIDTH_PX = 640
 NO_CAMERA = "No camera answers. Check its power, cable and network; this list refreshes every few seconds."
-AXIS = Style(color="black", bgcolor="bright_yellow", bold=True)
-
-
-class BoardPicture(PreviewPane):
-    """Live picture, the board's corners, and its origin and axes in letters."""
-
-    axes: tuple[tuple[str, float, float], ...] = ()
-    """Letter, x and y as shares of the image."""
-
-    def render_line(self, y: int) -> Strip:
-        strip = super().render_line(y)
-        if self._image is None or not self.axes:
-            return strip
-        height, width = self._image.shape
-        scale = min(self.size.width / width, 2 * self.size.height / height)
-        columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
-        left = (self.size.width - columns) // 2
-        for letter, share_x, share_y in self.axes:
-            column, row = left + int(share_x * columns), int(share_y * rows) // 2
-            if row == y and 0 <= column < self.size.width:
-                mark = Strip([Segment(letter, AXIS)])
-                strip = Strip.join([strip.crop(0, column), mark, strip.crop(column + 1)])
-        return strip
 
 
 class NewCell(ThemedApp[Ending]):
@@ -102,7 +77,6 @@ class NewCell(ThemedApp[Ending]):
         "rehearse": (CellStep.SAVE,),
     }
     """Steps in which an action means something."""
-    graphics: Graphics | None = None
     step: reactive[CellStep] = reactive(CellStep.ROBOT, init=False)
 
     def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
@@ -127,7 +101,7 @@ class NewCell(ThemedApp[Ending]):
                     yield Static("\n".join(DRAWINGS[mount]), id=mount, classes="drawing", markup=False)
             yield Static(id="live-lines", markup=False)
             yield Static(id="problem", markup=False)
-            yield BoardPicture(id="picture")
+            yield PreviewPane(id="picture")
             with VerticalScroll(id="text"):
                 yield Static(id="written", markup=False)
         yield Footer()
@@ -146,16 +120,13 @@ class NewCell(ThemedApp[Ending]):
     async def resume(self) -> None:
         """Connect to what the draft names; the first step that is not done is shown."""
         draft = self.setup.draft
-        try:
+        with self._problems():
             if draft.host:
                 self._say_live(f"Asking {draft.host} …")
                 await self.setup.connect(draft.host)
             if draft.camera is not None:
                 await self.setup.open(draft.camera)
-        except StationError as problem:
-            self._say_problem(str(problem))
-            return
-        self.step = flow.next_step(self.setup.draft)
+            self.step = flow.next_step(self.setup.draft)
 
     # --- what the devices show ---
 
@@ -205,14 +176,15 @@ class NewCell(ThemedApp[Ending]):
         self._show()
 
     async def _show_picture(self, image: Image, found: Detection | None) -> None:
-        pane, board = self.query_one(BoardPicture), self.setup.draft.board
+        pane, board = self.query_one(PreviewPane), self.setup.draft.board
         if not pane.display:
             return
         self._pictures += 1
         corners = np.zeros((0, 2)) if found is None else found.pixels
         preview = preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures)
-        pane.axes = () if found is None or board is None else _axes(board, found, preview.corners)
-        await pane.show(preview)
+        await pane.show(
+            preview, () if found is None or board is None else _axes(board, found, preview.corners)
+        )
 
     def _add_view(self) -> None:
         self.setup.take_view()
@@ -262,19 +234,15 @@ class NewCell(ThemedApp[Ending]):
         page = self.page
         if page.working:
             self._say_live(page.working)
-        try:
+        with self._problems():
             if chosen is not None:
                 await self.setup.open(chosen)
-            done = await page.accept(self.query_one("#typed", Input).value.strip())
-        except (CodedError, OSError) as problem:
-            self._say_problem(str(problem))
-            return
-        if not done:
-            self.watch_step()
-        elif page.step is CellStep.SAVE:
-            self.exit("serve")
-        else:
-            self.step = STEPS[STEPS.index(page.step) + 1]
+            if not await page.accept(self.query_one("#typed", Input).value.strip()):
+                self.watch_step()
+            elif page.step is CellStep.SAVE:
+                self.exit("serve")
+            else:
+                self.step = STEPS[STEPS.index(page.step) + 1]
 
     def action_rehearse(self) -> None:
         if self.setup.draft.written:
@@ -294,22 +262,15 @@ class NewCell(ThemedApp[Ending]):
 
     @work(group="print", exclusive=True, exit_on_error=False)
     async def action_print_board(self) -> None:
-        try:
+        with self._problems():
             path = await asyncio.to_thread(self.setup.print_board)
-        except (CodedError, OSError) as problem:
-            self._say_problem(str(problem))
-            return
-        self.notify(
-            f"Written: {path}. Print it at 100 %, glue it to something flat, and measure one square.",
-            timeout=20,
-        )
+            how = "Print it at 100 %, glue it to something flat, and measure one square."
+            self.notify(f"Written: {path}. {how}", timeout=20)
 
     @work(group="expose", exclusive=True, exit_on_error=False)
     async def action_expose(self, factor: float) -> None:
-        try:
+        with self._problems():
             await self.setup.expose(factor)
-        except StationError as problem:
-            self._say_problem(str(problem))
 
     def action_table_here(self) -> None:
         if self.setup.state is not None:
@@ -354,8 +315,8 @@ class NewCell(ThemedApp[Ending]):
         if setup.arm is not None:
             who = setup.arm.identity
             bar.append(Content.styled(f"  {who.model} {who.serial}", "bold $strong"))
-            bar.append(Content.styled(f"  {setup.arm.trouble() or 'ready'}", "$dim"))
-        bar.append(Content.styled("  Your hand moves the arm, never this wizard.", "$dim"))
+            bar.append(dim(f"  {setup.arm.trouble() or 'ready'}"))
+        bar.append(dim("  Your hand moves the arm, never this wizard."))
         self.query_one("#bar", Static).update(fitting(bar, width))
         self.query_one("#rail", Static).update(rail_line(self._rail(), self.step, width))
         self.query_one("#next", Static).update(next_line(self.page.next, width))
@@ -375,6 +336,14 @@ class NewCell(ThemedApp[Ending]):
 
     def _say_live(self, text: str) -> None:
         self.query_one("#live-lines", Static).update(text)
+
+    @contextmanager
+    def _problems(self) -> Iterator[None]:
+        """What goes wrong is said on the page."""
+        try:
+            yield
+        except (CodedError, OSError) as problem:
+            self._say_problem(str(problem))
 
     def _say_problem(self, text: str) -> None:
         problem = self.query_one("#problem", Static)

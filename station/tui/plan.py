@@ -6,7 +6,6 @@ import math
 import re
 from typing import ClassVar, Literal
 
-from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
@@ -18,10 +17,10 @@ from station.cell.status import PoseStatus, StationStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
 from station.tui.frame import Line
-from station.tui.screen import Box, Panel, Rows, StationScreen
+from station.tui.screen import Ask, Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.scene import LEGEND, cell_scene, draw, view_of
-from station.tui.words import MARKS, UNKNOWN, Mark, degrees, facts, limit_bar, many, mark, mm
+from station.tui.words import MARKS, UNKNOWN, Mark, degrees, dim, facts, limit_bar, lines, many, mark, mm
 
 COLUMNS = ("#", "error after", "", "distance", "tilt", "reason", "state")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
@@ -75,7 +74,7 @@ def facts_line(status: StationStatus) -> Content:
     """The plan in one line."""
     poses = status.session.poses
     if not poses:
-        return Content.styled(NO_PLAN, "$dim")
+        return dim(NO_PLAN)
     ends = [pose.predicted_sigma_mm for pose in poses if pose.predicted_sigma_mm is not None]
     line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose"))
     if ends:
@@ -83,7 +82,7 @@ def facts_line(status: StationStatus) -> Content:
         if (goal := status.estimate.goal_mm) is not None:
             line += Content("   ") + mark("done" if ends[-1] <= goal else "look", f"goal {goal:g} mm")
     left_out = sum(pose.state == "skipped" for pose in poses)
-    return line + Content.styled(f"   {many(left_out, 'pose')} skipped" * bool(left_out), "$dim")
+    return line + dim(f"   {many(left_out, 'pose')} skipped" * bool(left_out))
 
 
 def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: Scene | None) -> Content:
@@ -99,7 +98,7 @@ def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: Scene | None) 
     if pose.reason or seen:
         kind: Mark = "failed" if pose.state == "failed" else "look" if pose.reason else "done"
         rows.append(mark(kind, ". ".join(words for words in (pose.reason, seen) if words)))
-    return Content("\n").join(rows)
+    return lines(*rows)
 
 
 class PlanScreen(StationScreen):
@@ -135,7 +134,7 @@ class PlanScreen(StationScreen):
         self._turn_deg, self._zoom = -60.0, 1.0
 
     def body(self) -> ComposeResult:
-        yield Line(lambda known, _: facts_line(known.status or StationStatus()), id="plan-facts")
+        yield Line(lambda known, _: facts_line(known.shown), id="plan-facts")
         with Horizontal(id="plan"):
             with Vertical(id="plan-left"):
                 with Box("Poses", id="plan-poses"):
@@ -145,34 +144,23 @@ class PlanScreen(StationScreen):
                 yield Panel("The cell", self._cell, id="plan-cell", below="\\[ ] turn  + − zoom")
                 yield Panel("From above", self._above, id="plan-above", below=LEGEND)
 
-    def on_mount(self) -> None:
-        self.table.focus()
-
-    @property
-    def table(self) -> Rows:
-        return self.query_one(Rows)
-
     def show(self, known: Known) -> None:
         super().show(known)
-        status = known.status
-        if status is None:
-            return  # what was known last stands there
+        if (status := known.status) is None:
+            return
         poses, goal_mm = status.session.poses, status.estimate.goal_mm or 0.5
-        scene = cell_scene(self.desk.configuration, status)
+        scene = cell_scene(known.configuration, status)
         self.query_one("#plan-facts", Line).show(known)
         self.table.show([row_of(pose, goal_mm, scene) for pose in poses])
         self.draw_panels(known)
 
-    def on_data_table_row_highlighted(self) -> None:
-        self.draw_panels(self.desk.known())
-
     def _why(self, known: Known, width: int, height: int) -> Content:
-        status = known.status or StationStatus()
+        status = known.shown
         poses, line = status.session.poses, self.table.cursor_row
         if not line < len(poses):
-            return Content.styled(NO_PLAN, "$dim")
+            return dim(NO_PLAN)
         before = poses[line - 1] if line else None
-        return detail_of(poses[line], before, cell_scene(self.desk.configuration, status))
+        return detail_of(poses[line], before, cell_scene(known.configuration, status))
 
     def _cell(self, known: Known, width: int, height: int) -> Content:
         return self._drawn(known, width, height, self._turn_deg, 22.0, self._zoom)
@@ -183,24 +171,24 @@ class PlanScreen(StationScreen):
     def _drawn(
         self, known: Known, width: int, height: int, turn_deg: float, lift_deg: float, zoom: float
     ) -> Content:
-        status = known.status or StationStatus()
-        scene = cell_scene(self.desk.configuration, status)
+        status = known.shown
+        scene = cell_scene(known.configuration, status)
         if scene is None:
             words = "To draw the cell, the configuration needs initial camera and board poses."
-            return Content.styled(words, "$dim")
+            return dim(words)
         chosen = self.table.cursor_row if status.session.poses else None
         return draw(scene, status, chosen, width, height, turn_deg=turn_deg, lift_deg=lift_deg, zoom=zoom)
 
     def action_turn(self, by: int) -> None:
         self._turn_deg += by * TURN_DEG
-        self.draw_panels(self.desk.known())
+        self.draw_panels(self.known)
 
     def action_zoom(self, by: int) -> None:
         self._zoom = min(4.0, max(0.5, self._zoom * ZOOM**by))
-        self.draw_panels(self.desk.known())
+        self.draw_panels(self.known)
 
     def _selected(self) -> int | None:
-        status = self.desk.status
+        status = self.known.live
         if status is None or not status.session.poses:
             self.notify("No plan is loaded: n makes one, or `station plan` in a shell.", severity="warning")
             return None
@@ -208,10 +196,10 @@ class PlanScreen(StationScreen):
 
     def action_pose(self, verb: str) -> None:
         if (index := self._selected()) is not None:
-            self.desk.send(POSE_VERBS[verb](index))
+            self.post_message(Ask(POSE_VERBS[verb](index)))
 
     def action_shift(self, by: int) -> None:
-        status, line = self.desk.status, self.table.cursor_row
+        status, line = self.known.live, self.table.cursor_row
         if self._selected() is None or status is None:
             return
         if not 0 <= line + by < len(status.session.poses):
@@ -219,17 +207,16 @@ class PlanScreen(StationScreen):
             return
         order = [pose.index for pose in status.session.poses]
         order[line], order[line + by] = order[line + by], order[line]
-        self.desk.send(Reorder(tuple(order)))
+        self.post_message(Ask(Reorder(tuple(order))))
         self.table.move_cursor(row=line + by)
 
     def action_add(self) -> None:
-        status = self.desk.status
+        status = self.known.live
         if status is None or status.robot.joints_rad is None:
             self.notify("The arm's posture is not known: no robot state.", severity="warning")
             return
         name = f"here-{max((pose.index for pose in status.session.poses), default=-1) + 2}"
-        self.desk.send(Add(PlannedPose(name, status.robot.joints_rad, why="added on the screen")))
+        self.post_message(Ask(Add(PlannedPose(name, status.robot.joints_rad, why="added on the screen"))))
 
-    @work(exit_on_error=False)
-    async def action_make(self, aim: Literal["camera", "both"]) -> None:
-        await self.desk.ask(MakePlan(25, seed=1, aim=aim), timeout_s=PREPARE_S)
+    def action_make(self, aim: Literal["camera", "both"]) -> None:
+        self.post_message(Ask(MakePlan(25, seed=1, aim=aim), PREPARE_S))

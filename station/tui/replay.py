@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from bisect import bisect_right
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import TypeVar, cast
@@ -13,11 +14,11 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.files import MAIN_CAMERA
+from recordings.images import viewable
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.schema.messages import CaptureEvent, RobotState, View
-from station.analysis.preview import preview_image
-from station.analysis.worker import sight
+from station.analysis.worker import preview_image, sight
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StationError
 from station.cell.scene import flange_pose
@@ -92,9 +93,6 @@ class ReplayLink:
             remedy="Nothing can be commanded.",
         )
 
-    def outdate(self) -> None:
-        """Do nothing: a recording is never outdated."""
-
     async def statuses(self) -> AsyncIterator[StationStatus]:
         """Yield statuses until the end, which stays on the screen."""
         seen_s = time.monotonic()
@@ -147,7 +145,8 @@ class ReplayLink:
         except RecordingError as error:
             self._seen = DetectionStatus(reason=str(error))
             return PreviewImage()
-        seen = sight(taken.viewable(), self._timeline.recording.info.board, None, thorough=False)
+        pixels = viewable(taken.pixels, taken.pixel_format)
+        seen = sight(pixels, self._timeline.recording.info.board, None, thorough=False)
         self._seen = seen.status
         corners = seen.pixels if seen.status.found else np.zeros((0, 2))
         return preview_image(taken, corners, width, height, view.picture_sequence)
@@ -182,7 +181,7 @@ class Timeline:
 
     def image_s(self, at_s: float, by: int) -> float:
         """Time of the next image (`by` 1) or the one before (-1), seen from `at_s`."""
-        done = sum(time_s <= at_s for time_s in self._times_s)
+        done = bisect_right(self._times_s, at_s)
         if by > 0:
             return self._times_s[done] if done < len(self._times_s) else self.duration_s
         # In the midst of an image's time, back is the image before it.
@@ -190,13 +189,13 @@ class Timeline:
 
     def view_at(self, at_s: float) -> View | None:
         """The newest view taken by then."""
-        done = sum(time_s <= at_s for time_s in self._times_s)
+        done = bisect_right(self._times_s, at_s)
         return self.views[done - 1] if done else None
 
     def status(self, at_s: float) -> StationStatus:
         """`at_s`: since the recording's start."""
         robot = self._robot_at(at_s)
-        done = sum(time_s <= at_s for time_s in self._times_s)
+        done = bisect_right(self._times_s, at_s)
         info = self.recording.info
         ended = at_s >= self.duration_s
         state = StationState.IDLE if ended else _state(robot)

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar, cast
+from typing import ClassVar
 
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Container, Vertical
 from textual.content import Content
 from textual.coordinate import Coordinate
+from textual.message import Message
 from textual.reactive import reactive
 from textual.widgets import DataTable
 
+from station.protocol.client import ANSWER_S
+from station.protocol.verbs import Verb
 from station.tui.frame import Frame, Framed, Keys, Line
-from station.tui.results import ResultsDesk
 from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
 from station.tui.words import rich_text
@@ -38,7 +40,6 @@ class Panel(Line):
         self.border_title = f"{self._title}: OLD" if old else self._title
 
     def show(self, known: Known) -> None:
-        """Show the status; without one the last one known, marked old."""
         self.old = known.old
         if known.status is not None and self.display:
             super().show(known)
@@ -84,14 +85,25 @@ class Rows(DataTable[object]):
         self._cells, self._variables = cells, variables
 
 
+class Ask(Message):
+    """A wish for the daemon; a notice says why it was refused."""
+
+    def __init__(self, verb: Verb[object], timeout_s: float = ANSWER_S) -> None:
+        super().__init__()
+        self.verb, self.timeout_s = verb, timeout_s
+
+
 class StationScreen(Framed[None]):
     """One screen; `body` is what differs."""
 
+    AUTO_FOCUS = "Rows, #checklist-scroll, #log"
     MODE: ClassVar[str] = ""
     """Its step of the task, or its name."""
     TIP: ClassVar[str] = ""
     """Purpose in a few words."""
 
+    LOOK: ClassVar[str] = ""
+    """Action of the app that looks for what it shows."""
     NAME: ClassVar[str] = ""
     """Its name, where that is not its mode."""
 
@@ -105,18 +117,26 @@ class StationScreen(Framed[None]):
             yield from self.body()
         yield Keys(self.heading.lower())
 
-    @property
-    def desk(self) -> ResultsDesk:
-        return cast(ResultsDesk, self.app)
-
     def body(self) -> ComposeResult:
         yield from ()
+
+    async def on_screen_resume(self) -> None:
+        if self.LOOK:
+            await self.app.run_action(self.LOOK)
 
     def show(self, known: Known) -> None:
         self.set_class(known.old, "-old")
         for preview in self.query(PreviewPane):
             preview.old = known.old
         super().show(known)
+
+    @property
+    def table(self) -> Rows:
+        """The one table of a screen that has one."""
+        return self.query_one(Rows)
+
+    def on_data_table_row_highlighted(self) -> None:
+        self.draw_panels(self.known)
 
     def draw_panels(self, known: Known) -> None:
         for panel in self.query(Panel):

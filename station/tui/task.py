@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from station.cell.config import StationConfig
 from station.cell.status import StationState, StationStatus
 from station.operate.ending import Way, after_solve
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Check
-from station.tui.installed import Result
+from station.tui.installed import Past, Result
 from station.tui.words import Mark, duration, many
 
 STEPS = ("connect", "plan", "capture", "solve", "verify", "install")
 DIGITS = {mode: str(place) for place, mode in enumerate((*STEPS, "sessions", "log"), start=1)}
+SILENT = (
+    "Daemon not responding: the data below are old. The arm's watchdog stops it; if it moves, press the "
+    "emergency stop."
+)
 _STILL = {StationState.IDLE, StationState.PAUSED, StationState.FREE_DRIVE}
 
 
@@ -49,20 +54,44 @@ class Action:
 
 @dataclass(frozen=True)
 class Known:
-    """All that rail and next action are made of."""
+    """All that the screens know and are drawn from: the app has one, replaced by another at every change."""
 
     status: StationStatus | None = None
+    """The newest there ever was; it outlives the daemon."""
     checks: Sequence[Check] = ()
+    """The preflight check, as it was last seen."""
     result: Result | None = None
     """Result of the session, or the picked one; None: nothing is solved."""
     silent_s: float | None = None
+    """Seconds without an answer from the daemon; None while it answers."""
     busy: str = ""
-    trouble: str = ""
+    """Long work of the daemon for this screen, in words; empty: none."""
+    gone: str = ""
+    """Why there is no daemon; empty: there is one, or none was asked yet."""
+    configuration: StationConfig | None = None
+    """Facts of the cell; None until the daemon told them."""
+    past: Past | None = None
+    """What was recorded below the daemon's root; None: not looked yet."""
+
+    @property
+    def live(self) -> StationStatus | None:
+        """The status as the daemon tells it; None: there is no daemon."""
+        return None if self.gone else self.status
+
+    @property
+    def shown(self) -> StationStatus:
+        """The newest status, for what may be old."""
+        return self.status or StationStatus()
 
     @property
     def old(self) -> bool:
         """The status is no longer how it is."""
-        return bool(self.trouble) or self.silent_s is not None
+        return bool(self.gone) or self.silent_s is not None
+
+    @property
+    def works(self) -> bool:
+        """The arm works, or may: nothing beside it should cost the daemon time."""
+        return self.live is not None and self.live.state in RUNNING
 
     @property
     def missing(self) -> Check | None:
@@ -71,7 +100,7 @@ class Known:
 
 def steps(known: Known) -> tuple[Step, ...]:
     """The rail, from left to right."""
-    status = known.status
+    status = known.live
     if status is None:
         return tuple(Step(mode, "todo", UNTOLD) for mode in STEPS)
     made = [_connect(known, status), _plan(status), _capture(status), *_results(known)]
@@ -138,7 +167,7 @@ def _capture(status: StationStatus) -> Step:
 
 
 def _results(known: Known) -> tuple[Step, Step, Step]:
-    result, status = known.result, known.status
+    result, status = known.result, known.live
     calibration = None if result is None else result.calibration
     if result is None or calibration is None:
         waits = "after capture" if status is None or not status.session.recording else "not yet"
@@ -164,12 +193,12 @@ def _results(known: Known) -> tuple[Step, Step, Step]:
 
 def next_action(known: Known) -> Action:
     """Exactly one; alternatives stand in its sentence."""
-    status = known.status
+    status = known.live
     if known.silent_s is not None:
-        why = f"No answer for {known.silent_s:.0f} s: the data below are old. {known.trouble}"
+        why = f"No answer for {known.silent_s:.0f} s: the data below are old. {SILENT}"
         return Action("", "EMERGENCY STOP if it moves", why, look=True)
     if status is None:
-        return Action("", "Wait", known.trouble or "Connecting …", look=bool(known.trouble))
+        return Action("", "Wait", known.gone or "Connecting …", look=bool(known.gone))
     if status.playback:
         return Action("Space", "Pause or play", status.reason)
     latched = status.state in LATCHED or status.state is StationState.DISCONNECTED

@@ -15,11 +15,12 @@ from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
 from calibrate.boards.model import board_points, outer_corners
-from calibrate.files.calibration import Touch, read_calibration
-from calibrate.files.verification import touch_text
+from calibrate.files.calibration import read_calibration
+from calibrate.files.touch import Touch, touch_text
 from recordings.schema.messages import BoardSpec
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview
+from station.operate.motion import Approve
 from station.operate.touch_test import Hovering, note_touches, touch_test, touch_told
 from station.tui.desk import Desk, told
 from station.tui.frame import Question
@@ -36,6 +37,7 @@ POINTER = "pointer's length in mm; empty: as configured, or as on the pendant"
 class ChooseCorner(Question[int | None]):
     """Choice of the next corner and of the pointer. None: no more corners."""
 
+    TITLE = "Touch test of this calibration"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "dismiss(None)", "End", tooltip="No more corners")
     ]
@@ -55,7 +57,6 @@ class ChooseCorner(Question[int | None]):
         yield Label("Enter: that corner. Tab: the pointer's length. Escape: no more.", id="dialog-keys")
 
     def on_mount(self) -> None:
-        self.titled("Touch test of this calibration")
         corners = outer_corners(self._board)
         left = [line for line, corner in enumerate(corners) if corner not in self._found]
         self.query_one(OptionList).highlighted = left[0] if left else len(corners)
@@ -85,7 +86,8 @@ class Touching(Question[Touch | None]):
 
     def __init__(self, desk: Desk, corner: int, board: BoardSpec, arrival: Awaitable[Hovering]) -> None:
         super().__init__()
-        self._desk, self._corner, self._board, self._arrival = desk, corner, board, arrival
+        self._desk, self._board, self._arrival = desk, board, arrival
+        self.title = f"Corner {corner}"
         self._hovering: Hovering | None = None
 
     def body(self) -> ComposeResult:
@@ -95,7 +97,6 @@ class Touching(Question[Touch | None]):
         yield Label("Escape leaves this corner out", id="dialog-keys")
 
     def on_mount(self) -> None:
-        self.titled(f"Corner {self._corner}")
         self.query_one(Input).display = False
         self.await_arrival()
 
@@ -115,7 +116,7 @@ class Touching(Question[Touch | None]):
         if self._hovering is None:
             return
         try:
-            now = None if self._desk.silent_s is not None else self._desk.status
+            now = None if self.known.old else self.known.status
             self.dismiss(touch_told(self._hovering, event.value.strip(), now))
         except RefusedError as problem:
             self.query_one("#dialog-problem", Label).update(told(problem))
@@ -130,43 +131,43 @@ class Touching(Question[Touch | None]):
 class _ScreenToucher:
     """The person in front of this screen, who guides the tip."""
 
-    def __init__(self, desk: Desk, board: BoardSpec) -> None:
+    def __init__(self, desk: Desk, board: BoardSpec, approves: Approve) -> None:
         self._desk, self._board, self._pointer_mm = desk, board, ""
+        self._approves = approves
         self.found: dict[int, Touch] = {}
 
     async def next_corner(self) -> int | None:
         choice = ChooseCorner(self._board, self.found, self._pointer_mm)
-        corner: int | None = await self._desk.push_screen_wait(choice)
+        corner = await self._desk.question(choice)
         self._pointer_mm = choice.pointer_mm
         return corner
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        return await self._approves(preview)
 
     def pointer_m(self) -> float | None:
         return float(self._pointer_mm) / 1000 if self._pointer_mm else None
 
-    async def approves(self, preview: MotionPreview) -> bool:
-        return await self._desk.approves(preview)
-
     def refused(self, corner: int, problem: StationError) -> None:
-        self._desk.notify(told(problem), severity="warning", timeout=10, markup=False)
+        self._desk.app.notify(told(problem), severity="warning", timeout=10, markup=False)
 
     async def touch(self, offer: HoverOffer, arrival: Awaitable[Hovering]) -> None:
         screen = Touching(self._desk, offer.corner, self._board, arrival)
-        if (touch := await self._desk.push_screen_wait(screen)) is not None:
+        if (touch := await self._desk.question(screen)) is not None:
             self.found[offer.corner] = touch
 
 
-async def run_touch_test(desk: Desk, path: Path) -> bool:
+async def run_touch_test(desk: Desk, approves: Approve, path: Path) -> bool:
     """Visit corners until the person ends it. True when something was written into the file."""
-
     calibration = await desk.attempt(asyncio.to_thread(read_calibration, path))
     if calibration is None:
         return False
-    person = _ScreenToucher(desk, calibration.board)
+    person = _ScreenToucher(desk, calibration.board, approves)
     await desk.attempt(touch_test(desk, person, path))
     if not person.found:
         return False
     found = list(person.found.values())
     words = await desk.attempt(asyncio.to_thread(note_touches, state_root(str(path)), path, found))
     if words:
-        desk.notify(words, markup=False)
+        desk.app.notify(words, markup=False)
     return bool(words)

@@ -10,21 +10,9 @@ from typing import Literal
 from rich.text import Text
 from textual.content import Content
 
-from station.cell.status import PoseState, StationState, StationStatus
+from station.cell.status import StationState, StationStatus
 
 STATE_WORDS = {state: state.value.upper() for state in StationState} | {StationState.DISCONNECTED: "NO ROBOT"}
-
-POSE_MARKS: dict[PoseState, str] = {
-    "planned": "·",
-    "moving": ">",
-    "settling": "~",
-    "capturing": "o",
-    "writing": "w",
-    "done": "+",
-    "skipped": "-",
-    "failed": "x",
-}
-"""One plain character a state, so that neither colour nor a Unicode font is needed."""
 
 Mark = Literal["done", "now", "stopped", "look", "failed", "todo"]
 MARKS: dict[Mark, tuple[str, str]] = {
@@ -54,6 +42,14 @@ def shortened(text: str, cells: int, parts: bool = False) -> str:
 def mark(kind: Mark, text: str = "") -> Content:
     sign, colour = MARKS[kind]
     return Content.styled(f"{sign} {text}" if text else sign, colour)
+
+
+def dim(text: str) -> Content:
+    return Content.styled(text, "$dim")
+
+
+def lines(*rows: Content) -> Content:
+    return Content("\n").join(rows)
 
 
 def facts(*pairs: tuple[str, str, str]) -> Content:

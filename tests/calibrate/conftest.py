@@ -10,7 +10,8 @@ import pytest
 
 from calibrate.files.calibration import FramePose, write_calibration
 from calibrate.geometry import Transform, perturb
-from calibrate.pipeline import SolvedRecording, solve_recording
+from calibrate.job import SolvedRecording
+from calibrate.pipeline import solve_recording
 from tests.calibrate.sessions import Scene, write_session
 
 

@@ -18,7 +18,7 @@ import pytest
 from calibrate.bounds import SolveLimitError, bounded
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration, write_calibration
-from calibrate.pipeline import SolvedRecording
+from calibrate.job import SolvedRecording
 from tests.calibrate.calling import raises_code
 
 PROGRAM = (sys.executable, "-m", "calibrate.cli", "solve")

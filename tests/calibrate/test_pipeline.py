@@ -18,9 +18,9 @@ from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
+from calibrate.job import JobOptions, SolvedRecording
 from calibrate.kinematics import MODELS, forward, inverse_nearest
-from calibrate.load import load_views
-from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording
+from calibrate.pipeline import prepare_views, solve_recording
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Image, Stamps, View
@@ -57,13 +57,13 @@ def test_a_symmetric_board_solves_by_the_robots_motion(tmp_path: Path) -> None:
     """Every picture is read one of two ways; a single wrong one would miss by half a turn."""
     scene = Scene(board=SYMMETRIC_BOARD, mount="eye-to-hand", seed=3, roll_rad=3.1)
     path = write_session(tmp_path / "s.mcap", scene, known_lens=True)
-    views = load_views(open_recording(path)).views
-    prepared = prepare_views(path)
+    job = solve_recording(path)
     turned = [
-        not np.allclose(a.board_points, b.board_points) for a, b in zip(views, prepared.views, strict=True)
+        not np.allclose(a.board_points, b.board_points)
+        for a, b in zip(job.loaded.views, job.views, strict=True)
     ]
     assert 0 < sum(turned) < len(turned), "the scene does not show what it should"
-    mm, degrees = error_mm_deg(solve_recording(path).solution.matrix, X_TRUE)
+    mm, degrees = error_mm_deg(job.solution.matrix, X_TRUE)
     assert mm < 1.0
     assert degrees < 0.15
 
@@ -77,13 +77,13 @@ def test_the_number_of_threads_changes_nothing(real_session_file: Path) -> None:
     assert all(line.startswith("created:") for line in different)
 
 
-def test_a_wrong_square_size_is_found_and_said(real_session_file: Path) -> None:
+def test_a_wrong_square_size_is_found_and_said(real_session_file: Path, solved_real: SolvedRecording) -> None:
     job = solve_recording(real_session_file, JobOptions(square_m=0.026))
     session = job.solution.session
     assert session.reading is Reading.SQUARE_SIZE
     assert 0.026 * session.factor == pytest.approx(0.025, rel=0.005)
     assert {"session", "board_pull"} & {gate.name for gate in job.gates if not gate.passed}
-    right = solve_recording(real_session_file)
+    right = solved_real
     assert all(gate.passed for gate in right.gates if gate.name in ("session", "board_pull"))
     assert right.solution.board is not None
     assert abs(right.solution.board.scale) < 4 * right.solution.board.sigma[0]

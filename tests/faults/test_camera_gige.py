@@ -17,9 +17,10 @@ from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
-from station.simulation import genicam
-from station.simulation.launch import SimulatedGige, start_gige
+from station.simulation.gige import ADDRESSES
+from station.simulation.launch import SimulatedGige
 from tests.codes import raises
+from tests.numbered_gige import start_numbered
 
 pytestmark = pytest.mark.gige
 CONFIG = CameraConfig(device="127.0.0.1", packet_size=8996)
@@ -27,7 +28,7 @@ CONFIG = CameraConfig(device="127.0.0.1", packet_size=8996)
 
 @pytest.fixture
 def server(lonely_network: None) -> Iterator[SimulatedGige]:
-    with start_gige(numbered=True, serial="KJ0042") as running:
+    with start_numbered() as running:
         yield running
 
 
@@ -69,8 +70,8 @@ async def test_23_settings_changed_behind_our_back_are_refused(server: Simulated
     camera = AravisCamera(CONFIG)
     await camera.open()
     try:
-        for register, value in ((genicam.EXPOSURE, 4000), (genicam.GAIN, 100), (genicam.WIDTH, 640)):
-            before = {genicam.EXPOSURE: 10_000, genicam.GAIN: 0, genicam.WIDTH: 1280}[register]
+        for name, before, value in (("ExposureTime", 10_000, 4000), ("Gain", 0, 100), ("Width", 1280, 640)):
+            register = ADDRESSES[name]
             server.inject("register", [register, value])
             with raises("settings-changed"):
                 await camera.capture()
@@ -91,7 +92,7 @@ async def test_23_a_stream_ends_when_settings_are_changed_and_passes_no_picture_
     def keep(picture: Image) -> None:
         sizes.append(picture.pixels.shape)
         if len(sizes) == 5:
-            server.inject("register", [genicam.WIDTH, 640])
+            server.inject("register", [ADDRESSES["Width"], 640])
 
     await camera.open()
     try:
@@ -99,7 +100,7 @@ async def test_23_a_stream_ends_when_settings_are_changed_and_passes_no_picture_
             await asyncio.wait_for(camera.stream(keep, threading.Event()), 20)
         assert len(sizes) >= 5 and set(sizes) == {(1024, 1280)}
     finally:
-        server.inject("register", [genicam.WIDTH, 1280])
+        server.inject("register", [ADDRESSES["Width"], 1280])
         await camera.close()
 
 
@@ -124,7 +125,7 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
         assert time.monotonic() - start_s < 8
         assert beats >= 20 * (time.monotonic() - start_s) - 1, "the loop goes on while Aravis waits"
         beating.cancel()
-        with start_gige(numbered=True, serial="KJ0042"):
+        with start_numbered():
             assert (await camera.capture()).pixels.shape == (1024, 1280)
             assert camera.identity.serial == "KJ0042"
     finally:
@@ -135,9 +136,9 @@ _LOST_AND_FORGOTTEN = """
 import ctypes, gc, time
 from station.cell.config import CameraConfig
 from station.devices.aravis_device import GenicamDevice
-from station.simulation.launch import start_gige
+from tests.numbered_gige import start_numbered
 
-with start_gige(numbered=True, serial="KJ0042") as server:
+with start_numbered() as server:
     device = GenicamDevice(CameraConfig(device="127.0.0.1", packet_size=8996))
     device.open()
     device._stream = None

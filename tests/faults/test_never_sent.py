@@ -6,6 +6,7 @@ import ast
 import re
 import socket
 import time
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -32,15 +33,20 @@ PLAIN = re.compile(
 
 
 def sources(pattern: str) -> list[Path]:
-    """What is shipped or started by people; not the simulation, which must know what it must refuse."""
+    """List what is shipped or started by people; not the simulation, which must know what it must refuse."""
     folders = ["recordings", "calibrate", "station", "systemd", "benchmarks", "docs"]
     found = [p for folder in folders for p in (ROOT / folder).rglob(pattern) if p.is_file()]
     return [p for p in found if ROOT / "station" / "simulation" not in p.parents]
 
 
-def offences(source: str) -> list[str]:
+@cache
+def trees() -> dict[Path, ast.Module]:
+    return {path: ast.parse(path.read_text()) for path in sources("*.py")}
+
+
+def offences(source: ast.Module) -> list[str]:
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(source):
         if isinstance(node, ast.Attribute) and node.attr in LIBRARY_CALLS:
             found.append(f"line {node.lineno}: .{node.attr}")
         elif isinstance(node, ast.Name | ast.alias):
@@ -55,9 +61,8 @@ def offences(source: str) -> list[str]:
 
 
 def test_no_source_names_a_forbidden_command() -> None:
-    checked = sources("*.py")
-    assert len(checked) > 50
-    assert {str(p): o for p in checked if (o := offences(p.read_text()))} == {}
+    assert len(trees()) > 50
+    assert {str(p): o for p, tree in trees().items() if (o := offences(tree))} == {}
 
 
 def test_no_other_file_quotes_one() -> None:
@@ -77,13 +82,13 @@ def test_no_other_file_quotes_one() -> None:
     ],
 )
 def test_the_search_finds_what_it_looks_for(offence: str) -> None:
-    assert offences(offence)
+    assert offences(ast.parse(offence))
 
 
 def test_six_calls_of_the_vendors_library_are_used_and_no_other() -> None:
     control = pytest.importorskip("rtde_control").RTDEControlInterface
     every = {name for name in dir(control) if not name.startswith("_")}
-    nodes = [node for path in sources("*.py") for node in ast.walk(ast.parse(path.read_text()))]
+    nodes = (node for tree in trees().values() for node in ast.walk(tree))
     used = {node.attr for node in nodes if isinstance(node, ast.Attribute)} & every
     assert used == {"moveJ", "stopJ", "stopScript", "setWatchdog", "kickWatchdog", "getTCPOffset"}
 
@@ -97,8 +102,8 @@ def test_the_control_script_moves_the_arm_by_movej_alone() -> None:
 
 def test_the_vendors_library_has_one_door() -> None:
     doors = []
-    for path in sources("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+    for path, tree in trees().items():
+        for node in ast.walk(tree):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             if any(n.split(".")[0] in ("rtde_control", "rtde_receive", "rtde_io") for n in names):

@@ -39,6 +39,10 @@ def complaint(robot: UrRobot) -> ErrorData | None:
     return None
 
 
+never_driven = pytest.mark.parametrize("control_path", ["script"])
+"""Control is not started: there are no two ways of it."""
+
+
 async def test_nobody_is_there(tmp_path: Path) -> None:
     with raises("dashboard"):
         await robot_at("127.255.3.9", tmp_path).connect()
@@ -98,6 +102,7 @@ async def test_one_owner(controller: Start, tmp_path: Path) -> None:
     await second.close()
 
 
+@never_driven
 async def test_connecting_is_read_only(cell: Make) -> None:
     c = await cell(control=False)
     c.admin.ask("foreign", name="palletising.urp")
@@ -145,6 +150,7 @@ async def test_remote_control_lost_between_moves_ends_control(cell: Make) -> Non
         await c.robot.start_control()
 
 
+@never_driven
 @pytest.mark.parametrize("fault", [{"cmd": "freeze"}, {"cmd": "stall"}])
 async def test_old_news_is_not_taken_for_new(cell: Make, fault: dict[str, Any]) -> None:
     c = await cell(control=False)

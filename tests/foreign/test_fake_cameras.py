@@ -25,7 +25,7 @@ from recordings.reader import open_recording
 from station.cell.config import ApprovalConfig, StationConfig
 from station.cell.plan import Plan
 from station.cell.status import MotionPreview, StationState, StationStatus
-from station.operate.motion import SessionOutcome, carry_out, prepared_motion, wait_until_idle
+from station.operate.motion import carry_out, prepared_motion, wait_until_idle
 from station.plan.planner import make_plan
 from station.protocol.client import Client
 from station.protocol.verbs import Check, Doctor, Finish, Lease, LoadPlan, Purpose, Stop
@@ -101,7 +101,7 @@ async def yes(preview: MotionPreview) -> bool:
     return True
 
 
-async def captured(client: Client, plan: Plan) -> SessionOutcome:
+async def captured(client: Client, plan: Plan) -> StationStatus:
     await client.call(LoadPlan(plan))
     return await carry_out(client, Purpose.RUN, yes, lambda status: None, headless=True)
 
@@ -154,9 +154,9 @@ async def test_a_session_with_the_emulated_camera(
             await good(client, "camera")
             camera.mangle = loss(0.002)
             ended = await captured(client, plan)
-            assert ended.captured == 3, ended.status.reason
-            assert ended.status.camera.resent_packets > 0
-            views = open_recording(Path(ended.recording)).views()
+            assert ended.session.captured == 3, ended.reason
+            assert ended.camera.resent_packets > 0
+            views = open_recording(Path(ended.session.recording)).views()
             assert all(view.time_bound_s is not None and view.time_bound_s < 0.02 for view in views)
             power.close()
             assert (await checked(client))["camera"].state == "failed"
@@ -199,8 +199,8 @@ async def test_a_session_with_debians_fake_camera(arm: SimulatedController, tmp_
             power.callback(camera.kill)
             await good(client, "camera")
             ended = await captured(client, plan)
-            assert ended.status.state is StationState.PAUSED and ended.captured == 0
-            failed = [pose for pose in ended.status.session.poses if pose.state == "failed"]
+            assert ended.state is StationState.PAUSED and ended.session.captured == 0
+            failed = [pose for pose in ended.session.poses if pose.state == "failed"]
             assert len(failed) == 3, "there is no board"
             await client.call(Finish())
             finished = await status_when(client, lambda status: bool(status.session.recording))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from recordings.exporters.excerpt import write_excerpt
-from recordings.exporters.folder import Target, export_recording
+from recordings.exporters.folder import export_recording
 from recordings.reader import open_recording
 from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, Stamps
@@ -55,7 +55,7 @@ def recovered(folder: Path) -> Path:
 
 
 def ros2_export(folder: Path) -> Path:
-    bag = export_recording(open_recording(fresh(folder)), folder / "bag", Target.ROS2)
+    bag = export_recording(open_recording(fresh(folder)), folder / "bag", "ros2")
     return next(bag.glob("*.mcap"))
 
 

@@ -11,6 +11,7 @@ import pytest
 from mcap.writer import CompressionType
 
 from recordings.cli import main
+from recordings.images import viewable
 from recordings.importers.bag import import_bag
 from recordings.importers.messages import ros_types
 from recordings.importers.selection import Wanted
@@ -74,7 +75,7 @@ def test_every_pass_over_a_bag_tells_how_far_it_is(tmp_path: Path, description: 
         source,
         tmp_path / "out.mcap",
         description,
-        progress=lambda text, done, total: told.setdefault(text, []).append((done, total)),
+        progress=lambda done, total, text: told.setdefault(text, []).append((done, total)),
     )
     assert len(told) == (3 if "mcap" in kind else 2), "sqlite3 has no checksums to prove first"
     for steps in told.values():
@@ -122,7 +123,7 @@ def test_a_mosaic_stays_one(tmp_path: Path, description: Path, encoding: str) ->
     for number, (_, image) in enumerate(open_recording(tmp_path / "out.mcap").images()):
         assert (image.pixels.shape, image.pixel_format) == ((HEIGHT, WIDTH), "BayerGR8")
         assert np.unique(image.pixels) == 10 + 40 * number
-        assert image.viewable().shape == (HEIGHT, WIDTH, 3)
+        assert viewable(image.pixels, image.pixel_format).shape == (HEIGHT, WIDTH, 3)
 
 
 def test_the_rule_for_standing_is_the_stations() -> None:

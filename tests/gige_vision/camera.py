@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.devices.pixels import encode
-from station.simulation.gige import numbered_picture
 from tests.gige_vision import description as at
+from tests.numbered_gige import numbered_picture
 
 CONTROL_PORT = 3956
 _DISCOVERY, _RESEND, _READ_REGISTER, _WRITE_REGISTER = 0x0002, 0x0040, 0x0080, 0x0082
@@ -78,11 +78,11 @@ class EmulatedCamera:
         self.ptp_ns: Callable[[], int] = time.time_ns
         """The clock while IEEE 1588 is on, ns"""
         self.mangle: Callable[[Packets], Iterable[bytes]] = lambda packets: packets
-        """What the wire makes of a frame's packets when they are sent first: loss, order, copies."""
+        """Lose, reorder or copy a frame's packets as they are sent first."""
         self.stamp_error_ns = 0
         """Added to every stamp, chunks too"""
         self.chunk_exposure_us: float | None = None
-        """What the chunk says instead of the register"""
+        """The chunk's value instead of the register's"""
         self.mtu = 9000
         """Larger packets do not arrive."""
         self.readout_s = 0.002
@@ -122,7 +122,7 @@ class EmulatedCamera:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """As if its power was cut: nobody is told."""
+        """Cut its power: nobody is told."""
         self._ended.set()
         self._triggered.set()
         self._end.close()
@@ -294,7 +294,7 @@ class EmulatedCamera:
             self._release()
 
     def _release(self) -> None:
-        """What the standard asks for when control is given up or its heartbeat fails."""
+        """Reset as the standard asks when control is given up or its heartbeat fails."""
         self._controller = None
         for address in (_PRIVILEGE, at.ACQUISITION, _STREAM_PORT):
             self.set_register(address, 0)

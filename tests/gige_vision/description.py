@@ -110,7 +110,7 @@ def genicam_xml(serial: str) -> str:
 
 
 def zipped(xml: str) -> bytes:
-    """As most cameras keep it."""
+    """Pack it in the form that most cameras keep."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("camera.xml", xml)

@@ -79,7 +79,7 @@ def session_metadata(info: SessionInfo | None = None, file_format: str = FORMATS
 
 @dataclass
 class Counts:
-    """What the statistics record says."""
+    """Content of the statistics record."""
 
     messages: int = 0
     schemas: int = 0

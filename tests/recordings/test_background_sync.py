@@ -16,7 +16,7 @@ MIB = 2**20
 
 
 def in_memory_bytes(path: Path) -> int:
-    """Of the file, as the kernel tells."""
+    """Count the bytes of the file that the kernel holds in memory."""
     command = ["fincore", "--bytes", "--noheadings", "--output", "RES", str(path)]
     return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 

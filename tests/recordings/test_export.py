@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.cli import main
 from recordings.exporters.excerpt import write_excerpt
-from recordings.exporters.folder import Target, export_recording
+from recordings.exporters.folder import export_recording
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel, FrameTime, Stamps
@@ -42,7 +42,7 @@ from tests.recordings.small_recording import (
 
 def test_a_folder_export_imports_as_the_same_views(small: Path, tmp_path: Path) -> None:
     original = open_recording(small)
-    folder = export_recording(original, tmp_path / "out", Target.FOLDER)
+    folder = export_recording(original, tmp_path / "out", "folder")
     again = open_recording(import_folder(folder, tmp_path / "again.mcap").path)
     assert (again.info.board, again.info.mount, again.info.camera) == (
         original.info.board,
@@ -56,7 +56,7 @@ def test_a_folder_export_imports_as_the_same_views(small: Path, tmp_path: Path) 
 
 def test_an_imported_file_is_exported_byte_for_byte(folder: Path, tmp_path: Path) -> None:
     recording = open_recording(import_folder(folder, tmp_path / "a.mcap").path)
-    out = export_recording(recording, tmp_path / "out", Target.FOLDER)
+    out = export_recording(recording, tmp_path / "out", "folder")
     for index in range(3):
         assert (out / f"images/{index:03d}.png").read_bytes() == (folder / f"images/{index}.png").read_bytes()
 
@@ -69,7 +69,7 @@ def test_tables_hold_every_value_in_full_precision(tmp_path: Path) -> None:
             writer.image(make_picture(sequence))
             writer.view(make_view(0, sequence, attempt))
         recording = open_recording(writer.finish())
-    out = export_recording(recording, tmp_path / "out", Target.CSV)
+    out = export_recording(recording, tmp_path / "out", "csv")
     tables = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in out.iterdir()}
     assert {name: len(rows) for name, rows in tables.items()} == {
         "robot_states": 4,
@@ -89,9 +89,9 @@ def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: P
     taken = tmp_path / "taken"
     taken.mkdir()
     with refused("exists"):
-        export_recording(open_recording(small), taken, Target.CSV)
+        export_recording(open_recording(small), taken, "csv")
     with refused("disk", errno=errno.ENOENT):
-        export_recording(open_recording(small), tmp_path / "no" / "out", Target.CSV)
+        export_recording(open_recording(small), tmp_path / "no" / "out", "csv")
     assert list(taken.iterdir()) == []
     assert not (tmp_path / "no").exists()
 
@@ -100,7 +100,7 @@ def test_an_export_that_fails_halfway_leaves_nothing(small: Path, tmp_path: Path
     recording = open_recording(small)
     (tmp_path / "out.part").mkdir()
     with refused("disk", errno=errno.EEXIST):
-        export_recording(recording, tmp_path / "out", Target.FOLDER)
+        export_recording(recording, tmp_path / "out", "folder")
     assert not (tmp_path / "out").exists()
 
 
@@ -169,7 +169,7 @@ def test_quaternions_of_any_rotation_turn_back() -> None:
 
 
 def test_the_bag_has_the_profile_and_counts_that_ros_wants(small: Path, tmp_path: Path) -> None:
-    out = export_recording(open_recording(small), tmp_path / "bag", Target.ROS2)
+    out = export_recording(open_recording(small), tmp_path / "bag", "ros2")
     described = yaml.safe_load((out / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     counts = {t["topic_metadata"]["name"]: t["message_count"] for t in described["topics_with_message_count"]}
     assert counts == {"/camera/camera_info": 3, "/joint_states": 9, "/camera/image_raw": 3, "/tf": 5}
@@ -199,7 +199,7 @@ def test_an_image_between_poses_has_its_own_time_in_a_bag(tmp_path: Path) -> Non
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.image(msgspec.structs.replace(make_picture(0), time=told))
         recording = open_recording(writer.finish())
-    out = export_recording(recording, tmp_path / "bag", Target.ROS2)
+    out = export_recording(recording, tmp_path / "bag", "ros2")
     (image,) = read_bag(out)["/camera/image_raw"]
     stamp = image.header.stamp
     assert stamp.sec * 10**9 + stamp.nanosec == arrived.host_wall_ns - 21_000_000
@@ -214,7 +214,7 @@ def test_a_bag_holds_the_pose_that_counts_and_no_lens_that_nobody_knows(tmp_path
         writer.image(make_picture(1))
         writer.view(make_view(0, 1, attempt=2))
         recording = open_recording(writer.finish())
-    found = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))
+    found = read_bag(export_recording(recording, tmp_path / "bag", "ros2"))
     assert [message.transforms[0].transform.translation.z for message in found["/tf"]] == [TURNED[2][3]]
     camera = found["/camera/camera_info"][1]
     assert (camera.k.tolist(), len(camera.d), camera.p.tolist()) == ([0.0] * 9, 0, [0.0] * 12)
@@ -226,7 +226,7 @@ def test_a_short_list_of_distortion_is_filled_up_as_ros_expects_it(tmp_path: Pat
     with RecordingWriter(tmp_path / "a.mcap", make_info(camera=camera)) as writer:
         writer.image(make_picture(0))
         recording = open_recording(writer.finish())
-    (info,) = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))["/camera/camera_info"]
+    (info,) = read_bag(export_recording(recording, tmp_path / "bag", "ros2"))["/camera/camera_info"]
     assert info.d.tolist() == [0.1, 0.0, 0.0, 0.0, 0.0]
 
 
@@ -236,7 +236,7 @@ def test_times_that_ros_cannot_hold_are_said(tmp_path: Path) -> None:
         writer.robot_state(msgspec.structs.replace(make_state(0), stamps=late))
         recording = open_recording(writer.finish())
     with refused("stamp-too-late"):
-        export_recording(recording, tmp_path / "bag", Target.ROS2)
+        export_recording(recording, tmp_path / "bag", "ros2")
     assert not list(tmp_path.glob("bag*"))
 
 
@@ -249,7 +249,7 @@ def test_rosbags_reads_the_bag_back(tmp_path: Path, lossless_png: bool) -> None:
             writer.image(make_picture(index))
             writer.view(make_view(index))
         path = writer.finish()
-    found = read_bag(export_recording(open_recording(path), tmp_path / "bag", Target.ROS2))
+    found = read_bag(export_recording(open_recording(path), tmp_path / "bag", "ros2"))
     joints = found["/joint_states"][2]
     np.testing.assert_array_equal(joints.position, make_state(2).joints_rad)
     assert joints.header.stamp.sec * 10**9 + joints.header.stamp.nanosec == make_state(2).stamps.host_wall_ns
@@ -277,7 +277,7 @@ def test_a_colour_mosaic_leaves_as_what_it_is(tmp_path: Path, lossless_png: bool
         writer.image(msgspec.structs.replace(make_picture(0), pixel_format="BayerGR8"))
         writer.view(make_view(0))
         recording = open_recording(writer.finish())
-    found = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))
+    found = read_bag(export_recording(recording, tmp_path / "bag", "ros2"))
     if lossless_png:
         (message,) = found["/camera/image_raw/compressed"]
         assert message.format == "bayer_grbg8; png compressed"
@@ -287,6 +287,6 @@ def test_a_colour_mosaic_leaves_as_what_it_is(tmp_path: Path, lossless_png: bool
         assert message.encoding == "bayer_grbg8"
         mosaic = message.data.reshape(HEIGHT, WIDTH)
     np.testing.assert_array_equal(mosaic, make_image(0))
-    folder = export_recording(recording, tmp_path / "out", Target.FOLDER)
+    folder = export_recording(recording, tmp_path / "out", "folder")
     shown = cv2.imread(str(folder / "images/000.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(shown, cv2.cvtColor(make_image(0), cv2.COLOR_BayerGRBG2BGR))

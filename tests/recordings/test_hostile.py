@@ -252,16 +252,16 @@ def test_one_lie_is_enough(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_a_decompression_bomb_is_refused_at_once(tmp_path: Path, compression: str) -> None:
     path = write(tmp_path, bomb(compression))
-    start_s = time.perf_counter()
+    start_s = time.process_time()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with refused("damaged-recording"):
         open_recording(path)
-    assert time.perf_counter() - start_s < 0.5
+    assert time.process_time() - start_s < 0.5
     path.write_bytes(path.read_bytes().replace(struct.pack("<Q", BOMB_BYTES), struct.pack("<Q", 4_000_000)))
     with refused("damaged-recording"):
         open_recording(path)
     recover_recording(path)
-    assert time.perf_counter() - start_s < 1.0
+    assert time.process_time() - start_s < 1.0
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from recordings.cli import main
-from recordings.exporters.folder import Target, export_recording
+from recordings.exporters.folder import export_recording
 from recordings.importers.dataset import read_poses
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
@@ -89,7 +89,7 @@ def test_joints_behind_the_pose_reach_the_view(folder: Path, tmp_path: Path) -> 
     views = open_recording(import_folder(folder, tmp_path / "r.mcap").path).views()
     assert views[0].joints_rad == (0.1, -1.5, 1.5, -1.0, -1.57, 3.2)
     assert views[1].joints_rad is None, "empty cells: not known for that picture"
-    out = export_recording(open_recording(tmp_path / "r.mcap"), tmp_path / "out", Target.FOLDER)
+    out = export_recording(open_recording(tmp_path / "r.mcap"), tmp_path / "out", "folder")
     again = open_recording(import_folder(out, tmp_path / "again.mcap").path).views()
     assert [view.joints_rad for view in again] == [view.joints_rad for view in views]
 
@@ -276,7 +276,7 @@ DOCUMENT = Path(__file__).parent.parent.parent / "docs/integrator/import.md"
 
 
 def test_the_recipes_for_poses_of_other_tools_give_the_pose(tmp_path: Path) -> None:
-    """As they stand in the document, for one flange pose told in each convention."""
+    """Rows as they stand in the document, for one flange pose told in each convention."""
     from scipy.spatial.transform import Rotation
 
     text = DOCUMENT.read_text()

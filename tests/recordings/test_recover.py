@@ -125,9 +125,9 @@ def test_a_lost_dark_picture_does_not_make_recovery_slow(tmp_path: Path) -> None
     data = bytearray(path.read_bytes())
     data[open_recording(path).segments[0].messages(Topic.RAW_IMAGE).addresses[1] - 40] ^= 1
     path.write_bytes(data)
-    start_s = time.perf_counter()
+    start_s = time.process_time()
     recover_recording(path)
-    assert time.perf_counter() - start_s < 8
+    assert time.process_time() - start_s < 8
     assert [view.index for view in open_recording(path).views()] == [0, 2]
 
 

@@ -11,14 +11,14 @@ import pytest
 from recordings.errors import RecordingError
 from station.cell.plan import Plan
 from station.cell.status import StationState
-from station.plan.planner import make_plan
 from station.session.recording import SessionRecording
+from tests.station.quick_plan import quick_plan
 from tests.station.session_rig import POSES, TRUTH, HeldDisk, NewRig, Rig, memory_config
 
 
 @pytest.fixture(scope="session")
 def small_plan() -> Plan:
-    return make_plan(memory_config(), start_joints_rad=TRUTH.start_joints_rad, seed=3, count=POSES)
+    return quick_plan(memory_config(), TRUTH, seed=3, count=POSES)
 
 
 @pytest.fixture

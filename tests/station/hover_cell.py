@@ -17,7 +17,7 @@ from calibrate.files.calibration import (
     Views,
 )
 from calibrate.geometry import Array, Transform, inverse, perturb, transform_points
-from calibrate.lens.model import project
+from calibrate.projection import project_at
 from calibrate.views import BoardView
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig
@@ -84,7 +84,7 @@ def seen_from(
     X = np.array(truth.camera_mount)
     base_from_camera = base_from_flange @ X if truth.mount == "eye-in-hand" else X
     points = board_points(truth.board)
-    pixels = project(truth.camera, inverse(base_from_camera) @ base_from_board, points)
+    pixels = project_at(truth.camera, inverse(base_from_camera) @ base_from_board, points)
     if rng is not None:
         pixels = pixels + rng.normal(0, CORNER_PX, pixels.shape)
     return BoardView(0, "now", base_from_flange if told is None else told, points, pixels)

@@ -36,7 +36,7 @@ from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.scenes import cell_config, make_cell
 
-TRUTH = make_cell()
+TRUTH = make_cell("paper-binned")
 POSES = 4
 GLIMPSED = np.random.default_rng(1).integers(0, 255, (64, 80), dtype=np.uint8)
 PATIENCE_S = 30.0
@@ -230,7 +230,7 @@ class WorkerInThisProcess:
     def __init__(self) -> None:
         self.waiting = 0
         points = board_points(TRUTH.board)
-        pixels = 300 + 5000 * points[:, :2]
+        pixels = 150 + 2500 * points[:, :2]
         status = DetectionStatus(found=True, corners=len(points), expected=len(points))
         self.sees = BoardDetection(status, np.arange(len(points)), pixels)
 
@@ -337,11 +337,11 @@ class HeldDisk(asyncio.Event):
 
     fails = False
     asked = 0
-    """How often it was to take everything so far."""
+    """Requests to take everything so far."""
 
 
 def crash(rig: Rig) -> None:
-    """What SIGKILL leaves: no sealing, no goodbye, the file as the disk has it."""
+    """Leave what SIGKILL leaves: no sealing, no goodbye, the file as the disk has it."""
     for task in (*rig.session._tasks, rig.session._run):
         if task is not None:
             task.cancel()
@@ -353,7 +353,7 @@ def crash(rig: Rig) -> None:
 
 
 def sealed(rig: Rig) -> Recording:
-    """What the session wrote."""
+    """Open what the session wrote."""
     return open_recording(Path(rig.session.store.status.session.recording))
 
 

@@ -22,12 +22,12 @@ import pytest
 
 from station.cell.plan import Plan
 from station.cell.status import StationState, StationStatus
-from station.plan.planner import make_plan
 from station.protocol.client import Client
 from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
 from station.simulation.scenes import cell_config, make_cell
 from tests.conftest import CONTROL_PATHS
+from tests.station.quick_plan import quick_plan
 
 TRUTH = make_cell(seed=5)
 AT_REST_RAD_S = 1e-3
@@ -39,12 +39,12 @@ PROGRAM = (sys.executable, "-m", "tests.system.cell_daemon")
 @pytest.fixture(scope="session")
 def short_plan() -> Plan:
     """Three poses, driven slowly enough to be caught in mid-move."""
-    plan = make_plan(cell_config(TRUTH), start_joints_rad=TRUTH.start_joints_rad, seed=5, count=3)
+    plan = quick_plan(cell_config(TRUTH), TRUTH, seed=5, count=3)
     return msgspec.structs.replace(plan, joint_speed_rad_s=0.4)
 
 
 class Notified:
-    """What systemd would hear."""
+    """A socket in systemd's place, with what it would hear."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "notify"
@@ -143,7 +143,7 @@ class SystemRig:
     def __init__(self, controller: SimulatedController, folder: Path, root: Path, control: str = "") -> None:
         self.controller, self.folder, self.root = controller, folder, root
         self.control = control
-        """What drives the arm; empty: what is installed."""
+        """Control path that drives the arm; empty: the installed one."""
         self.admin: AdminClient = controller.admin()
         self.daemons: list[DaemonProcess] = []
         self._watch = Stopwatch()
@@ -203,7 +203,7 @@ async def status_when(
 
 
 async def go(client: Client, plan: Plan | None, purpose: str = "run") -> None:
-    """What an operator does up to the first motion."""
+    """Take control, load the plan and approve its motion, like an operator."""
     rest = (StationState.IDLE, StationState.PAUSED)
     await status_when(client, lambda s: s.state in rest and s.camera.connected)
     await client.request("lease", action="take")

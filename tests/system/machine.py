@@ -116,7 +116,7 @@ class Machine:
         raise TimeoutError("it did not come about in time")
 
     def run(self, *command: str, check: bool = True) -> str:
-        """What a command in the container prints."""
+        """Run a command in the container; give what it prints."""
         enter = ["nsenter", "--target", str(self._leader()), "--all"]
         done = subprocess.run([*enter, *command], capture_output=True, text=True, timeout=60)
         assert done.returncode == 0 or not check, f"{command}: {done.stdout}{done.stderr}\n{self.journal()}"

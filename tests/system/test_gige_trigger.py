@@ -11,10 +11,10 @@ from recordings.reader import open_recording
 from recordings.schema.frame_ids import frames_between
 from station.cli.demo import approve_simulated, simulated_daemon
 from station.operate.motion import carry_out, wait_until_idle
-from station.plan.planner import make_plan
 from station.protocol.client import Client
 from station.protocol.verbs import Purpose
 from station.simulation.scenes import cell_config, make_cell
+from tests.station.quick_plan import quick_plan
 
 POSES = 3
 
@@ -23,17 +23,17 @@ POSES = 3
 @pytest.mark.process
 async def test_every_pose_has_the_picture_of_its_own_pulse(lonely_network: None, tmp_path: Path) -> None:
     truth = make_cell()
-    plan = make_plan(cell_config(truth), start_joints_rad=truth.start_joints_rad, seed=0, count=POSES)
+    plan = quick_plan(cell_config(truth), truth, seed=0, count=POSES)
     with simulated_daemon(tmp_path, ["--gige", "--hardware-trigger"]) as socket:
         async with await Client.connect(socket) as client:
             await wait_until_idle(client)
             await client.request("lease", action="take")
             await client.request("load_plan", plan=msgspec.to_builtins(plan))
             ended = await carry_out(client, Purpose.RUN, approve_simulated, lambda status: None)
-    assert ended.captured == POSES, ended.status.reason
-    box = ended.status.trigger
+    assert ended.session.captured == POSES, ended.reason
+    box = ended.trigger
     assert box.identity == "calibration-trigger SIM1" and box.pulses == box.frames > POSES, "glimpses too"
-    pictures = [picture for _, picture in open_recording(Path(ended.recording)).images()]
+    pictures = [picture for _, picture in open_recording(Path(ended.session.recording)).images()]
     ids, counts = [p.frame_id for p in pictures], [p.trigger_count or 0 for p in pictures]
     assert counts[0] > 0 and counts == sorted(set(counts))
     # One frame for one pulse, glimpses included: ids and counts go on together.

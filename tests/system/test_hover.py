@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.files.calibration import Touch, read_calibration, write_calibration
-from calibrate.files.verification import agrees, note_in_file
+from calibrate.files.calibration import read_calibration, write_calibration
+from calibrate.files.touch import Touch, agrees
+from calibrate.files.versions import note_in_file
 from calibrate.geometry import Array, inverse, pose
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import CameraIdentity, Matrix4, RobotIdentity
@@ -120,7 +121,6 @@ async def test_the_tip_truly_stands_over_the_corner_slowly_and_the_offset_is_kep
             arrived = asyncio.Event()
             watch = asyncio.create_task(fastest_m_s(rig, told, arrived))
             await anna.request("go", token=offer.go.token)
-            anna.outdate()
             done = await status_when(anna, lambda s: s.state in (S.IDLE, S.FAULT, S.STOPPED))
             arrived.set()
             assert 0.02 < await watch <= SPEED_M_S

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import station
+from calibrate.cli import main as calibrate
 from calibrate.files.calibration import read_calibration
 from calibrate.files.install import installed_calibration
 from calibrate.files.versions import installed_versions
@@ -27,6 +28,7 @@ from station.protocol.client import Client
 from station.protocol.verbs import GetPlan, Lease, MakePlan, Purpose
 from station.simulation.cell import read_truth
 from station.simulation.scenes import make_cell
+from tests.command_line import call
 from tests.station.operate.guided_views import draft_of
 
 pytestmark = pytest.mark.process
@@ -102,11 +104,6 @@ async def test_nothing_of_the_configuration_is_connected_to(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rehearsal", "station.yaml"]
 
 
-def calibrate(*what: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "calibrate.cli", *map(str, what)]
-    return subprocess.run(command, capture_output=True, text=True)
-
-
 async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path: Path) -> None:
     """Mounting, board, lens and place are no default; the report says what the real run should reach."""
     truth = make_cell("paper-binned", seed=11, noise="mid")
@@ -126,8 +123,8 @@ async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path
             outcome = await carry_out(
                 client, Purpose.RUN, approved, lambda _: None, finish_with_loss=True, headless=True
             )
-            assert outcome.captured >= POSES - 2
-    solved = calibrate("solve", outcome.recording, "-o", result, "--report", report, "--json")
+            assert outcome.session.captured >= POSES - 2
+    solved = call(calibrate, "solve", outcome.session.recording, "-o", result, "--report", report, "--json")
     answer = json.loads(solved.stdout)
     simulated = np.array(read_truth(root / "simulation" / "truth.json").camera_mount)
     off = difference(np.array(answer["result"]["matrix"]), simulated)
@@ -135,10 +132,10 @@ async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path
     assert answer["verdict"] == "pass" and off @ np.linalg.solve(np.array(answer["covariance"]), off) < 22.5
     reached = f"{read_calibration(result).quality.predicted_error_mm:.2f} mm"
     assert f"The real run should reach {reached}" in report.read_text()
-    assert calibrate("install", result, "--cell", "simulated", "--root", root).returncode == 0
+    assert call(calibrate, "install", result, "--cell", "simulated", "--root", root).returncode == 0
     assert installed_calibration(root).created == read_calibration(result).created
     real = tmp_path / "real"
-    assert calibrate("install", result, "--root", real).returncode == 1
+    assert call(calibrate, "install", result, "--root", real).returncode == 1
     assert not installed_versions(real)
 
 

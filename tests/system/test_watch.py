@@ -16,7 +16,7 @@ from calibrate.files.install import install
 from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState
 from calibrate.geometry import inverse
-from calibrate.lens.model import project
+from calibrate.projection import project_at
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.status import StationState as S
 from station.daemon import Daemon
@@ -41,7 +41,7 @@ async def test_the_corners_belong_to_the_pose_that_is_told_with_them(rig: System
         seen = await client.call(Observe(TRUTH.board))
         mount, place = np.array(TRUTH.camera_mount), np.array(TRUTH.board_place)
         camera_from_board = inverse(np.array(seen.base_from_flange) @ mount) @ place
-        expected = project(TRUTH.camera, camera_from_board, board_points(TRUTH.board)[list(seen.corners)])
+        expected = project_at(TRUTH.camera, camera_from_board, board_points(TRUTH.board)[list(seen.corners)])
         assert len(seen.corners) == len(board_points(TRUTH.board))
         assert np.abs(np.array(seen.pixels) - expected).max() < 1.0  # the arm misses by 0.05 mm
     assert asked(rig.admin, "upload") == asked(rig.admin, "move") == 0

@@ -60,7 +60,7 @@ UNTIL_S = 40.0
 
 
 async def until(pilot: Pilot[None], condition: Callable[[], object]) -> None:
-    """What the screen comes to, however busy the computer is."""
+    """Wait until the condition holds, however busy the computer is."""
     give_up_s = time.monotonic() + UNTIL_S
     while not condition():
         assert time.monotonic() < give_up_s, "it did not come to that"
@@ -112,9 +112,6 @@ class FakeLink:
             self._images += not self.same_image
             return msgspec.structs.replace(self.answers["preview"], sequence=self._images)
         return self.answers.get(verb.verb(), Done())
-
-    def outdate(self) -> None:
-        """Every status of a test is a new one."""
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
         while (status := await self._statuses.get()) is not None:

@@ -39,7 +39,7 @@ _UNFINISHED = re.compile(r"\x1b(?:\[[0-9;?<>=]*|[P\]][^\x07]*)?$")
 
 
 class Glass:
-    """What a person would read: enough of a terminal for a program that places every line itself."""
+    """The text on a terminal that suffices for a program that places every line itself."""
 
     def __init__(self, columns: int, rows: int) -> None:
         self._columns = columns

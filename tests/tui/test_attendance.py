@@ -42,7 +42,7 @@ async def test_who_commands_a_moving_arm_is_asked_for(
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-        app._own_id = 7
+        app.desk.own_id = 7
         if answered:
             app.post_message(events.CursorPosition(0, 0))
         for _ in range(2 * attendance.UNANSWERED):
@@ -59,7 +59,7 @@ async def test_a_terminal_that_answers_keeps_control(link: FakeLink, monkeypatch
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-        app._own_id = 7
+        app.desk.own_id = 7
         for _ in range(3):
             app.post_message(events.CursorPosition(0, 0))
             await until(pilot, lambda: app._unanswered == 0)

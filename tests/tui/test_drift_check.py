@@ -91,7 +91,7 @@ async def test_what_the_daemon_refuses_is_said(link: FakeLink, installed: Path) 
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await ask_for_it(pilot)
         await until(pilot, lambda: said(app, "a session is open"))
-        assert "prepare" not in link.verbs and not app.busy
+        assert "prepare" not in link.verbs and not app.known.busy
 
 
 async def test_a_no_leaves_arm_and_plan_as_they_were(link: FakeLink, installed: Path) -> None:
@@ -111,7 +111,7 @@ async def test_a_plan_that_was_used_is_not_missed(link: FakeLink, installed: Pat
     link.show(msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, poses=poses)))
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: app.status is not None and app.status.session.poses == poses)
+        await until(pilot, lambda: app.known.status is not None and app.known.status.session.poses == poses)
         await ask_for_it(pilot)
         await until(pilot, lambda: app.screen.query("#confirm-body"))
         assert "plan" not in link.verbs
@@ -152,7 +152,7 @@ async def test_another_plan_ends_it_without_a_verdict(link: FakeLink, installed:
         await until(pilot, lambda: isinstance(app.screen, ConfirmMotion))
         await pilot.press("tab", "enter")
         link.show(check_session(installed))
-        await until(pilot, lambda: app.status == check_session(installed))
+        await until(pilot, lambda: app.known.status == check_session(installed))
         await pilot.pause(0.3)
         link.show(idle())
         await until(pilot, lambda: said(app, "no verdict"))
@@ -173,7 +173,7 @@ async def test_planning_it_is_said_on_every_screen(tmp_path: Path) -> None:
         await until(pilot, lambda: "poses 3, 7 failed" in text_of(app, "#next"))
         assert PLANNING in text_of(app, "#next")
         link.made.set()
-        await until(pilot, lambda: not app.busy)
+        await until(pilot, lambda: not app.known.busy)
 
 
 def test_the_history_is_of_this_camera_and_of_what_is_installed(tmp_path: Path) -> None:

@@ -11,8 +11,7 @@ from textual.widgets import DataTable
 
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install, rollback
-from calibrate.files.verification import note_installed
-from calibrate.files.versions import who
+from calibrate.files.versions import note_installed, who
 from station.cell.errors import StationError
 from station.tui import app as app_module
 from station.tui.app import StationApp
@@ -127,7 +126,7 @@ async def test_the_result_of_the_session_just_captured_needs_no_picking(link: Fa
         msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, calibration=path))
     )
     async with app.run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: app.status is not None and app.status.session.calibration)
+        await until(pilot, lambda: app.known.status is not None and app.known.status.session.calibration)
         await pilot.press("4")
         await until(pilot, lambda: "session s-1" in text_of(app, "#verdict"))
 

@@ -61,13 +61,18 @@ def _cell_size() -> object:
 
 
 def sharp_app(link: FakeLink, graphics: Graphics) -> StationApp:
-    app = app_on(link)
-    app.graphics = graphics
-    return app
+    PreviewPane.graphics = graphics
+    return app_on(link)
+
+
+@pytest.fixture(autouse=True)
+def blocks_again() -> Iterator[None]:
+    yield
+    PreviewPane.graphics = None
 
 
 def lines_of(pilot: Pilot[None]) -> list[str]:
-    """What the preview would write to the terminal, control sequences included."""
+    """Give what the preview would write to the terminal, control sequences included."""
     preview = pilot.app.screen_stack[0].query_one(PreviewPane)
     strips = preview.render_lines(Region(0, 0, *preview.size))
     return ["".join(segment.text for segment in strip) for strip in strips]
@@ -179,7 +184,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 
 
 def answer(terminal: int, *parts: bytes) -> threading.Thread:
-    """As a terminal does: once it is asked."""
+    """Answer once asked, like a terminal."""
 
     def work() -> None:
         if b"\x1b[c" in os.read(terminal, 100):

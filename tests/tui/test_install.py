@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import time
 from pathlib import Path
 
 import msgspec
 import pytest
+from rich.console import Console
 from textual.pilot import Pilot
 from textual.widgets import Input, OptionList, Static
 
-from calibrate.files.calibration import Override, Touch, write_calibration
+from calibrate.files.calibration import Override, write_calibration
 from calibrate.files.exports import FORMATS
+from calibrate.files.formatting import figures, summary
 from calibrate.files.install import install, installed_calibration
+from calibrate.files.touch import Touch
 from calibrate.files.validity import Validity, ValidityReason, ValidityState
-from calibrate.files.verification import note_installed
-from calibrate.files.versions import installed_versions
+from calibrate.files.versions import installed_versions, note_installed
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.tui.dialogs import ChooseFormat, Confirm, Reason
 from station.tui.installed import Installed, Result, local
-from station.tui.result import verdict_lines
+from station.tui.result import card, verdict_lines
 from tests.station.hover_cell import calibration_of
 from tests.station.session_rig import TRUTH
 from tests.tui.conftest import FakeLink, app_on, opened, text_of, until
@@ -55,6 +58,17 @@ def test_there_is_one_verdict_in_three_states(result: Result, verdict: str) -> N
     if result.calibration is not None:
         assert verdict_lines(result).plain.split(", ")[0][2:] == verdict
         assert f"session {GOOD.provenance.session}" in verdict_lines(result).plain
+
+
+def test_terminal_and_screen_say_the_same_figures() -> None:
+    said = io.StringIO()
+    Console(file=said, width=200).print(summary(DOUBTED))
+    screen = verdict_lines(Result("", DOUBTED)).plain
+    told = figures(DOUBTED, DOUBTED.verification)
+    assert {"error", "gates", "views", "touch"} <= set(told)
+    for name, figure in told.items():
+        assert figure.value in said.getvalue()
+        assert figure.value in (card(DOUBTED, name).plain if name == "held_out" else screen)
 
 
 async def press_on_result(pilot: Pilot[None], calibration: Path, *keys: str) -> None:

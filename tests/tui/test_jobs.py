@@ -12,8 +12,7 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Button, Label, RichLog
 
-from station.tui.dialogs import READ
-from station.tui.results import JobScreen
+from station.tui.dialogs import READ, JobScreen
 from tests.tui.conftest import FakeLink, app_on, text_of, until
 
 

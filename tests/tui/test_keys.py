@@ -225,7 +225,7 @@ async def test_after_looking_the_line_says_which_key_goes_on(link: FakeLink) -> 
 
 async def test_many_resizes_leave_a_working_screen(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        for i in range(0, 100, 4):
+        for i in range(0, 100, 10):
             await pilot.resize_terminal(60 + i, 20 + i % 40)
         await pilot.resize_terminal(80, 24)
         await pilot.pause()

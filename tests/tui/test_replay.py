@@ -15,8 +15,8 @@ from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationState
 from station.protocol import verbs
 from station.tui.app import ReplayApp
+from station.tui.live import ReplayScreen
 from station.tui.replay import END_TEXT, NO_ESTIMATE, ReplayLink, Timeline
-from station.tui.replay_screen import ReplayScreen
 from station.tui.widgets.preview import PreviewPane
 from tests.recordings.small_recording import make_info, make_picture, make_view
 from tests.tui.conftest import FakeLink, app_on, idle, summary, text_of, until
@@ -25,7 +25,10 @@ SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 
 
 def replay_app(pace: float) -> ReplayApp:
-    return ReplayApp(ReplayLink(SAMPLE, pace))
+    async def connect() -> ReplayLink:
+        return ReplayLink(SAMPLE, pace)
+
+    return ReplayApp(connect)
 
 
 def test_the_arm_stands_where_it_stood_when_each_picture_was_taken() -> None:
@@ -72,15 +75,15 @@ async def test_it_pauses_steps_jumps_and_starts_again() -> None:
         await shows(0, "playing")
         await pilot.press("right", "right", "right")
         await shows(3, "paused")
-        third = app.status
+        third = app.known.status
         await pilot.press("left")
         await shows(2, "paused")
         await pilot.press("right")
-        await until(pilot, lambda: app.status is not None and app.status.robot == third.robot)  # type: ignore[union-attr]
+        await until(pilot, lambda: app.known.status is not None and app.known.status.robot == third.robot)  # type: ignore[union-attr]
         await pilot.press("space")
         await shows(3, "playing")
         await pilot.press("pagedown")
-        await until(pilot, lambda: app.status is not None and app.status.session.elapsed_s > 10.0)
+        await until(pilot, lambda: app.known.status is not None and app.known.status.session.elapsed_s > 10.0)
         await pilot.press("pageup", "home")
         await shows(0, "0:00 of")
         for _ in range(26):

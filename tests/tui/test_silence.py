@@ -8,18 +8,19 @@ from textual.widgets import DataTable
 
 from station.cell.status import Event, StationState
 from station.protocol.client import DaemonGoneError
-from station.tui import app as attendance
-from station.tui.app import SILENT, StationApp
+from station.tui import desk
+from station.tui.app import StationApp
 from station.tui.desk import STOP_UNHEARD
 from station.tui.live import LiveScreen
+from station.tui.task import SILENT
 from station.tui.widgets.preview import OLD, PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 
 @pytest.fixture(autouse=True)
 def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attendance, "LISTEN_S", 0.2)
-    monkeypatch.setattr(attendance, "SILENT_S", 0.2)
+    monkeypatch.setattr(desk, "LISTEN_S", 0.2)
+    monkeypatch.setattr(desk, "SILENT_S", 0.2)
 
 
 async def test_a_daemon_that_does_not_answer_is_announced_and_what_it_said_is_old(link: FakeLink) -> None:
@@ -112,7 +113,7 @@ async def test_without_a_connection_stop_is_sent_all_the_same() -> None:
 
     sent: list[bool] = []
     app = StationApp(nobody)
-    app.stop_unconnected = lambda: sent.append(True) is None
+    app.desk.stop_unconnected = lambda: sent.append(True) is None
     async with app.run_test(size=(80, 24)) as pilot:
         await pilot.press("f12")
         await until(pilot, lambda: bool(sent))
@@ -125,7 +126,7 @@ async def test_news_that_arrive_while_the_screen_closes_do_no_harm(
     heard: list[bool] = []
 
     def on_unmount(screen: LiveScreen) -> None:
-        app.hear(5.0)
+        app.desk.hear(5.0)
         heard.append(True)
 
     monkeypatch.setattr(LiveScreen, "on_unmount", on_unmount, raising=False)

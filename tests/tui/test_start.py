@@ -49,10 +49,10 @@ async def test_what_was_missing_is_looked_for_on_every_screen(
     link.answers["doctor"] = MISSING
     async with opened(link) as pilot:
         await pilot.press("1")
-        await until(pilot, lambda: pilot.app.known().missing is not None)
+        await until(pilot, lambda: pilot.app.known.missing is not None)
         await pilot.press("3")
         link.answers["doctor"] = THERE
-        await until(pilot, lambda: pilot.app.known().missing is None)
+        await until(pilot, lambda: pilot.app.known.missing is None)
         assert isinstance(pilot.app.screen, LiveScreen)
 
 

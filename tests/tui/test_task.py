@@ -175,6 +175,11 @@ async def test_stop_stands_whole_on_every_screen_and_question(link: FakeLink, si
             stops = link.verbs.count("stop")
             await pilot.click(StopBlock)
             await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops + 1)  # type: ignore[misc]
+            link.show(idle(StationState.STOPPED))  # what is known goes on while a question is open
+            await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))
+            assert pilot.app.screen.query_one(StopBlock).latched
+            link.show(idle())
+            await until(pilot, lambda: "IDLE" in text_of(pilot.app, "#bar"))
             await pilot.app.pop_screen()
 
 
@@ -195,10 +200,10 @@ async def test_stop_can_be_clicked_in_the_wizard_too(tmp_path: Path, monkeypatch
 async def test_every_screen_can_be_drawn_in_every_theme(link: FakeLink) -> None:
     link.answers["sessions"], link.answers["doctor"] = [], []
     async with opened(link, (120, 36)) as pilot:
-        for key in DIGITS.values():
-            await pilot.press(key)
-            for theme in ("station-dark", "station-light", "ansi-dark", "ansi-light", "nord"):
-                pilot.app.theme = theme
+        for theme in ("station-dark", "station-light", "ansi-dark", "ansi-light", "nord"):
+            pilot.app.theme = theme
+            for key in DIGITS.values():
+                await pilot.press(key)
                 await pilot.pause()
                 drawn = pilot.app.screen._compositor.render_strips()
                 assert any("SIMULATED" in strip.text for strip in drawn)

@@ -135,7 +135,7 @@ async def test_or_is_read_from_the_arm_once_the_tip_is_on_the_corner(
         await pilot.press("enter")
         await until(pilot, lambda: "off the board" in shown(pilot, "#dialog-problem"))
         link.show(at(0.5, 0.25, 0))
-        await until(pilot, lambda: (s := pilot.app.status) is not None and s == at(0.5, 0.25, 0))  # type: ignore[attr-defined]
+        await until(pilot, lambda: (s := pilot.app.known.status) is not None and s == at(0.5, 0.25, 0))  # type: ignore[attr-defined]
         await pilot.press("enter")
         await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
         await pilot.press("escape")

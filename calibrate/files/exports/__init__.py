@@ -45,7 +45,7 @@ FORMATS: dict[str, Format] = {
     "ur-tool": Format(".txt", "camera as tool (TCP) or feature on the UR pendant", vision.ur_tool),
     "ur-kinematics": Format(".yaml", "the corrected arm for ROS 2's ur_description", models.ur_kinematics),
     "arm-urdf": Format(".urdf", "URDF of the corrected arm and its camera", models.arm_urdf),
-    "arm-json": Format(".json", "the corrected arm and the X that belongs to it", vision.arm_json),
+    "arm-json": Format(".json", "the corrected arm and the X that belongs to it", models.arm_json),
 }
 
 

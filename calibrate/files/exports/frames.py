@@ -75,7 +75,7 @@ def comment(calibration: Calibration, frames: FrameNames) -> str:
 
     One line whatever the file says: the rest of a name must not become a line of a launch file or a script.
     """
-    stamp = source_stamp(calibration)
+    stamp = source_stamp(calibration.source)
     origin = f"{calibration.provenance.session}, solved {calibration.created}"
     held = "" if frames.validity is None else validity_text(frames.validity)
     two = calibration.arm_table is not None and calibration.arm_table.offered

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
+import msgspec
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike
@@ -116,7 +117,7 @@ def link_origins(table: DhTable) -> Array:
     Raises ExportError where the table moves the flange behind the last joint, which that chain cannot say.
     """
     a, d, alpha, theta, beta = (getattr(table, name) for name in table.__struct_fields__)
-    model, after = RobotModel("corrected", a, d, "", alpha, theta, beta), [a[5], alpha[5], beta[5]]
+    model, after = RobotModel("corrected", a, d, alpha, theta, beta), [a[5], alpha[5], beta[5]]
     if np.abs(after).max() > 1e-12:
         raise ExportError("The table has a, alpha or beta of joint 6.", code="table-behind-joint-6")
     frames, behind, found = link_frames(model, np.zeros(6)), np.eye(4), []
@@ -186,3 +187,14 @@ def arm_urdf(calibration: Calibration, frames: FrameNames) -> str:
     parts.append(_camera(X.matrix, parent, frames))
     name = quoteattr(f"{arm.model}_corrected")
     return f"{_commented(note)}<robot name={name}>\n" + "\n".join(parts) + "\n</robot>\n"
+
+
+def arm_json(calibration: Calibration, frames: FrameNames) -> str:
+    """Only the arm's table and the X that belongs to it."""
+    table_origins(calibration, frames)  # refused where none is offered
+    plain = {
+        "of": comment(calibration, replace(frames, with_table=True)),
+        "mount": calibration.mount,
+        "arm_table": calibration.arm_table,
+    }
+    return msgspec.json.format(msgspec.json.encode(plain)).decode() + "\n"

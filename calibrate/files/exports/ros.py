@@ -9,8 +9,7 @@ import numpy as np
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports.frames import ExportError, FrameNames, comment, commented_yaml
 from calibrate.geometry import Array
-from calibrate.lens.model import distortion
-from calibrate.projection import camera_matrix
+from calibrate.projection import camera_matrix, distortion
 
 
 def ros_camera_info(calibration: Calibration, frames: FrameNames) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 
 import cv2
 import msgspec
@@ -18,10 +17,8 @@ from calibrate.files.exports.frames import (
     commented_yaml,
     roll_pitch_yaw,
 )
-from calibrate.files.exports.models import table_origins
 from calibrate.geometry import Array, inverse, rotation_log
-from calibrate.lens.model import distortion
-from calibrate.projection import camera_matrix, project_pixels
+from calibrate.projection import camera_matrix, distortion, project_pixels
 from recordings.schema.messages import CameraModel
 
 LENS_MISFIT_PX = 0.5
@@ -223,14 +220,3 @@ def matlab(calibration: Calibration, frames: FrameNames) -> bytes:
     savemat(file, {"calibration": held}, oned_as="row")
     # The first 116 bytes are free text, where SciPy writes the time: equal calibrations give equal files.
     return b"MATLAB 5.0 MAT-file, calibration".ljust(116) + file.getvalue()[116:]
-
-
-def arm_json(calibration: Calibration, frames: FrameNames) -> str:
-    """Only the arm's table and the X that belongs to it."""
-    table_origins(calibration, frames)  # refused where none is offered
-    plain = {
-        "of": comment(calibration, replace(frames, with_table=True)),
-        "mount": calibration.mount,
-        "arm_table": calibration.arm_table,
-    }
-    return msgspec.json.format(msgspec.json.encode(plain)).decode() + "\n"

@@ -25,8 +25,6 @@ from calibrate.handeye.axxb.objective import QuadraticObjective
 TOLERANCE = 1e-6
 FLOOR = 1e-8
 """Share of the form's trace below which an objective counts as zero in the relative gap."""
-_UNIQUE = 1e-9
-"""Share of the form's trace: a second eigenvalue below it means another minimum."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +42,9 @@ class Certificate:
     lower_bound: float
     floor: float
     """Absolute floor of the denominator, 1e-8 times the trace of the form."""
-    tolerance: float
-    unique: bool
-    """False where another X reaches the same value (all axes parallel)."""
     distance_sigma: float | None = None
     """Largest number of sigmas, over all directions, between the certified X and the final X."""
     problem: str = ""
-    pairs: int = 0
     restarts: int = 0
 
 
@@ -69,10 +63,7 @@ def certify(objective: QuadraticObjective, problem: str = "") -> CertifiedRotati
     candidate = np.append(np.eye(3).reshape(9), 1.0)
     f = float(objective.reduced()[9, 9]) / scale
     y, moment = _solve_dual(S)
-    lower, second = max(
-        (_bound(S, multipliers, f) for multipliers in (y, _stationary(S, y, candidate, f))),
-        key=lambda bound: bound[0],
-    )
+    lower = max(_bound(S, multipliers, f) for multipliers in (y, _stationary(S, y, candidate, f)))
     gap = max(0.0, f - lower) / max(f, FLOOR)
     certificate = Certificate(
         certified=bool(gap <= TOLERANCE),
@@ -80,10 +71,7 @@ def certify(objective: QuadraticObjective, problem: str = "") -> CertifiedRotati
         objective=f * scale,
         lower_bound=lower * scale,
         floor=FLOOR * scale,
-        tolerance=TOLERANCE,
-        unique=bool(second > _UNIQUE and objective.translation_rank() == 3),
         problem=problem,
-        pairs=objective.pairs,
     )
     return CertifiedRotation(certificate, project_to_rotation(moment[:9, 9].reshape(3, 3)) @ objective.R0)
 
@@ -96,12 +84,11 @@ def _in_candidate_frame(objective: QuadraticObjective) -> Array:
     return np.asarray(T.T @ objective.reduced() @ T)
 
 
-def _bound(S: Array, y: Array, gamma: float) -> tuple[float, float]:
-    """Lower bound by multipliers y, and the second smallest eigenvalue (0: the minimum is not unique)."""
+def _bound(S: Array, y: Array, gamma: float) -> float:
+    """Lower bound by multipliers y."""
     M = S - np.tensordot(y, _constraints(), axes=1)
     M[9, 9] -= gamma
-    eigenvalues = np.linalg.eigvalsh(M)
-    return gamma + 4.0 * min(0.0, float(eigenvalues[0])), float(eigenvalues[1])
+    return gamma + 4.0 * min(0.0, float(np.linalg.eigvalsh(M)[0]))
 
 
 def _stationary(S: Array, y: Array, candidate: Array, f: float) -> Array:

@@ -30,7 +30,6 @@ class QuadraticObjective:
     """(3, 3) centre; not necessarily the optimum."""
     b0: Array
     """(3,) metres"""
-    pairs: int
 
     def values(self, R: Array, b: Array) -> Array:
         """Evaluate f at candidates R (m, 3, 3), b (m, 3) → (m,)."""
@@ -54,10 +53,6 @@ class QuadraticObjective:
         cross = self.gram[_REST][:, 9:12]
         reduced = self.gram[np.ix_(_REST, _REST)] - cross @ self._b_inverse @ cross.T
         return np.asarray((reduced + reduced.T) / 2)
-
-    def translation_rank(self) -> int:
-        """Count the directions of b that the pairs determine, given R: 2 for turns about one axis."""
-        return int(np.linalg.matrix_rank(self.gram[9:12, 9:12], tol=1e-9 * np.trace(self.gram[9:12, 9:12])))
 
     def curvature(self, X: Array) -> Array:
         """Compute half the Gauss-Newton Hessian (6, 6) at X, for `geometry.perturb`'s delta."""
@@ -106,7 +101,7 @@ def build_objective(
     G[12, 12] += weight * (residual_t**2).sum()
     G[9:12, :9] = G[:9, 9:12].T
     G[12, :12] = G[:12, 12]
-    return QuadraticObjective(G, R0, b0, len(pairs))
+    return QuadraticObjective(G, R0, b0)
 
 
 def _add_chordal(G: Array, R_A: Array, R_B: Array, R0: Array) -> None:

@@ -27,7 +27,6 @@ class PaperResult:
     """(4, 4)"""
     vector: Array
     """(6,) [γ; b] (eq. 15)"""
-    value: float
     objective: QuadraticObjective
     on_box: tuple[str, ...]
     """Components on the box: the true camera is probably outside it."""
@@ -39,7 +38,7 @@ def solve_paper(pairs: Pairs, seed: int) -> PaperResult:
     evolved = evolve(paper_evaluate(objective), -BOX, BOX, np.random.default_rng(seed), SETTINGS)
     x = evolved.best
     X = pose(rotation_exp(x[:3]), x[3:])
-    return PaperResult(X, x, evolved.value, objective, on_box(x))
+    return PaperResult(X, x, objective, on_box(x))
 
 
 def on_box(vector: Array) -> tuple[str, ...]:

@@ -43,9 +43,11 @@ def solve_global(pairs: Pairs, seed: int, problem: str = "") -> GlobalResult:
     restarts = -1
     while restarts < MAX_RESTARTS:
         restarts += 1
-        R, value = _best_of(objective, np.concatenate([starts, _evolve_rotations(objective, rng)]))
-        if value < best:
-            best, X = value, pose(R, objective.best_translation(R[None])[0])
+        polished, values = polish(objective, np.concatenate([starts, _evolve_rotations(objective, rng)]))
+        least = int(np.argmin(values))
+        if values[least] < best:
+            R = polished[least]
+            best, X = float(values[least]), pose(R, objective.best_translation(R[None])[0])
             centred = build_objective(pairs, centre=X)
             R, _ = polish(centred, R[None])
             X = pose(R[0], centred.best_translation(R)[0])
@@ -74,12 +76,6 @@ def _rotations(quaternions: Array) -> Array:
     """(m, 3, 3) of quaternions (m, 4) of any length; a mutant of none at all is no turn."""
     nothing = np.linalg.norm(quaternions, axis=1, keepdims=True) < 1e-150
     return np.asarray(Rotation.from_quat(np.where(nothing, [0.0, 0.0, 0.0, 1.0], quaternions)).as_matrix())
-
-
-def _best_of(objective: QuadraticObjective, starts: Array) -> tuple[Array, float]:
-    R, values = polish(objective, starts)
-    best = int(np.argmin(values))
-    return R[best], float(values[best])
 
 
 def polish(objective: QuadraticObjective, R: Array) -> tuple[Array, Array]:

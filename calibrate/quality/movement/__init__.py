@@ -2,7 +2,7 @@
 
     monitor.MovementMonitor     takes pictures one after the other, yields `MovementEvent`s: the way in
     pictures            a picture as a deviation of the tag's pose, and what each unknown would do to it
-    repeated, free      the two tests: a posture against its own history; any postures against a common fit
+    comparisons         the two tests: a posture against its own history; any postures against a common fit
     evidence            likelihood ratios: did something move, and what
 
 Nothing here reads a file. `calibrate.files.loader.watch` is another thing: it tells programs of installs.

@@ -53,7 +53,6 @@ class WatchEntry(msgspec.Struct, frozen=True, omit_defaults=True):
         """The picture that the monitor takes."""
         return Picture(
             self.name,
-            self.wall_s,
             np.array(self.base_from_flange),
             None if self.joints_rad is None else np.array(self.joints_rad),
             self.corners,

@@ -14,8 +14,14 @@ from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, inverse, project_to_rotation, rotation_log
 from calibrate.lens.pnp import candidate_poses
 from calibrate.quality.drift import SHIFT_M, TURN_RAD
+from calibrate.quality.movement.comparisons import (
+    FIRST_VISITS,
+    FreePostures,
+    PostureIndex,
+    RepeatedPostures,
+    Row,
+)
 from calibrate.quality.movement.evidence import Moved, has_crept, move_size, what_moved
-from calibrate.quality.movement.free import FreePostures, Row
 from calibrate.quality.movement.pictures import (
     ArmErrors,
     CellModel,
@@ -26,10 +32,9 @@ from calibrate.quality.movement.pictures import (
     fitted_tag,
     same_corners,
 )
-from calibrate.quality.movement.postures import PostureIndex
-from calibrate.quality.movement.repeated import FIRST_VISITS, RepeatedPostures
 from calibrate.quality.movement.window import CREEP_WINDOW, KEPT, LEARNING, WindowFinding
 from calibrate.views import BoardView
+from recordings.errors import Value
 
 NAMED_AFTER = 30
 """Pictures after an alarm at which it is said what moved."""
@@ -71,7 +76,7 @@ class MovementEvent:
     pictures: int
     """Pictures with the tag so far."""
     moved: Moved | None = None
-    values: dict[str, str | float | int | bool | None] = field(default_factory=dict)
+    values: dict[str, Value] = field(default_factory=dict)
     """Figures; each name ends in its unit."""
 
 
@@ -134,7 +139,7 @@ class MovementMonitor:
         """Take note of a picture without the tag."""
         self.missed += 1
         if self.missed % MISSED_AFTER == 0:
-            yield MovementEvent(EventKind.TAG_UNSEEN, name, self.pictures, None, {"in_a_row": self.missed})
+            yield self._event(EventKind.TAG_UNSEEN, name, in_a_row=self.missed)
 
     def add(self, pictures: Iterable[Picture]) -> Iterator[MovementEvent]:
         """Judge pictures with the tag, oldest first. Many at once are faster, the events are the same."""
@@ -171,8 +176,7 @@ class MovementMonitor:
         kind = EventKind.LEARNED if misfit_px <= LARGEST_MISFIT_PX else EventKind.NOT_FIXED
         self.finished = kind is EventKind.NOT_FIXED
         self.P = None if self.finished else P
-        values = {"median_misfit_px": round(misfit_px, 3)}
-        return MovementEvent(kind, self._learning[-1].name, self.pictures, None, dict(values))
+        return self._event(kind, self._learning[-1].name, median_misfit_px=round(misfit_px, 3))
 
     def _tag_starts(self) -> list[Array]:
         """Places (4, 4) of the tag by single pictures, every tilt that one leaves open."""
@@ -252,8 +256,7 @@ class MovementMonitor:
 
     def _testing(self, picture: Picture, test: Test) -> MovementEvent:
         kind, self.learned = "repeated" if test is self.repeated else "any", self.pictures
-        values: dict[str, str | float | int | bool | None] = {"postures": kind, "noise": round(test.noise, 3)}
-        return MovementEvent(EventKind.TESTING, picture.name, self.pictures, None, values)
+        return self._event(EventKind.TESTING, picture.name, postures=kind, noise=round(test.noise, 3))
 
     def _judge(self, picture: Picture, test: Test, finding: WindowFinding) -> Iterator[MovementEvent]:
         if self._suspicion is not None:
@@ -267,7 +270,10 @@ class MovementMonitor:
             if share > self._share_of_noise(count):
                 yield self._alarm(picture, test, finding.far, finding)
             elif finding.far == _JUDGED_FOR:
-                yield MovementEvent(EventKind.PICTURES_WORSE, picture.name, self.pictures)
+                yield self._event(EventKind.PICTURES_WORSE, picture.name)
+
+    def _event(self, kind: EventKind, picture: str, **values: Value) -> MovementEvent:
+        return MovementEvent(kind, picture, self.pictures, None, values)
 
     def _share_of_noise(self, count: int) -> float:
         """Share of the noise of n pictures that p unknowns seldom explain: Beta(p/2, (6 n - p)/2)."""
@@ -276,19 +282,19 @@ class MovementMonitor:
 
     def _alarm(self, picture: Picture, test: Test, since: int, finding: WindowFinding) -> MovementEvent:
         self.alarmed, self._suspicion = True, _Suspicion(test, since)
-        values: dict[str, str | float | int | bool | None] = {
-            "log_ratio": round(finding.score, 2),
-            "limit": test.limit,
-            "since_pictures": since,
-            "fast_lane": not finding.alarm,
-        }
-        return MovementEvent(EventKind.ALARM, picture.name, self.pictures, None, values)
+        return self._event(
+            EventKind.ALARM,
+            picture.name,
+            log_ratio=round(finding.score, 2),
+            limit=test.limit,
+            since_pictures=since,
+            fast_lane=not finding.alarm,
+        )
 
     def _creep(self, picture: Picture, test: Test) -> Iterator[MovementEvent]:
         """Say that something crept since the learning, and what."""
         self.alarmed = True
-        values: dict[str, str | float | int | bool | None] = {"crept": True, "since_pictures": self.pictures}
-        yield MovementEvent(EventKind.ALARM, picture.name, self.pictures, None, values)
+        yield self._event(EventKind.ALARM, picture.name, crept=True, since_pictures=self.pictures)
         yield self._named(picture, test, CREEP_WINDOW, learned=True)
 
     def _name(self, picture: Picture, test: Test, suspicion: _Suspicion) -> Iterator[MovementEvent]:
@@ -306,7 +312,7 @@ class MovementMonitor:
         postures, turn_rad = self._variety(test, count)
         if postures < _FEWEST_POSTURES or turn_rad < _LEAST_TURN_RAD:
             moved = Moved.CANNOT_TELL
-        values: dict[str, str | float | int | bool | None] = {
+        values: dict[str, Value] = {
             "log_odds": round(log_odds, 2),
             "postures": postures,
             "turn_deg": round(float(np.degrees(turn_rad)), 2),

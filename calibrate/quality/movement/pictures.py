@@ -14,6 +14,7 @@ import numpy as np
 from calibrate.geometry import Array, inverse, perturb, skew, transform_points
 from calibrate.kinematics import RobotModel, jacobian
 from calibrate.projection import camera_matrix, project
+from calibrate.views import board_in_camera
 from recordings.schema.messages import CameraModel, Mount
 
 DEAD_BAND_M, DEAD_BAND_RAD = 0.03e-3, float(np.radians(0.003))
@@ -40,8 +41,6 @@ class Picture:
     """One production picture in which the tag was found."""
 
     name: str
-    wall_s: float
-    """Unix time; 0: unknown."""
     base_from_flange: Array
     """(4, 4)"""
     joints_rad: Array | None
@@ -91,20 +90,13 @@ class Deviations:
         return len(self.y)
 
 
-def predicted_board(cell: CellModel, flange: Array, P: Array) -> Array:
-    """Predict camera_from_tag (n, 4, 4); P: base_from_tag (eye-in-hand) or flange_from_tag, (4, 4)."""
-    if cell.mount == "eye-in-hand":
-        return np.asarray(inverse(flange @ cell.X) @ P)
-    return np.asarray(inverse(cell.X) @ flange @ P)
-
-
 def deviations(
     cell: CellModel, P: Array, pictures: list[Picture], arm: ArmErrors
 ) -> tuple[Deviations, Deviations]:
     """Whiten pictures of equally many corners for the two tests: repeated postures, and any postures."""
     flange = np.array([picture.base_from_flange for picture in pictures])
     points = np.array([picture.points for picture in pictures])
-    C = predicted_board(cell, flange, P)
+    C = board_in_camera(cell.mount, flange, cell.X, P)
     turned = points @ np.swapaxes(C[:, :3, :3], 1, 2)
     projected = project(cell.camera, turned + C[:, None, :3, 3], with_intrinsics=True)
     r = np.array([picture.pixels for picture in pictures]) - projected.pixels
@@ -113,7 +105,7 @@ def deviations(
     L_t = np.swapaxes(L, 1, 2)
     information = L_t @ L
     step = np.linalg.solve(information, L_t)
-    by_X, by_P, by_flange = _effects_of_poses(cell, flange, P, C)
+    by_X, by_P, by_flange = _effects_of_poses(cell, flange, P)
     assert projected.by_intrinsics is not None
     lens, K = projected.by_intrinsics.reshape(n, 2 * k, -1), camera_matrix(cell.camera)
     focal = lens[..., 0] * K[0, 0] + lens[..., 1] * K[1, 1]
@@ -152,22 +144,19 @@ def _alike(pixels: Array) -> Array:
     return np.asarray(_LENS_PX**2 * np.exp(-apart / (2 * _LENS_REACH_PX**2)))
 
 
-def _effects_of_poses(cell: CellModel, flange: Array, P: Array, C: Array) -> tuple[Array, Array, Array]:
+def _effects_of_poses(cell: CellModel, flange: Array, P: Array) -> tuple[Array, Array, Array]:
     """∂C/∂X, ∂C/∂P and ∂C/∂F, (n, 6, 6): the tag's motion in the camera by deltas of each."""
-    R_C = C[:, :3, :3]
-    near = cell.X
-    if cell.mount == "eye-in-hand":
-        tag = transform_points(inverse(flange), P[:3, 3][None])[:, 0]
-        R_camera = np.broadcast_to(near[:3, :3].T, R_C.shape)
-        R_far = R_camera @ np.swapaxes(flange[:, :3, :3], 1, 2)
-        by_X = -_turned_about(R_camera, tag - near[:3, 3])
+    in_hand = cell.mount == "eye-in-hand"
+    mount = inverse(flange) if in_hand else flange
+    tag = transform_points(mount, P[:3, 3][None])[:, 0]
+    R_camera = np.broadcast_to(cell.X[:3, :3].T, (len(flange), 3, 3))
+    R_far = R_camera @ mount[:, :3, :3]
+    if in_hand:
         by_flange = -_turned_about(R_far, P[:3, 3] - flange[:, :3, 3])
-        return by_X, _turned_about(R_far, np.zeros_like(tag)), by_flange
-    tag = transform_points(flange, P[:3, 3][None])[:, 0]
-    R_camera = np.broadcast_to(near[:3, :3].T, R_C.shape)
-    by_X = -_turned_about(R_camera, tag - near[:3, 3])
-    by_flange = _turned_about(R_camera, tag - flange[:, :3, 3])
-    return by_X, _turned_about(R_camera @ flange[:, :3, :3], np.zeros_like(tag)), by_flange
+    else:
+        by_flange = _turned_about(R_camera, tag - flange[:, :3, 3])
+    by_X = -_turned_about(R_camera, tag - cell.X[:3, 3])
+    return by_X, _turned_about(R_far, np.zeros_like(tag)), by_flange
 
 
 def _turned_about(R: Array, lever: Array) -> Array:
@@ -232,7 +221,7 @@ def same_corners(pictures: list[Picture]) -> list[list[Picture]]:
 def _median_px(cell: CellModel, P: Array, pictures: list[Picture]) -> float:
     found = []
     for group in same_corners(pictures):
-        C = predicted_board(cell, np.array([p.base_from_flange for p in group]), P)
+        C = board_in_camera(cell.mount, np.array([p.base_from_flange for p in group]), cell.X, P)
         seen = project(cell.camera, transform_points(C, np.array([p.points for p in group]))).pixels
         found.append(np.sqrt(np.mean((np.array([p.pixels for p in group]) - seen) ** 2, axis=(1, 2))))
     rms_px = np.concatenate(found)

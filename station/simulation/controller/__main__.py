@@ -10,11 +10,12 @@ import signal
 import sys
 from pathlib import Path
 
-from station.cell.errors import StationError
+import msgspec
+
 from station.simulation.controller.admin import AdminServer
 from station.simulation.controller.kinematics import TABLES
 from station.simulation.controller.machine import Machine
-from station.simulation.controller.state import Settings
+from station.simulation.controller.state import Settings, Six, version_of
 
 PARENT_POLL_S = 0.5
 
@@ -40,11 +41,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         settings = _settings(options)
-    except (OSError, ValueError, StationError) as error:
-        print(f"cannot start: {error}", file=sys.stderr)
+    except (OSError, msgspec.MsgspecError) as error:
+        of = f"{options.truth}: " if options.truth is not None else ""
+        print(f"cannot start: {of}{error}", file=sys.stderr)
         return 2
     try:
-        asyncio.run(_serve(options.host, settings, options, parent))
+        asyncio.run(_serve(options.host, settings, parent if options.die_with_parent else None))
     except OSError as error:
         print(
             f"cannot listen on {options.host}: {error.strerror or error}. Another controller runs on this "
@@ -56,6 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    """What a field of `Settings` is named after sets it."""
     parser = argparse.ArgumentParser(
         prog="station-controller",
         description="A simulated Universal Robots controller for unmodified RTDE, URScript and dashboard "
@@ -63,93 +66,51 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--model", default="UR10", choices=sorted(TABLES), help="default: UR10 (CB3, 125 Hz)")
-    parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on")
-    parser.add_argument(
-        "--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors, drift"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("--model", choices=sorted(TABLES), help="default: UR10 (CB3, 125 Hz)")
+    add("--host", default="127.0.0.1", help="loopback address to listen on")
+    add("--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors, drift")
+    add(
         "--program", action="append", default=[], metavar="NAME[=SCRIPT]",
         help="a program that the dashboard can load; without a file of URScript it only waits",
     )  # fmt: skip
-    parser.add_argument(
-        "--software", metavar="VERSION", help="answer with another version, for example 5.25.1"
-    )
-    parser.add_argument("--joints", type=float, nargs=6, metavar="RAD", help="start joints")
-    parser.add_argument("--serial", help="answer to `get serial number`")
-    parser.add_argument("--local", action="store_true", help="start in local control (e-Series)")
-    parser.add_argument(
-        "--time-scale", type=float, default=1.0, metavar="F", help="the arm moves F times faster; for tests"
-    )
-    parser.add_argument(
-        "--input-delay",
-        type=int,
-        default=0,
-        metavar="CYCLES",
-        help="registers act this much later; default 0",
-    )
-    parser.add_argument(
-        "--protective-stop-ends-program",
-        action="store_true",
+    text = "answer with another version, for example 5.25.1"
+    add("--software", type=version_of, metavar="VERSION", help=text)
+    add("--joints", dest="start_joints_rad", type=float, nargs=6, metavar="RAD", help="start joints")
+    add("--serial", help="answer to `get serial number`")
+    add("--local", dest="remote", action="store_const", const=False, help="start in local control (e-Series)")
+    add("--time-scale", type=float, metavar="F", help="the arm moves F times faster; for tests")
+    text = "registers act this much later; default 0"
+    add("--input-delay", dest="input_delay_cycles", type=int, metavar="CYCLES", help=text)
+    add(
+        "--protective-stop-ends-program", dest="paused_by_protective_stop", action="store_const", const=False,
         help="runtime state 1 instead of 4 after a protective stop (controllers differ)",
-    )
-    parser.add_argument(
-        "--die-with-parent", action="store_true", help="end when standard input closes or the parent is gone"
-    )
+    )  # fmt: skip
+    add("--die-with-parent", action="store_true", help="end when standard input closes or the parent is gone")
     return parser
 
 
 def _settings(options: argparse.Namespace) -> Settings:
-    if not options.time_scale > 0:
-        raise ValueError(f"--time-scale must be > 0, not {options.time_scale}")
-    given: dict[str, object] = {"model": options.model, "time_scale": options.time_scale}
-    given["remote"] = not options.local
-    given["input_delay_cycles"] = max(0, options.input_delay)
-    given["paused_by_protective_stop"] = not options.protective_stop_ends_program
-    if options.software is not None:
-        if not all(part.isdecimal() for part in options.software.split(".")):
-            raise ValueError(f"--software is numbers with dots, such as 5.25.1, not {options.software}")
-        given["software"] = tuple(map(int, options.software.split(".")))
+    """Raises OSError for a file that cannot be read, MsgspecError for what is no setting."""
+    truth = msgspec.json.decode(options.truth.read_bytes(), type=dict) if options.truth is not None else {}
     named = (text.partition("=") for text in options.program)
-    given["programs"] = {name: Path(file).read_text() if file else None for name, _, file in named}
-    options.drift_ppm = 0.0
-    if options.truth is not None:
-        from station.simulation.cell import read_truth  # loads numpy: only when it is asked for
-
-        truth = read_truth(options.truth)
-        options.drift_ppm = truth.controller_clock_drift_ppm
-        given |= {
-            "start_joints_rad": truth.start_joints_rad,
-            "sigma_m": truth.robot_sigma_m,
-            "sigma_rad": truth.robot_sigma_rad,
-            "seed": truth.seed,
-            "dh_delta": (
-                truth.dh_delta_a_m,
-                truth.dh_delta_d_m,
-                truth.dh_delta_alpha_rad,
-                truth.dh_delta_theta_rad,
-            ),
-            "factory": (
-                truth.factory_a_m,
-                truth.factory_d_m,
-                truth.factory_alpha_rad,
-                truth.factory_theta_rad,
-            ),
-            "states_factory": truth.states_factory,
-        }
-    if options.joints is not None:
-        given["start_joints_rad"] = tuple(options.joints)
-    if options.serial is not None:
-        given["serial"] = options.serial
-    return Settings(**given)  # type: ignore[arg-type]
+    programs = {name: Path(file).read_text() if file else None for name, _, file in named}
+    given = {name: value for name, value in vars(options).items() if value is not None}
+    kind = _OfTruth if options.truth is not None else Settings
+    return msgspec.convert({**truth, **given, "programs": programs}, kind)
 
 
-async def _serve(host: str, settings: Settings, options: argparse.Namespace, parent: int) -> None:
+class _OfTruth(Settings, frozen=True, kw_only=True):
+    start_joints_rad: Six
+
+
+async def _serve(host: str, settings: Settings, parent: int | None) -> None:
+    """Run until a signal, or until the parent is gone."""
     loop = asyncio.get_running_loop()
     ended = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.set)
-    machine = Machine(host, settings, options.drift_ppm)
+    machine = Machine(host, settings)
     try:
         machine.open()
         admin = await AdminServer(machine).open()
@@ -159,7 +120,7 @@ async def _serve(host: str, settings: Settings, options: argparse.Namespace, par
         raise
     ready = {"ready": True, "host": host, "model": settings.model, "pid": os.getpid()}
     print(json.dumps(ready), flush=True)
-    watch = loop.create_task(_parent_gone(ended, parent)) if options.die_with_parent else None
+    watch = loop.create_task(_parent_gone(ended, parent)) if parent is not None else None
     await ended.wait()
     if watch is not None:
         watch.cancel()

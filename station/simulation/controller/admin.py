@@ -6,80 +6,42 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import json
 import time
-from collections.abc import Awaitable, Callable, Sequence
-from math import inf, isfinite
+from collections.abc import Awaitable, Callable
+from functools import cache
+from typing import Annotated, Any, get_type_hints
+
+import msgspec
+from msgspec import Meta
 
 from station.simulation.controller.arm import Vibration
 from station.simulation.controller.interpreted import InterpretedProgram
-from station.simulation.controller.kinematics import ArmGeometry, Vector
 from station.simulation.controller.machine import Machine
 from station.simulation.controller.network import Cut
-from station.simulation.controller.paths import JointPath, Path, UnreachableError
+from station.simulation.controller.paths import JointPath, UnreachableError
 from station.simulation.controller.robot import WAITS
 from station.simulation.controller.rtde_server import ADMIN
+from station.simulation.controller.state import ZEROS, Six
 
 PORT = 29990
 LINE_LIMIT = 1_000_000
 TRUTH_WAIT_S = 2.0
-
-Command = Callable[..., Awaitable[dict[str, object] | None] | dict[str, object] | None]
 HAND_RAD_S2 = 2.0
 
-
-def number(name: str, value: float, low: float = -inf, high: float = inf) -> float:
-    """A finite number within low…high."""
-    checked = float(value)
-    if not (isfinite(checked) and low <= checked <= high):
-        raise ValueError(f"{name} must be a number in {low:g}…{high:g}, not {value}")
-    return checked
-
-
-def numbers(name: str, values: Sequence[float] | None, count: int) -> Vector:
-    """Exactly so many finite numbers; zeros for None."""
-    if values is None:
-        return (0.0,) * count
-    if not isinstance(values, list | tuple) or len(values) != count:
-        raise ValueError(f"{name}: expected {count} numbers, not {values}")
-    return tuple(number(name, value) for value in values)
+Json = dict[str, Any]
+Command = Callable[..., Awaitable[Json | None] | Json | None]
+Share = Annotated[float, Meta(ge=0, le=1)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=0)]
+JointSpeed = Annotated[float, Meta(ge=1e-3, le=100)]
+Three = tuple[float, float, float]
 
 
-def pstop(machine: Machine) -> None:
-    """Protective stop now."""
-    machine.robot.protective_stop("admin")
-
-
-def estop(machine: Machine, on: bool = True) -> None:
-    """Emergency stop button pressed (on) or pulled out again; afterwards the arm has no power: `run`."""
-    machine.robot.emergency_stop(on)
-
-
-def safeguard(machine: Machine, on: bool = True) -> None:
-    """Safeguard stop: the program pauses; released, it stays paused until `play`."""
-    machine.robot.safeguard(on)
-
-
-def power_off(machine: Machine) -> None:
-    """The arm loses power."""
-    machine.robot.power_off()
-
-
-def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> dict[str, object]:
+def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> Json:
     """Cuts every connection of these ports (rtde, script, dashboard; all if none named) by fin or rst."""
-    if how not in ("fin", "rst"):
-        raise ValueError(f"how is fin or rst, not {how}")
     return {"cut": machine.cut(how, ports)}
-
-
-def stall(machine: Machine, on: bool = True) -> None:
-    """RTDE links stay open but no data comes; everything else works."""
-    machine.rtde.stalled = on
-
-
-def freeze(machine: Machine, on: bool = True) -> None:
-    """RTDE sends the same packet for ever: the timestamp stands still on a live link."""
-    machine.rtde.frozen = on
 
 
 def mute(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
@@ -88,35 +50,32 @@ def mute(machine: Machine, on: bool = True, ports: list[str] | None = None) -> N
         service.silent = on
 
 
-def stall_dash(machine: Machine, on: bool = True) -> None:
-    """The dashboard accepts connections and never says a word."""
-    machine.dashboard.silent = on
-
-
 def black_hole(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
     """A cable pulled out: links carry nothing, connecting hangs."""
     for service in machine.chosen(ports):
         service.black_hole(on)
 
 
-def restart(machine: Machine, down_s: float = 1.0, running: bool = False) -> None:
+def restart(
+    machine: Machine, down_s: Annotated[float, Meta(ge=0, le=60)] = 1.0, running: bool = False
+) -> None:
     """The controller reboots: links reset, ports closed for down_s, time 0, no power unless running."""
-    machine.reboot(number("down_s", down_s, 0.0, 60.0), running)
+    machine.reboot(down_s, running)
 
 
-def late(machine: Machine, ms: float) -> None:
+def late(machine: Machine, ms: Annotated[float, Meta(ge=0, le=60_000)]) -> None:
     """No cycle runs for this long; then all that were due run at once (a hiccup of the simulation)."""
-    machine.clock.hold_until_ns = time.monotonic_ns() + int(number("ms", ms, 0.0, 60_000.0) * 1e6)
+    machine.clock.hold_until_ns = time.monotonic_ns() + int(ms * 1e6)
 
 
-def delay(machine: Machine, ms: float) -> None:
+def delay(machine: Machine, ms: Annotated[float, Meta(ge=0, le=10_000)]) -> None:
     """Every data packet leaves this much later from now on (0 = none): a slow network."""
-    machine.rtde.delay_s = number("ms", ms, 0.0, 10_000.0) / 1000
+    machine.rtde.delay_s = ms / 1000
 
 
-def lose(machine: Machine, packets: int) -> None:
+def lose(machine: Machine, packets: Count) -> None:
     """The next cycles' data packets are never sent."""
-    machine.lose_packets = int(number("packets", packets, 0))
+    machine.lose_packets = packets
 
 
 def in_use(machine: Machine, inputs: list[str], on: bool = True) -> None:
@@ -132,84 +91,46 @@ def in_use(machine: Machine, inputs: list[str], on: bool = True) -> None:
 
 def vibrate(
     machine: Machine,
-    amplitude_rad: float,
-    frequency_hz: float = 12.0,
-    decay_s: float | None = None,
-    joint: int = 1,
+    amplitude_rad: Annotated[float, Meta(ge=0, le=0.1)],
+    frequency_hz: NotNegative = 12.0,
+    decay_s: Annotated[float, Meta(ge=1e-3)] | None = None,
+    joint: Annotated[int, Meta(ge=0, le=5)] = 1,
 ) -> None:
     """A joint shakes about its rest: for ever, or fading after each motion. amplitude_rad 0 ends it."""
-    vibration = Vibration(
-        number("amplitude_rad", amplitude_rad, 0.0, 0.1),
-        number("frequency_hz", frequency_hz, 0.0),
-        None if decay_s is None else number("decay_s", decay_s, 1e-3),
-        int(number("joint", joint, 0, 5)),
-    )
-    machine.robot.arm.vibration = vibration if vibration.amplitude_rad > 0 else None
+    vibration = Vibration(amplitude_rad, frequency_hz, decay_s, joint)
+    machine.robot.arm.vibration = vibration if amplitude_rad > 0 else None
 
 
-def offset(machine: Machine, joints_rad: list[float] | None = None) -> None:
+def offset(machine: Machine, joints_rad: Six = ZEROS) -> None:
     """From the next motion on the arm rests this much short of its command (none: as commanded)."""
-    machine.robot.arm.offset = numbers("joints_rad", joints_rad, 6)
+    machine.robot.arm.offset = joints_rad
 
 
 def dh(
     machine: Machine,
-    a_m: list[float] | None = None,
-    d_m: list[float] | None = None,
-    alpha_rad: list[float] | None = None,
-    theta_rad: list[float] | None = None,
+    a_m: Six = ZEROS,
+    d_m: Six = ZEROS,
+    alpha_rad: Six = ZEROS,
+    theta_rad: Six = ZEROS,
 ) -> None:
     """The true arm differs from the nominal table by these; what the controller reports does not."""
-    nominal: ArmGeometry = machine.robot.table
-    machine.robot.true_table = nominal.plus(
-        numbers("a_m", a_m, 6),
-        numbers("d_m", d_m, 6),
-        numbers("alpha_rad", alpha_rad, 6),
-        numbers("theta_rad", theta_rad, 6),
-    )
+    machine.robot.true_table = machine.robot.table.plus(a_m, d_m, alpha_rad, theta_rad)
 
 
-def unlock(machine: Machine) -> dict[str, object]:
-    """A person clears the protective stop (refused within 5 s of it). Not in the dashboard's log."""
-    return {"unlocked": machine.robot.unlock()}
-
-
-def run(machine: Machine) -> None:
-    """A person powers the arm on and releases the brakes."""
-    machine.robot.run()
-
-
-def stop_program(machine: Machine) -> None:
-    """Stop pressed on the pendant."""
-    machine.robot.stop_program("pendant")
-
-
-def pause(machine: Machine) -> dict[str, object]:
-    """Pause pressed on the pendant."""
-    return {"paused": machine.robot.pause_program()}
-
-
-def play(machine: Machine) -> dict[str, object]:
-    """Play pressed on the pendant: a paused program goes on."""
-    return {"playing": machine.robot.play_program()}
-
-
-def program(machine: Machine) -> dict[str, object]:
-    """The text of the program that plays."""
-    return {"text": machine.robot.program.text if machine.robot.program else ""}
-
-
-def contact(machine: Machine, cycles: int = 10) -> None:
+def contact(machine: Machine, cycles: Count = 10) -> None:
     """The tool touches something: `tool_contact` answers that it has for so many cycles (0: nothing)."""
-    machine.robot.contact_cycles = int(number("cycles", cycles, 0))
+    machine.robot.contact_cycles = cycles
 
 
-def wires(machine: Machine, digital: int = 0, analog: list[float] | None = None) -> None:
+def wires(
+    machine: Machine,
+    digital: Annotated[int, Meta(ge=0, lt=2**18)] = 0,
+    analog: tuple[float, float] = (0.0, 0.0),
+) -> None:
     """Inputs: digital bits (standard 0-7, configurable 8-15, tool 16-17), analog 0 and 1 (V or A)."""
-    out = machine.robot.outputs
-    out.set("actual_digital_input_bits", int(number("digital", digital, 0, 2**18 - 1)))
-    for i, value in enumerate(numbers("analog", analog, 2)):
-        out.set(f"standard_analog_input{i}", value)
+    machine.robot.outputs.set("actual_digital_input_bits", digital)
+    for i, value in enumerate(analog):
+        machine.robot.outputs.set(f"standard_analog_input{i}", value)
 
 
 def foreign(machine: Machine, name: str = "palletising.urp") -> None:
@@ -217,9 +138,9 @@ def foreign(machine: Machine, name: str = "palletising.urp") -> None:
     machine.robot.start_program(InterpretedProgram(machine.robot, name, WAITS))
 
 
-def slider(machine: Machine, fraction: float) -> None:
+def slider(machine: Machine, fraction: Share) -> None:
     """Speed slider on the pendant, 0…1."""
-    machine.robot.slider = number("fraction", fraction, 0.0, 1.0)
+    machine.robot.slider = fraction
 
 
 def remote(machine: Machine, on: bool = True) -> None:
@@ -230,38 +151,32 @@ def remote(machine: Machine, on: bool = True) -> None:
     robot.remote = on
 
 
-def tcp(machine: Machine, pose: list[float]) -> None:
+def tcp(machine: Machine, pose: Six) -> None:
     """TCP of the installation: x y z [m], rotation vector [rad], in the flange."""
-    machine.robot.tcp = numbers("pose", pose, 6)
+    machine.robot.tcp = pose
 
 
-def payload(machine: Machine, kg: float, cog_m: list[float] | None = None) -> None:
+def payload(machine: Machine, kg: NotNegative, cog_m: Three = (0.0, 0.0, 0.0)) -> None:
     """Payload of the installation."""
-    machine.robot.payload_kg = number("kg", kg, 0.0)
-    machine.robot.payload_cog = numbers("cog_m", cog_m, 3)
+    machine.robot.payload_kg = kg
+    machine.robot.payload_cog = cog_m
 
 
-def jog(machine: Machine, joints_rad: list[float], speed_rad_s: float = 0.5) -> dict[str, object]:
+def jog(machine: Machine, joints_rad: Six, speed_rad_s: JointSpeed = 0.5) -> Json:
     """Moves the arm with the pendant's arrows. Refused while a program plays or the arm has no power."""
     return hand_move(machine, [joints_rad], speed_rad_s)
 
 
-def hand_move(machine: Machine, path: list[list[float]], speed_rad_s: float = 0.5) -> dict[str, object]:
+def hand_move(machine: Machine, path: list[Six], speed_rad_s: JointSpeed = 0.5) -> Json:
     """A person leads the arm through these joints (free-drive), the fastest joint at speed_rad_s."""
     robot = machine.robot
-    corners = [numbers("path", corner, 6) for corner in path]
-    speed_rad_s = number("speed_rad_s", speed_rad_s, 1e-3, 100.0)
-
-    def make_path(start: Vector) -> Path:
-        return JointPath(start, *corners)
-
-    length_rad = JointPath(robot.arm.command, *corners).length
-    if not robot.lead(make_path, speed_rad_s, HAND_RAD_S2):
+    length_rad = JointPath(robot.arm.command, *path).length
+    if not robot.lead(lambda start: JointPath(start, *path), speed_rad_s, HAND_RAD_S2):
         raise ValueError("the arm is not free: a program plays, a safety stop holds it, or it has no power")
     return {"length_rad": length_rad}
 
 
-async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> dict[str, object]:
+async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> Json:
     """Where the arm truly was at a time of the host's monotonic clock (now, if none is given; waits up to
     2 s for a time to come): joints_rad [6], base_from_flange [4][4], miss [6] = [δt m, δφ rad] of it."""
     at_ns = time.monotonic_ns() if at_monotonic_ns is None else at_monotonic_ns
@@ -279,7 +194,7 @@ async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> dict[st
     }
 
 
-def state(machine: Machine) -> dict[str, object]:
+def state(machine: Machine) -> Json:
     """The controller's state now."""
     robot = machine.robot
     return {
@@ -306,7 +221,7 @@ def state(machine: Machine) -> dict[str, object]:
     }
 
 
-def stats(machine: Machine) -> dict[str, object]:
+def stats(machine: Machine) -> Json:
     """Cycles, packets sent and skipped, lateness of cycles against their grid, CPU time of this process."""
     clock, rtde = machine.clock, machine.rtde
     return {
@@ -319,26 +234,74 @@ def stats(machine: Machine) -> dict[str, object]:
     }
 
 
-def log(machine: Machine, since_monotonic_ns: int = 0) -> dict[str, object]:
+def log(machine: Machine, since_monotonic_ns: int = 0) -> Json:
     """entries: every dashboard and script command, upload and RTDE write since that time (the newest 20 000);
     counts: how often each came, of all time."""
     journal = machine.robot.journal
     return {"entries": journal.entries(since_monotonic_ns), "counts": journal.counts}
 
 
-def list_commands(_: Machine) -> dict[str, object]:
+def help_(_: Machine) -> Json:
     """This list."""
-    return {"commands": {name: " ".join((c.__doc__ or "").split()) for name, c in COMMANDS.items()}}
+    return {"commands": {name: text for name, (text, _) in COMMANDS.items()}}
 
 
-_NAMED: tuple[Command, ...] = (
-    pstop, estop, safeguard, power_off, drop, stall, freeze, mute, stall_dash, black_hole, restart, late,
-    delay, lose, in_use, vibrate, offset, dh,
-    unlock, run, stop_program, pause, play, program, foreign, contact, wires,
-    slider, remote, tcp, payload, jog, hand_move,
-    truth, state, stats, log,
-)  # fmt: skip
-COMMANDS: dict[str, Command] = {command.__name__: command for command in _NAMED} | {"help": list_commands}
+_SHORT: dict[str, tuple[str, Command]] = {
+    "pstop": ("Protective stop now.", lambda m: m.robot.protective_stop("admin")),
+    "estop": (
+        "Emergency stop button pressed (on) or pulled out again; afterwards the arm has no power: `run`.",
+        lambda m, on=True: m.robot.emergency_stop(on),
+    ),
+    "safeguard": (
+        "Safeguard stop: the program pauses; released, it stays paused until `play`.",
+        lambda m, on=True: m.robot.safeguard(on),
+    ),
+    "power_off": ("The arm loses power.", lambda m: m.robot.power_off()),
+    "stall": (
+        "RTDE links stay open but no data comes; everything else works.",
+        lambda m, on=True: setattr(m.rtde, "stalled", on),
+    ),
+    "freeze": (
+        "RTDE sends the same packet for ever: the timestamp stands still on a live link.",
+        lambda m, on=True: setattr(m.rtde, "frozen", on),
+    ),
+    "stall_dash": (
+        "The dashboard accepts connections and never says a word.",
+        lambda m, on=True: setattr(m.dashboard, "silent", on),
+    ),
+    "unlock": (
+        "A person clears the protective stop (refused within 5 s of it). Not in the dashboard's log.",
+        lambda m: {"unlocked": m.robot.unlock()},
+    ),
+    "run": ("A person powers the arm on and releases the brakes.", lambda m: m.robot.run()),
+    "stop_program": ("Stop pressed on the pendant.", lambda m: m.robot.stop_program("pendant")),
+    "pause": ("Pause pressed on the pendant.", lambda m: {"paused": m.robot.pause_program()}),
+    "play": (
+        "Play pressed on the pendant: a paused program goes on.",
+        lambda m: {"playing": m.robot.play_program()},
+    ),
+    "program": (
+        "The text of the program that plays.",
+        lambda m: {"text": m.robot.program.text if m.robot.program else ""},
+    ),
+}
+COMMANDS = _SHORT | {
+    name.rstrip("_"): (" ".join(str(function.__doc__).split()), function)
+    for name, function in list(globals().items())
+    if inspect.isfunction(function) and function.__module__ == __name__
+}
+"""Name → what it does, and a function: what this takes besides the machine is what a client sends."""
+
+
+@cache
+def _arguments(name: str) -> type[msgspec.Struct]:
+    """Return a struct of what a command takes."""
+    _, function = COMMANDS[name]
+    hints = get_type_hints(function, include_extras=True)
+    _, *parameters = inspect.signature(function).parameters.values()
+    types = {p.name: hints.get(p.name, type(p.default)) for p in parameters}
+    fields = [(p.name, types[p.name], *(() if p.default is p.empty else (p.default,))) for p in parameters]
+    return msgspec.defstruct(name, fields, forbid_unknown_fields=True)
 
 
 class AdminServer:
@@ -359,17 +322,18 @@ class AdminServer:
         finally:
             writer.close()
 
-    async def _answer(self, line: bytes) -> dict[str, object]:
+    async def _answer(self, line: bytes) -> Json:
         try:
-            request = json.loads(line)
+            request = msgspec.json.decode(line, type=Json)
             name = request.pop("cmd")
-            command = COMMANDS[name]
-        except (ValueError, KeyError, AttributeError, TypeError):
+            _, command = COMMANDS[name]
+        except (msgspec.MsgspecError, KeyError, TypeError):
             return {"ok": False, "error": 'expected {"cmd": name, …}; {"cmd": "help"} lists the names'}
         try:
-            result = command(self._machine, **request)
+            given = msgspec.structs.astuple(msgspec.convert(request, _arguments(name)))
+            result = command(self._machine, *given)
             if result is not None and not isinstance(result, dict):
                 result = await result
-        except (TypeError, ValueError, LookupError, UnreachableError) as error:
+        except (msgspec.MsgspecError, ValueError, LookupError, UnreachableError) as error:
             return {"ok": False, "error": f"{name}: {error}"}
         return {"ok": True, **(result or {})}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import dist, exp, inf, pi, sin
@@ -281,40 +282,30 @@ class SimulatedArm:
 
 
 class History:
-    """One sample per cycle in a ring; interpolated between cycles."""
+    """One sample per cycle, the newest; interpolated between cycles."""
 
     def __init__(self, dt_s: float) -> None:
-        self._size = int(SPAN_S / dt_s)
-        self._ring: list[tuple[int, Vector, Vector]] = [(0, (), ())] * self._size
-        self._count = 0
+        self._samples: deque[tuple[int, Vector, Vector]] = deque(maxlen=int(SPAN_S / dt_s))
 
     def add(self, monotonic_ns: int, joints: Vector, miss: Vector) -> None:
-        self._ring[self._count % self._size] = (monotonic_ns, joints, miss)
-        self._count += 1
+        self._samples.append((monotonic_ns, joints, miss))
 
     @property
     def newest_ns(self) -> int:
-        return self._ring[(self._count - 1) % self._size][0] if self._count else 0
+        return self._samples[-1][0] if self._samples else 0
 
     def at(self, monotonic_ns: int) -> tuple[Vector, Vector]:
-        """Joints and miss at that time. LookupError when it is older than the ring or not yet reached."""
-        low, high = max(0, self._count - self._size), self._count - 1
-        if high < 0 or not self._time(low) <= monotonic_ns <= self._time(high):
-            raise LookupError(
-                f"time {monotonic_ns} is outside the history "
-                f"{self._time(low) if self._count else 0}…{self.newest_ns} ns"
-            )
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (middle, high) if self._time(middle) <= monotonic_ns else (low, middle)
-        t0, q0, m0 = self._ring[low % self._size]
-        t1, q1, m1 = self._ring[high % self._size]
-        u = (monotonic_ns - t0) / (t1 - t0) if t1 > t0 else 0.0
-        return between(q0, q1, u), between(m0, m1, u)
+        """Joints and miss at that time. LookupError when it is older than the samples or not yet reached."""
+        if monotonic_ns <= self.newest_ns:
+            t1, q1, m1 = self._samples[-1]
+            for t0, q0, m0 in reversed(self._samples):  # what is asked for is seldom old
+                if t0 <= monotonic_ns:
+                    u = (monotonic_ns - t0) / (t1 - t0) if t1 > t0 else 0.0
+                    return between(q0, q1, u), between(m0, m1, u)
+                t1, q1, m1 = t0, q0, m0
+        oldest_ns = self._samples[0][0] if self._samples else 0
+        raise LookupError(f"time {monotonic_ns} is outside the history {oldest_ns}…{self.newest_ns} ns")
 
     def before(self, cycles: int) -> Vector:
         """Joints so many cycles ago, or as long ago as is known."""
-        return self._ring[(self._count - 1 - min(cycles, self._count - 1, self._size - 1)) % self._size][1]
-
-    def _time(self, index: int) -> int:
-        return self._ring[index % self._size][0]
+        return self._samples[max(-1 - cycles, -len(self._samples))][1]

@@ -8,6 +8,8 @@ rotors' inertia nor friction: both are assumed, of the size that MuJoCo Menageri
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
+from operator import itemgetter
 from typing import NamedTuple
 
 from station.simulation.controller.kinematics import (
@@ -19,6 +21,7 @@ from station.simulation.controller.kinematics import (
     frames,
     place,
     plus,
+    read_table,
 )
 
 Matrix = list[list[float]]
@@ -43,37 +46,15 @@ class Drives(NamedTuple):
     """No joint gives more torque."""
 
 
-def _links(*masses: tuple[float, Vector]) -> tuple[Body, ...]:
-    return tuple(Body(i, *mass) for i, mass in enumerate(masses, 1))
+def _drives(rows: list[dict[str, str]]) -> Drives:
+    def body(row: dict[str, str]) -> Body:
+        x, y, z = (float(row[axis]) for axis in ("x_m", "y_m", "z_m"))
+        return Body(int(row["link"]), float(row["mass_kg"]), (x, y, z))
+
+    return Drives(tuple(map(body, rows)), tuple(float(row["most_nm"]) for row in rows))
 
 
-_LARGE = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)
-DRIVES = {
-    "UR3e": Drives(
-        _links(
-            (1.98, (0, -0.02, 0)), (3.4445, (0.13, 0, 0.1157)), (1.437, (0.05, 0, 0.0238)),
-            (0.871, (0, 0, 0.01)), (0.805, (0, 0, 0.01)), (0.261, (0, 0, -0.02)),
-        ), (54.0, 54.0, 28.0, 9.0, 9.0, 9.0),
-    ),
-    "UR5e": Drives(
-        _links(
-            (3.761, (0, -0.02561, 0.00193)), (8.058, (0.2125, 0, 0.11336)), (2.846, (0.15, 0, 0.0265)),
-            (1.37, (0, -0.0018, 0.01634)), (1.3, (0, 0.0018, 0.01634)), (0.365, (0, 0, -0.001159)),
-        ), (150.0, 150.0, 150.0, 28.0, 28.0, 28.0),
-    ),
-    "UR10e": Drives(
-        _links(
-            (7.369, (0.021, 0, 0.027)), (13.051, (0.38, 0, 0.158)), (3.989, (0.24, 0, 0.068)),
-            (2.1, (0, 0.007, 0.018)), (1.98, (0, 0.007, 0.018)), (0.615, (0, 0, -0.026)),
-        ), _LARGE,
-    ),
-    "UR16e": Drives(
-        _links(
-            (7.369, (0, -0.016, 0.03)), (10.45, (0.302, 0, 0.16)), (4.321, (0.194, 0, 0.065)),
-            (2.18, (0, -0.009, 0.011)), (2.033, (0, 0.018, 0.012)), (0.907, (0, 0, -0.044)),
-        ), _LARGE,
-    ),
-}  # fmt: skip
+DRIVES = {model: _drives(list(rows)) for model, rows in groupby(read_table("links.csv"), itemgetter("model"))}
 """Masses of the arms whose controllers take torques."""
 
 

@@ -15,8 +15,8 @@ from station.simulation.controller.script_io import Sockets, Wait, inputs_and_ou
 from station.simulation.controller.script_motion import ArmMotions
 from station.simulation.controller.script_pure import PURE, pose_of, six, text_of
 from station.simulation.controller.state import ControllerState
-from station.simulation.controller.urscript import Builtin, Pose, ScriptRun, ScriptRuntimeError
-from station.simulation.controller.urscript_parser import parse
+from station.simulation.controller.urscript import Pose, ScriptRun, ScriptRuntimeError
+from station.simulation.controller.urscript_parser import Builtin
 
 STEADY_RAD_S = 1e-3
 _QUIET = frozenset({"sync", "sleep", "textmsg", "force", "tool_contact"})
@@ -38,7 +38,7 @@ class InterpretedProgram:
             **{name: self._logged(name, builtin) for name, builtin in states.items()},
             **self._motions.builtins(),
         }
-        self._run = ScriptRun(parse(text, builtins))
+        self._run = ScriptRun(text, builtins)
 
     def _logged(self, name: str, builtin: Builtin) -> Builtin:
         """Wrap a function with each call in the log, unless it only asks or waits. Motions log themselves."""

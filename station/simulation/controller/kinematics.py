@@ -3,13 +3,17 @@
 `calibrate.kinematics` is deliberately not used: the station compares the controller's flange pose with
 its own, and shared code would let a shared sign error cancel. A rigid transform here is a 12-tuple,
 the rows of its upper 3×4 block. Standard Denavit-Hartenberg parameters as published by Universal Robots,
-"DH parameters for calculations of kinematics and dynamics". Metres and radians.
+"DH parameters for calculations of kinematics and dynamics". Metres and radians. The table
+of every model is in `arms.csv`.
 """
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass, field
-from math import acos, atan2, cos, hypot, pi, sin, sqrt
+from math import acos, atan2, copysign, cos, hypot, pi, sin, sqrt
+from operator import add
+from pathlib import Path
 
 Rigid = tuple[float, ...]
 """(12,) r00 r01 r02 tx r10 r11 r12 ty r20 r21 r22 tz"""
@@ -29,31 +33,28 @@ class ArmGeometry:
     published: ArmGeometry | None = field(default=None, compare=False)
     """The table it was made from; None: it is one itself."""
 
-    def plus(self, a_m: Vector, d_m: Vector, alpha_rad: Vector, theta_rad: Vector) -> ArmGeometry:
-        def add(x: Vector, y: Vector) -> Vector:
-            return tuple(i + j for i, j in zip(x, y, strict=True))
-
-        return ArmGeometry(
-            add(self.a_m, a_m),
-            add(self.d_m, d_m),
-            add(self.alpha_rad, alpha_rad),
-            add(self.theta_rad, theta_rad),
-            self.published or self,
-        )
+    def plus(self, *differences: Vector) -> ArmGeometry:
+        """differences: of a_m, d_m, alpha_rad and theta_rad."""
+        if not any(map(any, differences)):
+            return self
+        columns = zip((self.a_m, self.d_m, self.alpha_rad, self.theta_rad), differences, strict=True)
+        a, d, alpha, theta = (tuple(map(add, column, by)) for column, by in columns)
+        return ArmGeometry(a, d, alpha, theta, self.published or self)
 
 
-def _table(a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> ArmGeometry:
-    return ArmGeometry((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6))
+def read_table(name: str) -> list[dict[str, str]]:
+    """Rows of a CSV file beside this module."""
+    with Path(__file__).with_name(name).open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def _geometry(a2_m: float, a3_m: float, d1_m: float, d4_m: float, d5_m: float, d6_m: float) -> ArmGeometry:
+    return ArmGeometry((0.0, a2_m, a3_m, 0.0, 0.0, 0.0), (d1_m, 0.0, 0.0, d4_m, d5_m, d6_m))
 
 
 TABLES = {
-    "UR3": _table(-0.24365, -0.21325, 0.1519, 0.11235, 0.08535, 0.0819),
-    "UR5": _table(-0.425, -0.39225, 0.089159, 0.10915, 0.09465, 0.0823),
-    "UR10": _table(-0.612, -0.5723, 0.1273, 0.163941, 0.1157, 0.0922),
-    "UR3e": _table(-0.24355, -0.2132, 0.15185, 0.13105, 0.08535, 0.0921),
-    "UR5e": _table(-0.425, -0.3922, 0.1625, 0.1333, 0.0997, 0.0996),
-    "UR10e": _table(-0.6127, -0.57155, 0.1807, 0.17415, 0.11985, 0.11655),
-    "UR16e": _table(-0.4784, -0.36, 0.1807, 0.17415, 0.11985, 0.11655),
+    row.pop("model"): _geometry(**{name: float(value) for name, value in row.items()})
+    for row in read_table("arms.csv")
 }
 
 
@@ -124,23 +125,15 @@ def from_rotvec(rx: float, ry: float, rz: float, x: float = 0.0, y: float = 0.0,
 def to_rotvec(A: Rigid) -> tuple[float, float, float]:
     """Rotation vector [rad], angle in [0, π], by way of the quaternion (accurate near 0 and near π)."""
     m00, m01, m02, _, m10, m11, m12, _, m20, m21, m22, _ = A
-    trace = m00 + m11 + m22
-    if trace > 0:
-        s = 2 * sqrt(trace + 1)
-        w, x, y, z = s / 4, (m21 - m12) / s, (m02 - m20) / s, (m10 - m01) / s
-    elif m00 > m11 and m00 > m22:
-        s = 2 * sqrt(1 + m00 - m11 - m22)
-        w, x, y, z = (m21 - m12) / s, s / 4, (m01 + m10) / s, (m02 + m20) / s
-    elif m11 > m22:
-        s = 2 * sqrt(1 + m11 - m00 - m22)
-        w, x, y, z = (m02 - m20) / s, (m01 + m10) / s, s / 4, (m12 + m21) / s
-    else:
-        s = 2 * sqrt(1 + m22 - m00 - m11)
-        w, x, y, z = (m10 - m01) / s, (m02 + m20) / s, (m12 + m21) / s, s / 4
-    if w < 0:
-        w, x, y, z = -w, -x, -y, -z
-    norm = sqrt(x * x + y * y + z * z)
-    scale = 2.0 if norm < 1e-12 else 2 * atan2(norm, w) / norm
+    multiples = (  # of the quaternion w, x, y, z: by 4 w, 4 x, 4 y and 4 z
+        (1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01),
+        (m21 - m12, 1 + m00 - m11 - m22, m01 + m10, m02 + m20),
+        (m02 - m20, m01 + m10, 1 + m11 - m00 - m22, m12 + m21),
+        (m10 - m01, m02 + m20, m12 + m21, 1 + m22 - m00 - m11),
+    )
+    w, x, y, z = multiples[max(range(4), key=lambda i: multiples[i][i])]
+    norm = copysign(sqrt(x * x + y * y + z * z), w)
+    scale = 2 / w if abs(norm) < 1e-12 else 2 * atan2(abs(norm), abs(w)) / norm
     return x * scale, y * scale, z * scale
 
 

@@ -98,11 +98,11 @@ class Clock:
 
 
 class Machine:
-    def __init__(self, host: str, settings: Settings, drift_ppm: float = 0.0) -> None:
+    def __init__(self, host: str, settings: Settings) -> None:
         self.host = host
         self.settings = settings
         self.robot = SimulatedRobot(settings, Journal())
-        self.clock = Clock(self.robot.dt_s / (1 + drift_ppm * 1e-6), self._tick)
+        self.clock = Clock(self.robot.dt_s / (1 + settings.controller_clock_drift_ppm * 1e-6), self._tick)
         self.rtde = RtdeServer(host, self.robot)
         self.dashboard = dashboard_service(host, self.robot)
         scripts = script_services(host, self.robot)
@@ -126,7 +126,7 @@ class Machine:
         self.robot.tick(due_ns, late)
         if self.lose_packets > 0:
             self.lose_packets -= 1
-            self.rtde.lose()
+            self.rtde.skipped += 1
         else:
             self.rtde.send_states()
         if self._real_time.connections:

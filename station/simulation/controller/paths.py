@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from math import atan2, cos, hypot, pi, sin, sqrt
-from typing import Protocol
 
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
@@ -32,14 +31,6 @@ from station.simulation.controller.kinematics import (
 
 class UnreachableError(Exception):
     """The arm cannot go there: no inverse solution, or a joint beyond its limit."""
-
-
-class Path(Protocol):
-    @property
-    def length(self) -> float: ...
-
-    def at(self, s: float) -> Vector:
-        """Joints at s. Asked for in increasing order. Raises UnreachableError."""
 
 
 class JointPath:
@@ -131,17 +122,16 @@ class ArcPath(LinePath):
         return tuple(m + c * x + s * y for m, x, y in zip(self._centre, self._u, self._v, strict=True))
 
 
-class Profile(Protocol):
-    @property
-    def duration_s(self) -> float: ...
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """(s, ds/dt) at a time from the start."""
+Path = JointPath | LinePath
+"""`at(s)` gives the joints, asked for in increasing order. Raises UnreachableError."""
 
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """Constant acceleration, constant speed, constant deceleration (or a triangle, when short)."""
+    """Constant acceleration, constant speed, constant deceleration (or a triangle, when short).
+
+    `at` gives (s, ds/dt) at a time from the start.
+    """
 
     length: float
     speed: float
@@ -184,3 +174,6 @@ class Braking:
         t = min(t_s, self.duration_s)
         u = t / self.duration_s
         return self.start + self.speed * t * (1 - u / 2), self.speed * (1 - u)
+
+
+Profile = Trapezoid | Braking

@@ -10,6 +10,7 @@ import asyncio
 import struct
 import zlib
 
+from station.devices.rtde import RuntimeState
 from station.simulation.controller.kinematics import JOINT_LIMIT_RAD
 from station.simulation.controller.network import Connection, Service
 from station.simulation.controller.programs import UploadReader
@@ -32,6 +33,13 @@ _REAL_TIME = (
 )
 """RTDE variables in the order of the real-time message; a dash for each number that is not published."""
 _REAL_TIME_5_10 = f"{_REAL_TIME} - - - payload payload_cog payload_inertia"
+
+
+_JOINTS = (
+    "actual_q", "target_q", "actual_qd", "actual_current", "actual_joint_voltage", "joint_temperatures",
+    "joint_mode",
+)  # fmt: skip
+"""Of each joint in a robot state message."""
 
 
 def _frame(kind: int, payload: bytes) -> bytes:
@@ -66,9 +74,8 @@ def messages(robot: SimulatedRobot, kind: str, details: dict[str, object]) -> by
     if kind == "key":
         return _message(robot, _KEY, struct.pack(">ii", 0, 0) + titled)
     line = details.get("line")
-    return _message(
-        robot, _RUNTIME_EXCEPTION, struct.pack(">ii", line if isinstance(line, int) else 1, 1) + text
-    )
+    where = struct.pack(">ii", line if isinstance(line, int) else 1, 1)
+    return _message(robot, _RUNTIME_EXCEPTION, where + text)
 
 
 # -- state ----------------------------------------------------------------------------------------------
@@ -87,25 +94,10 @@ def _sub_packages(robot: SimulatedRobot) -> dict[int, bytes]:
     get, vector = out.get, out.vector
     bits = int(get("safety_status_bits"))
     powered = int(get("robot_status_bits")) & 1
-    flags = (
-        True,
-        True,
-        powered,
-        bits >> 7 & 1,
-        bits >> 2 & 1,
-        robot.runtime_state == 2,
-        robot.runtime_state == 4,
-    )
+    running, paused = robot.runtime_state == RuntimeState.PLAYING, robot.runtime_state == RuntimeState.PAUSED
+    flags = (True, True, powered, bits >> 7 & 1, bits >> 2 & 1, running, paused)
     modes = (robot.robot_mode & 0xFF, 2 if robot.freedrive else 3 if robot.force_mode else 0)
-    names = (
-        "actual_q",
-        "target_q",
-        "actual_qd",
-        "actual_current",
-        "actual_joint_voltage",
-        "joint_temperatures",
-    )
-    joints = zip(*(vector(name) for name in names), vector("joint_mode"), strict=True)
+    joints = zip(*map(vector, _JOINTS), strict=True)
     types = int(get("analog_io_types"))
     inputs = [get(f"standard_analog_input{i}") for i in (0, 1)]
     outputs = [get(f"standard_analog_output{i}") for i in (0, 1)]
@@ -115,8 +107,8 @@ def _sub_packages(robot: SimulatedRobot) -> dict[int, bytes]:
             robot.slider, get("speed_scaling") * robot.slider, 1.0,
         ) + bytes(robot.settings.version >= (3, 5)),
         1: b"".join(
-            struct.pack(">dddffffB", q, target, qd, current, voltage, celsius, celsius, int(mode))
-            for q, target, qd, current, voltage, celsius, mode in joints
+            struct.pack(">dddffffB", *numbers, celsius, celsius, int(mode))
+            for *numbers, celsius, mode in joints
         ),
         2: struct.pack(
             ">bbddfBffB", 0, 0, get("tool_analog_input0"), get("tool_analog_input1"), 48.0,

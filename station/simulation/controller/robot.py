@@ -22,7 +22,7 @@ from station.simulation.controller.kinematics import (
 from station.simulation.controller.paths import UnreachableError
 from station.simulation.controller.programs import Upload
 from station.simulation.controller.state import DIGITAL_BANKS, ControllerState, Journal, Settings
-from station.simulation.controller.urscript import ScriptError, ScriptSyntaxError
+from station.simulation.controller.urscript_parser import ScriptError, ScriptSyntaxError
 
 PROGRAM_START_S = 0.05
 UNLOCK_AFTER_S = 5.0

@@ -47,10 +47,6 @@ class RtdeServer:
             assert isinstance(connection, RtdeConnection)
             connection.send_state()
 
-    def lose(self) -> None:
-        """Called instead of `send_states` for a cycle whose packet is lost."""
-        self.skipped += 1
-
     def claim(self, name: str, owner: object) -> bool:
         return self.claims.setdefault(name, owner) is owner
 

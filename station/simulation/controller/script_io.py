@@ -8,7 +8,8 @@ import socket
 from collections.abc import Generator
 
 from station.simulation.controller.state import DIGITAL_BANKS, ControllerState
-from station.simulation.controller.urscript import Builtin, ScriptRuntimeError, Value
+from station.simulation.controller.urscript import ScriptRuntimeError, Value
+from station.simulation.controller.urscript_parser import Builtin
 
 Wait = Generator[None, None, Value]
 OPEN_S = 2.0
@@ -36,10 +37,6 @@ def registers(robot: ControllerState) -> dict[str, Builtin]:
             return f"{side}_bit_registers{'0_to_31' if address < 32 else '32_to_63'}", address % 32
         return name(side, "bit", address), 0
 
-    def read_bit(side: str, address: int) -> bool:
-        variable, bit = bits(side, address)
-        return bool(int(robot.outputs.get(variable)) >> bit & 1)
-
     def write_bit(address: int, value: bool) -> None:
         variable, bit = bits("output", address)
         others = int(robot.outputs.get(variable)) & ~(1 << bit)
@@ -53,21 +50,26 @@ def registers(robot: ControllerState) -> dict[str, Builtin]:
     def write_float(address: int, value: float) -> None:
         robot.outputs.set(name("output", "double", address), float(value))
 
-    found: dict[str, Builtin] = {
+    def read(side: str) -> dict[str, Builtin]:
+        store = robot.inputs if side == "input" else robot.outputs
+
+        def boolean(address: int) -> bool:
+            variable, bit = bits(side, address)
+            return bool(int(robot.outputs.get(variable)) >> bit & 1)
+
+        return {
+            f"read_{side}_boolean_register": boolean,
+            f"read_{side}_integer_register": lambda address: int(store.get(name(side, "int", address))),
+            f"read_{side}_float_register": lambda address: float(store.get(name(side, "double", address))),
+        }
+
+    return {
         "write_output_boolean_register": write_bit,
         "write_output_integer_register": write_integer,
         "write_output_float_register": write_float,
-        "read_input_boolean_register": lambda address: read_bit("input", address),
-        "read_output_boolean_register": lambda address: read_bit("output", address),
+        **read("input"),
+        **read("output"),
     }
-    for word, kind, make in (("integer", "int", int), ("float", "double", float)):
-        found[f"read_input_{word}_register"] = lambda address, kind=kind, make=make: make(
-            robot.inputs.get(name("input", kind, address))
-        )
-        found[f"read_output_{word}_register"] = lambda address, kind=kind, make=make: make(
-            robot.outputs.get(name("output", kind, address))
-        )
-    return found
 
 
 # -- inputs and outputs ---------------------------------------------------------------------------------
@@ -132,31 +134,25 @@ class Sockets:
         self._open.clear()
 
     def builtins(self) -> dict[str, Builtin]:
-        send = self._send
-        return {
-            "socket_open": self._connect,
-            "socket_close": self._disconnect,
-            "socket_send_int": lambda value, socket_name="socket_0": send(
-                int(value).to_bytes(4, "big", signed=True), socket_name
-            ),
-            "socket_send_byte": lambda value, socket_name="socket_0": send(
-                bytes([int(value) & 255]), socket_name
-            ),
-            "socket_send_string": lambda str, socket_name="socket_0": send(f"{str}".encode(), socket_name),
-            "socket_send_line": lambda str, socket_name="socket_0": send(f"{str}\n".encode(), socket_name),
-            "socket_set_var": lambda name, value, socket_name="socket_0": send(
-                f"SET {name} {value}\n".encode(), socket_name
-            ),
-            "socket_get_var": self._get_variable,
-            "socket_read_binary_integer": self._read_integers,
-            "socket_read_byte_list": self._read_bytes,
-            "socket_read_ascii_float": self._read_floats,
-            "socket_read_line": self._read_line,
-            "socket_read_string": self._read_string,
-        }
+        return {name: getattr(self, name) for name in vars(Sockets) if name.startswith("socket_")}
 
-    def _connect(self, address: str, port: int, socket_name: str = "socket_0") -> Wait:
-        self._disconnect(socket_name)
+    def socket_send_int(self, value: int, socket_name: str = "socket_0") -> bool:
+        return self._send(int(value).to_bytes(4, "big", signed=True), socket_name)
+
+    def socket_send_byte(self, value: int, socket_name: str = "socket_0") -> bool:
+        return self._send(bytes([int(value) & 255]), socket_name)
+
+    def socket_send_string(self, str: object, socket_name: str = "socket_0") -> bool:
+        return self._send(f"{str}".encode(), socket_name)
+
+    def socket_send_line(self, str: object, socket_name: str = "socket_0") -> bool:
+        return self._send(f"{str}\n".encode(), socket_name)
+
+    def socket_set_var(self, name: str, value: object, socket_name: str = "socket_0") -> bool:
+        return self._send(f"SET {name} {value}\n".encode(), socket_name)
+
+    def socket_open(self, address: str, port: int, socket_name: str = "socket_0") -> Wait:
+        self.socket_close(socket_name)
         link = socket.socket()
         link.setblocking(False)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -176,7 +172,7 @@ class Sockets:
                 link.close()
         return False
 
-    def _disconnect(self, socket_name: str = "socket_0") -> None:
+    def socket_close(self, socket_name: str = "socket_0") -> None:
         if socket_name in self._open:
             self._open.pop(socket_name)[0].close()
 
@@ -201,7 +197,7 @@ class Sockets:
         except OSError:
             pass
         if not buffer:
-            self._disconnect(name)
+            self.socket_close(name)
         return buffer
 
     def _take(self, name: str, timeout: float, pattern: bytes | int) -> Generator[None, None, bytes | None]:
@@ -229,18 +225,20 @@ class Sockets:
             if name not in self._open:
                 return None
 
-    def _read_integers(self, number: int, socket_name: str = "socket_0", timeout: float = 2) -> Wait:
+    def socket_read_binary_integer(
+        self, number: int, socket_name: str = "socket_0", timeout: float = 2
+    ) -> Wait:
         taken = yield from self._take(socket_name, timeout, 4 * int(number))
         if taken is None:
             return [0, *[-1] * int(number)]
         parts = (taken[i : i + 4] for i in range(0, len(taken), 4))
         return [int(number), *(int.from_bytes(part, "big", signed=True) for part in parts)]
 
-    def _read_bytes(self, number: int, socket_name: str = "socket_0", timeout: float = 2) -> Wait:
+    def socket_read_byte_list(self, number: int, socket_name: str = "socket_0", timeout: float = 2) -> Wait:
         taken = yield from self._take(socket_name, timeout, int(number))
         return [0, *[-1] * int(number)] if taken is None else [int(number), *taken]
 
-    def _read_floats(self, number: int, socket_name: str = "socket_0", timeout: float = 2) -> Wait:
+    def socket_read_ascii_float(self, number: int, socket_name: str = "socket_0", timeout: float = 2) -> Wait:
         taken = yield from self._take(socket_name, timeout, rb"\([^)]*\)\s*")
         try:
             values = [float(v) for v in taken.decode().strip(" \r\n()").split(",")] if taken else []
@@ -248,11 +246,11 @@ class Sockets:
             values = []
         return [len(values), *values] if len(values) == int(number) else [0, *[float("nan")] * int(number)]
 
-    def _read_line(self, socket_name: str = "socket_0", timeout: float = 2) -> Wait:
+    def socket_read_line(self, socket_name: str = "socket_0", timeout: float = 2) -> Wait:
         taken = yield from self._take(socket_name, timeout, rb"\n")
         return "" if taken is None else taken.decode(errors="replace").rstrip("\r\n")
 
-    def _read_string(
+    def socket_read_string(
         self,
         socket_name: str = "socket_0",
         prefix: str = "",
@@ -269,8 +267,8 @@ class Sockets:
         text = text[text.find(prefix) + len(prefix) :]
         return text.removesuffix(suffix)
 
-    def _get_variable(self, name: str, socket_name: str = "socket_0", timeout: float = 2) -> Wait:
+    def socket_get_var(self, name: str, socket_name: str = "socket_0", timeout: float = 2) -> Wait:
         self._send(f"GET {name}\n".encode(), socket_name)
-        answer = yield from self._read_line(socket_name, timeout)
+        answer = yield from self.socket_read_line(socket_name, timeout)
         words = answer.split()
         return int(float(words[1])) if len(words) == 2 else 0

@@ -30,7 +30,8 @@ from station.simulation.controller.paths import ArcPath, JointPath, LinePath, Pa
 from station.simulation.controller.script_io import Wait
 from station.simulation.controller.script_pure import pose_of, rigid, six, text_of
 from station.simulation.controller.state import ControllerState, twist_between
-from station.simulation.controller.urscript import Builtin, Pose, ScriptRuntimeError, Thread
+from station.simulation.controller.urscript import Pose, ScriptRuntimeError, Thread
+from station.simulation.controller.urscript_parser import Builtin
 
 KILLED_RAD_S2 = 40.0
 """Deceleration of an arm whose moving thread was killed and that nobody stops: very sudden."""
@@ -61,30 +62,16 @@ class ArmMotions:
         self._orphan = None
 
     def builtins(self) -> dict[str, Builtin]:
-        return {
-            "get_forward_kin": self._forward,
-            "get_inverse_kin": self._inverse,
-            "get_inverse_kin_has_solution": self._has_solution,
-            "is_within_safety_limits": self._within_limits,
-            "movej": self._movej,
-            "movel": self._movel,
-            "movep": self._movep,
-            "movec": self._movec,
-            "servoj": self._servoj,
-            "servoc": self._servoc,
-            "speedj": self._speedj,
-            "speedl": self._speedl,
-            "stopj": self._stopj,
-            "stopl": self._stopl,
-            **self._new(),
-        }
+        """What has no underscore below is called so by scripts."""
+        names = [n for n in vars(ArmMotions) if n[0] != "_" and n not in ("brake_orphan", "builtins")]
+        return {name: getattr(self, name) for name in names} | self._new()
 
     # -- kinematics -------------------------------------------------------------------------------------
 
     def _tool(self, joints: Vector) -> Rigid:
         return compose(forward(self._robot.table, joints), from_pose(self._robot.tcp))
 
-    def _forward(self, q: list[float] | None = None, tcp: Pose | None = None) -> Pose:
+    def get_forward_kin(self, q: list[float] | None = None, tcp: Pose | None = None) -> Pose:
         joints = self._robot.arm.actual if q is None else six(q)
         offset = self._robot.tcp if tcp is None else six(tcp)
         return pose_of(compose(forward(self._robot.table, joints), from_pose(offset)))
@@ -93,7 +80,7 @@ class ArmMotions:
         offset = from_pose(self._robot.tcp if tcp is None else six(tcp))
         return inverse_nearest(self._robot.table, compose(pose, invert(offset)), near)
 
-    def _inverse(
+    def get_inverse_kin(
         self,
         x: Pose,
         qnear: list[float] | None = None,
@@ -106,36 +93,36 @@ class ArmMotions:
             raise ScriptRuntimeError(f"get_inverse_kin found no solution for {text_of(x)}")
         return list(joints)
 
-    def _has_solution(self, *arguments: object, **named: object) -> bool:
+    def get_inverse_kin_has_solution(self, *arguments: object, **named: object) -> bool:
         try:
-            self._inverse(*arguments, **named)  # type: ignore[arg-type]
+            self.get_inverse_kin(*arguments, **named)  # type: ignore[arg-type]
         except ScriptRuntimeError:
             return False
         return True
 
-    def _within_limits(self, pose: list[float]) -> bool:
+    def is_within_safety_limits(self, pose: list[float]) -> bool:
         if isinstance(pose, Pose):
-            return self._has_solution(pose)
+            return self.get_inverse_kin_has_solution(pose)
         return all(abs(q) <= JOINT_LIMIT_RAD for q in pose)
 
     # -- motion -----------------------------------------------------------------------------------------
 
     def _joints(self, target: list[float]) -> Vector:
-        return tuple(self._inverse(target)) if isinstance(target, Pose) else six(target)
+        return tuple(self.get_inverse_kin(target)) if isinstance(target, Pose) else six(target)
 
     def _pose(self, target: list[float]) -> Rigid:
         return rigid(target) if isinstance(target, Pose) else self._tool(six(target))
 
-    def _movej(self, q: list[float], a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Wait:
-        yield from self._turn("movej", q, a, v, t)
+    def movej(self, q: list[float], a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Wait:
+        return self._turn("movej", q, a, v, t)
 
-    def _movel(self, pose: list[float], a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Wait:
-        yield from self._line("movel", pose, a, v, t)
+    def movel(self, pose: list[float], a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Wait:
+        return self._line("movel", pose, a, v, t)
 
-    def _movep(self, pose: list[float], a: float = 1.2, v: float = 0.25, r: float = 0) -> Wait:
-        yield from self._line("movep", pose, a, v)
+    def movep(self, pose: list[float], a: float = 1.2, v: float = 0.25, r: float = 0) -> Wait:
+        return self._line("movep", pose, a, v)
 
-    def _movec(
+    def movec(
         self,
         pose_via: list[float],
         pose_to: list[float],
@@ -146,16 +133,16 @@ class ArmMotions:
     ) -> Wait:
         via, goal, tcp = self._pose(pose_via), self._pose(pose_to), from_pose(self._robot.tcp)
         make_path = lambda start: ArcPath(self._robot.table, tcp, start, via, goal)  # noqa: E731
-        yield from self._move("movec", to_pose(goal), make_path, a, v, 0)
+        return self._move("movec", to_pose(goal), make_path, a, v, 0)
 
     def _turn(self, name: str, target: list[float], a: float, v: float, t: float = 0) -> Wait:
         goal = self._joints(target)
-        yield from self._move(name, goal, lambda start: JointPath(start, goal), a, v, t)
+        return self._move(name, goal, lambda start: JointPath(start, goal), a, v, t)
 
     def _line(self, name: str, target: list[float], a: float, v: float, t: float = 0) -> Wait:
         goal, tcp = self._pose(target), from_pose(self._robot.tcp)
         make_path = lambda start: LinePath(self._robot.table, tcp, start, goal)  # noqa: E731
-        yield from self._move(name, to_pose(goal), make_path, a, v, t)
+        return self._move(name, to_pose(goal), make_path, a, v, t)
 
     def _move(
         self, name: str, goal: Vector, make_path: Callable[[Vector], Path], a: float, v: float, t: float
@@ -171,7 +158,7 @@ class ArmMotions:
         self._robot.journal.note("script", name, goal=list(goal), a=a, v=v)
         yield from self._hold(arm.start(make_path, v, a))
 
-    def _servoj(
+    def servoj(
         self,
         q: list[float],
         a: float = 0,
@@ -186,18 +173,18 @@ class ArmMotions:
         def wanted(joints: Vector, dt_s: float) -> Vector:
             return tuple((g - c) / max(lag_s, dt_s) for g, c in zip(goal, joints, strict=True))
 
-        yield from self._flow("servoj", wanted, inf, t, lambda: True)
+        return self._flow("servoj", wanted, inf, t, lambda: True)
 
-    def _speedj(self, qd: list[float], a: float = 1.4, t: float = 0) -> Wait:
+    def speedj(self, qd: list[float], a: float = 1.4, t: float = 0) -> Wait:
         speeds, arm = six(qd), self._robot.arm
-        yield from self._flow("speedj", lambda _, __: speeds, a, t, lambda: arm.stream_speeds == speeds)
+        return self._flow("speedj", lambda _, __: speeds, a, t, lambda: arm.stream_speeds == speeds)
 
-    def _speedl(self, xd: list[float], a: float = 1.2, t: float = 0, aRot: object = "a") -> Wait:
+    def speedl(self, xd: list[float], a: float = 1.2, t: float = 0, aRot: object = "a") -> Wait:
         goal = six(xd)
         tool = _ToolSpeed(self._robot, lambda _: goal, a)
-        yield from self._flow("speedl", tool.joint_speeds, inf, t, lambda: tool.twist == goal)
+        return self._flow("speedl", tool.joint_speeds, inf, t, lambda: tool.twist == goal)
 
-    def _servoc(self, pose: Pose, a: float = 1.2, v: float = 0.25, r: float = 0) -> Wait:
+    def servoc(self, pose: Pose, a: float = 1.2, v: float = 0.25, r: float = 0) -> Wait:
         """Straight towards the pose, until it is reached or as near as the blend radius."""
         goal, robot = rigid(pose), self._robot
 
@@ -214,7 +201,7 @@ class ArmMotions:
 
         tool = _ToolSpeed(robot, towards, a)
         near_m = max(r, ARRIVED_M)
-        yield from self._flow("servoc", tool.joint_speeds, inf, 0, lambda: way(tool.place)[1] < near_m)
+        return self._flow("servoc", tool.joint_speeds, inf, 0, lambda: way(tool.place)[1] < near_m)
 
     def _flow(self, name: str, wanted: Speeds, a: float, t: float, arrived: Callable[[], bool]) -> Wait:
         """Lets the arm follow: for the time t, else until it has arrived. The next call must take over."""
@@ -222,58 +209,53 @@ class ArmMotions:
             raise ScriptRuntimeError(f"{name} with a={a}, t={t}")
         self._take_arm(name)
         self._robot.journal.count("script", name)
-        motion = self._robot.arm.stream(wanted, a)
-        self._mover, self._orphan = self._thread(), None
         left = self._robot.cycles(t) if t > 0 else 0
-        try:
-            while True:
-                yield
-                left -= 1
-                if motion.done or (left <= 0 if t > 0 else arrived()):
-                    return
-        finally:
-            self._mover = None
-            self._orphan = motion
+
+        def over() -> bool:
+            nonlocal left
+            left -= 1
+            return left <= 0 if t > 0 else arrived()
+
+        yield from self._hold(self._robot.arm.stream(wanted, a), over)
 
     def _optimovej(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
         """a and v are shares of what the arm can do, as in optimovel."""
-        yield from self._turn("optimovej", goal, a * JOINT_RAD_S2, v * JOINT_SPEED_RAD_S)
+        return self._turn("optimovej", goal, a * JOINT_RAD_S2, v * JOINT_SPEED_RAD_S)
 
     def _optimovel(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
-        yield from self._line(
-            "optimovel", goal, a * JOINT_RAD_S2 * TOOL_M_S / JOINT_SPEED_RAD_S, v * TOOL_M_S
-        )
+        slower = JOINT_RAD_S2 * TOOL_M_S / JOINT_SPEED_RAD_S
+        return self._line("optimovel", goal, a * slower, v * TOOL_M_S)
 
-    def _stopj(self, a: float = 2.0) -> Wait:
-        yield from self._stop("stopj", a)
+    def stopj(self, a: float = 2.0) -> Wait:
+        return self._stop("stopj", self._robot.arm.brake, a)
 
-    def _stopl(self, a: float = 2.0, aRot: object = "a") -> Wait:
-        yield from self._stop("stopl", a)
+    def stopl(self, a: float = 2.0, aRot: object = "a") -> Wait:
+        return self._stop("stopl", self._robot.arm.brake_tool, a)
 
-    def _stop(self, name: str, a: float) -> Wait:
+    def _stop(self, name: str, brake: Callable[[float], None], a: float) -> Wait:
         if not (isfinite(a) and a > 0):
             raise ScriptRuntimeError(f"{name} with a={a}")
         self._take_arm(name)
         self._robot.journal.note("script", name, a=a)
-        arm = self._robot.arm
-        (arm.brake if name == "stopj" else arm.brake_tool)(a)
-        if arm.motion is not None:
-            yield from self._hold(arm.motion)
+        brake(a)
+        if self._robot.arm.motion is not None:
+            yield from self._hold(self._robot.arm.motion)
 
     def _take_arm(self, name: str) -> None:
         if self._mover not in (None, self._thread()):
             raise ScriptRuntimeError(f"{name}: another thread is already controlling the robot")
 
-    def _hold(self, motion: JointMotion) -> Wait:
-        """Waits for its end. A thread killed meanwhile leaves it to whoever stops it in the same cycle."""
+    def _hold(self, motion: JointMotion, over: Callable[[], bool] = lambda: False) -> Wait:
+        """Waits for its end, or until it is over. Then whoever moves or stops in the same cycle has it."""
         self._mover, self._orphan = self._thread(), None
         try:
             while not motion.done:
                 yield
+                if over():
+                    return
         finally:
             self._mover = None
-            if not motion.done:
-                self._orphan = motion
+            self._orphan = None if motion.done else motion
 
     # -- torques ----------------------------------------------------------------------------------------
 
@@ -305,7 +287,7 @@ class ArmMotions:
                     raise UnreachableError("a joint exceeds its speed limit")
                 return faster
 
-            yield from self._flow("direct_torque", wanted, inf, robot.dt_s, lambda: True)
+            return self._flow("direct_torque", wanted, inf, robot.dt_s, lambda: True)
 
         def scaled(
             torque: Sequence[float],
@@ -316,7 +298,7 @@ class ArmMotions:
             for scale in (viscous_scale, coulomb_scale):
                 if len(scale) != 6 or not all(0 <= s <= 1 for s in scale):
                     raise ScriptRuntimeError(f"direct_torque with a scale of {text_of(list(scale))}")
-            yield from turn(torque)
+            return turn(torque)
 
         return optimal | {
             "direct_torque": scaled

@@ -21,7 +21,8 @@ from station.simulation.controller.kinematics import (
     plus,
     to_pose,
 )
-from station.simulation.controller.urscript import Builtin, Pose, ScriptRuntimeError, Value
+from station.simulation.controller.urscript import Pose, ScriptRuntimeError, Value
+from station.simulation.controller.urscript_parser import Builtin
 
 
 def six(values: Sequence[float]) -> Vector:

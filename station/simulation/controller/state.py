@@ -8,14 +8,16 @@ one of RTDE; empty: never.
 
 from __future__ import annotations
 
-import csv
 import random
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
 
 from station.devices.rtde import (
     DATA_TYPES,
@@ -34,6 +36,7 @@ from station.simulation.controller.kinematics import (
     compose,
     forward,
     from_pose,
+    read_table,
     to_pose,
 )
 
@@ -54,32 +57,46 @@ DIGITAL_BANKS = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}
 _JOINT_MODE = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255}
 
 
-@dataclass(frozen=True)
-class Settings:
+Six = Annotated[Vector, Meta(min_length=6, max_length=6)]
+ZEROS: Vector = (0.0,) * 6
+
+
+class Settings(msgspec.Struct, frozen=True):
+    """Those that a truth of a simulated cell has too are named as there."""
+
     model: str = "UR10"
-    start_joints_rad: Vector = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
+    start_joints_rad: Six = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
     serial: str = "20263000001"
-    time_scale: float = 1.0
+    time_scale: Annotated[float, Meta(gt=0)] = 1.0
     """The arm moves this many times faster than it says; clocks stay real. For tests."""
-    sigma_m: float = 0.0
-    sigma_rad: float = 0.0
+    robot_sigma_m: float = 0.0
+    robot_sigma_rad: float = 0.0
     seed: int = 0
-    dh_delta: tuple[Vector, Vector, Vector, Vector] = ((0.0,) * 6,) * 4
-    """a_m, d_m, alpha_rad, theta_rad of the true arm against the table that the controller uses."""
-    factory: tuple[Vector, Vector, Vector, Vector] = ((0.0,) * 6,) * 4
+    dh_delta_a_m: Six = ZEROS
+    """These of the true arm against the table that the controller uses."""
+    dh_delta_d_m: Six = ZEROS
+    dh_delta_alpha_rad: Six = ZEROS
+    dh_delta_theta_rad: Six = ZEROS
+    factory_a_m: Six = ZEROS
     """The same of the controller's table, its maker's calibration, against the published one."""
+    factory_d_m: Six = ZEROS
+    factory_alpha_rad: Six = ZEROS
+    factory_theta_rad: Six = ZEROS
     states_factory: bool = True
     """Port 30001 states the table in use; else the published one, which is then not true."""
+    controller_clock_drift_ppm: float = 0.0
     remote: bool = True
     paused_by_protective_stop: bool = True
     """runtime_state after a protective stop: paused (4), else stopped (1)."""
-    input_delay_cycles: int = 0
+    input_delay_cycles: Annotated[int, Meta(ge=0)] = 0
     """Registers act this many cycles later than the next one."""
-
-    programs: Mapping[str, str | None] = field(default_factory=dict)
+    programs: dict[str, str | None] = {}
     """That the dashboard can load: name → URScript; None: one that only waits."""
     software: tuple[int, ...] = ()
     """Another version than the usual one."""
+
+    def differences(self, of: str) -> list[Vector]:
+        return [getattr(self, f"{of}_{column}") for column in ("a_m", "d_m", "alpha_rad", "theta_rad")]
 
     @property
     def is_e_series(self) -> bool:
@@ -133,18 +150,21 @@ class Variable:
         return e_series in self.since and self.since[e_series] <= version
 
 
+def version_of(text: str) -> tuple[int, ...]:
+    return tuple(map(int, text.split(".")))
+
+
 def _read() -> dict[str, dict[str, Variable]]:
     found: dict[str, dict[str, Variable]] = {"input": {}, "output": {}}
-    with Path(__file__).with_name("variables.csv").open(newline="") as stream:
-        for row in csv.DictReader(stream):
-            columns = ((False, row["cb3"]), (True, row["e_series"]))
-            since = {e: tuple(map(int, v.split("."))) for e, v in columns if v}
-            variable = Variable(row["type"], since, tuple(map(float, row["rest"].split())))
-            stem, _, span = row["name"].rpartition("_")
-            first, dash, last = span.partition("-")
-            numbers = range(int(first), int(last) + 1) if dash else ()
-            names = [f"{stem}_{i}" for i in numbers] or [row["name"]]
-            found[row["direction"]] |= dict.fromkeys(names, variable)
+    for row in read_table("variables.csv"):
+        columns = ((False, row["cb3"]), (True, row["e_series"]))
+        since = {e: version_of(v) for e, v in columns if v}
+        variable = Variable(row["type"], since, tuple(map(float, row["rest"].split())))
+        stem, _, span = row["name"].rpartition("_")
+        first, dash, last = span.partition("-")
+        numbers = range(int(first), int(last) + 1) if dash else ()
+        names = [f"{stem}_{i}" for i in numbers] or [row["name"]]
+        found[row["direction"]] |= dict.fromkeys(names, variable)
     return found
 
 
@@ -198,9 +218,9 @@ class ControllerState(ABC):
         self.journal = journal
         self.dt_s = 1.0 / settings.rate_hz
         published = TABLES[settings.model]
-        self.table = published.plus(*settings.factory) if any(map(any, settings.factory)) else published
+        self.table = published.plus(*settings.differences("factory"))
         self.stated_table = self.table if settings.states_factory else published
-        self.true_table: ArmGeometry = self.table.plus(*settings.dh_delta)
+        self.true_table: ArmGeometry = self.table.plus(*settings.differences("dh_delta"))
         self._random = random.Random(settings.seed)
         self.arm = SimulatedArm(self.table, settings.start_joints_rad, self._draw_miss)
         self.tcp: Vector = (0.0,) * 6
@@ -258,7 +278,7 @@ class ControllerState(ABC):
         self.outputs.set(f"standard_analog_output{int(n)}", 10 * share if volts else 0.004 + 0.016 * share)
 
     def _draw_miss(self) -> Vector:
-        m, rad = self.settings.sigma_m, self.settings.sigma_rad
+        m, rad = self.settings.robot_sigma_m, self.settings.robot_sigma_rad
         return tuple(self._random.gauss(0.0, sigma) for sigma in (m, m, m, rad, rad, rad))
 
     def publish(self) -> None:

@@ -1,50 +1,33 @@
 """An interpreter of URScript: a text becomes a program that runs cycle by cycle.
 
-`urscript_parser` reads a text, `ScriptRun` runs it: in every `step`, one controller cycle, each thread
-goes on until it waits. What a call does is one table of builtins: a Python function each, with the
+`urscript_parser` makes Python of a text, `ScriptRun` runs it: in every `step`, one controller cycle, each
+thread goes on until it waits. What a call does is one table of builtins: a Python function each, with the
 script's own argument names. One that takes controller time is a generator which yields once per cycle.
 
 Rules (Universal Robots, "The URScript Programming Language"): a name without `local` or `global` is that of
 the nearest function around that has it, else the global one where there is one, else local. (The manual does
 not speak of functions around; Universal Robots' script for outside control relies on it.)
-Lists are copied by assignment. That a division of integers gives a float was
-not checked on a real controller. Imports nothing of the station and knows no robot.
+Lists are copied by assignment. That a division of integers gives a float was not checked on a real
+controller. Imports nothing of the station and knows no robot.
 """
 
 from __future__ import annotations
 
-import inspect
 import operator
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import ChainMap
+from collections.abc import Callable, Generator, Mapping, Sequence
+from traceback import walk_tb
 from types import GeneratorType
 from typing import Any
+
+from station.simulation.controller.urscript_parser import SCRIPT, Builtin, ScriptError, parse
 
 Value = Any
 """bool, int, float, str, list, Pose, Thread; None is what a function without `return` gives."""
 Steps = Generator[None, None, Value]
 """Yields once for every cycle it takes, then returns a value."""
-Node = Callable[["CallFrame"], Steps]
-"""A piece of program. A statement's value is None, or how it leaves its block: (word, value)."""
-Builtin = Callable[..., Any]
 
 STATEMENTS_PER_CYCLE = 20_000
-CALL_DEPTH = 40
-
-
-class ScriptError(Exception):
-    """Error for which the controller refuses or stops a program."""
-
-    def __init__(self, text: str, line: int = 0) -> None:
-        super().__init__(text)
-        self.text, self.line = text, line
-
-    def __str__(self) -> str:
-        return f"line {self.line}: {self.text}" if self.line else self.text
-
-
-class ScriptSyntaxError(ScriptError):
-    """The text is no program that this interpreter can run."""
 
 
 class ScriptRuntimeError(ScriptError):
@@ -75,18 +58,56 @@ class Thread:
         self._steps.close()
 
 
+class Scope(ChainMap[str, Value]):
+    """The variables of a call, of those of the functions around, and the global ones."""
+
+    def __getitem__(self, name: str) -> Value:
+        for variables in self.maps:
+            if name in variables:
+                return variables[name]
+        raise ScriptRuntimeError(f"compile_error_name_not_found:{name}:")
+
+    def __setitem__(self, name: str, value: Value) -> None:
+        variables = next((found for found in self.maps if name in found), self.maps[0])
+        variables[name] = copied(value)
+
+    @property
+    def local_only(self) -> Scope:
+        return Scope(self.maps[0])
+
+    @property
+    def global_only(self) -> Scope:
+        return Scope(self.maps[-1])
+
+    def set_item(self, name: str, index: Value, value: Value) -> None:
+        """Change the list that has this name now: what made the value may have made another."""
+        items = self[name]
+        items[_place_of(items, index)] = value
+
+    def enter(self, parameters: list[str], given: Sequence[Value], named: Mapping[str, Value]) -> Scope:
+        """Make the scope of a function in this one."""
+        values = {**dict(zip(parameters, given, strict=False)), **named}
+        return Scope({name: copied(value) for name, value in values.items()}, *self.maps)
+
+
 class ScriptRun:
     """A program under way, one `step` per controller cycle."""
 
-    def __init__(self, program: Function) -> None:
-        self.variables: dict[str, Value] = {}
-        """The global ones."""
+    def __init__(self, text: str, builtins: Mapping[str, Builtin]) -> None:
+        """Raises ScriptSyntaxError."""
         self.thread: Thread | None = None
         """The one whose turn it is."""
         self.halted = False
         self._threads: list[Thread] = []
         self._spent = 0
-        self.start(CallFrame(program, None, self, 0))
+        code, program, self._lines = parse(text, builtins)
+        names: dict[str, Any] = {
+            "_0": Scope({}), "Pose": Pose, "call": _call, "halt": self._halt, "item": _item, "join": _join,
+            "kill": _kill, "operate": operate, "spend": self._spend,
+            "start": self._start, "truth": truth,
+        } | {f"f_{name}": function for name, function in builtins.items()}  # fmt: skip
+        exec(code, names)
+        self._start(names[program])
 
     def step(self) -> bool:
         """False when the program has ended. Raises ScriptRuntimeError."""
@@ -96,8 +117,11 @@ class ScriptRun:
                 self.thread, self._spent = thread, 0
                 if not thread.done and not self.halted:
                     thread.step()
-        except RecursionError:
-            raise ScriptRuntimeError("nested too deeply") from None
+        except RecursionError as error:
+            raise ScriptRuntimeError("nested too deeply", self._line(error)) from None
+        except ScriptRuntimeError as error:
+            error.line = self._line(error)
+            raise
         finally:
             self.thread = None
         self._threads = [main, *(t for t in self._threads[1:] if not t.done)]
@@ -110,168 +134,42 @@ class ScriptRun:
             if not thread.done and thread is not self.thread:
                 thread.kill()
 
-    def start(self, frame: CallFrame) -> Thread:
-        self._threads.append(Thread(frame.function.steps(frame)))
+    def _line(self, error: BaseException) -> int:
+        """Return the script's line that is the nearest to where it was raised."""
+        places = [at for frame, at in walk_tb(error.__traceback__) if frame.f_code.co_filename == SCRIPT]
+        return self._lines[places[-1] - 1] if places else 0
+
+    def _halt(self) -> Steps:
+        self.halted = True
+        yield
+
+    def _start(self, function: Callable[..., Steps], /, *arguments: Value, **named: Value) -> Thread:
+        self._threads.append(Thread(function(*arguments, **named)))
         return self._threads[-1]
 
-    def spend(self) -> None:
-        """A statement begins. Raises ScriptRuntimeError for a program that never waits."""
+    def _spend(self) -> None:
+        """Called before every statement. Raises ScriptRuntimeError for a program that never waits."""
         self._spent += 1
         if self._spent > STATEMENTS_PER_CYCLE:
             raise ScriptRuntimeError("an infinite loop: it never waits")
 
 
-class CallFrame:
-    """The variables of one call."""
-
-    __slots__ = ("depth", "function", "outer", "run", "variables")
-
-    def __init__(self, function: Function, outer: CallFrame | None, run: ScriptRun, depth: int) -> None:
-        self.function, self.outer, self.run, self.depth = function, outer, run, depth
-        self.variables: dict[str, Value] = {}
-
-    def read(self, name: str) -> Value:
-        frame: CallFrame | None = self
-        while frame is not None:
-            if name in frame.variables:
-                return frame.variables[name]
-            frame = frame.outer
-        if name in self.run.variables:
-            return self.run.variables[name]
-        raise ScriptRuntimeError(f"compile_error_name_not_found:{name}:")
-
-    def write(self, name: str, value: Value, scope: str = "") -> None:
-        variables = self.run.variables if scope == "global" else self.variables
-        frame: CallFrame | None = None if scope else self
-        while frame is not None and name not in frame.variables:
-            frame = frame.outer
-        if frame is not None:
-            variables = frame.variables
-        elif not scope and name in self.run.variables:
-            variables = self.run.variables
-        variables[name] = type(value)(value) if isinstance(value, list) else value
-
-    def inner(self, function: Function) -> CallFrame:
-        """Make the frame of a function that is called from here."""
-        if self.depth >= CALL_DEPTH:
-            raise ScriptRuntimeError(f"{function.name} is called too deeply")
-        around: CallFrame | None = self
-        while around is not None and around.function is not function.outer:
-            around = around.outer
-        return CallFrame(function, around, self.run, self.depth + 1)
+def _call(name: str, function: Builtin, /, *arguments: Value, **named: Value) -> Steps:
+    try:
+        found = function(*arguments, **named)
+        return (yield from found) if isinstance(found, GeneratorType) else found
+    except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
+        raise ScriptRuntimeError(f"{name}: {error}") from None
 
 
-@dataclass
-class Function:
-    """A `def`, `sec` or `thread`. The outermost one is the program."""
-
-    name: str
-    outer: Function | None
-    parameters: list[tuple[str, Node | None]] = field(default_factory=list)
-    """Names and defaults."""
-    body: list[Node] = field(default_factory=list)
-    functions: dict[str, Function] = field(default_factory=dict)
-    calls: list[Call] = field(default_factory=list)
-    """All that are written in it."""
-
-    def steps(self, frame: CallFrame) -> Steps:
-        left = yield from execute(self.body, frame)
-        return left[1] if left is not None else None
-
-    def all_calls(self) -> Iterator[Call]:
-        """Its own, and those of the functions in it."""
-        yield from self.calls
-        for function in self.functions.values():
-            yield from function.all_calls()
+def _kill(thread: Value) -> None:
+    if isinstance(thread, Thread) and not thread.done:  # scripts keep a 0 where none started yet
+        thread.kill()
 
 
-@dataclass
-class Call:
-    name: str
-    inside: Function
-    arguments: Sequence[Node]
-    named: Mapping[str, Node]
-    line: int
-    function: Function | None = None
-    """Call whose meaning is found when the whole text was read: a function of the script, or a builtin."""
-    builtin: Builtin | None = None
-
-    def resolve(self, builtins: Mapping[str, Builtin]) -> None:
-        """Raises ScriptSyntaxError for what is nowhere, or called wrongly."""
-        around: Function | None = self.inside
-        while around is not None and self.name not in around.functions:
-            around = around.outer
-        if around is not None:
-            self.function = around.functions[self.name]
-            names = [name for name, _ in self.function.parameters]
-            fits = len(self.arguments) <= len(names) and set(self.named) <= set(names)
-        elif self.name in builtins:
-            self.builtin = builtins[self.name]
-            try:
-                inspect.signature(self.builtin).bind(*self.arguments, **self.named)
-                fits = True
-            except TypeError:
-                fits = False
-        else:
-            raise ScriptSyntaxError(f"compile_error_name_not_found:{self.name}:", self.line)
-        if not fits:
-            raise ScriptSyntaxError(f"{self.name} does not take these arguments", self.line)
-
-    def value(self, frame: CallFrame) -> Steps:
-        if self.function is not None:
-            inner = yield from self.enter(frame)
-            return (yield from self.function.steps(inner))
-        assert self.builtin is not None
-        arguments, named = yield from self._evaluated(frame)
-        try:
-            found = self.builtin(*arguments, **named)
-            return (yield from found) if isinstance(found, GeneratorType) else found
-        except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
-            raise ScriptRuntimeError(f"{self.name}: {error}", self.line) from None
-
-    def enter(self, frame: CallFrame) -> Generator[None, None, CallFrame]:
-        """The frame of the function that is called, its arguments in place."""
-        if self.function is None:
-            raise ScriptRuntimeError(f"{self.name} is no thread", self.line)
-        arguments, named = yield from self._evaluated(frame)
-        inner = frame.inner(self.function)
-        for (name, _), value in zip(self.function.parameters, arguments, strict=False):
-            inner.write(name, value, "local")
-        for name, default in self.function.parameters[len(arguments) :]:
-            if name in named:
-                inner.write(name, named[name], "local")
-            elif default is not None:
-                inner.write(name, (yield from default(inner)), "local")
-            else:
-                raise ScriptRuntimeError(f"{self.name} needs {name}", self.line)
-        return inner
-
-    def _evaluated(self, frame: CallFrame) -> Generator[None, None, tuple[list[Value], dict[str, Value]]]:
-        arguments = yield from evaluate_all(self.arguments, frame)
-        named = yield from evaluate_all(tuple(self.named.values()), frame)
-        return arguments, dict(zip(self.named, named, strict=True))
-
-
-def execute(body: Sequence[Node], frame: CallFrame) -> Steps:
-    """Statement by statement, until one leaves the block; how it does."""
-    for statement in body:
-        frame.run.spend()
-        try:
-            left = yield from statement(frame)
-        except ScriptRuntimeError as error:
-            error.line = error.line or vars(statement)["line"]
-            raise
-        if left is not None:
-            return left
-    return None
-
-
-def evaluate_all(nodes: Sequence[Node], frame: CallFrame) -> Generator[None, None, list[Value]]:
-    found = []
-    for node in nodes:
-        value = yield from node(frame)
-        found.append(value)
-    return found
+def _join(thread: Value) -> Steps:
+    while isinstance(thread, Thread) and not thread.done:
+        yield
 
 
 # -- values ---------------------------------------------------------------------------------------------
@@ -315,7 +213,16 @@ def operate(sign: str, left: Value, right: Value) -> Value:
         raise ScriptRuntimeError(f"{left} {sign} {right} has no result") from None
 
 
-def place_of(items: Value, index: Value) -> int:
+def copied(value: Value) -> Value:
+    """Lists are copied by assignment, and where they are given to a function."""
+    return type(value)(value) if isinstance(value, list) else value
+
+
+def _item(items: Value, index: Value) -> Value:
+    return items[_place_of(items, index)]
+
+
+def _place_of(items: Value, index: Value) -> int:
     if not isinstance(items, list):
         raise ScriptRuntimeError(f"{items!r} has no items")
     if not isinstance(index, int) or not 0 <= index < len(items):

@@ -1,28 +1,21 @@
-"""The text of a URScript program → what `urscript` runs: tokens, then recursive descent."""
+"""The text of a URScript program → Python's code: tokens, then recursive descent that writes Python.
+
+Variables of the script are items of a `Scope`, `_0` the global one, `_1` that of the program and so on; its
+functions are generators whose names begin with `f_`. What else is called here is told in `ScriptRun`.
+"""
 
 from __future__ import annotations
 
+import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import CodeType
+from typing import Any, NamedTuple
 
-from station.simulation.controller.urscript import (
-    Builtin,
-    Call,
-    CallFrame,
-    Function,
-    Node,
-    Pose,
-    ScriptSyntaxError,
-    Steps,
-    Thread,
-    Value,
-    evaluate_all,
-    execute,
-    operate,
-    place_of,
-    truth,
-)
+Builtin = Callable[..., Any]
+SCRIPT = "<URScript>"
+"""What Python takes for the file of a script."""
 
 _TOKEN = re.compile(
     r"""(?P<skip>[ \t\r]+|\#[^\n]*)
@@ -42,10 +35,31 @@ _WORDS = frozenset(
 _STATEMENTS = (
     "if", "while", "return", "kill", "join", "break", "continue", "halt", "global", "local",
 )  # fmt: skip
-_LEVELS = (("or", "xor"), ("and",), ("==", "!=", "<", "<=", ">", ">="), ("+", "-"), ("*", "/", "%"))
+_LEVELS = (
+    ("or", "xor"), ("and",), ("==", "!=", "<", "<=", ">", ">="), ("+", "-"), ("*", "/", "%"),
+)  # fmt: skip
 """Binary operators, the loosest first."""
 _NOT_LEVEL = 2
 """`not` binds looser than a comparison, tighter than `and`."""
+_LOGIC = {"or": "or", "xor": "!=", "and": "and"}
+
+Lines = list[tuple[int, str]]
+"""Python, each line with that of the script."""
+
+
+class ScriptError(Exception):
+    """Error for which the controller refuses or stops a program."""
+
+    def __init__(self, text: str, line: int = 0) -> None:
+        super().__init__(text)
+        self.text, self.line = text, line
+
+    def __str__(self) -> str:
+        return f"line {self.line}: {self.text}" if self.line else self.text
+
+
+class ScriptSyntaxError(ScriptError):
+    """The text is no program that this interpreter can run."""
 
 
 class Token(NamedTuple):
@@ -73,25 +87,85 @@ def tokens(text: str) -> list[Token]:
     return [*found, Token("line", "\n", line), Token("", "the end", line)]
 
 
-def parse(text: str, builtins: Mapping[str, Builtin]) -> Function:
-    """A whole program (`def name(): … end`), or bare statements. Raises ScriptSyntaxError."""
+@dataclass
+class Function:
+    """A `def`, `sec` or `thread` while it is read."""
+
+    parameters: dict[str, bool] = field(default_factory=dict)
+    """Those with a default are True."""
+    inner: dict[str, Function] = field(default_factory=dict)
+    written: Lines = field(default_factory=list)
+    """The inner functions in Python."""
+
+
+class Call(NamedTuple):
+    """A call, whose meaning is found when the whole text was read: a function of the script, or a builtin."""
+
+    name: Token
+    around: tuple[Function, ...]
+    plain: int
+    named: list[str]
+    runs: bool
+    """As a thread."""
+
+    def check(self, builtins: Mapping[str, Builtin]) -> None:
+        """Raises ScriptSyntaxError for what is nowhere, or called wrongly."""
+        _, name, line = self.name
+        found = next((f.inner[name].parameters for f in reversed(self.around) if name in f.inner), None)
+        if found is None and name not in builtins:
+            raise ScriptSyntaxError(f"compile_error_name_not_found:{name}:", line)
+        if found is None and self.runs:
+            raise ScriptSyntaxError(f"{name} is no thread", line)
+        fits = True
+        if found is not None:
+            given = {
+                *list(found)[: self.plain],
+                *self.named,
+                *(n for n, optional in found.items() if optional),
+            }
+            fits = self.plain <= len(found) and given == found.keys()
+        else:
+            try:
+                inspect.signature(builtins[name]).bind(*[0] * self.plain, **dict.fromkeys(self.named))
+            except TypeError:
+                fits = False
+        if not fits:
+            raise ScriptSyntaxError(f"{name} does not take these arguments", line)
+
+
+def parse(text: str, builtins: Mapping[str, Builtin]) -> tuple[CodeType, str, list[int]]:
+    """Return code that defines the program, what it defines, and the script's line of each line of it.
+
+    The program is a `def name(): … end`, or bare statements. Raises ScriptSyntaxError.
+    """
+    parser, lines = _Parser(tokens(text)), [0]
     try:
-        program = _Parser(tokens(text)).program()
-    except RecursionError:
+        outermost = parser.program()
+        for call in parser.calls:
+            call.check(builtins)
+        lines = [line for line, _ in outermost.written]
+        code = compile("\n".join(python for _, python in outermost.written), SCRIPT, "exec")
+    except SyntaxError as error:
+        raise ScriptSyntaxError(error.msg, lines[(error.lineno or 1) - 1]) from None
+    except (RecursionError, MemoryError, ValueError):
         raise ScriptSyntaxError("nested too deeply") from None
-    for call in program.all_calls():
-        call.resolve(builtins)
-    return program
+    (name,) = outermost.inner
+    return code, f"f_{name}", lines
 
 
 class _Parser:
-    """Recursive descent: each construct's method reads it and says what it does."""
+    """Each construct's method reads it and returns it in Python."""
 
     def __init__(self, found: list[Token]) -> None:
         self._tokens = found
         self._place = 0
-        self._inside = Function("line", None)
-        """The function that is being read."""
+        self.calls: list[Call] = []
+        self._around = [Function()]
+        """The functions that are being read, the innermost last; the first one is the text."""
+
+    @property
+    def _scope(self) -> str:
+        return f"_{len(self._around) - 1}"
 
     def _is(self, *words: str) -> bool:
         token = self._tokens[self._place]
@@ -122,208 +196,165 @@ class _Parser:
     # -- functions and statements -----------------------------------------------------------------------
 
     def program(self) -> Function:
+        """Return the text as a function that holds another: the program."""
         self._skip_lines()
         if self._is("def", "sec"):
-            program = self._function(None)
+            self._function()
             self._skip_lines()
         else:
-            program = self._inside
-            program.body = self._body()
+            self._around.append(Function())
+            self._define("line", 1, [], self._body())
         if self._tokens[self._place].kind:
             self._need()
-        return program
+        return self._around[0]
 
-    def _function(self, outer: Function | None) -> Function:
-        self._need("def", "sec", "thread")
-        around = self._inside
-        self._inside = function = Function(self._need(kind="name").text, outer)
+    def _function(self) -> None:
+        line = self._need("def", "sec", "thread").line
+        name = self._need(kind="name").text
+        self._around.append(Function())
+        parameters, defaults = self._around[-1].parameters, Lines()
         self._need("(")
         while not self._take(")"):
-            name = self._need(kind="name").text
-            function.parameters.append((name, self._expression() if self._take("=") else None))
+            parameter = self._need(kind="name").text
+            parameters[parameter] = self._take("=") is not None
+            if parameters[parameter]:
+                defaults.append((line, f"if {parameter!r} not in {self._scope}.maps[0]:"))
+                defaults.append((line, f" {self._scope}.local_only[{parameter!r}] = {self._expression()}"))
             if not self._is(")"):
                 self._need(",")
-        function.body = self._block()
-        self._inside = around
-        return function
+        self._define(name, line, defaults, self._block())
 
-    def _block(self, *others: str) -> list[Node]:
-        """Parse from the colon to `end`, or to one of the other words, which stays."""
-        self._need(":")
+    def _define(self, name: str, line: int, defaults: Lines, body: Lines) -> None:
+        """Functions come first where they are: a script may call what stands below."""
+        scope, function = self._scope, self._around.pop()
+        enter = f"{scope} = {self._scope}.enter({[*function.parameters]}, given, named)"
+        lines = [(line, enter), *defaults, *function.written, *body, (line, "return"), (line, "yield")]
+        outer = self._around[-1]
+        outer.written += [(line, f"def f_{name}(*given, **named):"), *_indented(lines)]
+        outer.inner[name] = function
+
+    def _block(self, *others: str) -> Lines:
+        """Read from the colon to `end`, or to one of the other words, which stays."""
+        line = self._need(":").line
         body = self._body("end", *others)
         if not self._is(*others):
             self._need("end")
-        return body
+        return [*body, (line, "pass")]
 
-    def _body(self, *ends: str) -> list[Node]:
+    def _body(self, *ends: str) -> Lines:
         """Statements up to one of these words, or to the end of the text."""
-        found: list[Node] = []
+        found = Lines()
         self._skip_lines()
         while not self._is(*ends) and self._tokens[self._place].kind:
             if self._is("def", "sec", "thread"):
-                function = self._function(self._inside)
-                self._inside.functions[function.name] = function
+                self._function()
             elif not self._take("pass", "enter_critical", "exit_critical"):  # no thread is interrupted here
-                line = self._tokens[self._place].line
-                found.append(self._statement())
-                vars(found[-1])["line"] = line
+                found.append((self._tokens[self._place].line, "spend()"))
+                found += self._statement()
             if not self._is(*ends, *_STATEMENTS):  # a keyword begins a statement without a new line
                 self._need(kind="line")
             self._skip_lines()
         return found
 
-    def _statement(self) -> Node:
+    def _statement(self) -> Lines:
+        line = self._tokens[self._place].line
         word = self._take(*_STATEMENTS)
-        if word is None:
-            return self._assignment()
-        if word.text in ("global", "local"):
-            return self._assign(word.text)
-        if word.text == "if":
-            return self._if()
-        if word.text == "while":
-            return self._while()
-        if word.text in ("kill", "join"):
-            return self._wait_or_kill(word.text == "kill")
-        value: Node | None = None
-        if word.text == "return" and not self._next_is("line"):
-            value = self._expression()
+        match word.text if word is not None else "":
+            case "if":
+                return self._if(line)
+            case "while":
+                test = self._expression()
+                return [(line, f"while truth({test}):"), *_indented([(line, "spend()"), *self._block()])]
+            case "global" | "local" as scope:
+                name = self._need(kind="name").text
+                self._need("=")
+                return [(line, f"{self._scope}.{scope}_only[{name!r}] = {self._expression()}")]
+            case "kill" | "join" as verb:
+                return [(line, f"yield from call('{verb}', {verb}, {self._expression()})")]
+            case "return":
+                return [(line, "return " + ("" if self._next_is("line") else self._expression()))]
+            case "halt":
+                return [(line, "yield from halt()")]
+            case "break" | "continue" as leave:
+                return [(line, leave)]
+        return [(line, self._assignment())]
 
-        def leave(frame: CallFrame) -> Steps:
-            frame.run.halted |= word.text == "halt"
-            if frame.run.halted:
-                yield
-            return word.text, (yield from value(frame)) if value is not None else None
-
-        return leave
-
-    def _assignment(self) -> Node:
+    def _assignment(self) -> str:
         """`a = …`, `a[i] = …`, or an expression for what it does."""
         if self._next_is("name", "="):
-            return self._assign("")
+            name = self._need(kind="name").text
+            self._need("=")
+            return f"{self._scope}[{name!r}] = {self._expression()}"
         if self._next_is("name", "["):
             before, name = self._place, self._need(kind="name").text
             self._need("[")
             index = self._expression()
             if self._take("]") and self._take("="):
-                return self._assign_item(name, index, self._expression())
+                return f"{self._scope}.set_item({name!r}, {index}, {self._expression()})"
             self._place = before
-        value = self._expression()
+        return self._expression()
 
-        def evaluate(frame: CallFrame) -> Steps:
-            yield from value(frame)
-
-        return evaluate
-
-    def _assign(self, scope: str) -> Node:
-        name = self._need(kind="name").text
-        self._need("=")
-        value = self._expression()
-
-        def assign(frame: CallFrame) -> Steps:
-            frame.write(name, (yield from value(frame)), scope)
-
-        return assign
-
-    def _assign_item(self, name: str, index: Node, value: Node) -> Node:
-        def assign(frame: CallFrame) -> Steps:
-            place = yield from index(frame)
-            found = yield from value(frame)
-            items = frame.read(name)
-            items[place_of(items, place)] = found
-
-        return assign
-
-    def _if(self) -> Node:
-        branches = [(self._expression(), self._block("elif", "else"))]
-        while self._take("elif"):
-            branches.append((self._expression(), self._block("elif", "else")))
-        otherwise = self._block() if self._take("else") else []
-
-        def choose(frame: CallFrame) -> Steps:
-            for condition, body in branches:
-                if truth((yield from condition(frame))):
-                    return (yield from execute(body, frame))
-            return (yield from execute(otherwise, frame))
-
-        return choose
-
-    def _while(self) -> Node:
-        condition, body = self._expression(), self._block()
-
-        def repeat(frame: CallFrame) -> Steps:
-            while truth((yield from condition(frame))):
-                frame.run.spend()
-                left = yield from execute(body, frame)
-                if left is not None and left[0] == "break":
-                    return None
-                if left is not None and left[0] != "continue":
-                    return left
-            return None
-
-        return repeat
-
-    def _wait_or_kill(self, kill: bool) -> Node:
-        thread = self._expression()
-
-        def end(frame: CallFrame) -> Steps:
-            found = yield from thread(frame)
-            while isinstance(found, Thread) and not found.done:  # scripts keep a 0 where none started yet
-                if kill:
-                    found.kill()
-                else:
-                    yield
-
-        return end
+    def _if(self, line: int) -> Lines:
+        found = [(line, f"if truth({self._expression()}):"), *_indented(self._block("elif", "else"))]
+        while word := self._take("elif"):
+            found.append((word.line, f"elif truth({self._expression()}):"))
+            found += _indented(self._block("elif", "else"))
+        if word := self._take("else"):
+            found += [(word.line, "else:"), *_indented(self._block())]
+        return found
 
     # -- expressions ------------------------------------------------------------------------------------
 
-    def _expression(self, level: int = 0) -> Node:
+    def _expression(self, level: int = 0) -> str:
         self._skip_lines()  # what was begun goes on in the next line
         if level == len(_LEVELS):
             return self._unary()
         if level == _NOT_LEVEL and self._take("not"):
-            return _not(self._expression(level))
+            return f"(not truth({self._expression(level)}))"
         left = self._expression(level + 1)
         while sign := self._take(*_LEVELS[level]):
             right = self._expression(level + 1)
-            left = (_logic if level < _NOT_LEVEL else _binary)(sign.text, left, right)
+            if sign.text in _LOGIC:
+                left = f"(truth({left}) {_LOGIC[sign.text]} truth({right}))"
+            else:
+                left = f"operate('{sign.text}', {left}, {right})"
         return left
 
-    def _unary(self) -> Node:
+    def _unary(self) -> str:
         if self._take("-"):
-            return _binary("-", _constant(0), self._unary())
+            return f"operate('-', 0, {self._unary()})"
         if self._take("run"):
-            return _started(self._call(self._need(kind="name")))
+            return self._call(self._need(kind="name"), runs=True)
         token = self._tokens[self._place]
         self._place += 1
         if token.kind == "int":
-            found = _constant(int(token.text, 16 if token.text[:2] in ("0x", "0X") else 10))
-        elif token.kind == "float":
-            found = _constant(float(token.text))
+            found = str(int(token.text, 16 if token.text[:2] in ("0x", "0X") else 10))
+        elif token.kind == "float" or token.text in ("True", "False"):
+            found = token.text
         elif token.kind == "string":
-            found = _constant(token.text[1:-1])
-        elif token.text in ("True", "False"):
-            found = _constant(token.text == "True")
+            found = repr(token.text[1:-1])
         elif (token.kind, token.text) == ("sign", "("):
-            found = self._expression()
+            found = self._expression()  # what is written in Python needs no brackets
             self._need(")")
         elif (token.kind, token.text) == ("sign", "["):
-            found = _items(self._list("]")[0], list)
+            found = f"[{', '.join(self._list(']')[0])}]"
         elif token.text == "p" and self._take("["):
             items = self._list("]")[0]  # a single one is an index into a variable of that name
-            found = _item(_name("p"), items[0]) if len(items) == 1 else _items(items, Pose)
+            found = (
+                f"item({self._scope}['p'], {items[0]})" if len(items) == 1 else f"Pose([{', '.join(items)}])"
+            )
         elif token.kind != "name":
             raise ScriptSyntaxError(f"{token.text!r} where a value was expected", token.line)
         else:
-            found = self._call(token).value if self._is("(") else _name(token.text)
+            found = self._call(token) if self._is("(") else f"{self._scope}[{token.text!r}]"
         while self._take("["):
-            found = _item(found, self._expression())
+            found = f"item({found}, {self._expression()})"
             while self._take(","):  # a matrix is a list of its rows
-                found = _item(found, self._expression())
+                found = f"item({found}, {self._expression()})"
             self._need("]")
         return found
 
-    def _list(self, end: str) -> tuple[list[Node], dict[str, Node]]:
+    def _list(self, end: str) -> tuple[list[str], dict[str, str]]:
         """Values up to this sign, those with names apart."""
         plain, named = [], {}
         while not self._take(end):
@@ -337,74 +368,16 @@ class _Parser:
                 self._need(",")
         return plain, named
 
-    def _call(self, name: Token) -> Call:
+    def _call(self, name: Token, runs: bool = False) -> str:
         self._need("(")
-        call = Call(name.text, self._inside, *self._list(")"), name.line)
-        self._inside.calls.append(call)
-        return call
+        plain, named = self._list(")")
+        self.calls.append(Call(name, tuple(self._around), len(plain), list(named), runs))
+        found = [f"f_{name.text}", *plain]
+        if named:
+            found.append("**{" + ", ".join(f"{key!r}: {value}" for key, value in named.items()) + "}")
+        start = "start(" if runs else f"(yield from call({name.text!r}, "
+        return start + ", ".join(found) + (")" if runs else "))")
 
 
-def _constant(value: Value) -> Node:
-    def constant(frame: CallFrame) -> Steps:
-        yield from ()
-        return value
-
-    return constant
-
-
-def _name(name: str) -> Node:
-    def read(frame: CallFrame) -> Steps:
-        yield from ()
-        return frame.read(name)
-
-    return read
-
-
-def _items(items: Sequence[Node], make: Callable[[list[Value]], list[Value]]) -> Node:
-    def build(frame: CallFrame) -> Steps:
-        return make((yield from evaluate_all(items, frame)))
-
-    return build
-
-
-def _item(of: Node, index: Node) -> Node:
-    def item(frame: CallFrame) -> Steps:
-        items = yield from of(frame)
-        place = yield from index(frame)
-        return items[place_of(items, place)]
-
-    return item
-
-
-def _not(of: Node) -> Node:
-    def negate(frame: CallFrame) -> Steps:
-        return not truth((yield from of(frame)))
-
-    return negate
-
-
-def _logic(word: str, left: Node, right: Node) -> Node:
-    def decide(frame: CallFrame) -> Steps:
-        first = truth((yield from left(frame)))
-        if word != "xor" and first == (word == "or"):
-            return first
-        second = truth((yield from right(frame)))
-        return first != second if word == "xor" else second
-
-    return decide
-
-
-def _binary(sign: str, left: Node, right: Node) -> Node:
-    def result(frame: CallFrame) -> Steps:
-        first = yield from left(frame)
-        return operate(sign, first, (yield from right(frame)))
-
-    return result
-
-
-def _started(call: Call) -> Node:
-    def start(frame: CallFrame) -> Steps:
-        inner = yield from call.enter(frame)
-        return frame.run.start(inner)
-
-    return start
+def _indented(lines: Lines) -> Lines:
+    return [(line, " " + text) for line, text in lines]

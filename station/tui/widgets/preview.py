@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import base64
 import time
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import groupby
-from typing import cast
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -20,8 +21,8 @@ from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
+from station.operate.motion import Link
 from station.protocol import verbs
-from station.tui.desk import Desk, ScreenLink
 from station.tui.widgets.graphics import PERIOD_S, SHARE, Graphics, SharpPicture
 
 Grey = NDArray[np.uint8]
@@ -29,6 +30,9 @@ LEVELS = 20
 """Shades a terminal image is drawn with: fewer styles to send, and no eye sees more in half blocks."""
 CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_rgb(0, 0, 0), bold=True))
 """A sign and not only a colour."""
+LETTER = Style(color="black", bgcolor="bright_yellow", bold=True)
+Letters = Sequence[tuple[str, float, float]]
+"""Letter, x and y as shares of the image."""
 
 OLD = "OLD IMAGE"
 SMALLEST = (16, 16)
@@ -45,6 +49,8 @@ class PreviewPane(Widget):
 
     DEFAULT_CSS = "PreviewPane { width: 1fr; height: 1fr; }"
 
+    graphics: ClassVar[Graphics | None] = None
+    """The terminal's own graphics; None: half blocks only."""
     old: reactive[bool] = reactive(False)
     """The camera may see something else by now; written across the picture."""
 
@@ -53,13 +59,14 @@ class PreviewPane(Widget):
         self._image: Grey | None = None
         self._sequence: int | None = None
         self._corners: NDArray[np.float64] = np.zeros((0, 2))
+        self._letters: Letters = ()
         self._rows: list[Strip] = []
         self._rows_size = Size(0, 0)
         self._sharp: SharpPicture | None = None
         self._next_s = 0.0
         """Not before: drawing takes no more than its share of the computer."""
 
-    async def fetch(self, link: ScreenLink) -> None:
+    async def fetch(self, link: Link) -> None:
         """Ask for an image and show it. What the daemon sees in it stands in the status, shown or not.
 
         Until the next one may be drawn the smallest will do: a large one is dear to send and to read.
@@ -70,8 +77,8 @@ class PreviewPane(Widget):
         if due and answer.jpeg_base64:
             await self.show(answer)
 
-    async def show(self, answer: verbs.PreviewImage) -> None:
-        """Show an image unless it stands there already."""
+    async def show(self, answer: verbs.PreviewImage, letters: Letters = ()) -> None:
+        """Show an image, with letters in it where half blocks draw it, unless it stands there already."""
         if answer.sequence == self._sequence:
             return
         data = np.frombuffer(base64.b64decode(answer.jpeg_base64), dtype=np.uint8)
@@ -80,6 +87,7 @@ class PreviewPane(Widget):
             return
         self._image, self._sequence = np.asarray(image, dtype=np.uint8), answer.sequence
         self._corners = np.array(answer.corners, dtype=float).reshape(-1, 2)
+        self._letters = letters
         self._rows_size = Size(0, 0)
         await self._sharpen(self.size)
         self.refresh()
@@ -93,7 +101,7 @@ class PreviewPane(Widget):
 
     def _graphics(self) -> Graphics | None:
         """The terminal's own graphics; None while half blocks are due."""
-        graphics = cast(Desk, self.app).graphics
+        graphics = self.graphics
         if graphics is None or self.old or not self.screen.is_active or not graphics.ready():
             return None
         return (
@@ -130,10 +138,10 @@ class PreviewPane(Widget):
         few = self.app.current_theme.ansi
         shades_of_a_cell = shades[:, 0] + shades[:, 1] if few else shades[:, 0] * LEVELS + shades[:, 1]
         cells = shades_of_a_cell.tolist()
-        for x, y in self._corners:
+        for letter, x, y in [*(("+", x, y) for x, y in self._corners), *self._letters]:
             row, column = int(y * rows) // 2, int(x * columns)
             if 0 <= row < rows // 2 and 0 <= column < columns:
-                cells[row][column] = -1
+                cells[row][column] = -ord(letter)
         left = (size.width - columns) // 2
         sides = (
             Segment(" " * left, self.rich_style),
@@ -148,7 +156,7 @@ def _runs(line: list[int], few: bool) -> list[Segment]:
     for cell, alike in groupby(line):
         count = len(list(alike))
         if cell < 0:
-            runs += [CORNER] * count
+            runs += [CORNER if cell == -ord("+") else Segment(chr(-cell), LETTER)] * count
         elif few:
             shade = FEW_SHADES[cell * len(FEW_SHADES) // (2 * LEVELS - 1)]
             runs.append(Segment(shade * count, Style()))

@@ -18,7 +18,8 @@ import pytest
 
 from calibrate.batch.cluster import Cluster, cluster_workers, dask_workers
 from calibrate.batch.fleet import collect_fleet
-from calibrate.batch.run import BatchResult, run_batch
+from calibrate.batch.run import run_batch
+from calibrate.batch.storage import BatchResult
 from calibrate.batch.workers import BatchError, pool
 from calibrate.errors import UsageError
 from tests.calibrate.batch.test_run import Counted, in_this_process, read_results, wait_until

@@ -122,7 +122,7 @@ def test_the_page_shows_doubt_first_and_asks_the_network_for_nothing(cells: list
 
 
 def upload(folder: Path, url: str) -> None:
-    """As tools that copy folders to object stores do: links become what they point to."""
+    """Copy a folder like a tool for object stores: links become what they point to."""
     fs, base = fsspec.core.url_to_fs(url)
     for path in folder.rglob("*"):
         if path.is_file():

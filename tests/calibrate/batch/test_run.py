@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 
 from benchmarks.batch import worker_pids
-from calibrate.batch.run import RESULTS, BatchResult, batch_key, run_batch
-from calibrate.batch.storage import Results
+from calibrate.batch.run import RESULTS, batch_key, run_batch
+from calibrate.batch.storage import BatchResult, Results
 from calibrate.batch.workers import Lost, R, T, pool
 from calibrate.bounds import Limits
-from calibrate.pipeline import JobOptions
+from calibrate.job import JobOptions
 
 
 def in_this_process(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from scipy import stats
 
 from calibrate.batch.page import trends_page
-from calibrate.batch.run import BatchResult
+from calibrate.batch.storage import BatchResult
 from calibrate.batch.trends import cells, trends_text
 from calibrate.geometry import Array, Transform, perturb, pose, rotation_exp
 

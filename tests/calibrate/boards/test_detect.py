@@ -17,7 +17,7 @@ from calibrate.boards.model import (
     looks_same_turns,
 )
 from calibrate.geometry import pose, rotation_exp
-from calibrate.lens.model import project
+from calibrate.projection import project_at
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.simulation.renderer import Light, render
 from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking
@@ -55,7 +55,7 @@ def test_points_lie_where_the_projection_puts_them(spec: BoardSpec) -> None:
         # Of 14 such small april grids half miss a marker or two; which ones is chance.
         least = 0.8 if spec.kind is BoardKind.APRIL_GRID else 0.9
         assert found.corners >= least * found.expected
-        truth = project(CAMERA, seen, board_points(spec)[found.indices])
+        truth = project_at(CAMERA, seen, board_points(spec)[found.indices])
         miss = np.linalg.norm(found.pixels - truth, axis=1)
         assert np.sqrt(np.square(miss).mean()) < EXACT_LIMIT_PX.get(spec.kind, 0.10)
 
@@ -67,7 +67,8 @@ def test_a_symmetric_board_is_found_in_one_of_its_turns(spec: BoardSpec) -> None
     image, seen = picture(spec, 4)
     found = detect(image, spec)
     readings = [
-        project(CAMERA, seen @ board_from_turned(spec, t), board_points(spec)) for t in looks_same_turns(spec)
+        project_at(CAMERA, seen @ board_from_turned(spec, t), board_points(spec))
+        for t in looks_same_turns(spec)
     ]
     assert min(np.abs(found.pixels - r).max() for r in readings) < 0.6
     assert "looks the same" in ambiguity_text(spec)
@@ -98,7 +99,7 @@ def test_partial_charuco_is_used_and_its_points_keep_their_identity() -> None:
     image[:, : CAMERA.width // 2] = 90
     found = detect(image, CHARUCO)
     assert 6 <= found.corners < found.expected
-    truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
+    truth = project_at(CAMERA, seen, board_points(CHARUCO)[found.indices])
     assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.6
 
 
@@ -107,7 +108,7 @@ def test_a_dark_charuco_board_is_found_whole() -> None:
         image, seen = picture(CHARUCO, seed, illumination=0.08)
         found = detect(image, CHARUCO)
         assert found.corners >= 0.9 * found.expected
-        truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
+        truth = project_at(CAMERA, seen, board_points(CHARUCO)[found.indices])
         assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.3
 
 
@@ -117,7 +118,7 @@ def test_corners_in_a_line_are_refused_and_not_handed_to_the_solver() -> None:
     points = board_points(CHARUCO)
     size_m = CHARUCO.square_m
     rows = np.array([[-1.0, -1.0], [7.0, -1.0], [7.0, 0.6], [-1.0, 0.6]]) * size_m
-    outline = project(CAMERA, seen, np.column_stack([rows, np.zeros(4)]))
+    outline = project_at(CAMERA, seen, np.column_stack([rows, np.zeros(4)]))
     band = cv2.fillConvexPoly(np.zeros_like(image), outline.round().astype(np.int32), 1)
     found = detect(np.where(band > 0, image, 90).astype(np.uint8), CHARUCO)
     assert (found.cause, found.corners) == ("in-line", 0)
@@ -148,7 +149,7 @@ def test_a_tag_that_lies_in_the_picture_is_found(spec: BoardSpec) -> None:
     """OpenCV's own search for quadrilaterals leaves out 8 of 55."""
     for seed in range(40):
         image, seen = picture(spec, seed)
-        truth = project(CAMERA, seen, board_points(spec))
+        truth = project_at(CAMERA, seen, board_points(spec))
         if truth.min() > 5 and (truth < np.array([CAMERA.width, CAMERA.height]) - 6).all():
             found = detect(image, spec)
             assert found.found, seed
@@ -230,7 +231,7 @@ def test_strong_tilt_blur_and_low_light(tilt_deg: float) -> None:
     light = Light(illumination=0.35, blur_px=1.2, pixel_noise=3.0)
     found = detect(render(CAMERA, PAPER_BOARD, seen, light, rng), PAPER_BOARD)
     assert found.found
-    truth = project(CAMERA, seen, board_points(PAPER_BOARD))
+    truth = project_at(CAMERA, seen, board_points(PAPER_BOARD))
     assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.4
 
 
@@ -247,7 +248,7 @@ def test_a_tilted_circle_is_its_own_centre_not_its_ellipses(spec: BoardSpec) -> 
         image = render(CAMERA, spec, seen, Light(pixel_noise=1.5), np.random.default_rng(seed))
         found = detect(image, spec)
         assert found.found
-        truth = project(CAMERA, seen, board_points(spec))
+        truth = project_at(CAMERA, seen, board_points(spec))
         both = [np.linalg.norm(found.pixels - t, axis=1) for t in (truth, truth[::-1])]
         misses += min(both, key=np.median).tolist()
     assert max(misses) < 0.2
@@ -259,7 +260,7 @@ def test_charuco_is_found_whole_at_sixty_degrees() -> None:
         seen = looking(CHARUCO, np.random.default_rng(seed), tilt=(1.04, 1.05), distance_m=0.3)
         image = render(CAMERA, CHARUCO, seen, Light(pixel_noise=1.5), np.random.default_rng(seed))
         found = detect(image, CHARUCO)
-        truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
+        truth = project_at(CAMERA, seen, board_points(CHARUCO)[found.indices])
         assert found.corners >= 0.9 * found.expected
         assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.3
 
@@ -271,5 +272,5 @@ def test_a_far_charuco_board_is_read_enlarged() -> None:
         image = render(CAMERA, CHARUCO, seen, Light(pixel_noise=1.5), np.random.default_rng(seed))
         found = detect(image, CHARUCO)
         assert found.corners >= 0.8 * found.expected
-        truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
+        truth = project_at(CAMERA, seen, board_points(CHARUCO)[found.indices])
         assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.5

@@ -16,7 +16,7 @@ from calibrate.cli.files import read_camera
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration, write_calibration
 from recordings.errors import UnfinishedRecordingError
-from recordings.exporters.folder import Target, export_recording
+from recordings.exporters.folder import export_recording
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel
@@ -177,7 +177,7 @@ def test_a_view_given_twice_is_refused_by_solve_and_check(
     session_file: Path, real_file: Path, tmp_path: Path
 ) -> None:
     """It would count as one more and halve the stated variance: the check would seem surer than it is."""
-    folder = export_recording(open_recording(session_file), tmp_path / "folder", Target.FOLDER)
+    folder = export_recording(open_recording(session_file), tmp_path / "folder", "folder")
     header, *rows = (folder / "poses.csv").read_text().splitlines()
     image, numbers = rows[2].split(",", 1)
     shutil.copy(folder / image, folder / "again.png")

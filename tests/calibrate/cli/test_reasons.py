@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from calibrate.errors import InstallError
-from calibrate.files.calibration import Touch, read_calibration
+from calibrate.files.calibration import read_calibration
 from calibrate.files.install import (
     install,
     installed_calibration,
@@ -17,8 +17,8 @@ from calibrate.files.install import (
     reason_problem,
     rollback,
 )
-from calibrate.files.verification import note_installed
-from calibrate.files.versions import before_current, installed_versions
+from calibrate.files.touch import Touch
+from calibrate.files.versions import before_current, installed_versions, note_installed
 from tests.calibrate.calling import raises_code
 
 MakeFile = Callable[..., Path]

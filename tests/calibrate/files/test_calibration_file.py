@@ -19,7 +19,7 @@ from calibrate.files.calibration import (
     write_output,
 )
 from calibrate.geometry import FrameMismatchError, Transform
-from calibrate.pipeline import SolvedRecording
+from calibrate.job import SolvedRecording
 from tests.calibrate.calling import raises_code
 
 

@@ -40,9 +40,9 @@ from calibrate.files.proof import check_result, proven_plain
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_from_rotvec, rotation_exp
 from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
+from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, base_from_flange, forward, with_near_axes
 from calibrate.load import arm_of_ros
-from calibrate.pipeline import SolvedRecording
 
 FOLLOWED = FrameNames(follow=("calibrate", "follow"))
 

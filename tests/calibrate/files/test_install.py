@@ -18,12 +18,13 @@ import calibrate
 import recordings
 from calibrate.cli import main
 from calibrate.errors import CalibrationFileError, GateFailedError, InstallError
-from calibrate.files.calibration import Touch, read_calibration
+from calibrate.files.calibration import read_calibration
 from calibrate.files.gate import Gate
 from calibrate.files.install import install, install_line, installed_calibration, rollback
 from calibrate.files.loader import load_installed
+from calibrate.files.touch import Touch
 from calibrate.files.versions import installed_versions, read_log
-from calibrate.pipeline import SolvedRecording
+from calibrate.job import SolvedRecording
 from tests.calibrate.calling import raises_code
 from tests.command_line import call
 
@@ -193,7 +194,7 @@ NOTE = """
 import sys
 from pathlib import Path
 from calibrate.files.calibration import read_calibration
-from calibrate.files.verification import note_installed
+from calibrate.files.versions import note_installed
 note_installed(Path(sys.argv[2]), read_calibration(Path(sys.argv[1])).verification)
 """
 TOUCH = Touch(

@@ -21,15 +21,14 @@ from hypothesis import strategies as st
 from calibrate import load_installed, watch
 from calibrate.errors import CalibrationFileError, InstallError
 from calibrate.files import hooks
-from calibrate.files.calibration import Touch
+from calibrate.files.folders import cameras
 from calibrate.files.hooks import HookRun
 from calibrate.files.install import install, installed_calibration, note_check, rollback, set_validity
 from calibrate.files.lines import read_lines
-from calibrate.files.loader import cameras
 from calibrate.files.proof import canonical_json
+from calibrate.files.touch import Touch
 from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState
-from calibrate.files.verification import note_installed
-from calibrate.files.versions import installed_versions
+from calibrate.files.versions import installed_versions, note_installed
 from tests.calibrate.calling import raises_code
 
 MakeFile = Callable[..., Path]

@@ -17,7 +17,7 @@ from calibrate.files.install import change_text, install, installed_calibration,
 from calibrate.files.lines import append_line
 from calibrate.files.versions import installed_versions, read_log
 from calibrate.geometry import Transform, perturb
-from calibrate.pipeline import SolvedRecording
+from calibrate.job import SolvedRecording
 from recordings.files import write_atomically
 from tests.calibrate.calling import raises_code
 from tests.durability import disk_order
@@ -164,7 +164,7 @@ def test_another_mount_does_not_follow(make_file, tmp_path: Path) -> None:  # ty
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can be two operators")
 def test_two_operators_of_a_group_share_a_folder(make_file) -> None:  # type: ignore[no-untyped-def]
-    """As /var/lib/station/calibrations: setgid, the group may write."""
+    """A folder like /var/lib/station/calibrations: setgid, the group may write."""
     with tempfile.TemporaryDirectory() as place:  # pytest's own folders are for one user
         Path(place).chmod(0o755)
         shared = Path(place) / "s" / "calibrations"

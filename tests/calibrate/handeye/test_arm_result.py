@@ -116,7 +116,7 @@ def test_a_good_arm_is_offered_nothing() -> None:
 
 def test_a_table_that_fails_elsewhere_is_not_offered(worn: Worn, monkeypatch: pytest.MonkeyPatch) -> None:
     worse = np.tile([[1e-3], [2e-3]], (1, 25))
-    monkeypatch.setattr("calibrate.handeye.arm_result.held_out_elsewhere", lambda fit, joints: worse)
+    monkeypatch.setattr("calibrate.handeye.solve.held_out_elsewhere", lambda fit, joints: worse)
     assert table_of(solve_views(worn.views, SolveOptions(holdout=False))).refused == "not-better"
 
 

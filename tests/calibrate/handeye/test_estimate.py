@@ -89,7 +89,7 @@ def test_the_region_holds_the_truth_with_a_lens_of_the_same_pictures():
 
 
 def test_smooth_corner_errors_are_in_the_claim():
-    """What iid noise would call certain: errors that vary slowly over each picture of the board."""
+    """Errors that vary slowly over each picture of the board; independent noise would call them certain."""
     held = 0
     for seed in range(10):
         rng = np.random.default_rng([3, seed])

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import perturb
+from calibrate.handeye.cell_state import CellState, Layout, flange_residuals
 from calibrate.handeye.corners import corner_residuals
 from calibrate.handeye.linear import Linear, Scales, first_scales
-from calibrate.handeye.observations import CellState, Layout, flange_residuals, observe_views
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
+from calibrate.views import observe_views
 from tests.calibrate.cells import LENSES, MID, CellNoise, changed, make_cell, real_cell
 
 ONE_CLASS = np.array([1.0, 1e-300, 1e-300, 1e-300])

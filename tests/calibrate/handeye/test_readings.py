@@ -148,7 +148,6 @@ def test_every_misread_recording_is_recognised_with_its_numbers(reading, mount):
     assert (found.reading, found.at) == (reading, at)
     assert found.factor == pytest.approx(factor, rel=0.01)
     assert found.log_evidence_gain > 10
-    assert found.share > 0.6
 
 
 @pytest.mark.parametrize(
@@ -189,7 +188,6 @@ def test_a_sound_recording_is_what_it_says(mount):
     for seed, noise in enumerate((LOW, MID, HIGH)):
         found = explained(cell(mount, seed, 12 + 4 * seed, noise).views)
         assert (found.reading, found.at, found.factor) == (Reading.AS_RECORDED, 0, 1.0)
-        assert found.share > 0.7
 
 
 def test_two_bad_views_hide_no_convention():
@@ -198,7 +196,6 @@ def test_two_bad_views_hide_no_convention():
     flange[[0, 1, 5]] = flange[[5, 2, 0]]
     found = explained(with_flange(views, flange))
     assert found.reading is Reading.QUATERNION_ORDER
-    assert 0.7 < found.share < 1.0
 
 
 @pytest.mark.parametrize("shift", [-3, -1, 2])

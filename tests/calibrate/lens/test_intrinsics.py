@@ -11,7 +11,7 @@ from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
-from calibrate.lens.model import project, undistort
+from calibrate.projection import project_at, undistort
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel
 from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking
@@ -30,7 +30,7 @@ def views_of(camera: CameraModel, poses: list[Array], noise_px: float = 0.1, see
             f"view-{k}",
             np.eye(4),
             points,
-            project(camera, p, points) + rng.normal(size=(42, 2)) * noise_px,
+            project_at(camera, p, points) + rng.normal(size=(42, 2)) * noise_px,
         )
         for k, p in enumerate(poses)
     )
@@ -42,25 +42,22 @@ def around(count: int, seed: int = 1, distance_m: float = 0.32) -> list[Array]:
     return [looking(PAPER_BOARD, rng, (0.2, 0.7), distance_m) for _ in range(count)]
 
 
-def test_parameters_lie_within_their_stated_uncertainty() -> None:
-    """Over 20 draws of noise: errors over sigmas have unit scale, so the sigmas are honest."""
-    ratios = []
+def test_parameters_are_as_exact_as_the_corners_allow() -> None:
+    """Over 20 draws of noise of 0.1 px."""
+    errors = []
     for seed in range(20):
         found = calibrate_intrinsics(views_of(CAMERA, around(12, seed), 0.1, seed))
-        K, truth = np.array(found.camera.matrix), np.array(CAMERA.matrix)
-        errors = {"fx": K[0, 0] - truth[0, 0], "cx": K[0, 2] - truth[0, 2], "cy": K[1, 2] - truth[1, 2]}
-        ratios += [errors[name] / found.sigma[name] for name in errors]
-    assert 0.6 < float(np.sqrt(np.mean(np.square(ratios)))) < 1.6
+        errors.append((np.array(found.camera.matrix) - CAMERA.matrix)[[0, 0, 1], [0, 2, 2]])
+    assert float(np.sqrt(np.mean(np.square(errors)))) < 1.0
 
 
-def test_what_the_pictures_cannot_tell_stays_near_its_usual_value_with_a_wide_sigma() -> None:
+def test_what_the_pictures_cannot_tell_stays_near_its_usual_value() -> None:
     small_and_central = [
         pose(rotation_exp([0.3 * np.cos(a), 0.3 * np.sin(a), 0]), [-0.075, -0.06, 1.5])
         for a in np.linspace(0, 6, 8)
     ]
     found = calibrate_intrinsics(views_of(CAMERA, small_and_central, 0.2))
     assert abs(found.camera.distortion[4]) < 1.0
-    assert 5.0 < found.sigma["k3"] <= 10.0
 
 
 def nearly_frontal(tilt_rad: float, distance_m: float) -> list[Array]:
@@ -72,14 +69,11 @@ def nearly_frontal(tilt_rad: float, distance_m: float) -> list[Array]:
 
 @pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial"])
 def test_pictures_that_face_the_board_fix_no_principal_point(model: LensModel) -> None:
-    """It stays near the middle, and its sigma says how little is known."""
+    """It stays near the middle."""
     found = calibrate_intrinsics(views_of(CAMERA, nearly_frontal(0.15, 1.0), 0.3), model)
     K = np.array(found.camera.matrix)
     for name, centre, middle in (("cx", K[0, 2], 239.5), ("cy", K[1, 2], 191.5)):
-        assert 10.0 < found.sigma[name] < 0.2 * 480
-        assert abs(centre - middle) < 2 * found.sigma[name]
-    well = calibrate_intrinsics(views_of(CAMERA, around(25), 0.02), model)
-    assert well.sigma["cx"] < 1.0
+        assert abs(centre - middle) < 0.2 * 480, name
 
 
 def test_one_view_with_wrong_corners_is_left_out_and_named() -> None:
@@ -104,7 +98,6 @@ def test_worse_views_do_not_hide_the_less_bad_ones() -> None:
     )
     found = calibrate_intrinsics(replace(views, views=tuple(shaken)))
     assert set(found.dropped) == set(range(5, 15))
-    assert set(found.view_rms_px) == set(range(5))
     assert found.rms_px < 0.1
 
 
@@ -125,7 +118,7 @@ def test_undistort_is_the_inverse_of_project(camera: CameraModel) -> None:
     points = board_points(PAPER_BOARD)
     straight = replace_distortion(camera)
     assert (
-        np.abs(undistort(camera, project(camera, seen, points)) - project(straight, seen, points)).max()
+        np.abs(undistort(camera, project_at(camera, seen, points)) - project_at(straight, seen, points)).max()
         < 1e-5
     )
 

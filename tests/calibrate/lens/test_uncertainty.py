@@ -6,10 +6,10 @@ import numpy as np
 
 from benchmarks.scene import CellNoise, make_cell, zhang
 from calibrate.geometry import Array, rotation_exp
-from calibrate.lens.intrinsics import fit_lens
-from calibrate.lens.model import undistort
+from calibrate.handeye.corners import linearise_corners
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
-from calibrate.projection import camera_matrix, project_pixels
+from calibrate.projection import camera_matrix, project_pixels, undistort
+from calibrate.views import observe_views
 from recordings.schema.messages import CameraModel
 
 PLACES = np.array([[640.0, 512.0], [0.0, 0.0], [1279.0, 0.0], [1279.0, 1023.0], [320.0, 768.0]])
@@ -48,7 +48,10 @@ def test_it_is_the_scatter_of_repeated_calibrations() -> None:
         found = zhang(board, exact + rng.normal(size=exact.shape) * noise, cell.camera)
         shifts.append(shift_after_best_turn(cell.camera, found, exact.reshape(-1, 2), PLACES))
     scatter = np.sqrt(np.square(shifts).sum(axis=-1).mean(axis=0))
-    covariance = fit_lens(cell.views, cell.camera).covariance
+    observed = observe_views(cell.views)
+    blocks = linearise_corners(observed, cell.camera, cell.C, observed.present, with_lens=True)
+    by_pose = np.swapaxes(blocks.LG, 1, 2) @ np.linalg.inv(blocks.LL) @ blocks.LG
+    covariance = noise**2 * np.linalg.inv((blocks.GG - by_pose).sum(axis=0))
     stated = lens_uncertainty(cell.camera, covariance, exact.reshape(-1, 2))
     columns = np.linspace(0, 1279, stated.sigma_px.shape[1])
     lines = np.linspace(0, 1023, stated.sigma_px.shape[0])
@@ -64,7 +67,7 @@ def test_the_figures_are_those_of_the_middle_the_worst_corner_and_the_worst_plac
     for row, column in ((0, 0), (0, 4), (2, 0), (2, 4)):
         grid = np.array([[4.0, 2, 1, 2, 4], [2, 9, 0.5, 2, 2], [4, 2, 1, 2, 4]])
         grid[row, column] = 5.0
-        figures = LensUncertainty(camera, np.zeros((9, 9)), grid).figures
+        figures = LensUncertainty(camera, grid).figures
         assert figures == {"centre": 0.5, "corner": 5.0, "worst": 9.0}
 
 

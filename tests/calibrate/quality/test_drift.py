@@ -15,10 +15,10 @@ from calibrate.cli.drift_check import check_text
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.files.calibration import FramePose
 from calibrate.geometry import Array, Transform, inverse, perturb, pose, rotation_exp
+from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, forward
-from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
-from calibrate.pipeline import SolvedRecording
+from calibrate.projection import project_at
 from calibrate.quality.checks import CheckEntry, append_check, earlier_results, find_trend, read_checks
 from calibrate.quality.drift import POWER, DriftCheck, Noise, check_drift, judge_shift, pnp_covariance, powers
 from calibrate.views import BoardView, ViewSet
@@ -40,7 +40,9 @@ def few_views(rng: np.random.Generator, X: Array, count: int = 5, mount: Mount =
         seen = looking(PAPER_BOARD, rng, (0.25, 0.6), 0.45, 1.2)
         flange = BOARD @ inverse(X @ seen) if mount == "eye-in-hand" else X @ seen @ inverse(BOARD)
         error = np.r_[rng.normal(size=3) * NOISE.robot_m, rng.normal(size=3) * NOISE.robot_rad]
-        pixels = project(CAMERA, seen, board_points(PAPER_BOARD)) + rng.normal(size=(42, 2)) * NOISE.corner_px
+        pixels = (
+            project_at(CAMERA, seen, board_points(PAPER_BOARD)) + rng.normal(size=(42, 2)) * NOISE.corner_px
+        )
         found.append(BoardView(k, str(k), perturb(flange, error), board_points(PAPER_BOARD), pixels))
     return solve_pnp(ViewSet(mount, tuple(found), CAMERA))
 
@@ -48,7 +50,7 @@ def few_views(rng: np.random.Generator, X: Array, count: int = 5, mount: Mount =
 def checks(
     count: int, shift_m: float, shift_rad: float, seed: int, mount: Mount = "eye-in-hand"
 ) -> list[DriftCheck]:
-    """As after an installation with its own error, and a shift in a random direction since."""
+    """Views after an installation with its own error, and a shift in a random direction since."""
     rng = np.random.default_rng(seed)
     root = np.linalg.cholesky(INSTALLED_COVARIANCE)
     found = []
@@ -212,7 +214,7 @@ def test_the_pose_covariance_is_that_of_many_repetitions() -> None:
     rng = np.random.default_rng(9)
     seen = looking(PAPER_BOARD, rng, (0.4, 0.41), 0.45)
     points = board_points(PAPER_BOARD)
-    exact = project(CAMERA, seen, points)
+    exact = project_at(CAMERA, seen, points)
     errors = []
     for _ in range(300):
         view = BoardView(0, "", np.eye(4), points, exact + rng.normal(size=exact.shape) * 0.1)

@@ -21,7 +21,7 @@ from calibrate.handeye.solution import (
     Remark,
     Solution,
 )
-from calibrate.pipeline import SolvedRecording
+from calibrate.job import SolvedRecording
 from calibrate.quality.gates import GateInputs, GateLimits, judge, read_limits
 from calibrate.results import HoldoutScore
 from tests.calibrate.calling import raises_code
@@ -46,7 +46,7 @@ def solution(solved_real: SolvedRecording) -> Solution:
         noise=noise,
         weights=dict.fromkeys(found.used, 1.0),
         session=Explanation(Reading.AS_RECORDED, 0.0),
-        cross_validation=CrossValidation(0.0005, 0.001, 0.0004, 1.5, 5, {}),
+        cross_validation=CrossValidation(0.0005, 0.001, 0.0004, 1.5, 5),
         lens_finding=Finding(2.0, 0.0001),
         board_finding=Finding(2.0, 0.0001),
         predicted_error_m=0.0005,

@@ -25,9 +25,9 @@ from calibrate.quality.movement.pictures import (
     CellModel,
     Picture,
     deviations,
-    predicted_board,
 )
 from calibrate.quality.movement.window import KEPT, LEARNING, RunningSums
+from calibrate.views import board_in_camera
 from recordings.schema.messages import Mount
 
 MOUNTS: tuple[Mount, Mount] = ("eye-in-hand", "eye-to-hand")
@@ -172,7 +172,7 @@ def test_effects_are_the_derivatives_of_the_picture(mount: Mount) -> None:
     P[:3, 3] += [0.1, 0.0, 0.6] if mount == "eye-in-hand" else [0.0, 0.0, 0.1]
 
     def seen(cell: CellModel, tag: Array) -> list[Picture]:
-        C = predicted_board(cell, np.array([p.base_from_flange for p in pictures]), tag)
+        C = board_in_camera(cell.mount, np.array([p.base_from_flange for p in pictures]), cell.X, tag)
         points = np.array([p.points for p in pictures])
         pixels = project_pixels(cell.camera, transform_points(C, points))
         return [replace(p, pixels=pixels[k]) for k, p in enumerate(pictures)]

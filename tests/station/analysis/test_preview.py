@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recordings.schema.messages import Image, Stamps
-from station.analysis.preview import JPEG_LIMIT_BYTES, preview_image
+from station.analysis.worker import JPEG_LIMIT_BYTES, preview_image
 
 NONE = np.zeros((0, 2))
 

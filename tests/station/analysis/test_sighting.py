@@ -9,7 +9,8 @@ import pytest
 
 import recordings
 from recordings.reader import open_recording
-from station.analysis.worker import seen_before, sight
+from station.analysis.estimation import seen_before
+from station.analysis.worker import sight
 from station.cell.config import PAPER_BOARD
 from station.simulation.placement import seen_from
 from station.simulation.renderer import Light, render, scaled

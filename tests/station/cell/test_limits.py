@@ -8,13 +8,11 @@ import pytest
 
 from calibrate.geometry import rotation_exp
 from calibrate.kinematics import MODELS, forward
-from station.cell.collision import CellGeometry, margins, moving_points, plate
-from station.cell.config import Capsule, LimitsConfig, Plane
+from station.cell.collision import SPACING_M, CellGeometry, margins, moving_points, plate
+from station.cell.config import SPEED_CAP_M_S, Capsule, LimitsConfig, Plane
 from station.cell.limits import (
     JOINT_ACCELERATION_CAP_RAD_S2,
     JOINT_SPEED_CAP_RAD_S,
-    SPACING_M,
-    SPEED_CAP_M_S,
     check_path,
     check_plan,
     leaving,

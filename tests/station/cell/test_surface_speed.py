@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from calibrate.kinematics import MODELS
 from station.cell.collision import ARM_BODIES, CellGeometry, body_segments
-from station.cell.config import Capsule, LimitsConfig
-from station.cell.limits import SPEED_CAP_M_S, check_plan, point_speed_m_s
+from station.cell.config import SPEED_CAP_M_S, Capsule, LimitsConfig
+from station.cell.limits import check_plan, point_speed_m_s
 from station.cell.plan import Plan, PlannedPose
 from station.simulation.controller.kinematics import TABLES, ArmGeometry
 

@@ -156,7 +156,6 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
     ("args", "exit_code", "code"),
     [
         (("serve",), 2, "usage"),
-        (("serve", "--simulate", "--scene", "moon"), 2, "usage"),
         (("serve", "--config", "absent.yaml"), 2, "unreadable-config"),
         (("status", "--socket", "/nowhere/s"), 1, "no-daemon"),
         (("capture",), 2, "usage"),
@@ -174,7 +173,9 @@ def test_what_a_person_can_cause_has_a_code(args: tuple[str, ...], exit_code: in
     assert (problem.value.exit_code, problem.value.code) == (exit_code, code)
 
 
-@pytest.mark.parametrize("args", [("dance",), ("retake", "0"), ("capture", "--frobnicate")])
+@pytest.mark.parametrize(
+    "args", [("dance",), ("retake", "0"), ("capture", "--frobnicate"), ("demo", "--scene", "moon")]
+)
 def test_wrong_usage_ends_with_2_and_nothing_on_stdout(args: tuple[str, ...]) -> None:
     done = call(main, *args)
     assert (done.returncode, done.stdout) == (2, "") and done.stderr

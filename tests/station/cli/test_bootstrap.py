@@ -43,7 +43,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def socket(root: Path) -> Iterator[Path]:
-    """Of a simulated daemon, faster than real time."""
+    """Socket of a simulated daemon, faster than real time."""
     with simulated_daemon(root, ["--seed", str(SEED), "--time-scale", "4"]) as socket:
         yield socket
 

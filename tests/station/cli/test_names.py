@@ -15,9 +15,7 @@ from station.cell.status import Event, MotionPreview, PoseStatus, SessionStatus,
 from station.cli import control as cli_control
 from station.cli import main
 from station.cli import session as cli_session
-from station.cli.attended import ask_person
-from station.cli.progress import SessionProgress
-from station.operate.motion import SessionOutcome
+from station.cli.attended import SessionProgress, ask_person
 from station.plan.files import save_plan
 from station.protocol.verbs import Check
 from station.simulation.scenes import cell_config, make_cell
@@ -92,7 +90,7 @@ def test_a_question(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
 def test_how_a_session_ended(recording: str, capsys: pytest.CaptureFixture[str]) -> None:
     status = StationStatus(reason=ALL, session=SessionStatus(recording=recording))
     with pytest.raises(typer.Exit):
-        cli_session._finish(SessionOutcome(status), as_json=False)
+        cli_session._finish(status, as_json=False)
     assert ALL in "".join(capsys.readouterr())
 
 

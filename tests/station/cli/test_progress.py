@@ -7,7 +7,7 @@ import io
 from rich.console import Console
 
 from station.cell.status import Event, StationStatus
-from station.cli.progress import SessionProgress
+from station.cli.attended import SessionProgress
 
 
 def test_what_happened_before_the_session_is_not_said_again():

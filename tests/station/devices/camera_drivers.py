@@ -19,7 +19,7 @@ from station.cell.config import CameraConfig, TriggerConfig
 from station.devices import webcam
 from station.devices.aravis import AravisCamera
 from station.devices.base import Camera, Trigger
-from station.devices.playback import PlaybackCamera
+from station.devices.playback import PlaybackCamera, PlaybackRobot
 from station.devices.serial_trigger import SerialTrigger
 from station.devices.webcam import WebcamCamera
 from station.simulation.camera import RenderedCamera
@@ -27,6 +27,7 @@ from station.simulation.launch import SimulatedController
 from station.simulation.scenes import make_cell
 from station.simulation.trigger import SimulatedTriggerBox
 from tests.gige_vision.camera import EmulatedCamera
+from tests.station.devices.test_playback import record
 
 SIZE = (320, 240)
 VideoCapture = cv2.VideoCapture
@@ -66,9 +67,7 @@ def rendered(request: pytest.FixtureRequest) -> Driver:
 
 def playback(request: pytest.FixtureRequest) -> Driver:
     folder: Path = request.getfixturevalue("tmp_path")
-    for number in range(20):
-        cv2.imwrite(str(folder / f"{number:02}.png"), np.full(SIZE[::-1], 10 * number, np.uint8))
-    return Driver(PlaybackCamera(CameraConfig(driver="playback", device=str(folder))))
+    return Driver(PlaybackCamera(PlaybackRobot(record(folder / "session.mcap", joints=True))))
 
 
 def aravis(request: pytest.FixtureRequest) -> Driver:

@@ -54,7 +54,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def shown_ns(device: Any, camera: Clockwork) -> list[int]:
-    """What the clock was told, one latch."""
+    """Result of one latch of the clock."""
     device._camera = camera
     clock = DeviceClock()
     device.latch(clock)
@@ -107,7 +107,7 @@ class Box:
 
     async def fire(self) -> TriggerPulse:
         self.fired += 1
-        return TriggerPulse(self.fired, 0, 0)
+        return TriggerPulse(self.fired, 0)
 
 
 def opened(device: Device, config: CameraConfig, trigger: Any = None) -> AravisCamera:

@@ -28,7 +28,7 @@ LATE_S = 0.3
 
 @pytest.fixture(scope="module")
 def arm(request: pytest.FixtureRequest) -> Iterator[SimulatedController]:
-    """What a rendered camera looks from; in the network of the others, where there is one."""
+    """Controller that a rendered camera looks from; in the network of the others, where there is one."""
     with suppress(pytest.skip.Exception):
         request.getfixturevalue("lonely_network")
     with start_controller() as running:

@@ -87,7 +87,7 @@ def test_a_sweep_corrects_the_source_that_it_measured_and_no_other() -> None:
 
 def test_without_a_clock_the_pulse_of_the_trigger_box_tells_and_a_sweep_narrows_it() -> None:
     """The box fired at 501.000 s ± 1 ms, the camera waits 2 ms, exposes 20 ms and reads out for 13 ms."""
-    pulse = TriggerPulse(1, 0, 501_000 * MS, 0.001)
+    pulse = TriggerPulse(1, 501_000 * MS, 0.001)
     rough = FrameClock(trigger_delay_us=2000.0).timed(frame(0, 501_035), asked_ns=500_999 * MS, pulse=pulse)
     assert rough.time == FrameTime(501_012 * MS, pytest.approx(0.014), "trigger"), "it may wait 13 ms more"
     measured = TimeCorrection(0.0004, 0.0001, "trigger")

@@ -1,4 +1,4 @@
-"""A folder, a video or a recording plays as a camera; a recording also as the robot that was there."""
+"""A recording plays as the camera and the robot that were there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -23,7 +22,7 @@ from recordings.schema.messages import (
     View,
 )
 from recordings.writer import RecordingWriter
-from station.cell.config import PAPER_BOARD, CameraConfig
+from station.cell.config import PAPER_BOARD
 from station.cell.errors import StaleStateError
 from station.devices.playback import PlaybackCamera, PlaybackRobot
 from tests.codes import raises
@@ -34,18 +33,6 @@ TCP = (0.0, 0.0, 0.1, 0.0, 0.0, 0.3)
 
 def image(number: int) -> np.ndarray:
     return np.full((24, 32), 40 + 10 * number, np.uint8)
-
-
-def config(path: Path, pace: float = 0.0) -> CameraConfig:
-    return CameraConfig(driver="playback", device=str(path), playback_pace=pace)
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    for number in range(3):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), image(number))
-    (tmp_path / "notes.txt").write_text("not a picture")
-    return tmp_path
 
 
 @pytest.fixture
@@ -75,83 +62,25 @@ def record(path: Path, *, joints: bool, cut: int | None = None) -> Path:
     return writer.finish()
 
 
-async def played(path: Path, pace: float = 0.0) -> list[Image]:
-    camera = PlaybackCamera(config(path, pace))
-    await camera.open()
-    pictures = [await camera.capture() for _ in range(3)]
-    with raises("played-out"):
-        await camera.capture()
-    await camera.close()
-    return pictures
-
-
-async def test_a_folder_plays_in_the_order_of_its_names(folder: Path) -> None:
-    pictures = await played(folder)
-    assert all(np.array_equal(p.pixels, image(i)) for i, p in enumerate(pictures))
-    assert [p.sequence for p in pictures] == [0, 1, 2] and [p.frame_id for p in pictures] == [1, 2, 3]
-    assert all(p.pixel_format == "Mono8" for p in pictures)
-    assert pictures[0].stamps.host_monotonic_ns < pictures[2].stamps.host_monotonic_ns
-
-
-async def test_a_video_plays_every_frame(tmp_path: Path) -> None:
-    path = tmp_path / "film.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (32, 24))
-    for number in range(3):
-        writer.write(cv2.cvtColor(image(number), cv2.COLOR_GRAY2BGR))
-    writer.release()
-    pictures = await played(path)
-    assert [round(float(p.pixels.mean()), -1) for p in pictures] == [40, 50, 60]
-    assert pictures[0].pixels.shape == (24, 32, 3) and pictures[0].pixel_format == "BGR8"
-
-
-async def test_a_recording_plays_its_views_and_keeps_the_cameras_name(recording: Path) -> None:
-    pictures = await played(recording)
-    assert all(np.array_equal(p.pixels, image(i)) for i, p in enumerate(pictures))
-    camera = PlaybackCamera(config(recording))
-    identity = await camera.open()
-    assert (identity.model, identity.serial, identity.driver) == ("MER-131-75GM", "KJ1", "playback")
-
-
-async def test_its_own_pace_is_kept_and_a_faster_one_is_faster(recording: Path) -> None:
-    start_s = time.monotonic()
-    await played(recording, pace=1.0)
-    own_s = time.monotonic() - start_s
-    await played(recording, pace=8.0)
-    faster_s = time.monotonic() - start_s - own_s
-    assert own_s >= 0.4 and faster_s < own_s - 0.2
-
-
-async def test_a_picture_that_is_not_due_in_time_is_refused(folder: Path) -> None:
-    camera = PlaybackCamera(config(folder, pace=0.01))
-    await camera.open()
-    await camera.capture()
-    with raises("no-image"):
-        await camera.capture(timeout_s=0.05)
-
-
-async def test_what_cannot_be_played_is_named(tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "bad" / "0.png").write_bytes(b"no picture")
-    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n")
-    for name, code in (
-        ("none", "nothing-to-play"),
-        ("empty", "nothing-to-play"),
-        ("cut.mcap", "unreadable-recording"),
-    ):
-        with raises(code):
-            await PlaybackCamera(config(tmp_path / name)).open()
-    camera = PlaybackCamera(config(tmp_path / "bad"))
+async def test_the_camera_keeps_its_name_and_is_marked_as_played(recording: Path) -> None:
+    camera = PlaybackCamera(PlaybackRobot(recording))
     with raises("not-open"):
         await camera.capture()
-    await camera.open()
-    with raises("unreadable-image"):
-        await camera.capture()
+    identity = await camera.open()
+    assert (identity.model, identity.serial, identity.driver) == ("MER-131-75GM", "KJ1", "playback")
+    assert await camera.settings() == {"device": str(recording)}
+
+
+def test_what_cannot_be_played_is_named(tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n")
+    for name in ("none.mcap", "cut.mcap"):
+        with raises("unreadable-recording"):
+            PlaybackRobot(tmp_path / name)
 
 
 async def test_robot_and_camera_stand_where_the_recorded_ones_stood(recording: Path) -> None:
     robot = PlaybackRobot(recording)
-    camera = PlaybackCamera(config(recording), robot)
+    camera = PlaybackCamera(robot)
     await robot.connect()
     await camera.open()
     await robot.start_control()
@@ -170,7 +99,7 @@ async def test_robot_and_camera_stand_where_the_recorded_ones_stood(recording: P
 
 async def test_a_recorded_picture_that_cannot_be_decoded_is_the_cameras_error(tmp_path: Path) -> None:
     robot = PlaybackRobot(record(tmp_path / "a.mcap", joints=True, cut=1))
-    camera = PlaybackCamera(config(tmp_path / "a.mcap"), robot)
+    camera = PlaybackCamera(robot)
     await robot.connect()
     await camera.open()
     await robot.start_control()
@@ -215,8 +144,3 @@ async def test_states_are_published_and_stop_halts_a_move(recording: Path) -> No
 def test_a_recording_without_joints_plays_as_a_camera_only(tmp_path: Path) -> None:
     with raises("no-joints"):
         PlaybackRobot(record(tmp_path / "imported.mcap", joints=False))
-
-
-async def test_what_is_played_is_in_the_settings(folder: Path) -> None:
-    settings = await PlaybackCamera(config(folder, pace=2.0)).settings()
-    assert settings == {"device": str(folder), "pace": 2.0}

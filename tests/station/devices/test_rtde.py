@@ -82,19 +82,15 @@ def test_recipes_round_trip(types: list[str], data: st.DataObject) -> None:
         "I": st.integers(0, 2**32 - 1), "Q": st.integers(0, 2**64 - 1),
         "i": st.integers(-(2**31), 2**31 - 1), "d": st.floats(allow_nan=False),
     }  # fmt: skip
-    values, elements = {}, []
-    for i, name in enumerate(types):
-        kind = DATA_TYPES[name]
-        drawn = [data.draw(strategies[kind.code]) for _ in range(kind.count)]
-        values[f"v{i}"] = drawn[0] if kind.count == 1 else tuple(drawn)
-        elements += drawn
-    recipe = Recipe(1, tuple(values), tuple(types))
-    assert recipe.unpack(recipe.pack(elements)[3:]) == values
+    kinds = [DATA_TYPES[name] for name in types]
+    elements = [data.draw(strategies[kind.code]) for kind in kinds for _ in range(kind.count)]
+    recipe = Recipe(1, tuple(f"v{i}" for i in range(len(types))), tuple(types))
+    assert recipe.unpack_elements(recipe.pack(elements)[3:]) == tuple(elements)
 
 
 def test_a_packet_of_the_wrong_length_is_refused() -> None:
     with raises("rtde-size"):
-        MOVE.unpack(b"\x01\x00")
+        MOVE.unpack_elements(b"\x01\x00")
 
 
 def test_a_refused_variable_is_named() -> None:

@@ -81,7 +81,7 @@ async def test_something_else_on_the_port(serve: Serve, greeting: bytes) -> None
     begun = time.monotonic()
     with pytest.raises(DashboardError):
         await Dashboard.open(host, timeout_s=0.3)
-    assert time.monotonic() - begun < 1.0
+    assert time.monotonic() - begun < 3.0
 
 
 async def test_a_reply_that_is_too_late_breaks_the_connection(serve: Serve) -> None:

@@ -94,7 +94,7 @@ def test_news_that_wait_unread_are_no_matter_of_the_cable(link: Any) -> None:
         assert link.stale(0.2).code == "stale-state"
         robots.send(b"news")
         assert link.stale(0.2).code == "computer-busy"
-        reader.request_end()
+        reader._stop_write.close()
         reader._stop_read.close()
 
 

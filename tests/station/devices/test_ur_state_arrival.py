@@ -24,7 +24,7 @@ class Clocks:
         monkeypatch.setattr(time, "time_ns", lambda: self.now_ns + self.ahead_ns)
 
     def stamp(self) -> list[tuple[int, int, bytes]]:
-        """What the kernel says of bytes that come now."""
+        """Give the stamp of the kernel on bytes that come now."""
         value = ur_state._TIMESPEC.pack(*divmod(self.now_ns + self.ahead_ns, S))
         return [(socket.SOL_SOCKET, ur_state.SO_TIMESTAMPNS, value)]
 
@@ -38,7 +38,7 @@ def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
 def reader(clocks: Clocks) -> Iterator[StateReader]:
     made = StateReader("127.0.0.1", lambda state: None, lambda why: None)
     yield made
-    made.request_end()
+    made._stop_write.close()
     made._stop_read.close()
 
 

@@ -26,7 +26,7 @@ FACTORY = UR10.calibrated(
 
 
 def sample(arm: RobotModel, joints_rad: Vector6, tool: Vector6) -> RobotState:
-    """What a controller with this arm reports."""
+    """Give what a controller with this arm reports."""
     T = forward(arm, joints_rad) @ pose_from_rotvec(tool[:3], tool[3:])
     pose = tuple(np.concatenate([T[:3, 3], rotation_log(T[:3, :3])]).tolist())
     fields = dict.fromkeys(RobotState.__struct_fields__, 0)
@@ -39,7 +39,7 @@ def sample(arm: RobotModel, joints_rad: Vector6, tool: Vector6) -> RobotState:
 
 
 def stated(arm: RobotModel, tool: Vector6) -> Installation:
-    return Installation(tool, (arm.theta_offset_rad, arm.a_m, arm.d_m, arm.alpha_rad))  # type: ignore[arg-type]
+    return Installation(tool, (arm.theta_rad, arm.a_m, arm.d_m, arm.alpha_rad))  # type: ignore[arg-type]
 
 
 def test_the_controllers_words_are_taken_when_they_fit() -> None:
@@ -52,7 +52,7 @@ def test_the_factory_calibration_is_told_where_it_explains_the_poses() -> None:
     own = FACTORY
     told = TcpCheck(UR10, False, sample(own, HERE, TOOL), stated(own, TOOL)).kinematics
     assert told is not None and (told.model, told.source) == ("UR10", "controller")
-    assert told.a_m == own.a_m and told.theta_rad == own.theta_offset_rad
+    assert told.a_m == own.a_m and told.theta_rad == own.theta_rad
     # Stated untruly: the poses follow another table than the one on the wire.
     far = UR10.calibrated(a_m=(0.0, 0.003, 0.0, 0.0, 0.0, 0.0))
     assert TcpCheck(UR10, False, sample(far, HERE, TOOL), stated(UR10, TOOL)).kinematics is None
@@ -129,8 +129,8 @@ def state_of(made: SimulatedRobot) -> bytes:
 
 
 def test_the_controllers_statements_are_understood() -> None:
-    factory = ((0.0, 1e-4, 0.0, 0.0, 0.0, 0.0), *((0.0,) * 6,) * 3)
-    made = SimulatedRobot(Settings(model="UR10", factory=factory), Journal())
+    factory = (0.0, 1e-4, 0.0, 0.0, 0.0, 0.0)
+    made = SimulatedRobot(Settings(model="UR10", factory_a_m=factory), Journal())
     made.tcp = TOOL
     said = read_state(state_of(made))
     table = made.stated_table

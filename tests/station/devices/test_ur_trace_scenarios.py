@@ -11,14 +11,15 @@ import pytest
 
 from station.cell.errors import RefusedError
 from station.cli import trace as command
-from station.devices.ur_trace_scenarios import ScenarioRecorder, scenarios
-from station.devices.ur_traces import (
+from station.devices.ur_trace_scenarios import (
     SHIPPED,
+    ScenarioRecorder,
     ScenarioTrace,
     TraceFile,
     compare,
     figures,
     read_traces,
+    scenarios,
     write_traces,
 )
 from station.simulation.launch import start_controller

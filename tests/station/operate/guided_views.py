@@ -39,7 +39,7 @@ def guided_joints(truth: CellTruth) -> list[Array]:
 
 
 def seen_by_hand(truth: CellTruth, joints: Array, noise_px: float = 0.1, seed: int = 0) -> GuidedView:
-    """What the true camera sees from there."""
+    """Give what the true camera sees from there."""
     rng = np.random.default_rng(seed)
     flange = forward(MODELS[truth.robot_model], joints)
     X, Y = np.array(truth.camera_mount), np.array(truth.board_place)

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import ArmSubject, Figure, StopTestOffer, StopWay
+from station.cell.acceptance import STOP_GIVEN, STOP_TESTED, ArmSubject, Figure, StopTestOffer, StopWay
 from station.cell.errors import StationError
 from station.cell.status import Event, MotionPreview, StationState, StationStatus
 from station.operate import acceptance
-from station.operate.acceptance import STOP_GIVEN, STOP_TESTED, AcceptanceTest, JudgedStop
+from station.operate.acceptance import AcceptanceTest, JudgedStop
 from station.protocol.verbs import Go, StopTest, Verb
 
 SUBJECT = ArmSubject("real", "UR10e", "1", "5.11", (), "ur_rtde")
@@ -49,8 +49,6 @@ class Daemon:
         events = {GIVEN: (given, tested), UNBEGUN: ()}.get(end, (tested,))
         state = StationState.STOPPED if end == HELD else StationState.IDLE
         yield StationStatus(state=state, events=events)
-
-    def outdate(self) -> None: ...
 
 
 class Hands:
@@ -92,7 +90,7 @@ class Nothing:
 
 @pytest.fixture(autouse=True)
 def verdicts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What the judge says: anything in it is bad."""
+    """Findings of the judge: any is bad."""
     bad: list[str] = []
 
     async def at_once(*_: object) -> None: ...

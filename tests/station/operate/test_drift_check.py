@@ -44,9 +44,6 @@ class FakeLink:
         for status in self._told:
             yield status
 
-    def outdate(self) -> None:
-        pass
-
 
 class Person:
     def __init__(self, yes: bool = True) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from calibrate.files.calibration import Calibration, RejectedView, Touch
+from calibrate.files.calibration import Calibration, RejectedView
 from calibrate.files.gate import Gate
+from calibrate.files.touch import Touch
 from calibrate.quality.checks import CheckEntry
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.status import PoseStatus, SessionStatus

@@ -12,8 +12,8 @@ from station.operate.touch_test import (
     Hovering,
     read_offset_mm,
     tip_on_board_m,
-    told_offset_mm,
     touch_of,
+    touch_told,
     two_lengths_mm,
 )
 
@@ -45,7 +45,7 @@ def test_the_tip_is_found_on_the_board(place: tuple[float, float, float]) -> Non
 def test_a_tip_over_its_corner_has_arrived_and_knows_how_far_beside_it_stands() -> None:
     hovering = Hovering.arrived(OFFER, flange_with_tip_at((0.1004, 0.0497, -0.08)), "")
     assert hovering.beside_mm == pytest.approx([0.4, -0.3])
-    assert told_offset_mm(hovering, np.array([1.0, 1.0])) == pytest.approx([0.6, 1.3])
+    assert touch_told(hovering, "1, 1", None).offset_mm == pytest.approx((0.6, 1.3))
 
 
 @pytest.mark.parametrize("place", [(0.106, 0.05, -0.08), (0.1, 0.044, -0.08), (0.1, 0.05, -0.074)])

@@ -9,8 +9,7 @@ import pytest
 from calibrate.geometry import difference, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
 from station.cell.scene import guess_from
-from station.plan.belief import BootstrapView, believe, improved_config
-from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
+from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, BootstrapView, believe, improved_config, next_move
 from station.plan.planner import make_plan
 from station.plan.visibility import outline, visible
 from station.simulation.scenes import cell_config, make_cell

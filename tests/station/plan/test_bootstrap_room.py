@@ -17,8 +17,7 @@ from station.cell.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, 
 from station.cell.limits import check_path
 from station.cell.scene import geometry_from, geometry_of, guess_from
 from station.plan import bootstrap
-from station.plan.belief import BootstrapView
-from station.plan.bootstrap import as_taught, next_move
+from station.plan.bootstrap import BootstrapView, as_taught, next_move
 from station.plan.visibility import outline
 from tests.codes import raises
 

@@ -73,11 +73,10 @@ def test_the_tip_stands_over_the_true_corner_and_nothing_comes_near(
     reached = 0
     for corner in outer_corners(truth.board)[::2]:
         try:
-            answer = asked(truth, corner, pointer)
+            hover, _, _ = asked(truth, corner, pointer)
         except LimitError:
             continue  # not every corner is within the reach of a long slanting pointer
         reached += 1
-        hover = answer.hover
         flange = forward(MODELS["UR10"], hover.plan.poses[-1].joints_rad)
         tip = board_from_tip(board, flange, pointer)
         away = tip - board_points(truth.board)[corner]
@@ -119,7 +118,7 @@ def test_three_sigma_and_the_arms_own_miss_are_kept_away_from() -> None:
     )
     least_m = 0.05 + 0.005 + 0.005 + 3 * worst_m + 0.004
     near, far = (HoverQuestion(0, least_m + by, POINTER, start, 0.004) for by in (-1e-5, 1e-5))
-    assert answer_hover(config, calibration, view, far).hover.standoff_m == far.standoff_m
+    assert answer_hover(config, calibration, view, far)[0].standoff_m == far.standoff_m
     with raises("standoff-too-small"):
         answer_hover(config, calibration, view, near)
 

@@ -20,7 +20,8 @@ from calibrate.geometry import (
     rotation_exp,
 )
 from calibrate.kinematics import MODELS, forward
-from station.cell.limits import SPEED_CAP_M_S, check_plan
+from station.cell.config import SPEED_CAP_M_S
+from station.cell.limits import check_plan
 from station.cell.scene import cell_geometry, scene_of
 from station.plan import planner
 from station.plan.candidates import NOT_IN_PICTURE, find_candidates
@@ -37,6 +38,10 @@ CELLS = [
     ("paper", "eye-to-hand", 1),
     ("blog", "eye-in-hand", 0),
 ]
+
+
+FEW = PlanOptions(pool=150)
+"""Fewer candidates than usual, for what does not depend on their number."""
 
 
 @cache
@@ -104,7 +109,7 @@ def test_the_board_stays_in_the_picture_along_the_way():
 
 
 def test_an_order_takes_the_way_that_keeps_the_board_in_the_picture(monkeypatch):
-    """Of two equally long ways round, the one that sees the board."""
+    """Two ways round are equally long; one of them sees the board."""
     _, config = cell()
     times = np.array([[0, 1, 1.01], [1, 0, 1], [1.01, 1, 0.0]])
     monkeypatch.setattr(planner, "time_matrix", lambda *_: times)
@@ -138,9 +143,11 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another():
         progress=lambda text, done: told.append(done),
     )
     assert told == sorted(told) and told[-1] == 1.0
-    other = make_plan(config, start_joints_rad=truth.start_joints_rad, seed=2)
     assert again == planned()
-    assert other.poses != again.poses
+    one, two = (
+        plan_scene(scene_of(config), replace(FEW, seed=seed), truth.start_joints_rad).poses for seed in (1, 2)
+    )
+    assert one != two
 
 
 def test_the_choice_beats_random_poses_of_the_same_pool():
@@ -209,7 +216,7 @@ def impossible(name):
 def test_an_impossible_plan_is_explained(name, code, constraint):
     config, start = impossible(name)
     with raises(code, wanted=25) as caught:
-        make_plan(config, start_joints_rad=start)
+        plan_scene(scene_of(config), FEW, start)
     assert constraint is None or caught.value.values["constraints"].startswith(constraint)
     assert caught.value.remedy
 
@@ -218,7 +225,7 @@ def test_a_fixed_camera_that_looks_away_from_the_arm_is_explained():
     truth, config = cell("paper", "eye-to-hand", 1)
     away = moved(config, camera_guess=turned(config.camera_guess, [0, np.pi, 0]))
     with raises("out-of-reach"):
-        make_plan(away, start_joints_rad=truth.start_joints_rad)
+        plan_scene(scene_of(away), FEW, truth.start_joints_rad)
 
 
 def test_what_planning_needs_is_asked_for():
@@ -256,7 +263,7 @@ def test_every_lens_model_can_be_planned_with(kind, distortion):
     truth, config = cell()
     lens = moved(config.camera.model, distortion=distortion, distortion_model=kind)
     other = moved(config, camera=moved(config.camera, model=lens))
-    plan = make_plan(other, start_joints_rad=truth.start_joints_rad, count=6)
+    plan = plan_scene(scene_of(other), replace(FEW, count=6), truth.start_joints_rad)
     assert len(plan.poses) == 6
     assert plan.poses[-1].predicted_sigma_m < 0.01
 
@@ -264,14 +271,14 @@ def test_every_lens_model_can_be_planned_with(kind, distortion):
 def test_a_plan_without_a_start_and_with_few_poses():
     _, config = cell()
     plan = plan_scene(
-        scene_of(config), PlanOptions(count=4, criterion="D", view=replace(ViewRange(), doubt=1.0))
+        scene_of(config), replace(FEW, count=4, criterion="D", view=replace(ViewRange(), doubt=1.0))
     )
     assert len(plan.poses) == 4
     assert check_plan(plan, None, cell_geometry(config)).problems == ()
 
 
 def test_six_poses_for_a_known_lens_tell_more_of_where_the_camera_sits():
-    """As `station check` asks for them: the installed calibration knows the lens."""
+    """A drift check asks for them so: the installed calibration knows the lens."""
     truth, config = cell()
     scene, sigmas_m = scene_of(config), []
     for known in (False, True):

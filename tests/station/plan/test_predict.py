@@ -11,14 +11,13 @@ import pytest
 from calibrate.handeye.arm import PARAMETERS
 from calibrate.handeye.information import MeasurementNoise
 from calibrate.kinematics import forward
-from station.analysis.estimation import next_best_text
 from station.cell.config import CaptureConfig
 from station.cell.limits import check_path
 from station.cell.plan import PlannedPose
 from station.cell.scene import scene_of
 from station.plan.choose import CRITERIA
 from station.plan.planner import make_plan
-from station.plan.predict import advise, forecast_arm, forecast_views, with_forecast
+from station.plan.predict import advise, forecast_arm, forecast_views, next_best_text, with_forecast
 from station.simulation.scenes import cell_config, make_cell
 
 

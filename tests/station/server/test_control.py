@@ -28,7 +28,8 @@ from station.protocol.messages import (
     Reply,
 )
 from station.protocol.verbs import Go
-from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer, Peer
+from station.server.approval import Peer
+from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer
 
 
 class RecordingHandler:
@@ -120,6 +121,25 @@ async def test_watchers_get_everything_once_then_only_changes(server: Served) ->
         control.publish(StationStatus(state=StationState.PAUSED, cell="lab"))
         newest = await anext(statuses)
         assert (newest.state, newest.cell) == (StationState.PAUSED, "lab")
+
+
+async def test_who_was_answered_knows_what_came_of_it(tmp_path: Path) -> None:
+    state = StationState.IDLE
+
+    class Running(RecordingHandler):
+        async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
+            nonlocal state
+            if verb == "skip":
+                state = StationState.CHECKING
+            return await super().handle(peer, verb, {"index": 0})
+
+    control = ControlServer(tmp_path / "s", Running(), lambda: StationStatus(state=state))
+    await control.start()
+    async with await Client.connect(tmp_path / "s") as client:
+        assert (await anext(client.statuses())).state is StationState.IDLE
+        await client.request("skip")
+        assert (await anext(client.statuses())).state is StationState.CHECKING
+    await control.close()
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,8 @@ from station.cell.socket_folder import user_name
 from station.cell.status import StationState
 from station.protocol.client import Client
 from station.server import dispatch
-from station.server.approval import Process, process
-from station.server.control import ControlServer, Peer
+from station.server.approval import Peer, Process, process
+from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
 from tests.codes import raises
 from tests.station.session_rig import POSES, NewRig, Rig

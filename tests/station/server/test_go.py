@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import secrets
+
 import msgspec
 import pytest
 
@@ -33,10 +35,12 @@ def offered(
     desk: ApprovalManager, client_id: int = 1, replanned: PlanRevision | None = None
 ) -> MotionApproval:
     summary = MotionPreview(
-        desk.new_token(), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1"
+        secrets.token_urlsafe(16), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1"
     )
     summary = msgspec.structs.replace(summary, start_joints_rad=HERE)
-    return desk.offer(MotionApproval(summary, client_id, (0, 1, 2, 3), replanned=replanned))
+    desk.offer(MotionApproval(summary, client_id, (0, 1, 2, 3), replanned=replanned))
+    assert desk.waiting is not None
+    return desk.waiting
 
 
 def test_a_go_is_for_one_use() -> None:
@@ -90,8 +94,8 @@ def test_a_newer_go_replaces_the_older_and_void_ends_both() -> None:
     desk = ApprovalManager(Clock())
     old, new = offered(desk), offered(desk)
     assert old.summary.token != new.summary.token
-    assert desk.void()
-    assert not desk.void()
+    desk.void()
+    assert desk.waiting is None
     for go in (old, new):
         with pytest.raises(RefusedError):
             desk.redeem(go.summary.token, 1, PLAN, HERE)

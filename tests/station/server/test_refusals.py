@@ -11,7 +11,7 @@ from station.cell.errors import RefusedError
 from station.cell.plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import VERBS
-from station.server.control import Peer
+from station.server.approval import Peer
 from station.server.dispatch import SessionDispatcher
 from tests.codes import raises
 from tests.station.session_rig import POSES, Rig

@@ -269,7 +269,7 @@ def test_a_fake_daemon_in_a_strangers_folder_is_not_believed(tmp_path: Path) -> 
 
 @ONLY_ROOT
 def test_the_folder_that_root_made_for_the_daemons_account_is_believed(tmp_path: Path) -> None:
-    """As /run/station, which belongs to the user station."""
+    """A folder like /run/station, which belongs to the user station."""
     folder = Path("/run") / f"station-test-{os.getpid()}"
     folder.mkdir(mode=0o755)
     try:

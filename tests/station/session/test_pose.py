@@ -70,7 +70,7 @@ async def test_it_is_the_pose_of_mid_exposure(rig: Rig, monkeypatch: pytest.Monk
 async def test_the_time_bound_is_the_cameras_and_the_robots(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot_clock = ClockFit(0.0, 0.0, 0.0, 0.0, 0.003, 99, 0.001, 60.0)
+    robot_clock = ClockFit(0.0, 0.0, 0.0, 0.0, 0.003, 0.001, 60.0)
     assert robot_clock.bound_s > 0.002
     monkeypatch.setattr(rig.arm, "clock", lambda: robot_clock)
     await rig.give_go()

@@ -31,7 +31,7 @@ async def test_the_recording_keeps_the_arm_s_own_table(rig: Rig, small_plan: Pla
     await rig.until(S.IDLE)
     arm = load_views(sealed(rig), fewest=0).views.arm
     assert arm is not None and arm.name == "UR10"
-    assert (arm.a_m, arm.d_m, arm.alpha_rad, arm.theta_offset_rad) == (
+    assert (arm.a_m, arm.d_m, arm.alpha_rad, arm.theta_rad) == (
         (0.1,) * 6,
         (0.2,) * 6,
         (0.3,) * 6,

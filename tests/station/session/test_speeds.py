@@ -8,7 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from station.cell.limits import SPEED_CAP_M_S, check_path, point_speed_m_s, sample_path, with_plan_speeds
+from station.cell.config import SPEED_CAP_M_S
+from station.cell.limits import check_path, point_speed_m_s, sample_path, with_plan_speeds
 from station.cell.plan import Plan
 from station.cell.scene import geometry_from
 from station.cell.status import StationState as S

@@ -11,11 +11,21 @@ import sys
 import textwrap
 from collections import deque
 from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any
 
 import pytest
 
-from station.devices.rtde import PORT, PacketReader, PacketType, Recipe, join_names, packet, split_names
+from station.devices.rtde import (
+    DATA_TYPES,
+    PORT,
+    PacketReader,
+    PacketType,
+    Recipe,
+    join_names,
+    packet,
+    split_names,
+)
 from station.devices.ur import library_installed
 from station.simulation.controller.programs import Upload
 from station.simulation.controller.robot import SimulatedRobot
@@ -147,7 +157,11 @@ class RtdeClient:
     def sample(self) -> dict[str, Any]:
         kind, payload = self.receive()
         assert kind == PacketType.DATA and self.output is not None
-        return self.output.unpack(payload)
+        recipe, elements = self.output, iter(self.output.unpack_elements(payload))
+        types = dict(zip(recipe.names, recipe.types, strict=True))
+        counts = {name: DATA_TYPES[kind].count for name, kind in types.items()}
+        taken = {name: tuple(islice(elements, count)) for name, count in counts.items()}
+        return {name: found if counts[name] > 1 else found[0] for name, found in taken.items()}
 
     def close(self) -> None:
         self._socket.close()

@@ -223,7 +223,7 @@ def test_a_script_talks_over_a_socket(context) -> None:
 
 
 def told(made) -> list[tuple[str, dict[str, object]]]:
-    """What the primary interface is told, from now on."""
+    """Collect what the primary interface is told from now on."""
     found: list[tuple[str, dict[str, object]]] = []
     made.robot.tell = lambda kind, **details: found.append((kind, details))
     return found

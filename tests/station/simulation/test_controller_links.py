@@ -16,7 +16,7 @@ pytestmark = pytest.mark.process
 
 
 def greeting(host: str) -> str:
-    """Of the dashboard."""
+    """Read the greeting of the dashboard."""
     with socket.create_connection((host, 29999), 3) as link, link.makefile() as lines:
         return lines.readline().strip()
 

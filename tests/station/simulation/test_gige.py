@@ -13,19 +13,20 @@ import pytest
 from calibrate.boards.detect import detect
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
-from station.simulation import genicam
 from station.simulation.cell import write_truth
+from station.simulation.gige import DESCRIPTION
 from station.simulation.launch import SimulatedController, start_gige
 from station.simulation.netns import is_isolated, isolated_command
 from station.simulation.scenes import make_cell
 from tests.codes import raises
+from tests.numbered_gige import start_numbered
 
 
 def test_it_does_not_run_beside_other_networks() -> None:
     if is_isolated():
         pytest.skip("this machine has nothing but lo")
     with raises("not-isolated"):
-        start_gige(numbered=True)
+        start_numbered()
 
 
 @pytest.mark.gige
@@ -50,8 +51,8 @@ async def test_its_pictures_show_the_board_from_where_the_arm_stands(
 
 @pytest.mark.gige
 def test_a_second_camera_on_the_same_address_is_refused(lonely_network: None) -> None:
-    with start_gige(numbered=True), raises("simulation-not-started"):
-        start_gige(numbered=True)
+    with start_numbered(), raises("simulation-not-started"):
+        start_numbered()
 
 
 def test_a_command_can_be_run_with_nothing_but_lo() -> None:
@@ -65,7 +66,7 @@ def test_a_command_can_be_run_with_nothing_but_lo() -> None:
 
 
 def test_the_description_is_whole_and_every_reference_leads_somewhere() -> None:
-    root = ElementTree.fromstring(genicam.genicam_xml())
+    root = ElementTree.parse(DESCRIPTION).getroot()
     names = {node.get("Name") for node in root.iter() if node.get("Name")}
     for tag in ("pFeature", "pValue", "pPort", "pMax", "pVariable"):
         for node in root.iter(f"{{http://www.genicam.org/GenApi/Version_1_1}}{tag}"):

@@ -10,12 +10,12 @@ import pytest
 from rich.console import Console
 
 from calibrate.errors import CalibrationFileError, InstallError
-from calibrate.files.calibration import Touch, read_calibration, write_calibration
+from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.formatting import summary
 from calibrate.files.install import install, installed_calibration, rollback
-from calibrate.files.verification import agrees, note_in_file, note_installed, touch_sigmas, touch_text
-from calibrate.files.versions import installed_versions, read_log
-from calibrate.pipeline import SolvedRecording
+from calibrate.files.touch import Touch, agrees, touch_sigmas, touch_text
+from calibrate.files.versions import installed_versions, note_in_file, note_installed, read_log
+from calibrate.job import SolvedRecording
 from calibrate.report.page import report_page
 from tests.calibrate.calling import raises_code
 

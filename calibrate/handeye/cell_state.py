@@ -7,65 +7,16 @@ flange is Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand): the robot's
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibrate.geometry import Array, difference, inverse, perturb, skew
+from calibrate.geometry import Array, difference, perturb, skew
 from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
-from calibrate.views import ViewSet
+from calibrate.results import SHAPE
+from calibrate.views import Observations, implied_flange
 from recordings.schema.messages import CameraModel, Mount
-
-Places = NDArray[np.intp]
-Moved = Literal["camera", "board"]
-
-SHAPE = ("scale", "anisotropy", "bend xx", "bend yy", "bend xy")
-"""The board's shape: a point (x, y) of the sheet, (u, v) the same mapped to -1 … 1 over the corners, lies at
-(x + s x + a x/2, y + s y - a y/2, b1 (1 - u²) + b2 (1 - v²) + b3 u v); s and a plain, b in metres."""
-
-
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """Padded arrays of all views, one row a view."""
-
-    mount: Mount
-    flange: Array
-    """(n, 4, 4) recorded base_from_flange."""
-    points: Array
-    """(n, k, 3) corners on the board, metres; rows beyond a view's own corners are padding."""
-    pixels: Array
-    """(n, k, 2)"""
-    present: Array
-    """(n, k) 1 for a corner, 0 for padding."""
-    table: Array | None = None
-    """(n, 6, q) motion of the flange, in base, by each error of the kinematic table; None without joints."""
-    extent: Array = field(default_factory=lambda: np.array([[0.0, 0.0], [1.0, 1.0]]))
-    """(2, 2) middle and half size of all corners seen, metres: what the board's bends refer to."""
-    later: NDArray[np.bool_] | None = None
-    """(n,) the views after something was moved (`CellState.second`); None where nothing was."""
-    moved: Moved = "board"
-    """Camera (X has a second value) or board (Y has)."""
-
-    def __len__(self) -> int:
-        return len(self.flange)
-
-    @property
-    def has_pixels(self) -> bool:
-        return bool(self.present.any())
-
-    def part(self, places: Places) -> Observations:
-        """Select these views."""
-        return replace(
-            self,
-            flange=self.flange[places],
-            points=self.points[places],
-            pixels=self.pixels[places],
-            present=self.present[places],
-            table=None if self.table is None else self.table[places],
-            later=None if self.later is None else self.later[places],
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +45,6 @@ class CellState:
         if observed.moved == "camera":
             return np.where(later, self.second, self.X), self.Y
         return self.X, np.where(later, self.second, self.Y)
-
-    def of_views(self, places: Places) -> CellState:
-        """Select the board poses of these views."""
-        return replace(self, C=self.C[places])
 
     def with_boards(self, C: Array) -> CellState:
         """Replace the board poses by others (m, 4, 4)."""
@@ -140,31 +87,6 @@ class Layout:
         slices = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
         X, Y, at_lens, shape, table, at_second = slices
         return cls(X, Y, at_lens, shape, table, at_second, ends[-1])
-
-
-def observe_views(views: ViewSet) -> Observations:
-    """Pad the views' corners to one array."""
-    count = max(1, max(len(view.pixels) for view in views))
-    n = len(views)
-    points, pixels, present = np.zeros((n, count, 3)), np.zeros((n, count, 2)), np.zeros((n, count))
-    for i, view in enumerate(views):
-        k = len(view.pixels)
-        points[i, :k], pixels[i, :k], present[i, :k] = view.board_points, view.pixels, 1.0
-    extent = extent_of(points[present > 0]) if present.any() else np.array([[0.0, 0.0], [1.0, 1.0]])
-    return Observations(views.mount, views.base_from_flange, points, pixels, present, extent=extent)
-
-
-def extent_of(points: Array) -> Array:
-    """Compute middle and half size (2, 2), metres, of points (m, 3) on the board."""
-    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    return np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-6)])
-
-
-def implied_flange(mount: Mount, X: Array, Y: Array, C: Array) -> Array:
-    """Compute base_from_flange (n, 4, 4): Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand)."""
-    if mount == "eye-in-hand":
-        return np.asarray(Y @ inverse(C) @ inverse(X))
-    return np.asarray(X @ C @ inverse(Y))
 
 
 def flange_residuals(observed: Observations, state: CellState) -> Array:
@@ -218,3 +140,18 @@ def _inverse_left_jacobian(v: Array) -> Any:
     c = np.where(angle < 1e-4, 1 / 12, (1 - half / np.tan(half)) / (4 * half * half))
     S = skew(v)
     return np.eye(3) - S / 2 + c[:, None, None] * (S @ S)
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """Log density around a state: log + right · step - ½ step · N · step."""
+
+    N: Array
+    """(G, G)"""
+    right: Array
+    """(G,)"""
+    log: float = 0.0
+
+    def gain(self, step: Array) -> float:
+        """Compute the log density at a step (G,) against that at the state."""
+        return float(self.right @ step - 0.5 * step @ self.N @ step)

@@ -6,10 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate.geometry import difference, perturb, pose, random_rotation
-from calibrate.handeye.observations import (
-    flange_derivatives,
-    implied_flange,
-)
+from calibrate.handeye.cell_state import flange_derivatives
+from calibrate.views import implied_flange
 
 
 def anywhere(rng, count=None):

@@ -1,0 +1,82 @@
+"""Folders of installed calibrations: where they lie, which is current, whether it holds.
+
+ROOT/calibrations/                  camera `main`: its versions, `current`, logs and validity
+ROOT/calibrations/cameras/NAME/     the same for every other camera of the cell
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+
+from calibrate.errors import InstallError
+from calibrate.files.validity import Validity, read_validity, time_text, unrecorded
+from recordings.files import MAIN_CAMERA, is_session_name, state_root
+
+VERSION_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
+
+
+def calibrations_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
+    """Folder of one camera's installed calibrations. InstallError for what is no name of a camera."""
+    if not is_session_name(camera):
+        raise InstallError(
+            f"{camera!r} is no name of a camera.", code="camera-name", remedy="Use 1 to 40 of a-z, 0-9 and -."
+        )
+    folder = state_root(root) / "calibrations"
+    return folder if camera == MAIN_CAMERA else folder / "cameras" / camera
+
+
+def readable_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
+    """Folder of the calibrations; InstallError where it may not be looked into."""
+    folder = calibrations_folder(root, camera)
+    try:
+        (folder / "gen").exists()
+    except PermissionError as problem:
+        raise InstallError(
+            f"{folder}: {problem.strerror}.",
+            code="state-folder",
+            remedy="Name another state folder with --root.",
+        ) from None
+    return folder
+
+
+def cameras(root: Path | str | None = None) -> list[str]:
+    """Names of the cameras for which something was ever installed below `root`, `main` first."""
+    folder = readable_folder(root)
+    others = sorted(path.parent.name for path in (folder / "cameras").glob("*/gen"))
+    return [*([MAIN_CAMERA] if (folder / "gen").is_dir() else []), *filter(is_session_name, others)]
+
+
+def current_version(folder: Path) -> tuple[int, Path]:
+    """(number, file) of what `current` points to. InstallError when nothing is installed."""
+    try:
+        name = (folder / "current").readlink().name
+    except OSError:
+        name = ""
+    match = VERSION_NAME.fullmatch(name)
+    if match is None:
+        raise InstallError(
+            f"{folder / 'current'}: nothing is installed.",
+            code="nothing-installed",
+            remedy="Run: calibrate install FILE",
+        )
+    return int(match[1]), folder / "gen" / name
+
+
+def current_validity(folder: Path, now: datetime | None = None) -> Validity:
+    """Validity of what is installed there, at `now` (default: this moment). InstallError when nothing is."""
+    return validity_of(folder, current_version(folder)[0], now)
+
+
+def validity_of(folder: Path, number: int, now: datetime | None = None) -> Validity:
+    """Read the validity of one version: what is current may change while it is read."""
+    try:
+        installed = datetime.fromtimestamp((folder / "current").lstat().st_mtime, UTC)
+        found = read_validity(folder).get(number) or unrecorded(number, time_text(installed))
+    except OSError as problem:
+        raise InstallError(
+            f"{problem.filename or folder}: {problem.strerror}. Its validity is not known.",
+            code="state-folder",
+        ) from None
+    return found.at(now or datetime.now(UTC))

@@ -1,0 +1,16 @@
+"""A plan for tests that drive one: from fewer candidates than usual, which takes a fifth of the time."""
+
+from __future__ import annotations
+
+from station.cell.config import StationConfig
+from station.cell.plan import Plan
+from station.cell.scene import scene_of
+from station.plan.planner import PlanOptions, plan_scene
+from station.simulation.cell import CellTruth
+
+POOL = 200
+
+
+def quick_plan(config: StationConfig, truth: CellTruth, seed: int, count: int) -> Plan:
+    options = PlanOptions(count=count, seed=seed, pool=POOL)
+    return plan_scene(scene_of(config), options, truth.start_joints_rad)

@@ -191,7 +191,9 @@ async def stream(fps: float, seconds: float, root: Path) -> StreamOutcome:
     command = [sys.executable, "-m", "benchmarks.daemon_stream", "serve", str(fps), str(root)]
     with (
         (root / "daemon.log").open("wb") as log,
-        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log) as started,
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True
+        ) as started,
         ChildProcess(started) as child,
     ):
         assert child.process.stdout is not None

@@ -50,7 +50,8 @@ def put_before_others(daemon: int, niceness: int) -> None:
     """The daemon and its children, as on a computer of their own: each leads a group that Linux weighs."""
     for pid in _family(daemon):
         with contextlib.suppress(OSError):  # not permitted, or no such groups here
-            Path(f"/proc/{pid}/autogroup").write_text(str(niceness))
+            if os.getsid(pid) == pid:  # never the group of the shell that this runs in: it would stay so
+                Path(f"/proc/{pid}/autogroup").write_text(str(niceness))
 
 
 def step_behind_others() -> None:

@@ -141,7 +141,7 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     f = np.einsum("...i,...i->...", d2, r)
     parallel = a * e - b * b
     s = np.where(
-        parallel > 1e-9 * a * e, np.clip((b * f - c * e) / np.maximum(parallel, _TINY**2), 0.0, 1.0), 0.0
+        parallel > 1e-12 * a * e, np.clip((b * f - c * e) / np.maximum(parallel, _TINY**2), 0.0, 1.0), 0.0
     )
     t = (b * s + f) / e
     s = np.where(t < 0, np.clip(-c / a, 0, 1), np.where(t > 1, np.clip((b - c) / a, 0, 1), s))

@@ -24,6 +24,7 @@ from recordings.reader import open_recording
 from station.cell.plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.client import Client
+from station.tui.words import STATE_WORDS
 from tests.system.conftest import SystemRig, go, status_when
 from tests.system.machine import CHECKOUT, PREFIX, REPOSITORY, VENV, CannotBootError, Machine
 from tests.tui.terminal import KEYS, Glass
@@ -132,7 +133,8 @@ async def test_the_screen_comes_up_on_a_console_and_its_stop_key_reaches_the_dae
     station: Machine, rig: SystemRig, console: Console
 ) -> None:
     station.run("systemctl", "start", "station-tui@tty1")
-    await rig.until(lambda: "STOP" in console.text() and "F12" in console.text(), 40)
+    connected = STATE_WORDS[S.IDLE]
+    await rig.until(lambda: all(word in console.text() for word in ("STOP", "F12", connected)), 40)
     async with await client_of(station) as anna:
         await status_when(anna, lambda s: s.state is S.IDLE)
         console.press("f12")

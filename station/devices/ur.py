@@ -14,6 +14,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Coroutine, Sequence
+from functools import cache
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -67,6 +68,7 @@ def control_path(config: RobotConfig) -> ControlPath:
     return config.control or ("ur_rtde" if library_installed() else "script")
 
 
+@cache
 def library_installed() -> bool:
     return find_spec("rtde_control") is not None
 

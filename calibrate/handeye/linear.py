@@ -132,23 +132,33 @@ class CornerModes:
         x = step[self.shared]
         return float(self.right.sum(axis=0) @ x - 0.5 * x @ self.information.sum(axis=0) @ x)
 
-    def variances(self, lambda_px: float, covariance: Array, step: Array) -> tuple[float, float]:
-        """Fit σ² of plain corner noise and λ² of that in the modes of lens and shape, px², after a step."""
+    @cached_property
+    def _whitening(self) -> tuple[Array, float]:
+        """W (n, g, g) with |W·r|² = rᵀ·information⁻¹·r where the information is not empty, and its rank."""
         scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->ni", self.whole), 1e-300))
         values, vectors = np.linalg.eigh(self.information * scale[:, :, None] * scale[:, None, :])
         kept = values > 1e-6
-        inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0) / _INFORMATION
+        root = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0) / np.sqrt(_INFORMATION)
+        return root[:, :, None] * np.swapaxes(vectors, 1, 2) * scale[:, None, :], float(kept.sum())
 
-        def inside(right: Array) -> float:
-            return float((np.einsum("nij,ni->nj", vectors, right * scale) ** 2 * inverse).sum())
+    def _inside(self, right: Array) -> float:
+        """Squares (px²) that lens and shape of each view alone could take from `right` (n, g)."""
+        return float(((self._whitening[0] @ right[..., None]) ** 2).sum())
 
-        rank = float(kept.sum())
-        rest = max(float(self.left.sum()) - inside(self.right), 0.0)
-        sigma2 = max(rest / max(float(self.rows.sum()) - 6 * len(self.rows) - rank, 1.0), 1e-8)
-        after = self.right - np.einsum("nij,j->ni", self.information, step[self.shared])
+    @cached_property
+    def _plain(self) -> float:
+        """σ² of plain corner noise, px²."""
+        rest = max(float(self.left.sum()) - self._inside(self.right), 0.0)
+        free = float(self.rows.sum()) - 6 * len(self.rows) - self._whitening[1]
+        return max(rest / max(free, 1.0), 1e-8)
+
+    def variances(self, lambda_px: float, covariance: Array, step: Array) -> tuple[float, float]:
+        """Fit σ² of plain corner noise and λ² of that in the modes of lens and shape, px², after a step."""
+        after = self.right - self.information @ step[self.shared]
         part = covariance[self.shared, self.shared]
         used = float(np.einsum("ij,ji", part, self.information.sum(axis=0))) / lambda_px**2
-        lambda2 = (inside(after) + _MODE_COUNT * sigma2) / max(rank - used + _MODE_COUNT, 1.0)
+        sigma2, rank = self._plain, self._whitening[1]
+        lambda2 = (self._inside(after) + _MODE_COUNT * sigma2) / max(rank - used + _MODE_COUNT, 1.0)
         return sigma2, max(lambda2, sigma2)
 
     @property
@@ -213,7 +223,7 @@ class Linear:
             S, S_inverse = self._noise(scales)
             chances, _ = _chances(residual, S, S_inverse, scales.shares)
             WJ = np.einsum("nk,nkij->nij", chances, S_inverse) @ self.J
-            N = prior.N + np.einsum("nia,nib->ab", self.J, WJ, optimize=True)
+            N = prior.N + _summed(self.J, WJ)
             right = prior.right - np.einsum("nia,ni->a", WJ, self.m)
             if modes is not None:
                 N[modes.shared, modes.shared] += modes.information.sum(axis=0) / scales.lambda_px**2
@@ -265,8 +275,8 @@ class Linear:
             return updated
         sigma2, lambda2 = self.modes.variances(scales.lambda_px, covariance, step)
         tau2 = scales.tau_px**2
-        gained = np.einsum("nk,nki,nij,nkj->", chances, z, self.B, z, optimize=True)
-        spent = np.einsum("nk,nkij,nji->", chances, P, self.B, optimize=True)
+        gained = np.einsum("nk,nki,nij,nkj->", chances, z, self.B, z)
+        spent = np.einsum("nk,nkij,nji->", chances, P, self.B)
         tau2 *= float((gained + _MODE_COUNT * lambda2 / tau2**2) / (spent + _MODE_COUNT / tau2))
         tau, lambda_, sigma = np.sqrt([max(tau2, lambda2), lambda2, sigma2]).tolist()
         return replace(updated, tau_px=tau, lambda_px=lambda_, sigma_px=sigma)
@@ -279,7 +289,7 @@ class Linear:
     def board_step(self, solved: LinearSolution) -> Array:
         """Compute the step (n, 6) of the board poses that belongs to the step of the shared unknowns."""
         pull = np.einsum("nk,nki->ni", solved.chances, solved.z)
-        by_robot = np.einsum("nij,nkj,nk->ni", self.H, self.A, pull, optimize=True)
+        by_robot = np.einsum("nij,nkj,nk->ni", self.H, self.A, pull)
         step = -(solved.scales.tau_px**2) * by_robot
         if self.modes is not None:
             step += self.modes.to_optimum - self.modes.by_shared @ solved.step[self.modes.shared]
@@ -292,7 +302,7 @@ class Linear:
     def lost(self, solved: LinearSolution) -> Array:
         """Compute the information (G, G) that not knowing the views' classes costs (Louis 1982)."""
         mean = np.einsum("nk,nki->ni", solved.chances, solved.z)
-        spread = np.einsum("nk,nki,nkj->nij", solved.chances, solved.z, solved.z, optimize=True)
+        spread = np.einsum("nk,nki,nkj->nij", solved.chances, solved.z, solved.z)
         spread -= mean[:, :, None] * mean[:, None, :]
         _, S_inverse = self._noise(solved.scales)
         W = np.einsum("nk,nkij->nij", solved.chances, S_inverse)
@@ -302,7 +312,7 @@ class Linear:
         values, vectors = np.linalg.eigh((inner + np.swapaxes(inner, 1, 2)) / 2)
         inner = (vectors * np.clip(values, 0.0, 1.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
         spread = root @ inner @ np.swapaxes(root, 1, 2)
-        return np.asarray(np.einsum("nia,nij,njb->ab", self.J, spread, self.J, optimize=True))
+        return _summed(self.J, spread @ self.J)
 
     def noise_parts(self, solved: LinearSolution, covariance: Array) -> Array:
         """Compute X's whitened variance (3,) from corners, robot translation and robot rotation."""
@@ -327,12 +337,17 @@ class Linear:
 
 def _chances(residual: Array, S: Array, S_inverse: Array, shares: Array) -> tuple[Array, Array]:
     """Chances (n, K) of the classes and the log density (n,) of each view's residual (n, 6)."""
-    square = np.einsum("ni,nkij,nj->nk", residual, S_inverse, residual, optimize=True)
+    square = np.einsum("ni,nkij,nj->nk", residual, S_inverse, residual)
     log = np.log(shares) - 0.5 * (square + np.linalg.slogdet(S)[1] + 6 * np.log(2 * np.pi))
     top = log.max(axis=1, keepdims=True)
     density = np.exp(log - top)
     total = density.sum(axis=1, keepdims=True)
     return density / total, (top + np.log(total))[:, 0]
+
+
+def _summed(J: Array, WJ: Array) -> Array:
+    """Sum of the views' Jᵀ·WJ (a, b), for J (n, 6, a) and WJ (n, 6, b)."""
+    return np.asarray(J.reshape(-1, J.shape[-1]).T @ WJ.reshape(-1, WJ.shape[-1]))
 
 
 def inverse_of(N: Array) -> Array:

@@ -46,8 +46,8 @@ class BoardPoses:
         return cls(C, np.zeros((0, len(C), 6)), np.zeros(0))
 
     def at(self, factors: Array) -> Array:
-        """Compute the poses (n, 4, 4) for factors (p,)."""
-        return perturb(self.C, np.einsum("p,pni->ni", factors - 1.0, self.motion))
+        """Compute the poses (..., n, 4, 4) for factors (..., p)."""
+        return perturb(self.C, np.einsum("...p,pni->...ni", factors - 1.0, self.motion))
 
     def part(self, places: Places) -> BoardPoses:
         return replace(self, C=self.C[places], motion=self.motion[:, places])
@@ -84,11 +84,7 @@ def agreed_start(H: Array, boards: BoardPoses, seed: int, candidate: Array | Non
         factors = np.concatenate([np.ones((1, len(boards.sigma))), factors])
     voters = np.unique(np.linspace(0, n - 1, min(n, _VOTERS)).astype(np.intp))
     judged = boards.part(voters)
-    best, chosen = np.inf, 0
-    for place, (X, factor) in enumerate(zip(Xs, factors, strict=True)):
-        reach = float(_reach(H[voters] @ X @ judged.at(factor)).min())
-        if reach < best:
-            best, chosen = reach, place
+    chosen = _reach(H[voters] @ Xs[:, None] @ judged.at(factors)).min(axis=1).argmin()
     X, factor = Xs[chosen], factors[chosen]
     return Start(X, central_pose(H @ X @ boards.at(factor)), factor)
 
@@ -142,16 +138,17 @@ def _quorum(count: int) -> int:
 
 
 def _reach(places: Array) -> Array:
-    """(n,) distance within which each place has its share of the others."""
-    quorum = _quorum(len(places))
-    return np.asarray(np.partition(_distance(places, places), quorum, axis=1)[:, quorum])
+    """(..., n) distance within which each place has its share of the others."""
+    quorum = _quorum(places.shape[-3])
+    return np.asarray(np.partition(_distance(places, places), quorum, axis=-1)[..., quorum])
 
 
 def _distance(first: Array, second: Array) -> Array:
-    """(n, m) between poses: metres, and radians at half a metre."""
-    shift = np.linalg.norm(first[:, None, :3, 3] - second[None, :, :3, 3], axis=-1)
-    R, Q = first[:, :3, :3].reshape(-1, 9), second[:, :3, :3].reshape(-1, 9)
-    return np.asarray(shift + _LEVER_M * np.arccos(np.clip((R @ Q.T - 1) / 2, -1.0, 1.0)))
+    """(..., n, m) between poses: metres, and radians at half a metre."""
+    shift = np.linalg.norm(first[..., :, None, :3, 3] - second[..., None, :, :3, 3], axis=-1)
+    R, Q = (places[..., :3, :3].reshape(*places.shape[:-2], 9) for places in (first, second))
+    cosine = (R @ np.swapaxes(Q, -1, -2) - 1) / 2
+    return np.asarray(shift + _LEVER_M * np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 _STEPS = 8

@@ -31,9 +31,9 @@ demo: $(READY)  ## the whole job with no hardware: simulated UR10 and camera to 
 demo-gige: $(READY)  ## the same, with the camera over real GigE Vision inside a network namespace
 	@$(BIN)/station demo --gige
 
-# Three workers on two cores: half of the time is waiting for arms that move.
+# Two workers a core: half of the time is waiting for arms that move.
 test: $(READY)  ## all tests of our own
-	$(BIN)/python -m pytest -n 3 --dist worksteal --ignore tests/foreign
+	$(BIN)/python -m pytest -n 4 --dist worksteal --ignore tests/foreign
 
 check: $(READY)  ## ruff, mypy strict, import contracts
 	$(BIN)/ruff check .

@@ -230,16 +230,18 @@ class UrLink:
         assert reader is not None
         if reader.ended is not None:
             return link_lost(reader.ended)
-        text, code = f"no news from the robot for {age_s * 1000:.0f} ms", ""
-        remedy, less_load = "Check cable and network.", "Reduce the load of this computer"
-        if (waited := waited_share()) >= _BUSY_SHARE:
-            remedy = f"{less_load}: programs wait for it {waited:.0%} of the time. {remedy}"
-        if reader.waits_unread():
-            text = f"this computer was too busy for {age_s * 1000:.0f} ms to read the robot's state"
-            remedy, code = f"{less_load}.", "computer-busy"
+        less_load = "Reduce the load of this computer"
         if reader.stands_still:
             text = f"the controller's clock stands still since {age_s * 1000:.0f} ms"
-            remedy = "Restart the controller."
+            code, remedy = "", "Restart the controller."
+        elif reader.waits_unread():
+            text = f"this computer was too busy for {age_s * 1000:.0f} ms to read the robot's state"
+            code, remedy = "computer-busy", f"{less_load}."
+        else:
+            text, code = f"no news from the robot for {age_s * 1000:.0f} ms", ""
+            remedy = "Check cable and network."
+            if (waited := waited_share()) >= _BUSY_SHARE:
+                remedy = f"{less_load}: programs wait for it {waited:.0%} of the time. {remedy}"
         return StaleStateError(text, code=code, remedy=remedy, age_s=age_s, limit_s=STALE_S)
 
     def at(self, host_monotonic_ns: int) -> RobotState:

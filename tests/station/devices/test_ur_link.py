@@ -94,6 +94,8 @@ def test_news_that_wait_unread_are_no_matter_of_the_cable(link: Any) -> None:
         assert link.stale(0.2).code == "stale-state"
         robots.send(b"news")
         assert link.stale(0.2).code == "computer-busy"
+        reader.stands_still = True  # what waits tells the same time again
+        assert link.stale(0.2).code == "stale-state"
         reader._stop_write.close()
         reader._stop_read.close()
 

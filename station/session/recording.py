@@ -149,7 +149,7 @@ class SessionRecording:
             settings = await self._cell.camera.settings()
         except CameraError as error:
             settings = {"error": str(error)}  # its images will say the same
-        await asyncio.to_thread(self._open, queue.plan, queue.sha256, first_image, settings)
+        await to_the_end(asyncio.to_thread(self._open, queue.plan, queue.sha256, first_image, settings))
         await self.save_state(queue)
 
     def _open(

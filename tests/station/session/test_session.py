@@ -5,13 +5,16 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import threading
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
 from calibrate.load import load_views
+from recordings.manifest import enter_part
 from recordings.reader import open_recording
 from recordings.schema.messages import ArmKinematics
 from station.cell.errors import LimitError, RobotError
@@ -19,7 +22,7 @@ from station.cell.plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Add, Drop, Purpose, Reorder, Retake, Skip
 from tests.codes import raises
-from tests.station.session_rig import POSES, HeldDisk, Rig, sealed
+from tests.station.session_rig import PATIENCE_S, POSES, HeldDisk, Rig, sealed
 
 WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
 
@@ -264,6 +267,26 @@ async def test_the_end_of_the_daemon_stops_then_seals(rig: Rig) -> None:
     await rig.session.close()
     assert rig.arm.log.index("stop") < rig.arm.log.index("close")
     assert len(open_recording(folder).views()) == 1
+
+
+async def test_the_end_of_the_daemon_seals_a_recording_that_is_just_being_opened(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    reached, held = threading.Event(), threading.Event()
+
+    def enter(*arguments: Any) -> None:
+        reached.set()
+        assert held.wait(PATIENCE_S)
+        enter_part(*arguments)
+
+    monkeypatch.setattr("station.session.recording.enter_part", enter)
+    await rig.give_go()
+    assert await asyncio.to_thread(reached.wait, PATIENCE_S)
+    closing = asyncio.create_task(rig.session.close())
+    await rig.until(S.STOPPED)
+    held.set()
+    await closing
+    assert list(tmp_path.rglob("*.mcap")) and not list(tmp_path.rglob("*.part"))
 
 
 async def test_the_log_is_in_the_recording_too(rig: Rig) -> None:

@@ -140,6 +140,7 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     c = np.einsum("...i,...i->...", d1, r)
     f = np.einsum("...i,...i->...", d2, r)
     parallel = a * e - b * b
+    # Below a millionth of a radian rounding decides; what parallel costs then is that angle times the length.
     s = np.where(
         parallel > 1e-12 * a * e, np.clip((b * f - c * e) / np.maximum(parallel, _TINY**2), 0.0, 1.0), 0.0
     )

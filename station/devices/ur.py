@@ -70,6 +70,7 @@ def control_path(config: RobotConfig) -> ControlPath:
 
 @cache
 def library_installed() -> bool:
+    """Looked up once: what drives an arm does not change under a running daemon."""
     return find_spec("rtde_control") is not None
 
 

@@ -50,7 +50,7 @@ LIBRARY_WORDS = {
     ),
 }
 """Words of ur_rtde's refusals, in small letters, as it has no codes: code, what it is, what to do."""
-LIBRARY_REMEDY = "Install it, or set robot.control: script in the configuration."
+LIBRARY_REMEDY = "Install it and restart the daemon, or set robot.control: script in the configuration."
 
 
 class MotionServer:

@@ -73,10 +73,6 @@ STATION = LazyGroup(
             "station.cli.accept:accept_command",
             ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.05"),
         ),
-        "trace": LazyCommand(
-            "station.cli.trace:trace_command",
-            ("station trace record 192.168.56.101 -o ursim.json.gz", "station trace compare ursim.json.gz"),
-        ),
         "new": LazyCommand("station.cli.new:new_command", ("station new", "station new -o station.yaml")),
         "bootstrap": LazyCommand(
             "station.cli.bootstrap:bootstrap_command",

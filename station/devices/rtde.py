@@ -238,10 +238,6 @@ class RtdeLink:
         if self._ask(PacketType.START) != b"\x01":
             raise RtdeError("the controller refused to send its state")
 
-    def pause(self) -> None:
-        """The state is sent no more."""
-        self._ask(PacketType.PAUSE)
-
     def _ask(self, kind: PacketType, payload: bytes = b"") -> bytes:
         """The reply's payload; what else arrives before it (messages) is skipped."""
         self._link.sendall(packet(kind, payload))

@@ -23,7 +23,7 @@ from calibrate.files.exports import FORMATS, FrameNames, follow_command
 from calibrate.files.folders import cameras, current_validity, readable_folder
 from calibrate.files.formatting import override_text, pose_difference, pose_text, summary, verdict_text
 from calibrate.files.lines import read_lines
-from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
+from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.files.versions import LOG, InstalledVersion, LogEntry, installed_versions, read_log
 from recordings.files import MAIN_CAMERA, state_root
 
@@ -174,9 +174,9 @@ def install(
 ) -> None:
     """Make a calibration the installed one.
 
-    What was installed stays: `calibrate rollback` goes back. Programs read one path that never changes:
-    ROOT/calibrations/current. Refused are a failed gate, another robot or camera than the cell's, and
-    whatever does not come from this kind of cell.
+    What was installed stays: `calibrate rollback` goes back. The first one is undone by `calibrate withdraw`.
+    Programs read one path that never changes: ROOT/calibrations/current. Refused are a failed gate, another
+    robot or camera than the cell's, and whatever does not come from this kind of cell.
 
     Exit codes: 0 installed, 4 a gate failed, 1 refused for another reason; then nothing was changed.
     """
@@ -194,6 +194,9 @@ def install(
         max_age_days=facts.max_age_days if max_age_days is None else max_age_days,
     )
     _switched(made, as_json)
+    if not as_json:
+        camera = camera or facts.camera or read_calibration(made.path).camera_name
+        out.print(f"To undo: {installing.undo_line(root, camera)}", soft_wrap=True)
 
 
 def rollback(
@@ -222,10 +225,7 @@ def withdraw(
     Programs are refused it from now on. Installing another, or `calibrate rollback NUMBER`, ends that; no
     check does.
     """
-    if problem := installing.reason_problem(reason):
-        raise UsageError(problem, code="reason-too-short")
-    cause = ValidityReason("withdrawn", reason.strip())
-    validity = installing.set_validity(root, ValidityState.WITHDRAWN, cause, camera=camera)
+    validity = installing.withdraw(root, reason, camera=camera)
     if as_json:
         print_json(validity)
     else:

@@ -22,6 +22,7 @@ from calibrate.files.lines import append_line
 from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import (
+    WITHDRAWN_REMEDY,
     CheckKind,
     Validity,
     ValidityReason,
@@ -171,7 +172,7 @@ def rollback(
         if to is None:
             older = before_current(known)
             if older is None:
-                raise InstallError(f"{folder}: no older calibration to go back to.", code="nothing-older")
+                raise _nothing_older(root, camera, current_validity(folder))
             target = older
         else:
             target = next((g for g in known if g.number == to), None) or no_such_version(folder, to, known)
@@ -187,6 +188,39 @@ def rollback(
         validity = _validity_again(target, _max_age_days(folder, None))
         made = make_current(folder, target, "rollback", validity, change, reason)
     return _announced(root, camera, "rollback", made)
+
+
+def _nothing_older(root: Path | None, camera: str, validity: Validity) -> InstallError:
+    folder, command = calibrations_folder(root, camera), _withdraw_line(root, camera)
+    withdrawn = validity.state is ValidityState.WITHDRAWN
+    return InstallError(
+        f"{folder}: no older calibration to go back to.",
+        code="nothing-older",
+        remedy=WITHDRAWN_REMEDY if withdrawn else f"To take it out of use: {command}",
+    )
+
+
+def withdraw(root: Path | None, reason: str, *, camera: str = MAIN_CAMERA) -> Validity:
+    """Take what is installed out of use. Raises InstallError, also for a reason that says nothing."""
+    _require_words(reason)
+    cause = ValidityReason("withdrawn", reason.strip())
+    return set_validity(root, ValidityState.WITHDRAWN, cause, camera=camera)
+
+
+def undo_line(root: Path | None = None, camera: str = MAIN_CAMERA) -> str:
+    """The command that undoes the last installation: back to the one before, or out of use without one."""
+    if before_current(installed_versions(root, camera)) is None:
+        return _withdraw_line(root, camera)
+    return shlex.join(["calibrate", "rollback", *_where(root, camera)])
+
+
+def _withdraw_line(root: Path | None, camera: str) -> str:
+    return shlex.join(["calibrate", "withdraw", "REASON", *_where(root, camera)])
+
+
+def _where(root: Path | None, camera: str) -> list[str]:
+    named = [] if camera == MAIN_CAMERA else ["--camera", camera]
+    return [*([] if root is None else ["--root", str(root)]), *named]
 
 
 def _validity_again(target: InstalledVersion, max_age_days: float | None) -> Validity:

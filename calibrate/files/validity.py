@@ -16,6 +16,10 @@ from typing import Literal
 
 FILE = "validity.jsonl"
 CheckKind = Literal["drift-check", "touch-test", "watch"]
+WITHDRAWN_REMEDY = (
+    "Solve a new recording and run `calibrate install FILE`, "
+    "or `calibrate rollback NUMBER` to another version of `calibrate list`."
+)
 
 
 class ValidityState(StrEnum):

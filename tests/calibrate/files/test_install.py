@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import compileall
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -20,7 +21,14 @@ from calibrate.cli import main
 from calibrate.errors import CalibrationFileError, GateFailedError, InstallError
 from calibrate.files.calibration import read_calibration
 from calibrate.files.gate import Gate
-from calibrate.files.install import install, install_line, installed_calibration, rollback
+from calibrate.files.install import (
+    install,
+    install_line,
+    installed_calibration,
+    rollback,
+    undo_line,
+    withdraw,
+)
 from calibrate.files.loader import load_installed
 from calibrate.files.touch import Touch
 from calibrate.files.versions import installed_versions, read_log
@@ -63,6 +71,32 @@ def test_nothing_installed_and_nothing_older_are_said(make_file, tmp_path: Path)
         rollback(tmp_path)
     with raises_code(InstallError, "no-such-version", generation=9):
         rollback(tmp_path, to=9)
+
+
+def test_what_undoes_an_install_is_named_and_works(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    """The first has none before it: it is withdrawn. Every later one is rolled back."""
+    root = tmp_path / "a state"
+    with raises_code(InstallError, "nothing-installed"):
+        rollback(root)
+    for camera in ("main", "wrist"):
+        install(make_file(), root, camera=camera)
+        with raises_code(InstallError, "nothing-older") as refused:
+            rollback(root, camera=camera)
+        line = undo_line(root, camera)
+        assert line in refused.value.remedy and "withdraw" in line
+        assert call(main, *shlex.split(line)[1:]).returncode == 0
+        with raises_code(InstallError, "calibration-withdrawn"):
+            load_installed(root, camera=camera)
+        with raises_code(InstallError, "nothing-older") as refused:
+            rollback(root, camera=camera)
+        assert line not in refused.value.remedy, "it is withdrawn already"
+    install(make_file(0.001), root)
+    install(make_file(0.002), root)
+    assert call(main, *shlex.split(undo_line(root))[1:]).returncode == 0
+    assert load_installed(root).version == 2
+    with raises_code(InstallError, "reason-too-short"):
+        withdraw(root, "xxx")
+    assert load_installed(root).version == 2
 
 
 @pytest.mark.parametrize("source", ["simulated", "playback", "imported"])

@@ -32,6 +32,13 @@ _EXTRAS = {
 """Packages that only some commands need, and the extra that brings each."""
 
 
+class GoneError(CodedError):
+    """A command or an option of an earlier release is asked for."""
+
+    code = "gone"
+    exit_code = 2
+
+
 class LazyCommand(NamedTuple):
     """One command of a group."""
 
@@ -41,6 +48,8 @@ class LazyCommand(NamedTuple):
     """Command lines as a person types them, a remark behind `#`."""
     old_options: Mapping[str, str] = {}
     """Options by their names of the last release, and what they are called now."""
+    gone: Mapping[str, str] = {}
+    """Options that are no more, and what to do instead."""
     passes_on: bool = False
     """All arguments are another program's, `--help` too."""
 
@@ -68,10 +77,18 @@ class LazyCommand(NamedTuple):
 
 
 class LazyGroup(TyperGroup):
-    """A command line of `LazyCommand`s; `aliases` are hidden former names."""
+    """A command line of `LazyCommand`s.
+
+    `aliases` are hidden former names; `gone` commands are no more, and what to do instead.
+    """
 
     def __init__(
-        self, commands: Mapping[str, LazyCommand], help: str, epilog: str, aliases: Mapping[str, str] = {}
+        self,
+        commands: Mapping[str, LazyCommand],
+        help: str,
+        epilog: str,
+        aliases: Mapping[str, str] = {},
+        gone: Mapping[str, str] = {},
     ) -> None:
         super().__init__(
             commands={name: TyperCommand(name) for name in commands},
@@ -82,7 +99,7 @@ class LazyGroup(TyperGroup):
             context_settings=_HELP_KEYS,
             params=_group_options(),
         )
-        self._lazy, self._aliases = commands, aliases
+        self._lazy, self._aliases, self._gone = commands, aliases, gone
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command's line in the group's help."""
@@ -93,10 +110,14 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The loaded command in place of its line in the group's help."""
-        name, _, rest = super().resolve_command(ctx, [self._aliases.get(args[0], args[0]), *args[1:]])
+        asked = self._aliases.get(args[0], args[0])
+        _refuse_gone(asked, self._gone)
+        name, _, rest = super().resolve_command(ctx, [asked, *args[1:]])
         if name is None:
             return None, None, rest
         command = self._lazy[name]
+        for word in rest:
+            _refuse_gone(word.partition("=")[0], command.gone)
         return name, command.load(name), [_renamed(word, command.old_options) for word in rest]
 
 
@@ -121,6 +142,11 @@ def _group_options() -> list[Any]:
     app = typer.Typer()
     app.callback()(_options)
     return list(get_command(app).params)
+
+
+def _refuse_gone(word: str, gone: Mapping[str, str]) -> None:
+    if word in gone:
+        raise GoneError(f"`{word}` is gone.", remedy=gone[word], word=word)
 
 
 def _renamed(word: str, old_options: Mapping[str, str]) -> str:

@@ -182,6 +182,7 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     plan_sha256: str = ""
     poses: tuple[PoseStatus, ...] = ()
     current: int | None = None
+    """Number of the pose under way, or of the last one: its `index`, not its place in `poses`."""
     captured: int = 0
     elapsed_s: float = 0.0
     remaining_s: float | None = None
@@ -192,6 +193,11 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     check: bool = False
     """A drift check: to be compared with what is installed, not to be solved."""
     source: Source = "real"
+
+    @property
+    def place(self) -> int | None:
+        """Place of `current` in `poses`; None: there is none, or it was dropped."""
+        return next((place for place, pose in enumerate(self.poses) if pose.index == self.current), None)
 
 
 class LeaseStatus(msgspec.Struct, frozen=True, omit_defaults=True):

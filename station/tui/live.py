@@ -28,8 +28,6 @@ from station.tui.widgets.preview import PreviewPane
 from station.tui.widgets.scene import cell_scene, fields_of
 from station.tui.words import UNKNOWN, clock, degrees, dim, duration, facts, lines, mark, mm
 
-CLOCKS_POOR_MS = 1000 * CaptureConfig().time_bound_s
-"""Poses known worse than that are refused by default."""
 BURNT = 0.01
 """Share of saturated pixels from which on a person should look."""
 _STEPS = {"moving": "move", "settling": "settle", "capturing": "capture", "writing": "save"}
@@ -99,9 +97,9 @@ def pose_line(status: StationStatus) -> Content:
 
 def _under_way(status: StationStatus) -> PoseStatus | None:
     session = status.session
-    if session.current is None or session.current >= len(session.poses):
+    if session.place is None:
         return None
-    pose = session.poses[session.current]
+    pose = session.poses[session.place]
     resting = status.state in (StationState.IDLE, StationState.PAUSED)
     return None if pose.state == "done" and resting else pose
 
@@ -141,9 +139,9 @@ def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:
     """A chip a pose, in the order of driving; of a long plan the rows around the one under way."""
     each = 4 if len(session.poses) < 100 else 5
     per_row = max(1, (width + 1) // (each + 1))
-    made = [_chip(pose, place == session.current, each) for place, pose in enumerate(session.poses)]
+    made = [_chip(pose, pose.index == session.current, each) for pose in session.poses]
     whole = [made[i : i + per_row] for i in range(0, len(made), per_row)]
-    first = max(0, min((session.current or 0) // per_row - 1, len(whole) - rows))
+    first = max(0, min((session.place or 0) // per_row - 1, len(whole) - rows))
     for row in whole[first : first + rows]:
         yield Content(" ").join(row)
 
@@ -263,10 +261,11 @@ def device_lines(known: Known, width: int, height: int) -> Content:
         parts.append(mark("todo", "not recording"))
     known_ms = [ms for ms in (bounds.camera_bound_ms, bounds.controller_bound_ms) if ms is not None]
     if known_ms:
+        capture = CaptureConfig() if known.configuration is None else known.configuration.capture
         parts.append(
             _device(
                 "clocks",
-                sum(known_ms) < CLOCKS_POOR_MS,
+                sum(known_ms) <= 1000 * capture.time_bound_s,
                 f"± {sum(known_ms):.1f} ms {bounds.camera_source or ''}".rstrip(),
             )
         )
@@ -380,8 +379,10 @@ class LiveScreen(StationScreen):
         if status is None:
             return
         session = status.session
-        place = 0 if session.current is None else session.current + 1
-        title = f"Pose {place} of {len(session.poses)}" if place and status.state in RUNNING else "Poses"
+        title = "Poses"
+        if session.place is not None and status.state in RUNNING:
+            number = session.poses[session.place].index + 1
+            title = f"Pose {number} ({session.place + 1} of {len(session.poses)})"
         self.query_one("#progress").border_title = f"{title}: OLD" if known.old else title
         self.query_one("#picture").border_title = (
             f"Camera  {status.camera.model}"

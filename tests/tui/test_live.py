@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import pose as pose_of
-from station.cell.config import matrix4
+from station.cell.config import CaptureConfig, matrix4
 from station.cell.scene import scene_of
-from station.cell.status import EstimateStatus, Event, PoseStatus, StationState, StationStatus
+from station.cell.status import ClockStatus, EstimateStatus, Event, PoseStatus, StationState, StationStatus
 from station.tui.live import (
     chips,
     counted_line,
@@ -23,7 +23,7 @@ from station.tui.task import Known
 from station.tui.widgets.canvas import Canvas, Series, curve
 from station.tui.widgets.scene import draw, fields_of, view_of
 from station.tui.words import limit_bar
-from tests.tui.conftest import CELL, idle
+from tests.tui.conftest import CELL, FakeLink, idle, opened, until
 
 SEALED = Event(
     0, "info", "sealed with 25 of 26 poses: /var/lib/station/sessions/20260131-101500-cell/session.mcap"
@@ -74,6 +74,27 @@ def test_the_chip_of_the_pose_under_way_is_always_there(
     assert max(map(len, shown)) <= width
     if current is not None:
         assert f"{current + 1}▶" in "".join(shown)
+
+
+@pytest.mark.parametrize("numbers", [(4, 0, 1, 2, 3), (0, 1, 2, 4)], ids=["reordered", "one dropped"])
+async def test_the_pose_under_way_is_told_by_its_number(numbers: tuple[int, ...], link: FakeLink) -> None:
+    poses = tuple(
+        PoseStatus(index=i, name=f"p{i + 1}", state="moving" if i == 4 else "planned") for i in numbers
+    )
+    moving = session(idle(StationState.MOVING), poses=poses, current=4)
+    assert "▶ move" in pose_line(moving).plain
+    assert "5▶" in "".join(row.plain for row in chips(moving.session, 60, 1))
+    link.show(moving)
+    async with opened(link) as pilot:
+        title = f"Pose 5 ({numbers.index(4) + 1} of {len(numbers)})"
+        await until(pilot, lambda: pilot.app.screen.query_one("#progress").border_title == title)
+
+
+@pytest.mark.parametrize(("limit_s", "marked"), [(0.02, "✗ clocks"), (0.08, "✓ clocks")])
+def test_clocks_are_judged_by_the_limit_of_this_cell(limit_s: float, marked: str) -> None:
+    status = msgspec.structs.replace(idle(), clock=ClockStatus(camera_bound_ms=45.0, camera_source="arrival"))
+    cell = msgspec.structs.replace(CELL, capture=CaptureConfig(time_bound_s=limit_s))
+    assert marked in device_lines(Known(status, configuration=cell), 80, 4).plain
 
 
 def test_the_error_falls_towards_its_goal() -> None:

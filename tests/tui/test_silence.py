@@ -104,7 +104,7 @@ async def test_a_screen_that_was_away_meanwhile_shows_what_was_known_last(link: 
         await pilot.press("3")
         await until(pilot, lambda: "p08" in text_of(pilot.app, "#poses"))
         assert "NO DAEMON" in text_of(pilot.app, "#bar")
-        assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose 8 of 25: OLD"
+        assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose 8 (8 of 25): OLD"
 
 
 async def test_without_a_connection_stop_is_sent_all_the_same() -> None:

@@ -9,6 +9,10 @@ import msgspec
 
 from recordings.schema.messages import Matrix4, Mount, Vector6
 
+Criterion = Literal["A", "D", "arm", "all"]
+"""Smallest error of X; smallest ellipsoid of X; smallest error over the workspace with the arm's table;
+smallest ellipsoid of X, board, lens and table together."""
+
 
 class ExpectedView(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
     """Expected look of the board from here, by the guess the plan was made with."""
@@ -46,6 +50,8 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     joint_acceleration_rad_s2: float = 1.0
     seed: int | None = None
     note: str = ""
+    criterion: Criterion | None = None
+    """Criterion by which the planner chose all poses; None: a person taught, listed or changed some."""
     motion: Literal["stops", "sweep"] = "stops"
     """sweep: the arm swings through the poses without a stop for an image, while the camera runs."""
 

@@ -23,12 +23,12 @@ from station.cell.config import StationConfig
 from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, LimitError, StationError
 from station.cell.limits import PlanCheck, Problem, check_plan
-from station.cell.plan import Plan, plan_sha256
+from station.cell.plan import Criterion, Plan, plan_sha256
 from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
 from station.cell.socket_folder import default_socket
 from station.cli.console import AsJson, Socket, err, out, print_json
 from station.operate.motion import status_now
-from station.plan.choose import CRITERIA, WITH_TABLE, Aim, Criterion
+from station.plan.choose import CRITERIA, WITH_TABLE, Aim
 from station.plan.files import import_list, load_plan, save_plan, taught_plan
 from station.plan.planner import make_plan
 from station.plan.predict import ArmForecast, forecast_arm, with_forecast

@@ -12,6 +12,7 @@ from typing import Protocol, TypeVar
 import msgspec
 
 from station.cell.errors import RefusedError, StationError
+from station.cell.plan import Criterion
 from station.cell.status import MotionPreview, StationState, StationStatus
 from station.protocol.client import ANSWER_S, Client, DaemonGoneError
 from station.protocol.verbs import PLANNED_ELSEWHERE, Finish, GetPlan, Go, MakePlan, Prepare, Purpose, Verb
@@ -22,6 +23,8 @@ Approve = Callable[[MotionPreview], Awaitable[bool]]
 """Show a person what would move; True: they approve exactly this motion."""
 PlansHere = Callable[[StationError], Awaitable[bool]]
 """Show a person why the plan is refused; True: they want it made again from where the arm stands."""
+REPLACEABLE: Criterion = "A"
+"""Poses that `MakePlan` would choose too; what a person taught, listed or asked for is never replaced."""
 HASH_DIGITS = 12
 """Digits of a plan's hash that are shown; fewer approve nothing."""
 CONNECT_WAIT_S = 30.0
@@ -90,9 +93,10 @@ async def prepared_motion(
     try:
         preview = await link.call(Prepare(purpose), timeout_s=PREPARE_S)
     except StationError as refusal:
-        if refusal.code != PLANNED_ELSEWHERE or plans_here is None or not await plans_here(refusal):
+        if refusal.code != PLANNED_ELSEWHERE or plans_here is None:
             raise
-        if (plan := (await link.call(GetPlan())).plan) is None:
+        plan = (await link.call(GetPlan())).plan
+        if plan is None or plan.criterion != REPLACEABLE or not await plans_here(refusal):
             raise
         await link.call(MakePlan(max(4, len(plan.poses)), plan.seed or 0), timeout_s=PREPARE_S)
         preview = await link.call(Prepare(purpose), timeout_s=PREPARE_S)

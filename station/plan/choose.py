@@ -22,11 +22,9 @@ from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import with_near_axes
 from calibrate.projection import intrinsics_names
+from station.cell.plan import Criterion
 from station.cell.scene import Scene
 
-Criterion = Literal["A", "D", "arm", "all"]
-"""Smallest error of X; smallest ellipsoid of X; smallest error over the workspace with the arm's table;
-smallest ellipsoid of X, board, lens and table together."""
 WITH_TABLE = ("arm", "all")
 Aim = Literal["camera", "arm", "both"]
 CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm", "both": "all"}

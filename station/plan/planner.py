@@ -17,7 +17,7 @@ from station.cell.collision import margins
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
 from station.cell.limits import check_plan
-from station.cell.plan import Plan
+from station.cell.plan import Criterion, Plan
 from station.cell.scene import Scene, require_kept_clear, scene_of
 from station.plan.candidates import (
     ARM_IN_SIGHT,
@@ -27,7 +27,7 @@ from station.plan.candidates import (
     best_group,
     find_candidates,
 )
-from station.plan.choose import WITH_TABLE, Criterion, Objective, choose, informations, objective_for
+from station.plan.choose import WITH_TABLE, Objective, choose, informations, objective_for
 from station.plan.order import BLOCKED, move_times, short_order, time_matrix
 from station.plan.visibility import ViewRange, blind_share, expected_view, planned_pose, view_range, visible
 
@@ -330,4 +330,5 @@ def _describe(
         joint_speed_rad_s=limits.joint_speed_rad_s,
         joint_acceleration_rad_s2=limits.joint_acceleration_rad_s2,
         seed=options.seed,
+        criterion=options.criterion,
     )

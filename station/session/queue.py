@@ -169,6 +169,7 @@ class PoseQueue:
             text = f"An order names each of the {len(self._poses)} poses exactly once."
             raise RefusedError(text, code="wrong-order")
         self._poses = {i: self._poses[i] for i in order}
+        self._changed()
 
     def add(self, pose: PlannedPose) -> int:
         """At the end; returns its number."""
@@ -179,6 +180,7 @@ class PoseQueue:
         index, self.next_index = self.next_index, self.next_index + 1
         self._poses[index] = pose
         self._status[index] = _fresh(index, pose)
+        self._changed()
         return index
 
     def drop(self, index: int) -> None:
@@ -191,6 +193,11 @@ class PoseQueue:
         if len(self._poses) == 1:
             raise _refused("last-pose", index, "is the last one", "Finish the session instead.")
         del self._poses[index], self._status[index]
+        self._changed()
+
+    def _changed(self) -> None:
+        """Note that a person changed the plan: no other takes its place unasked."""
+        self._plan = msgspec.structs.replace(self._plan, criterion=None)
 
 
 def _refused(code: str, index: int, what: str, remedy: str = "") -> RefusedError:

@@ -109,14 +109,14 @@ async def _refused(context: SessionContext, plan: Plan, check: PlanCheck, start:
     cell, first_rad = context.cell, plan.poses[0].joints_rad
     if (await context.workers.call(check_run, cell.config, plan, first_rad)).problems:
         return refused
-    command = ""
+    command, own = "", plan.criterion is None
     if cell.config_path:
         command = f": `station plan --config {shlex.quote(cell.config_path)} -o plan.yaml`"
     return LimitError(
         f"The plan was made from another posture. The arm stands at {_degrees(start)}; from there "
         f"to {check.moves[0].name} at {_degrees(first_rad)} {check.problems[0].text}",
         code=PLANNED_ELSEWHERE,
-        remedy=f"Plan again from here{command}.",
+        remedy="Bring the arm to its first pose by hand." if own else f"Plan again from here{command}.",
         problems=len(check.problems),
     )
 

@@ -43,7 +43,8 @@ def test_a_plan_is_made_shown_and_saved(made):
 def test_the_other_criterion_makes_another_plan(made, tmp_path):
     result = run("--poses", 12, "-o", tmp_path / "d.yaml", "--d-optimal")
     assert result.returncode == 0, result.stderr
-    assert load_plan(tmp_path / "d.yaml").poses != load_plan(made[1]["plan.yaml"]).poses
+    mine, other = load_plan(made[1]["plan.yaml"]), load_plan(tmp_path / "d.yaml")
+    assert other.poses != mine.poses and (mine.criterion, other.criterion) == ("A", "D")
 
 
 def test_the_scene_file_opens_and_shows_the_arm_moving(made):

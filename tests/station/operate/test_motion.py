@@ -6,12 +6,15 @@ import asyncio
 from collections.abc import AsyncIterator
 from typing import Any, cast
 
+import msgspec
 import pytest
 
-from station.cell.errors import RefusedError
-from station.cell.status import CameraStatus, RobotStatus, StationState, StationStatus
+from station.cell.errors import LimitError, RefusedError, StationError
+from station.cell.plan import Plan, PlannedPose
+from station.cell.status import CameraStatus, MotionPreview, RobotStatus, StationState, StationStatus
 from station.operate import motion
 from station.protocol.client import Client
+from station.protocol.verbs import PLANNED_ELSEWHERE, Done, GetPlan, LoadedPlan, MakePlan, Prepare, Purpose
 
 CAMERA = CameraStatus(connected=True)
 STANDING = RobotStatus(connected=True, joints_rad=(0.0,) * 6)
@@ -62,3 +65,40 @@ def test_what_does_not_come_is_named(
     with pytest.raises(RefusedError) as refused:
         waited(told)
     assert refused.value.code == missing
+
+
+class Elsewhere:
+    """A daemon whose arm stands elsewhere than its plan begins, until another plan is made."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan, self.made = plan, False
+
+    async def call(self, verb: object, **_: float) -> object:
+        match verb:
+            case GetPlan():
+                return LoadedPlan(self.plan, "ab" * 32)
+            case MakePlan():
+                self.made = True
+            case Prepare() if not self.made:
+                raise LimitError("The plan was made from another posture.", code=PLANNED_ELSEWHERE)
+            case Prepare():
+                return MotionPreview("t", "run plan", "ab" * 32, 1, 1.0, 0.1, 0.1, 10.0, "to pose 1")
+        return Done()
+
+
+@pytest.mark.parametrize("criterion", [None, "D", "arm", "all"])
+def test_only_a_plan_of_default_poses_is_made_again(criterion: Any) -> None:
+    async def yes(_: object) -> bool:
+        return True
+
+    def started(link: Elsewhere) -> bool:
+        begun = motion.prepared_motion(cast("motion.Link", link), Purpose.RUN, yes, plans_here=yes)
+        return asyncio.run(begun)
+
+    plan = Plan("UR10", "eye-in-hand", (PlannedPose("p01", (0.0,) * 6),), criterion=criterion)
+    link = Elsewhere(plan)
+    with pytest.raises(StationError) as refused:
+        started(link)
+    assert refused.value.code == PLANNED_ELSEWHERE and not link.made
+    own = Elsewhere(msgspec.structs.replace(plan, criterion="A"))
+    assert started(own) and own.made

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import msgspec
 import pytest
 
 from station.cell.plan import Plan, PlannedPose
@@ -18,6 +21,19 @@ def queue_of(count: int = 4) -> PoseQueue:
 
 def pose(name: str, guided: bool = False) -> PlannedPose:
     return PlannedPose(name, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0), guided=guided)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda q: q.reorder((1, 0, 2, 3)), lambda q: q.drop(1), lambda q: q.add(pose("own"))],
+    ids=["reordered", "dropped", "added"],
+)
+def test_a_plan_that_a_person_changed_is_no_longer_the_planners(change: Callable[[PoseQueue], None]) -> None:
+    queue = PoseQueue(msgspec.structs.replace(queue_of().plan, criterion="A"))
+    queue.skip(3)
+    assert queue.plan.criterion == "A"
+    change(queue)
+    assert queue.plan.criterion is None
 
 
 @pytest.mark.parametrize("state", sorted(BUSY))

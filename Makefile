@@ -42,7 +42,7 @@ check: $(READY)  ## ruff, mypy strict, import contracts, budget
 	$(BIN)/lint-imports
 	$(BIN)/python tests/budget.py
 
-budget: $(READY)  ## store today's size in budget.toml
+budget: $(READY)  ## lower budget.toml to today's size
 	$(BIN)/python tests/budget.py --write
 
 # Other people's programs, apart from ours: half a gigabyte, and npm's part only where there is npm.

@@ -42,7 +42,7 @@ SHOWN: dict[str, str] = {
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
     "batch": "speed-up|bits",
     "fleet": "process|Dask",
-    "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves, plan|predicted)",
+    "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
     "improving": "improved",
     "watch": r"^\| (repeated|any) .* of ",
     "watch_real": "",

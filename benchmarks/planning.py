@@ -1,4 +1,4 @@
-"""Planned poses: error of X, its prediction, safety, time, and plans from a bad first guess.
+"""Planned poses: error of X, its prediction, safety and time.
 
 Cells come from `random_cells`, every check of a plan too. X is estimated by the product's own
 estimate with the lens free, from simulated corners and robot poses at mid noise (0.2 px,
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -30,7 +29,7 @@ from benchmarks.random_cells import (
 )
 from benchmarks.scene import MID
 from benchmarks.trials import trials
-from calibrate.geometry import Array, difference, perturb, pose, rotation_exp
+from calibrate.geometry import Array, difference, perturb
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.estimate import estimate
@@ -40,12 +39,10 @@ from calibrate.kinematics import forward
 from calibrate.projection import project
 from calibrate.results import SHAPE
 from calibrate.views import Observations, extent_of
-from station.analysis.worker import check_run
 from station.cell.errors import LimitError
 from station.cell.limits import allowed_speed, check_plan, sample_path
-from station.cell.plan import Plan, PlannedPose
-from station.cell.scene import Scene, guess_from, scene_of
-from station.plan.bootstrap import BootstrapView, improved_config, next_move
+from station.cell.plan import Plan
+from station.cell.scene import Scene, scene_of
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, candidate_pool, plan_scene
 from station.plan.visibility import ViewRange
@@ -91,7 +88,6 @@ def measure(seed: int) -> CellResult:
     rng = np.random.default_rng([32, seed])
     _compare_choices(cell, result, rng, seed)
     _plan_and_check(cell, result, rng, seed)
-    _bootstrap(cell, result, np.random.default_rng([33, seed]), seed)
     return result
 
 
@@ -185,46 +181,3 @@ def x_error(cell: RandomCell, flange: Array, rng: np.random.Generator) -> Array:
     start = CellState(cell.X, cell.Y, C, CAMERA, np.zeros(len(SHAPE)), np.zeros(0))
     found = estimate(replace(observed, pixels=pixels), start, _PRIORS)
     return difference(found.state.X, cell.X)
-
-
-def _bootstrap(cell: RandomCell, result: CellResult, rng: np.random.Generator, seed: int) -> None:
-    """From a mount guess wrong by 30° and 100 mm and no idea of the board's place."""
-
-    def unit() -> Array:
-        v = rng.normal(size=3)
-        return np.asarray(v / np.linalg.norm(v))
-
-    wrong = pose(rotation_exp(unit() * np.deg2rad(30)) @ cell.X[:3, :3], cell.X[:3, 3] + 0.1 * unit())
-    config = msgspec.structs.replace(cell.config, camera_guess=guess_from(wrong, 0.06, 0.3), board_guess=None)
-
-    def glimpse(joints: Sequence[float]) -> BootstrapView:
-        C = cell.camera_from_board(forward(ARM, joints))
-        result.boot_unseen += not shows_board(C)
-        seen = perturb(C, rng.normal(size=6) * np.repeat([4e-4, 8e-4], 3))
-        return BootstrapView(np.array(joints), seen)
-
-    def require_passing(pose: PlannedPose) -> None:
-        """LimitError where the daemon, which knows the wrong guess only, would refuse."""
-        start = tuple(glimpses[-1].joints_rad) if glimpses else pose.joints_rad
-        problems = check_run(config, Plan(ARM.name, "eye-in-hand", (pose,)), start).problems
-        if problems:
-            raise LimitError(f"the daemon would refuse: {problems[0]}")
-
-    glimpses: list[BootstrapView] = []
-    try:
-        require_passing(PlannedPose("taught", tuple(cell.start)))
-        glimpses.append(glimpse(cell.start.tolist()))
-        while (move := next_move(config, glimpses)) is not None:
-            require_passing(move)
-            _check_path(glimpses[-1].joints_rad, np.array(move.joints_rad), cell, result)
-            glimpses.append(glimpse(move.joints_rad))
-        scene = scene_of(improved_config(config, glimpses))
-        plan = plan_scene(scene, PlanOptions(seed=seed, noise=NOISE), glimpses[-1].joints_rad.tolist())
-    except LimitError as error:
-        result.failures.append(f"bootstrap of cell {seed}: {error}")
-        return
-    result.bootstrapped = len(plan.poses) == 25
-    result.boot_moves = len(glimpses) - 1
-    result.boot_unseen += sum(
-        not shows_board(cell.camera_from_board(forward(ARM, p.joints_rad))) for p in plan.poses
-    )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import msgspec
 import numpy as np
 
@@ -28,9 +26,6 @@ class CellResult(msgspec.Struct):
     cpu_seconds: float = 0.0
     motion_s: float = 0.0
     motion_random_s: float = 0.0
-    bootstrapped: bool = False
-    boot_moves: int = 0
-    boot_unseen: int = 0
     failures: list[str] = []
 
 
@@ -87,7 +82,6 @@ def _facts(cells: list[CellResult]) -> list[list[str]]:
     seconds, cpu = (np.array([getattr(c, n) for c in planned]) for n in ("seconds", "cpu_seconds"))
     motion, other = (np.array([getattr(c, n) for c in planned]) for n in ("motion_s", "motion_random_s"))
     ratio = rms(by_cell)
-    boot = Counter(cell.boot_moves for cell in cells if cell.bootstrapped)
     return [
         ["full plan of 25", f"{len(planned)} of {len(cells)}", "≥ 99 %"],
         [
@@ -96,7 +90,7 @@ def _facts(cells: list[CellResult]) -> list[list[str]]:
             "0",
         ],
         [
-            "moves, plan and bootstrap, that touch something or halve the wanted clearance to table or board",
+            "moves that touch something or halve the wanted clearance to table or board",
             f"{sum(cell.colliding for cell in cells)} of {moves}",
             "0",
         ],
@@ -113,16 +107,5 @@ def _facts(cells: list[CellResult]) -> list[list[str]]:
             "predicted / achieved sigma, pooled",
             f"{1 / ratio:.3f} ± {rms_spread(by_cell) / ratio**2:.3f}",
             "0.9-1.1",
-        ],
-        [
-            "full plan from a guess wrong by 30°, 100 mm",
-            f"{sum(cell.bootstrapped for cell in cells)} of {len(cells)}",
-            "≥ 99 %",
-        ],
-        ["bootstrap moves", ", ".join(f"{n}: {k} times" for n, k in sorted(boot.items())), "3-5"],
-        [
-            "bootstrap and its plan: views without the whole board",
-            f"{sum(cell.boot_unseen for cell in cells)} of {sum((26 + n) * k for n, k in boot.items())}",
-            "",
         ],
     ]

@@ -18,7 +18,7 @@ from tests.test_examples import PROGRAMS, commands_in
 
 ROOT = Path(__file__).parents[1]
 NEEDS_A_CELL = (
-    *(f"station {name}" for name in ("serve", "capture", "bootstrap", "drift-check")),
+    *(f"station {name}" for name in ("serve", "capture", "drift-check")),
     "station plan --config station.yaml --taught",
     "calibrate sweep",
     "calibrate solve session.mcap --time-offset",

@@ -1,8 +1,10 @@
-"""What counts as code, and what a budget says of too much."""
+"""What counts as code, what a budget says of too much, and that it is never raised."""
 
 from __future__ import annotations
 
-from tests.budget import code_lines, over
+import tomllib
+
+from tests.budget import code_lines, lowered, over
 
 SOURCE = '''"""A module
 of one class."""
@@ -28,3 +30,5 @@ def test_only_what_exceeds_its_limit_is_told() -> None:
     allowed = {"code_lines": {"station": 10, "tests": 5}, "count": {"verbs": 2}}
     found = {"code_lines": {"station": 13, "tests": 5}, "count": {"verbs": 1, "drivers": 1}}
     assert over(allowed, found) == {"code_lines.station": 3, "count.drivers": 1}
+    lower = {"code_lines": {"station": 10, "tests": 5}, "count": {"verbs": 1, "drivers": 1}}
+    assert tomllib.loads(lowered(allowed, found)) == lower

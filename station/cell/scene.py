@@ -41,7 +41,7 @@ _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
 _DOUBT = 3.0
 """Sigmas by which a body on a guess is thickened: nothing else keeps a wrong mount off the arm."""
 _MOST_DOUBT_M = 0.03
-"""A camera thicker than this could not stand beside any wrist; bootstrap is for guesses that are worse."""
+"""A camera thicker than this could not stand beside any wrist: `station new` makes a guess better."""
 _DRAWS = 2000
 
 
@@ -128,7 +128,7 @@ def scene_of(config: StationConfig) -> Scene:
         raise ConfigError(
             f"planning needs {missing} in the configuration",
             code="no-guess",
-            remedy="Add it, or let `station bootstrap` find it.",
+            remedy="Add it, or let `station new` find it.",
             missing=missing,
         )
     return Scene(
@@ -236,7 +236,7 @@ def require_kept_clear(config: StationConfig) -> None:
         f"{name} is known to {1000 * guess.sigma_m:.0f} mm only (limit {1000 * _MOST_DOUBT_M:.0f} mm): "
         "moves of a plan might touch something",
         code="guess-too-rough",
-        remedy="Let `station bootstrap` find it, or measure it better.",
+        remedy="Let `station new` find it, or measure it better.",
         sigma_m=guess.sigma_m,
         limit_m=_MOST_DOUBT_M,
     )

@@ -74,10 +74,6 @@ STATION = LazyGroup(
             ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.05"),
         ),
         "new": LazyCommand("station.cli.new:new_command", ("station new", "station new -o station.yaml")),
-        "bootstrap": LazyCommand(
-            "station.cli.bootstrap:bootstrap_command",
-            ("station bootstrap --config station.yaml -o guesses.yaml",),
-        ),
         "doctor": LazyCommand(
             "station.cli.control:doctor_command",
             ("station doctor --example > station.yaml", "station doctor --config station.yaml"),
@@ -88,6 +84,7 @@ STATION = LazyGroup(
         ),
     },
     aliases={"check": "drift-check", "verify": "touch-test", "improve": "replan", "best": "next-pose"},
+    gone={"bootstrap": "`station new` finds camera and board from views that you guide by hand."},
     help="A calibration station for a robot cell. Without a command: the operator screen.",
     epilog=examples(
         "station demo  # first time: everything, with no hardware",

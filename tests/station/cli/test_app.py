@@ -164,7 +164,7 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
         (("demo", "--out", __file__), 2, "not-a-folder"),
         (("plan", "--start", "1,2,3"), 2, "usage"),
         (("plan", "--check", "a", "--from-list", "b"), 2, "usage"),
-        (("bootstrap", "--config", "absent.yaml"), 2, "unreadable-config"),
+        (("bootstrap", "--config", "absent.yaml"), 2, "gone"),
     ],
 )
 def test_what_a_person_can_cause_has_a_code(args: tuple[str, ...], exit_code: int, code: str) -> None:

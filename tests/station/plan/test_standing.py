@@ -5,16 +5,30 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibrate.geometry import inverse, pose
-from calibrate.kinematics import forward, link_frames
-from station.analysis.worker import check_run
+from calibrate.geometry import inverse, pose, rotation_exp
+from calibrate.kinematics import MODELS, forward, link_frames
+from recordings.schema.messages import CameraModel
 from station.cell.collision import margins
-from station.cell.plan import Plan
-from station.cell.scene import cell_geometry, geometry_from
-from station.plan.bootstrap import next_move
-from tests.station.plan.test_bootstrap_room import ARM, GLIMPSE, TAUGHT, WRONG, X, config
+from station.cell.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, RobotConfig, StationConfig
+from station.cell.scene import cell_geometry, geometry_from, guess_from
 
+ARM = MODELS["UR10"]
+TAUGHT = np.array([-0.364, -2.365, -0.459, 0.876, -0.866, -1.122])
+X = pose(rotation_exp([-0.261, 0.808, 2.537]), [0.014, -0.078, 0.076])
+WRONG = pose(rotation_exp([0.152, 0.643, 2.156]), [0.089, -0.084, 0.142])
+"""X turned by 30° and shifted by 100 mm."""
+LENS = CameraModel(1280, 1024, ((1667.0, 0.0, 639.5), (0.0, 1667.0, 511.5), (0.0, 0.0, 1.0)), (-0.09, 0.11))
 FLANGE = forward(ARM, TAUGHT)
+
+
+def config(mount, sigma_m, sigma_rad):
+    return StationConfig(
+        robot=RobotConfig(model="UR10"),
+        camera=CameraConfig(driver="rendered", model=LENS),
+        board=PAPER_BOARD,
+        camera_guess=guess_from(mount, sigma_m, sigma_rad),
+        limits=LimitsConfig(planes=(Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),)),
+    )
 
 
 def beside_the_forearm(beside_m):
@@ -50,13 +64,3 @@ def test_room_that_is_less_than_the_check_of_a_path_wants_is_none():
 def test_a_sharp_guess_one_with_room_and_one_far_inside_stay(mount, sigma_m):
     guessed = config(mount, sigma_m, 0.1)
     assert geometry_from(guessed, TAUGHT).solids == cell_geometry(guessed).solids
-
-
-def test_bootstrap_moves_away_from_a_guess_inside_the_arm_as_the_daemon_allows():
-    shift = 0.2 * np.array([-0.637, 0.765, -0.088])
-    guessed = config(pose(X[:3, :3], X[:3, 3] + shift), 0.06, 0.15)
-    assert room_m(cell_geometry(guessed)) < 0
-    move = next_move(guessed, [GLIMPSE])
-    assert move is not None
-    plan = Plan("UR10", "eye-in-hand", (move,))
-    assert check_run(guessed, plan, tuple(TAUGHT)).problems == ()

@@ -134,7 +134,7 @@ def export(
 ) -> None:
     """Write a calibration in another program's format.
 
-    The file says whether the installed calibration still holds; a warning on stderr does where it does not.
+    The installed one is refused while it is in doubt or withdrawn; unverified, file and stderr say so.
     """
     calibration, validity = named_or_installed(file, root, camera)
     names = FrameNames.of_camera(camera if file is None else calibration.camera_name)

@@ -196,7 +196,7 @@ def _nothing_older(root: Path | None, camera: str, validity: Validity) -> Instal
     return InstallError(
         f"{folder}: no older calibration to go back to.",
         code="nothing-older",
-        remedy=WITHDRAWN_REMEDY if withdrawn else f"To take it out of use: {command}",
+        remedy=f"{WITHDRAWN_REMEDY}." if withdrawn else f"To take it out of use: {command}",
     )
 
 

@@ -22,8 +22,8 @@ from calibrate.files.validity import (
     ValidityReason,
     ValidityState,
     parse_time,
+    require_usable,
     time_text,
-    validity_text,
 )
 from calibrate.geometry import Array, Transform
 from calibrate.kinematics import base_from_flange
@@ -198,7 +198,10 @@ def load_installed(
                     found,
                     validity=replace(found.validity, state=doubt, since=time_text(), reason=reason),
                 )
-    _require(found, require_valid)
+    if require_valid is not False:
+        anyway = "require_valid=False loads it all the same"
+        proven = require_valid is True
+        require_usable(found.validity, str(found.path), anyway, proven=proven, camera=found.camera_name)
     return found
 
 
@@ -213,24 +216,6 @@ def _read(root: Path | str | None, camera: str) -> InstalledCalibration:
             f"{path}: {problem} is missing or of another kind.", code="contradiction"
         ) from None
     return InstalledCalibration(camera, number, path, validity_of(folder, number), plain)
-
-
-def _require(found: InstalledCalibration, valid: bool | None) -> None:
-    validity = found.validity
-    refused = [ValidityState.IN_DOUBT, ValidityState.WITHDRAWN]
-    if valid:
-        refused.append(ValidityState.UNVERIFIED)
-    if valid is False or validity.state not in refused:
-        return
-    raise InstallError(
-        f"{found.path}: {validity_text(validity).rstrip('.')}.",
-        code=f"calibration-{validity.state}",
-        remedy="Run `station drift-check`, or calibrate again; require_valid=False loads it all the same.",
-        camera=found.camera_name,
-        version=found.version,
-        since=validity.since,
-        reason=validity.reason.code,
-    )
 
 
 # --- and when it changes ---

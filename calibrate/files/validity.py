@@ -14,11 +14,13 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Literal
 
+from calibrate.errors import InstallError
+
 FILE = "validity.jsonl"
 CheckKind = Literal["drift-check", "touch-test", "watch"]
 WITHDRAWN_REMEDY = (
     "Solve a new recording and run `calibrate install FILE`, "
-    "or `calibrate rollback NUMBER` to another version of `calibrate list`."
+    "or `calibrate rollback NUMBER` to another version of `calibrate list`"
 )
 
 
@@ -97,6 +99,33 @@ class Validity:
             since = self.since if self.state is ValidityState.VALID else time_text(when)
             return replace(changed, state=ValidityState.VALID, since=since, verified=time_text(when))
         return replace(changed, state=ValidityState.UNVERIFIED) if doubted else self
+
+
+def require_usable(
+    validity: Validity, what: str, anyway: str, *, proven: bool = False, **values: str | int
+) -> None:
+    """Refuse what is in doubt or withdrawn, and with `proven` what is unverified too.
+
+    `anyway`: how to get it all the same. Raises InstallError with code `calibration-STATE`.
+    """
+    refused = [
+        ValidityState.IN_DOUBT,
+        ValidityState.WITHDRAWN,
+        *([ValidityState.UNVERIFIED] if proven else []),
+    ]
+    if validity.state not in refused:
+        return
+    withdrawn = validity.state is ValidityState.WITHDRAWN
+    remedy = WITHDRAWN_REMEDY if withdrawn else "Run `station drift-check`, or calibrate again"
+    raise InstallError(
+        f"{what}: {validity_text(validity).rstrip('.')}.",
+        code=f"calibration-{validity.state}",
+        remedy=f"{remedy}; {anyway}.",
+        version=validity.version,
+        since=validity.since,
+        reason=validity.reason.code,
+        **values,
+    )
 
 
 def validity_text(validity: Validity) -> str:

@@ -12,6 +12,7 @@ from calibrate.files.exports import models, ros, vision
 from calibrate.files.exports.frames import ExportError as ExportError
 from calibrate.files.exports.frames import FrameNames as FrameNames
 from calibrate.files.exports.frames import follow_command as follow_command
+from calibrate.files.validity import require_usable
 
 
 class Format(NamedTuple):
@@ -50,12 +51,18 @@ FORMATS: dict[str, Format] = {
 
 
 def export(calibration: Calibration, name: str, frames: FrameNames | None = None) -> bytes:
-    """Make the file's content. Raises ExportError for an unknown format, or one that cannot hold it."""
+    """Make the file's content. Raises ExportError for an unknown format, or one that cannot hold it.
+
+    What is installed (`frames.validity`) and in doubt or withdrawn is refused as by `load_installed`.
+    """
     if name not in FORMATS:
         raise ExportError(
             f"There is no format {name!r}.", remedy=f"Choose one of {', '.join(FORMATS)}.", format=name
         )
     frames = frames or FrameNames()
+    if frames.validity is not None:
+        anyway = "a calibration file that is named is exported all the same"
+        require_usable(frames.validity, "The installed calibration", anyway)
     if frames.with_table:
         calibration = _of_table(calibration, name)
     made = FORMATS[name].make(calibration, frames)

@@ -22,7 +22,7 @@ import scipy.io
 import yaml
 from scipy.spatial.transform import Rotation
 
-from calibrate.errors import CalibrationError
+from calibrate.errors import CalibrationError, InstallError
 from calibrate.files import exports
 from calibrate.files.calibration import (
     Calibration,
@@ -43,6 +43,7 @@ from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
 from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, base_from_flange, forward, with_near_axes
 from calibrate.load import arm_of_ros
+from tests.calibrate.calling import raises_code
 
 FOLLOWED = FrameNames(follow=("calibrate", "follow"))
 
@@ -406,9 +407,12 @@ def test_equal_calibrations_give_equal_bytes(calibration: Calibration, name: str
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_says_whether_the_installed_one_holds(calibration: Calibration, name: str) -> None:
-    doubted = Validity(3, ValidityState.WITHDRAWN, "2026-01-01T00:00:00+00:00", ValidityReason("withdrawn"))
-    names = replace(FOLLOWED, validity=doubted)
-    assert "withdrawn" in export(calibration, name, names)
+    names = replace(FOLLOWED, validity=unrecorded(3, "2026-01-01T00:00:00+00:00"))
+    assert "unverified" in export(calibration, name, names)
+    for state in (ValidityState.IN_DOUBT, ValidityState.WITHDRAWN):
+        held = Validity(3, state, "2026-01-01T00:00:00+00:00", ValidityReason("watch"))
+        with raises_code(InstallError, f"calibration-{state}", version=3, reason="watch"):
+            export(calibration, name, replace(FOLLOWED, validity=held))
 
 
 def test_camera_info_is_named_by_the_body_frame(calibration: Calibration) -> None:

@@ -86,8 +86,9 @@ def test_what_a_person_withdrew_no_check_brings_back_and_no_rollback_finds(
 ) -> None:
     set_validity(root, W, KNOCKED)
     assert check(root, passed=True).state is W
-    with raises_code(InstallError, "calibration-withdrawn", reason="withdrawn"):
+    with raises_code(InstallError, "calibration-withdrawn", reason="withdrawn") as refused:
         load_installed(root)
+    assert "drift-check" not in refused.value.remedy and "calibrate install" in refused.value.remedy
     install(make_file(0.001), root)
     assert load_installed(root).validity.state is V
     with raises_code(InstallError, "nothing-older"):

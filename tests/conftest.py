@@ -43,16 +43,16 @@ MAY_BE_SENT = {
     "dashboard: get robot model", "dashboard: is in remote control", "dashboard: robotmode",
     "dashboard: safetystatus", "dashboard: programState", "dashboard: running",
     "dashboard: get loaded program", "upload: rtde_control", "upload: station_control",
-    "script: movej", "script: stopj", "script: stopl", "script: rtde_set_watchdog",
+    "script: movej", "script: stopj", "script: rtde_set_watchdog",
     "script: force_mode_set_gain_scaling", "script: force_mode_set_damping",
 }  # fmt: skip
 """Everything a station ever says to a controller; a change here is a change of the safety rules. (The last
-two are what ur_rtde's own script does when it starts; it stops by stopl whichever stop it is asked for.)"""
+two are what ur_rtde's own script does when it starts.)"""
 
 CONTROL_WORDS = {
     "upload": ("upload: rtde_control", "upload: station_control"),
     "move": ("script: movej",),
-    "stop": ("script: stopj", "script: stopl"),
+    "stop": ("script: stopj",),
 }
 """How the controller's log names the same thing on the two control paths."""
 no_library = pytest.mark.skipif(not library_installed(), reason="ur_rtde is not installed")

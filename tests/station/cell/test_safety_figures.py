@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from station.cell import limits, stillness
-from station.devices import ur_child, ur_condition, ur_control, ur_moves
+from station.devices import ur_child, ur_condition, ur_control, ur_moves, ur_script
 from station.plan import hover
 from station.session import lease, supervisor
 
@@ -32,7 +32,8 @@ PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
         (stillness.REST_PATIENCE_S, 1.0, "(1 s at rest)"),
         (ur_moves.STRAYED_RAD, 0.05, "(by 0.05 rad)"),
         (ur_moves.SLIDER_ZERO_S, 10.0, "after 10 s the move is given up"),
-        (ur_child.STOP_DECELERATION, 2.0, "decelerates the tool with 2 m/s²"),
+        (ur_child.STOP_DECELERATION, 4.0, "the joints brake with 4 rad/s²"),
+        (ur_script.STOP_RAD_S2, 4.0, "the joints brake with 4 rad/s²"),
         (hover.SPEED_M_S, 0.05, "faster than 0.05 m/s"),
         (lease.APPROVAL_LIFETIME_S, 120.0, "It is for one use"),
         (lease.START_TOLERANCE_RAD, 0.005, "from where the arm stood"),

@@ -150,13 +150,15 @@ def test_numbers_the_library_would_pass_on_are_refused(child: Conversation, join
     assert "six finite joint angles" in answers[-1]["error"] and "moveJ" not in child.library.names
 
 
-def test_stop_is_asynchronous(child: Conversation) -> None:
-    assert child.say({"do": "stop", "deceleration": 2.0}) == [{"stopped": True}]
-    assert child.library.calls[0] == ("stopJ", (True,))
+def test_a_stop_is_the_one_that_the_librarys_script_takes_for_a_stop_of_the_joints(
+    child: Conversation,
+) -> None:
+    assert child.say({"do": "stop", "deceleration": 4.0}) == [{"stopped": True}]
+    assert child.library.calls[0] == ("stopJ", (False,))
 
 
 def test_nothing_moves_after_a_stop(child: Conversation) -> None:
-    answers = child.say(beat(), {"do": "stop", "deceleration": 2.0}, beat(), move())
+    answers = child.say(beat(), {"do": "stop", "deceleration": 4.0}, beat(), move())
     assert answers[-1] == {"id": 7, "ok": False, "error": "a stop was asked for"}
     assert "moveJ" not in child.library.names
 
@@ -323,7 +325,7 @@ async def test_a_process_that_reads_nothing_does_not_hold_the_loop_up(parent: Pa
 
 async def test_a_stop_is_acknowledged_by_its_answer_and_by_the_end(parent: Parent, tmp_path: Path) -> None:
     parent.child.stop()
-    assert await parent.asked() == {"do": "stop", "deceleration": 2.0}
+    assert await parent.asked() == {"do": "stop", "deceleration": 4.0}
     parent.answer({"stopped": True})
     await asyncio.wait_for(parent.child.stop_acknowledged, 1.0)
     dying = Parent(tmp_path)

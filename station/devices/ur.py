@@ -43,6 +43,8 @@ from station.devices.ur_moves import MoveWatch, check_goal
 log = logging.getLogger(__name__)
 
 POLL_S = 0.005
+TOOL_S = 0.04
+"""Between two looks at TCP and payload in a move: each takes the loop up to a millisecond."""
 ONE_WAY_S = 1.0
 RESTING_RAD_S = 0.005
 STOP_WAIT_S = 0.05
@@ -212,6 +214,7 @@ class UrRobot(UrLink):
             self.notice, self._one_way_s = "", None
 
     async def _follow(self, watch: MoveWatch, child: ControlChild) -> None:
+        tool_s = 0.0
         while True:
             if self._stop_reason:
                 raise _stopped(f": {self._stop_reason}")
@@ -220,6 +223,9 @@ class UrRobot(UrLink):
                 self._played_s = sample.state.stamps.host_monotonic_ns / 1e9
             if watch.step(sample.state, sample.operation, self.age_s(), time.monotonic()):
                 return
+            if time.monotonic() > tool_s + TOOL_S:
+                tool_s = time.monotonic()
+                self.check_tool(sample)
             child.check()
             self.notice = watch.notice
             await asyncio.sleep(POLL_S)

@@ -260,12 +260,16 @@ class UrLink:
         stop = safety_stop(state)
         if stop is not None:
             raise stop
-        if self._tool is not None and self._primary is not None:
-            self._tool.check(state, self._primary.installation)
-        if self._payload is not None:
-            check_payload(self.newest().payload, self._payload)
+        self.check_tool(self.newest())
         if self._trouble is not None:
             raise self._trouble
+
+    def check_tool(self, sample: Sample) -> None:
+        """Raises RobotError when TCP or payload are other ones than at connect; in motion, too."""
+        if self._tool is not None and self._primary is not None:
+            self._tool.check(sample.state, self._primary.installation)
+        if self._payload is not None:
+            check_payload(sample.payload, self._payload)
 
     def _reader_ended(self, reader: StateReader, why: str) -> None:
         """Once for each reader: its own word may come after the supervision saw it."""

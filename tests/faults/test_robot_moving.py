@@ -40,8 +40,10 @@ async def test_safety_stop(strike: Strike, model: str, fault: str, code: str) ->
         ({"cmd": "pause"}, "program-ended"),
         ({"cmd": "power_off"}, "not-powered"),
         ({"cmd": "remote", "on": False}, "local-control"),
+        ({"cmd": "tcp", "pose": [0.0, 0.0, 0.002, 0.0, 0.0, 0.0]}, "tcp-changed"),
+        ({"cmd": "payload", "kg": 1.5}, "payload-changed"),
     ],
-    ids=["program stopped", "program paused", "power off", "remote control lost"],
+    ids=["program stopped", "program paused", "power off", "remote control lost", "TCP", "payload"],
 )
 async def test_something_on_the_pendant(strike: Strike, fault: dict[str, Any], code: str) -> None:
     c, outcome = await strike(lambda c: c.admin.ask(**fault), "UR10e")

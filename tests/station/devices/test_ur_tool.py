@@ -111,6 +111,19 @@ def test_with_a_configured_table_the_check_is_fine_without_the_controllers_words
             check.check(sample(arm, THERE, moved), Installation())
 
 
+def test_in_motion_joints_and_pose_of_neighbouring_cycles_are_no_change_but_another_tool_is() -> None:
+    check = TcpCheck(FACTORY, True, sample(FACTORY, HERE, TOOL), Installation())
+    speeds: Vector6 = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    ahead: Vector6 = (HERE[0] + 0.008, *HERE[1:])
+    late = msgspec.structs.replace(sample(FACTORY, HERE, TOOL), joints_rad=ahead, joint_speeds_rad_s=speeds)
+    check.check(late, Installation())
+    with raises("tcp-changed"):
+        check.check(msgspec.structs.replace(late, joint_speeds_rad_s=NO_TOOL), Installation())
+    moved = sample(FACTORY, HERE, (TOOL[0] + 0.08, *TOOL[1:]))
+    with raises("tcp-changed"):
+        check.check(msgspec.structs.replace(moved, joint_speeds_rad_s=speeds), Installation())
+
+
 def test_a_tool_of_more_than_a_metre_is_a_mix_up() -> None:
     long: Vector6 = (0.0, 0.0, 1.05, 0.0, 0.0, 0.0)
     with raises("tcp-too-far"):

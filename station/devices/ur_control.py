@@ -74,7 +74,7 @@ class MotionServer:
                 self.answer({"id": request["id"], "ok": not error, "error": error})
             elif verb == "stop":
                 self._stopped = True
-                # Asynchronously, ur_rtde 1.6.5's script would brake the tool (stopl), whatever it is asked for.
+                # Asynchronously, ur_rtde 1.6.5's script brakes the tool (stopl), whatever it is asked for.
                 # The stop is sent at once all the same; the call returns when the joints rest.
                 self._control.stopJ(float(request["deceleration"]), False)
                 self.answer({"stopped": True})

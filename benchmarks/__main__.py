@@ -43,7 +43,6 @@ SHOWN: dict[str, str] = {
     "batch": "speed-up|bits",
     "fleet": "process|Dask",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
-    "improving": "improved",
     "watch": r"^\| (repeated|any) .* of ",
     "watch_real": "",
     "drift": r"planned \| [38] \|",

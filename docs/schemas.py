@@ -56,7 +56,7 @@ TYPES: dict[str, tuple[str, Any]] = {
     "doctor": ("station doctor --json", DoctorJson),
     "demo": ("station demo --json", DemoJson),
     "plan-report": ("station plan --json", PlanJson),
-    "capture": ("station capture | resume | replan --json", SessionJson),
+    "capture": ("station capture | resume --json", SessionJson),
     "info": ("recordings info --json", RecordingInfoJson),
     "recover": ("recordings recover --json", list[Recovery]),
     "import": ("recordings import --json", ImportJson),

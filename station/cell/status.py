@@ -168,8 +168,6 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     goal_mm: float | None = None
     enough: bool = False
     advice: str = ""
-    improve: str = ""
-    """Why and how the poses that are left should be planned anew; empty = no need."""
     image_coverage: tuple[tuple[int, ...], ...] = ()
     """Corners seen so far in each part of the image, rows from the top."""
     image_views: tuple[tuple[int, ...], ...] = ()

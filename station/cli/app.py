@@ -52,8 +52,6 @@ STATION = LazyGroup(
             "station.cli.control:retake_command", ("station retake 7  # then: station resume",)
         ),
         "skip": LazyCommand("station.cli.control:skip_command", ("station skip 7",)),
-        "replan": LazyCommand("station.cli.session:replan_command", ("station replan",)),
-        "next-pose": LazyCommand("station.cli.session:next_pose_command", ("station next-pose",)),
         "drift-check": LazyCommand(
             "station.cli.session:drift_check_command",
             ("station drift-check", "station drift-check --poses 12"),
@@ -84,7 +82,11 @@ STATION = LazyGroup(
         ),
     },
     aliases={"check": "drift-check", "verify": "touch-test", "improve": "replan", "best": "next-pose"},
-    gone={"bootstrap": "`station new` finds camera and board from views that you guide by hand."},
+    gone={
+        "bootstrap": "`station new` finds camera and board from views that you guide by hand.",
+        "next-pose": "F3 on the screen adds views that you guide by hand.",
+        "replan": "`station finish`, then `station plan` plans again.",
+    },
     help="A calibration station for a robot cell. Without a command: the operator screen.",
     epilog=examples(
         "station demo  # first time: everything, with no hardware",

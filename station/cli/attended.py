@@ -87,15 +87,13 @@ class Attended:
     async def carry_out(self, purpose: Purpose) -> StationStatus:
         """One session, until it rests."""
         self.progress.skip(await self.status())
-        # One pose more never ends a session that has others left.
-        to_the_end = self._headless and purpose is not Purpose.NEXT_POSE
         with self.progress:
             return await carry_out(
                 self.client,
                 purpose,
                 self.approves,
                 self.progress,
-                finish_with_loss=to_the_end,
+                finish_with_loss=self._headless,
                 headless=not self.interactive,
                 plans_here=self.plans_here if self.interactive else None,
             )

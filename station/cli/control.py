@@ -105,10 +105,10 @@ def acknowledge_command(socket: Socket = None) -> None:
 def pause_command(socket: Socket = None) -> None:
     """Pause after the pose under way.
 
-    Anyone may. Next: `station resume`, `replan`, `next-pose` or `finish`.
+    Anyone may. Next: `station resume` or `finish`.
     """
     ask(socket or default_socket(), Pause())
-    out.print("Pauses after this pose. Next: `station resume`, `replan`, `next-pose` or `finish`")
+    out.print("Pauses after this pose. Next: `station resume` or `finish`")
 
 
 def finish_command(socket: Socket = None) -> None:

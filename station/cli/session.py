@@ -1,4 +1,4 @@
-"""The commands of a session: `capture`, `resume`, `replan`, `next-pose` and `drift-check`."""
+"""The commands of a session: `capture`, `resume` and `drift-check`."""
 
 from __future__ import annotations
 
@@ -74,29 +74,6 @@ def resume_command(
     _finish(asyncio.run(session(socket, Purpose.RESUME, headless, approve, as_json)), as_json)
 
 
-def replan_command(headless: Headless = False, socket: Socket = None, as_json: AsJson = False) -> None:
-    """Replan the remaining poses of a paused session from its images.
-
-    Shows what would change and asks; then continues the session. Ctrl-C stops the arm.
-    """
-    _finish(asyncio.run(session(socket, Purpose.REPLAN, headless, quiet=as_json)), as_json)
-
-
-def next_pose_command(headless: Headless = False, socket: Socket = None) -> None:
-    """Add the most useful pose to a paused session and capture it.
-
-    Shows the pose and its gain, and asks; its path is checked as any other. Then the session is paused as
-    before, or finished when no other pose was left. Ctrl-C stops the arm.
-
-    Exit codes: 0 captured, 1 not captured.
-    """
-    outcome = asyncio.run(session(socket, Purpose.NEXT_POSE, headless))
-    added = max(outcome.session.poses, key=lambda pose: pose.index)
-    out.print(f"pose {added.index + 1}: {added.state}{f', {added.reason}' if added.reason else ''}")
-    _say_state(outcome, outcome.reason or outcome.session.recording)
-    raise typer.Exit(0 if added.state == "done" else 1)
-
-
 def drift_check_command(
     poses: Annotated[int, typer.Option(min=4, max=50, help="Poses to capture")] = POSES,
     headless: Headless = False,
@@ -170,7 +147,7 @@ class PosesJson(msgspec.Struct, frozen=True):
 
 
 class SessionJson(msgspec.Struct, frozen=True):
-    """`station capture --json`, `station resume --json`, `station replan --json`"""
+    """`station capture --json`, `station resume --json`"""
 
     state: StationState
     poses: PosesJson

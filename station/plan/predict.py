@@ -114,13 +114,9 @@ def advise(
     captured: ArrayLike,
     goal_m: float,
     joints_now_rad: Sequence[float],
-    onward_rad: Sequence[float] | None = None,
     pool_size: int = 150,
 ) -> Advice:
-    """Are the captured flange poses (n, 4, 4) enough? If not: the next best pose, and how many more.
-
-    `onward_rad`: joints of the pose after it; the path on to it must be free too.
-    """
+    """Are the captured flange poses (n, 4, 4) enough? If not: the next best pose, and how many more."""
     flange = np.asarray(captured, dtype=float).reshape(-1, 4, 4)
     objective = objective_for(scene, "A", free_intrinsics=True)
     known = informations(scene, flange).sum(axis=0)
@@ -133,8 +129,7 @@ def advise(
     if len(pool) == 0:
         return Advice(now, False, f"{state}; no further pose is reachable with the board in view")
     gains = informations(scene, pool.base_from_flange)
-    stops = [start] if onward_rad is None else [start, np.asarray(onward_rad, dtype=float)]
-    best = _best_free(scene, stops, pool.joints_rad, objective(known + gains))
+    best = _best_free(scene, start, pool.joints_rad, objective(known + gains))
     if best is None:
         return Advice(
             now, False, f"{state}; no free path from here to a pose that helps: jog the arm and ask again"
@@ -150,10 +145,10 @@ def advise(
     return Advice(now, False, text, pose, missing)
 
 
-def _best_free(scene: Scene, stops: Sequence[Array], joints_rad: Array, scores: Array) -> int | None:
-    """Row of the joints (n, 6) with the lowest score and free paths to the stops (6,); few are tried."""
+def _best_free(scene: Scene, start: Array, joints_rad: Array, scores: Array) -> int | None:
+    """Row of the joints (n, 6) with the lowest score and a free path from `start` (6,); few are tried."""
     for place in np.argsort(scores, kind="stable")[:_TRIES]:
-        if not any(check_path(scene.geometry, stop, joints_rad[place]).problems for stop in stops):
+        if not check_path(scene.geometry, start, joints_rad[place]).problems:
             return int(place)
     return None
 
@@ -166,20 +161,6 @@ def _missing(known: Array, gains: Array, goal_m: float, objective: Objective) ->
         if sigma_of(total, objective.prior)[0] <= goal_m:
             return count
     return None
-
-
-def next_best(
-    config: StationConfig,
-    base_from_flange: Array,
-    joints_now_rad: Sequence[float],
-    onward_rad: Sequence[float] | None,
-) -> Advice:
-    """Find the pose that would help most after those captured (n, 4, 4), whether or not these are enough.
-
-    Free to reach from here, and from it the pose that is next (`onward_rad`). By forecast from the configured
-    guesses; ConfigError where these are missing.
-    """
-    return advise(scene_of(config), base_from_flange, 0.0, joints_now_rad, onward_rad)
 
 
 def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:

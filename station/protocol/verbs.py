@@ -161,8 +161,6 @@ class Purpose(StrEnum):
     DRIFT_CHECK = "check"
     RESUME = "resume"
     RETAKE = "retake"
-    REPLAN = "improve"
-    NEXT_POSE = "best"
 
 
 class Hello(Verb[Welcome], frozen=True):

@@ -16,7 +16,7 @@ from station.cell.session_folder import SessionSummary, list_sessions
 from station.cell.socket_folder import user_name
 from station.cell.status import HoverOffer, LeaseStatus, MotionPreview
 from station.protocol import verbs
-from station.protocol.verbs import VERBS, Purpose, Verb
+from station.protocol.verbs import VERBS, Verb
 from station.server.approval import ApprovalRule, Peer, Process, process
 from station.session.checklist import checklist
 from station.session.recording import software
@@ -128,8 +128,6 @@ class SessionDispatcher:
         return verbs.PlanFacts(len(queue.statuses), queue.sha256)
 
     async def _prepare(self, caller: Peer, args: verbs.Prepare) -> MotionPreview:
-        if args.purpose in (Purpose.REPLAN, Purpose.NEXT_POSE):
-            self._rule.by_person(await self._asks(caller), "A changed plan")
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
 
     async def _hover(self, caller: Peer, args: verbs.Hover) -> HoverOffer:

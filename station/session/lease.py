@@ -13,7 +13,7 @@ from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError
 from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus, MotionPreview
 from station.protocol.verbs import Purpose
-from station.session.queue import PlanRevision
+from station.session.queue import OfferedPoses
 
 START_TOLERANCE_RAD = 0.005
 """The arm must stand where it stood when the person was asked."""
@@ -62,8 +62,8 @@ class MotionApproval:
     """Pose numbers it covers, in order; more may not be driven to with it."""
     purpose: Purpose | None = None
     """None: a touch test, or a stop test."""
-    replanned: PlanRevision | None = None
-    """Poses that take the place of the session's with this approval."""
+    begins: OfferedPoses | None = None
+    """Poses of the session that begins with this approval."""
     beside: Drive | None = None
     """Drives a checked motion instead of poses of the plan; nothing is recorded then."""
     expires_s: float = 0.0
@@ -121,7 +121,7 @@ class ApprovalManager:
             raise _void("approval-expired", text, limit_s=APPROVAL_LIFETIME_S)
         if asked.client_id != client_id:
             raise _void("approval-of-another", "Approval was asked for by another client.")
-        before = asked.replanned.before_sha256 if asked.replanned else asked.summary.plan_sha256
+        before = asked.begins.before_sha256 if asked.begins else asked.summary.plan_sha256
         if asked.beside is None and before != plan_sha256:  # what is beside carries its own
             raise _void("plan-changed", "The plan changed since the approval was asked for.")
         require_start(joints_rad, asked.start_joints_rad, "since the approval was asked for")

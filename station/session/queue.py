@@ -21,17 +21,15 @@ NOT_AGAIN = "not captured again: its image counts"
 
 
 @dataclass(frozen=True, eq=False)
-class PlanRevision:
-    """Poses that wait for a person's approval to take the place of the session's."""
+class OfferedPoses:
+    """Poses that wait for a person's approval."""
 
     purpose: Purpose
     queue: PoseQueue
     poses: tuple[int, ...]
     """Those that the approval covers, in order."""
     before_sha256: str
-    """Hash of the poses that they replace."""
-    changes: tuple[str, ...]
-    """Gains, in words."""
+    """Hash of the poses that are shown until then."""
 
 
 class PoseQueue:
@@ -66,11 +64,6 @@ class PoseQueue:
     def open(self) -> tuple[int, ...]:
         """Poses still to be driven to, in order."""
         return tuple(i for i in self._poses if self._status[i].state == "planned")
-
-    @property
-    def fresh(self) -> tuple[int, ...]:
-        """Poses that are open and were never tried, in order."""
-        return tuple(i for i in self.open if not self._status[i].attempt)
 
     @property
     def done(self) -> int:
@@ -110,20 +103,6 @@ class PoseQueue:
         """Note the expected error after this pose; nothing for one that is gone meanwhile."""
         if index in self._status:
             self._status[index] = msgspec.structs.replace(self._status[index], estimated_sigma_mm=sigma_mm)
-
-    def with_fresh(self, poses: Sequence[PlannedPose]) -> PoseQueue:
-        """A copy with these, at most as many, in place of the fresh ones, by the same numbers, at the end."""
-        fresh = self.fresh
-        taken = [(i, pose) for i, pose in self._poses.items() if i not in fresh]
-        placed = [(i, _named(pose, i, "anew")) for i, pose in zip(fresh, poses, strict=False)]
-        plan = msgspec.structs.replace(self._plan, poses=tuple(pose for _, pose in (*taken, *placed)))
-        known = [*(self._status[i] for i, _ in taken), *(_fresh(i, pose) for i, pose in placed)]
-        return PoseQueue(plan, known)
-
-    def with_more(self, pose: PlannedPose) -> tuple[PoseQueue, int]:
-        """A copy with this pose too, at the end, and its number."""
-        more = PoseQueue(self.plan, self.statuses)
-        return more, more.add(_named(pose, more.next_index, "more"))
 
     def anew(self, guided: bool = True) -> PoseQueue:
         """A copy for another session: what is skipped stays left out, all else is planned once more.
@@ -202,11 +181,6 @@ class PoseQueue:
 
 def _refused(code: str, index: int, what: str, remedy: str = "") -> RefusedError:
     return RefusedError(f"Pose {index + 1} {what}.", code=code, remedy=remedy, pose=index)
-
-
-def _named(pose: PlannedPose, index: int, word: str) -> PlannedPose:
-    """Told apart from the poses of the first plan."""
-    return msgspec.structs.replace(pose, name=f"p{index + 1:02d} {word}")
 
 
 def _fresh(index: int, pose: PlannedPose) -> PoseStatus:

@@ -107,7 +107,6 @@ class SessionRecording:
         self.folder = folder or new_session_folder(root, cell.config.name)
         self.recorder: Recorder | None = None
         self._sequence = 0
-        self._plans = 1
         self._saving = asyncio.Lock()
         self._closing: threading.Thread | None = None
         self.recovering = asyncio.Lock()
@@ -222,14 +221,6 @@ class SessionRecording:
         numbered = msgspec.structs.replace(image, sequence=self._sequence, pixels=pixels)
         self._sequence += 1
         return numbered
-
-    def attach_plan(self, plan: Plan) -> None:
-        """Attaches the plan as it was changed, beside the one it began with. Raises RecordingError.
-
-        JSON: writing YAML would hold the loop up for longer than STOP may wait.
-        """
-        self._plans += 1
-        self.require_open().attach(f"plan-{self._plans}.json", "application/json", msgspec.json.encode(plan))
 
     def image(self, image: Image) -> None:
         """Hands it to the writer. Raises RecordingError when the disk cannot keep up or has failed."""

@@ -34,12 +34,12 @@ from station.protocol import verbs
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import RunRequests, SessionContext, StatusStore
+from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
 from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
 from station.session.monitor import DeviceConnector, Previewer
 from station.session.queue import PoseQueue
 from station.session.recording import Logbook, SessionRecording
-from station.session.replan import Estimator, Replanner
 from station.session.run import Run, SweepRun, close_or_seal, unmark_busy
 from station.session.stop_test import prepare_stop_test
 from station.session.summary import begun_anew, poses_to_drive, summarise
@@ -72,8 +72,7 @@ class Session:
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context)
-        self._replanner = Replanner(self.context)
-        self._estimator = Estimator(self.context, self._replanner.hint)
+        self._estimator = Estimator(self.context)
         self._touch_tests = TouchTestPlanner(self.context)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
@@ -163,10 +162,11 @@ class Session:
     async def prepare(self, client_id: int, purpose: Purpose, index: int | None = None) -> MotionPreview:
         """Checks the whole path from where the arm is and offers a one-use approval for it."""
         offer = await self._begin_offer(verbs.Prepare, client_id)
-        found = await self._replanner.replan(purpose) or begun_anew(self.context, purpose)
-        offered = found or poses_to_drive(self.context, purpose, index)
+        await look_back(self.context)
+        begun = begun_anew(self.context, purpose)
+        offered = begun or poses_to_drive(self.context, purpose, index)
         summary = await summarise(self.context, offered, self._notes)
-        offer(MotionApproval(summary, client_id, offered.poses, purpose, found))
+        offer(MotionApproval(summary, client_id, offered.poses, purpose, begun))
         return summary
 
     async def prepare_hover(self, client_id: int, request: verbs.Hover) -> HoverOffer:
@@ -225,8 +225,9 @@ class Session:
         context.requests = RunRequests()
         if context.recording is None and go.beside is None:
             context.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
-        if go.replanned is not None:
-            self._replanner.adopt(go.replanned)
+        if go.begins is not None:
+            context.queue = go.begins.queue
+            context.show_poses()
         drive = (go.beside or self._drive_poses)(go)
         self.store.enter(StationState.CHECKING)
         self.store.event("approved", go.said, plan_sha256=go.summary.plan_sha256)

@@ -19,7 +19,7 @@ from station.cell.plan import Plan
 from station.cell.status import MotionPreview
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext, displacement
-from station.session.queue import PlanRevision, PoseQueue
+from station.session.queue import OfferedPoses, PoseQueue
 
 POSE_OVERHEAD_S = 0.8
 """Settle, expose, look, write: what a stop takes beside the move."""
@@ -27,16 +27,16 @@ _PROBLEMS_SHOWN = 12
 _SLOW_SLIDER = 0.99
 
 
-def begun_anew(context: SessionContext, purpose: Purpose) -> PlanRevision | None:
+def begun_anew(context: SessionContext, purpose: Purpose) -> OfferedPoses | None:
     """The loaded plan for a session that begins with this approval; until then the last one stays shown."""
     queue = context.queue
     if purpose is not Purpose.RUN or context.recording is not None or queue is None:
         return None
     again = queue.anew()
-    return PlanRevision(purpose, again, _open(again), queue.sha256, ())
+    return OfferedPoses(purpose, again, _open(again), queue.sha256)
 
 
-def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None) -> PlanRevision:
+def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None) -> OfferedPoses:
     """The session's poses that an approval for this purpose covers. RefusedError when there are none."""
     queue = context.loaded()
     if purpose in (Purpose.RETAKE, Purpose.RESUME) and context.recording is None:
@@ -48,10 +48,10 @@ def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None)
             )
         if queue.status(index).state != "planned":
             queue.retake(index)
-        return PlanRevision(purpose, queue, (index,), queue.sha256, ())
+        return OfferedPoses(purpose, queue, (index,), queue.sha256)
     if purpose is Purpose.DRIFT_CHECK and context.recording is not None:
         raise RefusedError("A session is open.", code="session-open", remedy="Finish it first, then check.")
-    return PlanRevision(purpose, queue, _open(queue), queue.sha256, ())
+    return OfferedPoses(purpose, queue, _open(queue), queue.sha256)
 
 
 def _open(queue: PoseQueue) -> tuple[int, ...]:
@@ -60,7 +60,7 @@ def _open(queue: PoseQueue) -> tuple[int, ...]:
     return queue.open
 
 
-async def summarise(context: SessionContext, offered: PlanRevision, notes: tuple[str, ...]) -> MotionPreview:
+async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple[str, ...]) -> MotionPreview:
     """Checks the whole path in the worker. LimitError: it is not free; RobotError: what the arm lacks."""
     try:
         require_free_space(context.root, context.cell.config.capture.free_space_bytes)
@@ -81,7 +81,6 @@ async def summarise(context: SessionContext, offered: PlanRevision, notes: tuple
         plan_sha256=queue.sha256,
         poses=len(poses),
         first_move=f"{displacement(context, start, first)} to pose {poses[0] + 1}",
-        changes=offered.changes,
         warnings=(*notes, *motion_warnings(context)),
     )
 
@@ -141,10 +140,6 @@ def _purpose_words(context: SessionContext, purpose: Purpose, poses: tuple[int, 
         return "drift check of the installed calibration"
     if context.recording is None:
         return "run plan"
-    if purpose is Purpose.NEXT_POSE:
-        return f"next pose for session {context.recording.name}"
-    if purpose is Purpose.REPLAN:
-        return f"continue session {context.recording.name} with the remaining poses replanned"
     return f"continue session {context.recording.name}"
 
 

@@ -21,7 +21,7 @@ from station.cell.status import StationStatus
 from station.operate import motion
 from station.protocol import verbs
 from station.protocol.client import ANSWER_S
-from station.protocol.verbs import Purpose, Verb
+from station.protocol.verbs import Verb
 from station.tui.task import Known
 from station.tui.themes import ThemedApp
 
@@ -41,10 +41,6 @@ REMEDIES = {
     "unfinished-recording": "c on 7 recovers it.",
 }
 """By an error's code, where the way out on a screen is another than in a shell."""
-BUSY: dict[Purpose, str] = {
-    Purpose.REPLAN: "Planning the remaining poses again … Nothing moves.",
-    Purpose.NEXT_POSE: "Looking for the most useful pose … Nothing moves.",
-}
 
 
 class ScreenLink(motion.Link, Protocol):
@@ -253,7 +249,7 @@ def busy_words(verb: Verb[object]) -> str:
         case verbs.MakePlan():
             return f"Planning {verb.poses} poses … Nothing moves."
         case verbs.Prepare():
-            return BUSY.get(verb.purpose, "Checking the path … Nothing moves.")
+            return "Checking the path … Nothing moves."
         case verbs.Hover():
             return f"Looking for a path over corner {verb.corner} … Nothing moves."
     return ""

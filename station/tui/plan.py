@@ -106,7 +106,7 @@ class PlanScreen(StationScreen):
 
     MODE, TIP = "plan", "All poses, their gain and reason"
     HELP = (
-        "Poses in capture order. Nothing moves without your approval: F5, p and b show the motion and ask. "
+        "Poses in capture order. Nothing moves without your approval: F5 shows the motion and asks. "
         "Home and End go to the first and the last pose. Error after: the expected error (1σ) after this "
         "pose, against the goal."
     )
@@ -119,8 +119,6 @@ class PlanScreen(StationScreen):
         Binding("s", "pose('skip')", "Skip", tooltip=SKIP),
         Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
         Binding("a", "add", "Add here", tooltip="Add the arm's present posture as a pose"),
-        Binding("p", "app.start('improve')", "Replan", tooltip="Plan the remaining poses again (asks)"),
-        Binding("b", "app.start('best')", "Next pose", tooltip="Add and capture the most useful pose (asks)"),
         Binding("ctrl+up", "shift(-1)", "Order", group=MOVE, tooltip="Visit this pose earlier"),
         Binding("ctrl+down", "shift(1)", "Order", group=MOVE, tooltip="Visit this pose later"),
         Binding("left_square_bracket", "turn(-1)", "Turn", show=False, tooltip="Turn the view of the cell"),

@@ -240,7 +240,7 @@ def _progress(status: StationStatus) -> str:
     estimate = status.estimate
     if estimate.enough:
         return f"The goal of {estimate.goal_mm:g} mm is reached: F7 finishes, or take all poses."
-    return estimate.improve or estimate.advice or "F12 stops the arm at once."
+    return estimate.advice or "F12 stops the arm at once."
 
 
 def _at_rest(known: Known, status: StationStatus) -> Action:

@@ -123,16 +123,12 @@ async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(link: Fa
             await until(pilot, lambda request=request: request in link.asked)  # type: ignore[misc]
 
 
-@pytest.mark.parametrize(("key", "purpose"), [("p", verbs.Purpose.REPLAN), ("b", verbs.Purpose.NEXT_POSE)])
-async def test_changing_the_plan_on_the_way_asks_as_every_motion_does(
-    link: FakeLink, key: str, purpose: verbs.Purpose
-) -> None:
+async def test_what_an_approval_changes_is_told_with_it(link: FakeLink) -> None:
     link.answers["prepare"] = msgspec.structs.replace(SUMMARY, changes=("0.61 → 0.52 mm " * 6,))
     async with opened(link) as pilot:
-        await pilot.press("2", key)
+        await pilot.press("f5")
         await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
         assert isinstance(pilot.app.screen, ConfirmMotion)
-        assert verbs.Prepare(purpose) in link.asked
         assert "go" not in link.verbs
         facts = text_of(pilot.app, "#confirm-body").splitlines()
         change = next(i for i, line in enumerate(facts) if line.startswith("Change"))
@@ -159,7 +155,7 @@ async def test_the_palette_names_the_screen_s_own_keys_too(link: FakeLink) -> No
         await pilot.press("2")
         await pilot.pause()
         named = {command.title: command for command in pilot.app.get_system_commands(pilot.app.screen)}
-        assert {"Retake (r)", "Next pose (b)", "Pause (f6)", "STOP (f12)"} <= set(named)
+        assert {"Retake (r)", "Pause (f6)", "STOP (f12)"} <= set(named)
         named["Skip (s)"].callback()
         await until(pilot, lambda: verbs.Skip(0) in link.asked)
 

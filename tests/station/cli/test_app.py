@@ -19,7 +19,6 @@ import pytest
 import typer
 
 from recordings.errors import CodedError, ErrorReport
-from station.cell.errors import RefusedError
 from station.cell.plan import plan_sha256
 from station.cell.status import MotionPreview
 from station.cli import attended, main
@@ -67,22 +66,6 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
 
 
 def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: dict[str, bool] = {}
-
-    async def carry_out(
-        _: object, purpose: str, *more: object, finish_with_loss: bool, **rest: object
-    ) -> None:
-        asked[purpose] = finish_with_loss
-        raise RefusedError("seen enough", code="seen")
-
-    # One pose more leaves the session open: where nobody is there to say how it goes on, every other command
-    # finishes what it got.
-    with monkeypatch.context() as patched:
-        patched.setattr(attended, "carry_out", carry_out)
-        for command in ("next-pose", "replan", "resume"):
-            assert shell.refused(command, "--headless") == "seen"
-    assert asked == {"best": False, "improve": True, "resume": True}
-
     plan = tmp_path / "plan.yaml"
     assert shell("plan", "--poses", "4", "-o", str(plan), "--json")[0] == 0
 

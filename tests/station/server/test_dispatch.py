@@ -190,8 +190,6 @@ async def test_a_program_cannot_approve_motion_of_a_real_arm_whatever_it_says(
                 await program.request("go", token=summary["token"], **named)
             said = msgspec.json.encode(refused.value.data).decode()
             assert summary["token"] not in said and plan_sha256(small_plan)[:12] not in said
-        with raises("no-terminal"):
-            await program.request("prepare", purpose="improve")
     assert "move" not in served.rig.arm.log and "start control" not in served.rig.arm.log
     await served.control.close()
 
@@ -207,8 +205,6 @@ async def test_a_named_service_approves_by_the_plans_hash_and_is_written_down(
             with pytest.raises(RefusedError):
                 await program.request("go", token=summary["token"], **wrong)
         assert "move" not in served.rig.arm.log
-        with raises("no-terminal"):
-            await program.request("prepare", purpose="best")
         summary = await offered(program, small_plan)
         await program.request("go", token=summary["token"], plan_sha256=plan_sha256(small_plan))
         await served.rig.until_true(lambda: bool(session.store.status.session.recording))

@@ -10,6 +10,7 @@ import pytest
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan
 from station.cell.status import MotionPreview
+from station.protocol.verbs import Purpose
 from station.session.lease import (
     APPROVAL_LIFETIME_S,
     START_TOLERANCE_RAD,
@@ -17,7 +18,7 @@ from station.session.lease import (
     LeaseManager,
     MotionApproval,
 )
-from station.session.queue import PlanRevision, PoseQueue
+from station.session.queue import OfferedPoses, PoseQueue
 from tests.codes import raises
 
 HERE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)
@@ -31,14 +32,12 @@ class Clock:
         return self.now_s
 
 
-def offered(
-    desk: ApprovalManager, client_id: int = 1, replanned: PlanRevision | None = None
-) -> MotionApproval:
+def offered(desk: ApprovalManager, client_id: int = 1, begins: OfferedPoses | None = None) -> MotionApproval:
     summary = MotionPreview(
         secrets.token_urlsafe(16), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1"
     )
     summary = msgspec.structs.replace(summary, start_joints_rad=HERE)
-    desk.offer(MotionApproval(summary, client_id, (0, 1, 2, 3), replanned=replanned))
+    desk.offer(MotionApproval(summary, client_id, (0, 1, 2, 3), begins=begins))
     assert desk.waiting is not None
     return desk.waiting
 
@@ -79,14 +78,14 @@ def test_a_go_is_bound_to_what_was_shown_and_a_wrong_try_voids_it(
         desk.redeem(token, 1, PLAN, HERE)
 
 
-def test_improved_poses_go_only_into_the_plan_they_were_made_for() -> None:
+def test_a_session_begins_only_from_the_plan_that_was_shown() -> None:
     desk, before = ApprovalManager(Clock()), "ef" * 32
-    better = PlanRevision("improve", PoseQueue(Plan("UR10", "eye-in-hand", ())), (), before, ())
+    better = OfferedPoses(Purpose.RUN, PoseQueue(Plan("UR10", "eye-in-hand", ())), (), before)
     for plan in (PLAN, "cd" * 32):
-        token = offered(desk, replanned=better).summary.token
+        token = offered(desk, begins=better).summary.token
         with raises("plan-changed"):
             desk.redeem(token, 1, plan, HERE)
-    go = offered(desk, replanned=better)
+    go = offered(desk, begins=better)
     assert desk.redeem(go.summary.token, 1, before, HERE) == go
 
 

@@ -147,19 +147,3 @@ def test_another_session_leaves_out_what_was_left_out_and_on_wish_what_a_hand_fo
     ]
     assert again.status(0).attempt == 0
     assert [status.index for status in queue.anew(guided=False).statuses] == [0, 1, 2, 3]
-
-
-def test_new_poses_take_the_place_of_fresh_ones_only() -> None:
-    queue = queue_of()
-    queue.start_attempt(0)
-    queue.mark(0, "done")
-    queue.start_attempt(1)
-    placed = queue.with_fresh([pose("x"), pose("y")])
-    assert queue.fresh == (2, 3)
-    assert [p.name for p in placed.plan.poses] == ["p0", "p1", "p03 anew", "p04 anew"]
-    assert placed.status(0).state == "done" and placed.status(2).attempt == 0
-    fewer = queue.with_fresh([pose("x")])
-    assert [status.index for status in fewer.statuses] == [0, 1, 2]
-    more, index = queue.with_more(pose("z"))
-    assert (index, more.plan.poses[-1].name) == (4, "p05 more")
-    assert len(queue.statuses) == 4

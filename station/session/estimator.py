@@ -1,0 +1,95 @@
+"""The running estimate: what the images so far tell of camera and board, and which pose would help most."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+
+import msgspec
+import numpy as np
+
+from recordings.errors import RecordingError
+from station.analysis.estimation import running_estimate, seen_before
+from station.analysis.pool import WorkerError
+from station.cell.status import EstimateStatus
+from station.plan.predict import next_best_text
+from station.session.context import SessionContext
+from station.session.recording import stamps_now
+
+_LOOK_BACK_S, _ESTIMATE_S = 120.0, 20.0
+
+log = logging.getLogger(__name__)
+
+
+class Estimator:
+    """Keeps the running estimate fresh: one look in the worker after each pose, never two at once."""
+
+    def __init__(self, context: SessionContext) -> None:
+        self._context = context
+        self._known: tuple[int, ...] = ()
+        self._woken = asyncio.Event()
+
+    def poke(self) -> None:
+        """Something changed; cheap."""
+        if tuple(self._context.seen) != self._known:
+            self._woken.set()
+
+    async def run(self) -> None:
+        context, config = self._context, self._context.cell.config
+        while True:
+            await self._woken.wait()
+            self._woken.clear()
+            self._known = tuple(context.seen)
+            if not self._known:
+                context.store.update(estimate=EstimateStatus())
+                continue
+            camera = config.camera.model
+            if camera is None or camera.matrix is None:
+                continue
+            try:
+                estimate = await self._estimate()
+            except Exception as error:  # this task looks on; it must outlive every image and every defect
+                if not isinstance(error, WorkerError):
+                    log.exception("the running estimate failed")
+                context.store.problem(error, said="no running estimate: {}")
+                continue
+            context.store.update(estimate=estimate)
+            if (queue := context.queue) is not None:
+                queue.note_estimate(self._known[-1], estimate.sigma_translation_mm)
+                context.store.update_session(poses=queue.statuses)
+            if (recording := context.recording) is not None:
+                with contextlib.suppress(RecordingError):  # a full disk ends the run, not this look
+                    recording.show_frames(estimate.camera_pose, estimate.board_pose, stamps_now())
+
+    async def _estimate(self) -> EstimateStatus:
+        """Estimate with advice on the next pose, where one more would help."""
+        context, config = self._context, self._context.cell.config
+        seen = list(context.seen.values())
+        known = context.cell.camera_model is not None
+        estimate = await context.workers.call(running_estimate, config, known, seen, timeout_s=_ESTIMATE_S)
+        joints = context.store.status.robot.joints_rad
+        if joints is None or estimate.sigma_translation_mm is None or estimate.enough:
+            return estimate
+        flange = np.array([view.base_from_flange for view in seen])
+        text = await context.workers.call(next_best_text, config, flange, joints, timeout_s=_ESTIMATE_S)
+        return msgspec.structs.replace(estimate, advice=text or estimate.advice)
+
+
+async def look_back(context: SessionContext) -> None:
+    """Reads what the images from before a restart show, for the estimate.
+
+    Read from the recording, which is made whole first; nothing when it is known already.
+    """
+    recording, queue = context.recording, context.queue
+    if recording is None or recording.recorder is not None or context.seen or queue is None or not queue.done:
+        return
+    try:
+        await context.recover_segments(recording)
+        found = await context.workers.call(
+            seen_before, recording.whole, context.cell.config.board, timeout_s=_LOOK_BACK_S
+        )
+    except (RecordingError, WorkerError) as error:
+        context.store.problem(error, said="the estimate restarts, without the images so far: {}")
+        return
+    context.seen.update({view.index: view for view in found})

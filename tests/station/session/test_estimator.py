@@ -1,0 +1,138 @@
+"""The running estimate over a session, a restart in between."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibrate.boards.model import board_points
+from calibrate.geometry import inverse, transform_points
+from calibrate.kinematics import MODELS, forward
+from calibrate.projection import project
+from recordings.reader import open_recording
+from station.analysis.estimation import seen_before
+from station.analysis.worker import BoardDetection, sight
+from station.cell.plan import Plan
+from station.cell.status import StationState as S
+from station.protocol.verbs import Purpose, Skip
+from station.session.queue import PoseQueue
+from tests.codes import raises
+from tests.station.quick_plan import quick_plan
+from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, crash, memory_config, sealed
+
+POSES, BEFORE = 12, 7
+
+
+class WorkerThatSees(WorkerInThisProcess):
+    """Finds the board where the true camera would show it."""
+
+    def __init__(self, rig: Rig) -> None:
+        super().__init__()
+        self.rig, self.noise = rig, np.random.default_rng(5)
+
+    async def call(
+        self, function: Callable[..., Any], *args: Any, timeout_s: float = 60.0, **named: Any
+    ) -> Any:
+        if function is not sight:
+            return await super().call(function, *args, timeout_s=timeout_s, **named)
+        flange = forward(MODELS["UR10"], self.rig.arm.joints)
+        board = inverse(flange @ np.array(TRUTH.camera_mount)) @ np.array(TRUTH.board_place)
+        points = board_points(TRUTH.board)
+        pixels = project(TRUTH.camera, transform_points(board, points)).pixels
+        return BoardDetection(
+            self.sees.status, np.arange(len(points)), pixels + self.noise.normal(0, 0.1, pixels.shape)
+        )
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    return quick_plan(memory_config(), TRUTH, seed=3, count=POSES)
+
+
+@pytest.fixture
+async def half_way(new_rig: NewRig, plan: Plan, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    """Paused after some poses, by a clock on which each of them takes its time."""
+    hurried = SimpleNamespace(**vars(time) | {"monotonic": lambda: 1000 * time.monotonic()})
+    monkeypatch.setattr("station.session.recording.time", hurried)
+    rig = await new_rig()
+    rig.session.context.workers = WorkerThatSees(rig)  # type: ignore[assignment]
+    rig.session.load_plan(1, plan)
+    ended = rig.session.store.watch(lambda: _pause_after(rig, BEFORE))
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    ended()
+    return rig
+
+
+def _pause_after(rig: Rig, poses: int) -> None:
+    if rig.session.store.status.session.captured == poses:
+        rig.session.context.requests.pause_by = "anna"
+
+
+def queue_of(rig: Rig) -> PoseQueue:
+    return rig.session.context.require_queue()
+
+
+class WorkerThatLooksBack(WorkerInThisProcess):
+    """Finds in the pictures on the disk what it found in them when they were taken."""
+
+    def __init__(self, rig: Rig) -> None:
+        super().__init__()
+        self.known = list(rig.session.context.seen.values())
+
+    async def call(
+        self, function: Callable[..., Any], *args: Any, timeout_s: float = 60.0, **named: Any
+    ) -> Any:
+        if function is not seen_before:
+            return await super().call(function, *args, timeout_s=timeout_s, **named)
+        assert len(open_recording(args[0]).views()) == BEFORE  # it is whole by then
+        return self.known
+
+
+async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate(
+    half_way: Rig, new_rig: NewRig
+) -> None:
+    await half_way.until_true(lambda: half_way.session.store.status.estimate.views == BEFORE)
+    known = half_way.session.store.status
+    crash(half_way)
+    again = await new_rig(with_plan=False)
+    elapsed_s = again.session.store.status.session.elapsed_s
+    assert elapsed_s > 0.5 * known.session.elapsed_s > 0, "the time before the crash is part of the session's"
+    again.session.context.workers = WorkerThatLooksBack(half_way)  # type: ignore[assignment]
+    again.session.take_lease(1, "anna")
+    again.session.acknowledge("anna")
+    await again.session.prepare(1, Purpose.RESUME)
+    await again.until_true(lambda: again.session.store.status.estimate.views == BEFORE)
+    assert again.session.store.status.estimate.translation_mm == known.estimate.translation_mm
+    await again.give_go(Purpose.RESUME)
+    await again.until(S.IDLE)
+    assert again.session.store.status.session.elapsed_s > elapsed_s
+    assert [view.index for view in sealed(again).views()] == list(range(POSES))
+
+
+async def test_nothing_moves_by_poses_that_the_disk_did_not_take(
+    half_way: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    moves = half_way.arm.log.count("move")
+    summary = await half_way.session.prepare(1, Purpose.RESUME)
+    monkeypatch.setattr("station.session.recording.write_state", full)
+    half_way.session.go(1, summary.token)
+    await half_way.until_true(lambda: "No space left" in half_way.session.store.status.reason)
+    assert half_way.state is S.PAUSED
+    assert half_way.arm.log.count("move") == moves
+
+
+async def test_it_is_void_when_the_poses_change_meanwhile(half_way: Rig) -> None:
+    summary = await half_way.session.prepare(1, Purpose.RESUME)
+    await half_way.session.edit(Skip, 1, lambda queue: queue.skip(BEFORE + 1))
+    with raises("approval-used"):
+        half_way.session.go(1, summary.token)
+    assert "p09" in [status.name for status in queue_of(half_way).statuses]

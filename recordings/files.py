@@ -17,6 +17,8 @@ PART_SUFFIX = ".part"
 """Suffix of an unfinished recording; gone once it is finished and on the disk."""
 EMPTY_SUFFIX = ".empty"
 """Suffix of a segment that holds nothing; recovery sets it aside."""
+LOG_LIMIT_BYTES = 64 * 1024 * 1024
+"""No file of lines that only grows is larger."""
 ASKED_FOR = 0o666
 """Permissions of a file that somebody asked for: their umask decides."""
 _SESSION_NAME = re.compile(r"[a-z0-9-]{1,40}")
@@ -56,16 +58,41 @@ def create_exclusively(path: Path) -> int:
     return descriptor
 
 
-def open_file(path: Path) -> int:
-    """Descriptor for reading. RecordingError when it is no readable file."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    except OSError as error:
-        raise disk_error("open", path, error) from error
+def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
+    """Descriptor of whatever a person named or a group member made: it opens at once, or not at all.
+
+    Opening a pipe waits for its other end, and a device may never end. OSError where it is no regular file.
+    """
+    descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY, ASKED_FOR)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise RecordingError(f"{path} is not a file", code="no-file")
+        raise OSError(errno.EINVAL, "it is a folder, a pipe or a device, not a file", str(path))
     return descriptor
+
+
+def read_beginning(path: Path, length: int) -> bytes:
+    """At most the first `length` bytes of such a file. Raises OSError."""
+    with os.fdopen(open_regular(path), "rb") as file:
+        return file.read(length)
+
+
+def read_file(path: Path, limit_bytes: int) -> bytes:
+    """The whole content of such a file. OSError, with errno EFBIG where it is larger than `limit_bytes`."""
+    content = read_beginning(path, limit_bytes + 1)
+    if len(content) > limit_bytes:
+        text = f"it is larger than {bytes_text(limit_bytes)}; check that it is the right file"
+        raise OSError(errno.EFBIG, text, str(path))
+    return content
+
+
+def open_file(path: Path) -> int:
+    """Descriptor of a recording or a bag for reading. RecordingError when it is no readable file."""
+    try:
+        return open_regular(path)
+    except OSError as error:
+        if error.errno == errno.EINVAL:
+            raise RecordingError(f"{path} is not a file", code="no-file") from error
+        raise disk_error("open", path, error) from error
 
 
 def lock(descriptor: int, path: Path) -> None:
@@ -81,7 +108,7 @@ def lock(descriptor: int, path: Path) -> None:
 def discard_leftover(path: Path) -> None:
     """Removes what a killed process left half-written. RecordingError when a living one still writes it."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+        descriptor = open_regular(path, os.O_RDONLY | os.O_NOFOLLOW)
     except OSError:  # nothing there, or nothing of ours: the exclusive creation will tell
         return
     try:
@@ -155,6 +182,8 @@ def require_free_space(folder: Path, reserve_bytes: int) -> int:
 
 def bytes_text(count: int) -> str:
     """Write a size for people: 4.0 GB, 120 MB."""
+    if count < 1_000_000:
+        return f"{count / 1e3:.0f} kB"
     return f"{count / 1e9:.1f} GB" if count >= 1_000_000_000 else f"{count / 1e6:.0f} MB"
 
 

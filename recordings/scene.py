@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -15,7 +16,7 @@ from mcap_protobuf.writer import Writer
 from numpy.typing import NDArray
 
 from recordings.errors import disk_error, exists_error
-from recordings.files import ASKED_FOR, write_atomically
+from recordings.files import ASKED_FOR, open_regular, write_atomically
 
 TOPIC = "/plan/scene"
 _SUMMARY_BYTES = 256 * 1024
@@ -64,7 +65,7 @@ def write_scene(path: Path, steps: Sequence[tuple[float, Sequence[Entity]]]) -> 
 
 def _is_scene(path: Path) -> bool:
     """The schemas stand in the summary, at the file's end."""
-    with path.open("rb") as file:
+    with os.fdopen(open_regular(path), "rb") as file:
         file.seek(max(0, path.stat().st_size - _SUMMARY_BYTES))
         return SceneUpdate.DESCRIPTOR.full_name.encode() in file.read()
 

@@ -17,8 +17,10 @@ import msgspec
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, R, T
 from calibrate.document import software_versions
 from calibrate.errors import UsageError
+from recordings.files import read_file
 
 _CONNECT_S = 30
+_FILE_LIMIT_BYTES = 1024 * 1024
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Cluster:
     def from_file(cls, path: Path, *tls: Path | None) -> Cluster:
         """Read `dask scheduler --scheduler-file`'s JSON; `tls`: as the other fields. Raises UsageError."""
         try:
-            address = msgspec.json.decode(path.read_bytes(), type=_SchedulerFile).address
+            address = msgspec.json.decode(read_file(path, _FILE_LIMIT_BYTES), type=_SchedulerFile).address
         except (OSError, msgspec.DecodeError, UnicodeDecodeError) as problem:
             raise UsageError(
                 f"{path} is no scheduler file ({problem}).",

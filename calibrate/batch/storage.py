@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import msgspec
 from calibrate.batch.workers import BatchError
 from calibrate.files.calibration import write_output
 from calibrate.files.lines import S, append_line, parse_lines, read_lines
+from calibrate.files.proof import read_bounded
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.versions import LOG, LogEntry, content_name
 from calibrate.quality.checks import FILE as CHECKS_FILE
@@ -109,7 +111,7 @@ def cell_folder(root: str) -> Iterator[Path]:
 
 def _link_again(current: Path, names: Sequence[str]) -> None:
     """The copy becomes its version's file again, and `current` a link to it; `names` of the versions."""
-    tail = f"-{content_name(current.read_bytes())}.yaml"
+    tail = f"-{content_name(read_bounded(current))}.yaml"
     switched = [f"{entry.generation:04d}{tail}" for entry in read_lines(current.parent / LOG, LogEntry)]
     name = max((n for n in names if n.endswith(tail)), key=lambda n: (n in switched[-1:], n), default="")
     if name:
@@ -186,4 +188,4 @@ class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
 
 def whole(place: Path | str) -> str:
     """An absolute path, or the URL as it is."""
-    return str(place) if is_url(str(place)) else str(Path(place).resolve())
+    return str(place) if is_url(str(place)) else os.path.realpath(place)

@@ -14,9 +14,9 @@ from calibrate.files.calibration import FORMAT, read_calibration
 from calibrate.lens.intrinsics import LensModel
 from calibrate.projection import camera_matrix, distortion
 from recordings import strict_yaml
+from recordings.files import read_file
 from recordings.schema.messages import BoardSpec, CameraModel, TimeCorrection
 
-_LIMIT_BYTES = strict_yaml.LIMIT_BYTES
 T = TypeVar("T")
 
 
@@ -108,18 +108,9 @@ def _strictly(path: Path, kind: type[T], under: str) -> T:
 
 def _content(path: Path) -> bytes:
     try:
-        with path.open("rb") as file:
-            content = file.read(_LIMIT_BYTES + 1)
+        return read_file(path, strict_yaml.LIMIT_BYTES)
     except OSError as problem:
         raise UsageError(f"{path}: {problem.strerror or problem}.", code="input-file") from None
-    if len(content) > _LIMIT_BYTES:
-        raise UsageError(
-            f"{path}: larger than {_LIMIT_BYTES // 1024} kB.",
-            code="input-file",
-            remedy="Check that it is the right file.",
-            limit_bytes=_LIMIT_BYTES,
-        )
-    return content
 
 
 def _read(path: Path, wanted: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from calibrate.load import Progress as LoadProgress
 from recordings.cli.console import AsJson as AsJson
 from recordings.cli.console import plain_console, progress_bar
 from recordings.cli.console import print_json as print_json
+from recordings.files import read_beginning
 from recordings.mcap.records import MAGIC
 
 _told_width = sys.stdout.isatty() or "COLUMNS" in os.environ
@@ -37,8 +38,7 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
             raise UsageError(f"{target} is a folder, a device or a pipe.", remedy="Name a file.")
         if not target.exists():
             return
-        with target.open("rb") as file:
-            start = file.read(64)
+        start = read_beginning(target, 64)
     except OSError as problem:
         raise UsageError(f"{target}: {problem.strerror}.", remedy="Name another place.") from None
     if kind == "calibration":

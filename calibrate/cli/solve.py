@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -56,7 +57,7 @@ def solve(
     check_target(target, "calibration")
     if report is not None:
         check_target(report, "report")
-        if report.resolve() == target.resolve():
+        if os.path.realpath(report) == os.path.realpath(target):
             raise UsageError(
                 f"{target} cannot be calibration and report.",
                 code="target-exists",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import shlex
 import time
 from collections.abc import Callable, Iterator
@@ -40,7 +41,7 @@ from calibrate.quality.movement.monitor import LARGEST_MISFIT_PX, NAMED_AFTER, E
 from calibrate.quality.movement.pictures import CellModel
 from recordings.cli.console import progress_bar
 from recordings.errors import BadImageError, ImportSourceError, Value
-from recordings.files import MAIN_CAMERA
+from recordings.files import MAIN_CAMERA, open_regular
 from recordings.importers.dataset import DATASET_FILE, PoseRow, read_dataset, read_poses
 from recordings.importers.folder import read_image
 from recordings.reader import open_recording
@@ -189,7 +190,7 @@ def watch_pictures(
 def _alone(folder: Path) -> Iterator[None]:
     """One watch of a camera at a time: two would mix their pictures. Raises InstallError, OSError."""
     path = folder / LOCK
-    with path.open("a") as file:
+    with os.fdopen(open_regular(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "a") as file:
         share(path)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

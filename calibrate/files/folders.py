@@ -11,8 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from calibrate.errors import InstallError
-from calibrate.files.validity import Validity, read_validity, time_text, unrecorded
-from recordings.files import MAIN_CAMERA, is_session_name, state_root
+from calibrate.files.validity import FILE, Validity, parse_validity, time_text, unrecorded
+from recordings.files import LOG_LIMIT_BYTES, MAIN_CAMERA, is_session_name, read_file, state_root
 
 VERSION_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
 
@@ -62,6 +62,12 @@ def current_version(folder: Path) -> tuple[int, Path]:
             remedy="Run: calibrate install FILE",
         )
     return int(match[1]), folder / "gen" / name
+
+
+def read_validity(folder: Path) -> dict[int, Validity]:
+    """Read the last record of each version. OSError as it comes."""
+    path = folder / FILE
+    return parse_validity(read_file(path, LOG_LIMIT_BYTES)) if path.exists() else {}
 
 
 def current_validity(folder: Path, now: datetime | None = None) -> Validity:

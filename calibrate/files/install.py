@@ -15,7 +15,13 @@ import numpy as np
 
 from calibrate.errors import GateFailedError, InstallError
 from calibrate.files.calibration import Calibration, Override, read_calibration
-from calibrate.files.folders import calibrations_folder, current_validity, current_version, readable_folder
+from calibrate.files.folders import (
+    calibrations_folder,
+    current_validity,
+    current_version,
+    read_validity,
+    readable_folder,
+)
 from calibrate.files.gate import Gate
 from calibrate.files.hooks import HookEvent, announce
 from calibrate.files.lines import append_line
@@ -27,7 +33,6 @@ from calibrate.files.validity import (
     Validity,
     ValidityReason,
     ValidityState,
-    read_validity,
     time_text,
     unrecorded,
 )

@@ -10,13 +10,15 @@ from typing import TypeVar
 
 import msgspec
 
+from recordings.files import LOG_LIMIT_BYTES, open_regular, read_file
+
 S = TypeVar("S", bound=msgspec.Struct)
 
 
 def append_line(path: Path, entry: object) -> None:
     """Append a struct or dataclass. Raises OSError. What a crash left half-written is ended first."""
     new = not path.exists()
-    with path.open("a+b") as file:
+    with os.fdopen(open_regular(path, os.O_RDWR | os.O_APPEND | os.O_CREAT), "a+b") as file:
         if new:
             share(path)
         if file.tell() > 0:
@@ -38,7 +40,7 @@ def share(path: Path) -> None:
 
 def read_lines(path: Path, kind: type[S]) -> list[S]:
     """Oldest first; empty when there is no file. Lines that are no `kind` are left out."""
-    return parse_lines(path.read_bytes(), kind) if path.exists() else []
+    return parse_lines(read_file(path, LOG_LIMIT_BYTES), kind) if path.exists() else []
 
 
 def parse_lines(content: bytes, kind: type[S]) -> list[S]:

@@ -14,6 +14,7 @@ from calibrate.errors import CalibrationFileError
 from calibrate.geometry import Array, is_rigid, skew
 from calibrate.kinematics import TABLE_COLUMNS
 from recordings import strict_yaml
+from recordings.files import read_beginning
 
 FORMAT_NAME = "handeye-calibration/1"
 _MCAP = b"\x89MCAP"
@@ -23,8 +24,7 @@ _LIMIT_BYTES = 4 * 1024 * 1024
 def read_bounded(path: Path) -> bytes:
     """The file's content, one byte over the limit at most. CalibrationFileError where it cannot be read."""
     try:
-        with path.open("rb") as file:
-            return file.read(_LIMIT_BYTES + 1)
+        return read_beginning(path, _LIMIT_BYTES + 1)
     except OSError as problem:
         raise CalibrationFileError(f"{path}: {problem.strerror or problem}.") from None
 

@@ -11,7 +11,6 @@ import json
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
-from pathlib import Path
 from typing import Literal
 
 from calibrate.errors import InstallError
@@ -138,14 +137,12 @@ def validity_text(validity: Validity) -> str:
     return f"{words} since {_shown(validity.since)}{by}{why}"
 
 
-def read_validity(folder: Path) -> dict[int, Validity]:
-    """Read the last record of each version, as it was then (`Validity.at` tells what it is now).
+def parse_validity(content: bytes) -> dict[int, Validity]:
+    """Take the last record of each version, as it was then (`Validity.at` tells what it is now).
 
-    OSError as it comes; lines that are cut or of another shape are left out.
+    Lines that are cut or of another shape are left out.
     """
-    path = folder / FILE
-    lines = path.read_bytes().splitlines() if path.exists() else []
-    return {entry.version: entry for line in lines if (entry := _parse(line)) is not None}
+    return {entry.version: entry for line in content.splitlines() if (entry := _parse(line)) is not None}
 
 
 def unrecorded(version: int, installed: str = "") -> Validity:

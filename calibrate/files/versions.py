@@ -33,20 +33,20 @@ from calibrate.files.calibration import (
     read_calibration,
     write_calibration,
 )
-from calibrate.files.folders import VERSION_NAME, calibrations_folder, readable_folder
+from calibrate.files.folders import VERSION_NAME, calibrations_folder, read_validity, readable_folder
 from calibrate.files.hooks import HookRun, announce
 from calibrate.files.lines import append_line, read_lines, share
+from calibrate.files.proof import read_bounded
 from calibrate.files.touch import LIMIT_SIGMAS, Touch, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import (
     Validity,
     ValidityReason,
     ValidityState,
-    read_validity,
     time_text,
     unrecorded,
 )
-from recordings.files import MAIN_CAMERA, sync_folder, write_atomically
+from recordings.files import MAIN_CAMERA, open_regular, sync_folder, write_atomically
 
 LOG = "log.jsonl"
 Action = Literal["install", "rollback", "verify"]
@@ -140,7 +140,7 @@ def add_version(
     number = max(numbers, default=0) + 1
     path = folder / "gen" / f"{number:04d}-{content_name(content)}.yaml"
     write_atomically(path, content)
-    decode_calibration(path.read_bytes(), str(path))
+    decode_calibration(read_bounded(path), str(path))
     version = InstalledVersion(number, path, True, calibration)
     return make_current(folder, version, action, validity, change, reason)
 
@@ -151,7 +151,7 @@ def make_current(
     """Switch to it with this validity; log it. In `locked` only. InstallError: it does not read back."""
     validity = replace(validity, version=version.number)
     append_line(folder / VALIDITY_FILE, validity)  # before anybody can ask for it
-    _switch(folder, version.path.name, version.path.read_bytes())
+    _switch(folder, version.path.name, read_bounded(version.path))
     entry = LogEntry(time_text(), action, version.number, who(), change, reason)
     append_line(folder / LOG, entry)
     return replace(version, current=True, validity=validity)
@@ -179,7 +179,7 @@ def _switch(folder: Path, name: str, content: bytes) -> None:
     temporary.symlink_to(Path("gen") / name)
     temporary.replace(folder / "current")
     sync_folder(folder)
-    if (folder / "current").read_bytes() != content:
+    if read_bounded(folder / "current") != content:
         raise InstallError(
             f"{folder / 'current'} does not read back what was installed.",
             code="read-back",
@@ -195,7 +195,7 @@ def locked(folder: Path) -> Iterator[None]:
             if not part.exists():
                 part.touch() if part.name == "lock" else part.mkdir(parents=True, exist_ok=True)
                 share(part)
-        descriptor = os.open(folder / "lock", os.O_RDWR)
+        descriptor = open_regular(folder / "lock", os.O_RDWR)
     except OSError as problem:
         raise InstallError(
             f"{folder} cannot be used: {problem.strerror}.",

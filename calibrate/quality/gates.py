@@ -14,6 +14,7 @@ from calibrate.errors import UsageError
 from calibrate.files.gate import Gate, Sense
 from calibrate.handeye.solution import Reading, Solution
 from recordings import strict_yaml
+from recordings.files import read_file
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,12 +68,12 @@ class GateInputs:
 def read_limits(path: Path) -> GateLimits:
     """Read YAML with some of GateLimits' fields. Raises UsageError naming file and field."""
     try:
-        with path.open("rb") as file:
-            return strict_yaml.load(file.read(strict_yaml.LIMIT_BYTES + 1), GateLimits)
+        return strict_yaml.load(read_file(path, strict_yaml.LIMIT_BYTES), GateLimits)
     except (OSError, strict_yaml.StrictYamlError) as problem:
         names = ", ".join(GateLimits.__struct_fields__)
+        said = problem.strerror if isinstance(problem, OSError) else problem
         raise UsageError(
-            f"{path}: {problem}.", code="gate-limits", remedy=f"Allowed: {names}.", path=str(path)
+            f"{path}: {said}.", code="gate-limits", remedy=f"Allowed: {names}.", path=str(path)
         ) from None
 
 

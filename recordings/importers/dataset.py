@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import math
 import time
@@ -15,7 +16,7 @@ import numpy as np
 
 from recordings import strict_yaml
 from recordings.errors import ImportSourceError, disk_error
-from recordings.files import session_name_from
+from recordings.files import read_file, session_name_from
 from recordings.images import SIDE_LIMIT_PX
 from recordings.schema.messages import (
     LARGEST_FLATNESS_M,
@@ -154,14 +155,11 @@ def read_small_file(path: Path, limit_bytes: int) -> bytes:
         remedy = f"A folder to import has {DATASET_FILE}, {POSES_FILE} and images."
         raise ImportSourceError(f"{path} is missing", code="no-file", remedy=remedy)
     try:
-        with path.open("rb") as file:
-            content = file.read(limit_bytes + 1)
+        return read_file(path, limit_bytes)
     except OSError as error:
-        raise disk_error("read", path, error) from error
-    if len(content) > limit_bytes:
-        text = f"{path} is larger than {limit_bytes // 1024} kB"
-        raise ImportSourceError(text, code="file-too-large", remedy="Check that it is the right file.")
-    return content
+        if error.errno != errno.EFBIG:
+            raise disk_error("read", path, error) from error
+        raise ImportSourceError(f"{path}: {error.strerror}", code="file-too-large") from error
 
 
 def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:

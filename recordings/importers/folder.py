@@ -8,6 +8,7 @@ from pathlib import Path
 
 from recordings import strict_yaml
 from recordings.errors import ImportSourceError
+from recordings.files import read_beginning
 from recordings.images import (
     IMAGE_LIMIT_BYTES,
     KEPT_FORMATS,
@@ -112,8 +113,7 @@ def _beginning(folder: Path, row: PoseRow, size: tuple[int, int], limit_bytes: i
             raise _wrong(folder, row, "cannot be read (not a file)", "unreadable")
         if not Path(os.path.realpath(path)).is_relative_to(folder.resolve()):
             raise _wrong(folder, row, "lies outside the folder", "outside", "Copy it inside.")
-        with path.open("rb") as file:
-            data = file.read(limit_bytes)
+        data = read_beginning(path, limit_bytes)
         header = read_header(data)
     except OSError as error:
         raise _wrong(folder, row, f"cannot be read ({error.strerror})", "unreadable") from error

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.files import write_atomically
+from recordings.files import read_file, write_atomically
 from station.cell.status import MotionPreview
 
+_LIMIT_BYTES = 1024 * 1024
 ACCEPTANCE_NAME = "acceptance.json"
 """Below the daemon's root."""
 STOP_TESTED = "stop-tested"
@@ -151,7 +152,7 @@ def write_acceptance(root: Path, acceptance: Acceptance) -> Path:
 def read_acceptance(root: Path) -> Acceptance | None:
     """The newest test below this root; None: there is none, or its file cannot be read."""
     try:
-        return msgspec.json.decode((root / ACCEPTANCE_NAME).read_bytes(), type=Acceptance)
+        return msgspec.json.decode(read_file(root / ACCEPTANCE_NAME, _LIMIT_BYTES), type=Acceptance)
     except (OSError, msgspec.DecodeError):
         return None
 

@@ -14,7 +14,7 @@ from calibrate.boards.model import BoardError, board_points, check_board
 from calibrate.geometry import Array, pose_from_quaternion, quaternion_from_matrix, transform_points
 from calibrate.kinematics import MODELS
 from recordings import strict_yaml
-from recordings.files import is_session_name
+from recordings.files import is_session_name, read_file
 from recordings.schema.messages import BoardSpec
 from recordings.strict_yaml import YamlProblem
 from station.cell.config import REAL_DRIVERS, SPEED_CAP_M_S, CameraConfig, Plane, PoseGuess, StationConfig
@@ -65,7 +65,7 @@ def config_error(path: Path, problems: tuple[YamlProblem, ...]) -> ConfigError:
 def examine_config(path: Path) -> ConfigReport:
     """Find every problem of the file at once, of whatever kind. ConfigError where it cannot be read."""
     try:
-        content = path.read_bytes()
+        content = read_file(path, strict_yaml.LIMIT_BYTES)
     except OSError as error:
         raise ConfigError(
             f"{path}: {error.strerror}",

@@ -13,7 +13,7 @@ from typing import Literal
 
 import msgspec
 
-from recordings.files import PART_SUFFIX, session_name_from, sync_folder, write_atomically
+from recordings.files import PART_SUFFIX, read_file, session_name_from, sync_folder, write_atomically
 from recordings.schema.messages import Source
 from station.cell.errors import StationError
 from station.cell.plan import Plan
@@ -24,6 +24,7 @@ CALIBRATION_FILE = "calibration.yaml"
 _ACTIVE = "active"
 _NAME_ATTEMPTS = 100
 _LISTED = 200
+_LIMIT_BYTES = 1024 * 1024
 
 
 class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -89,8 +90,8 @@ def write_state(folder: Path, state: SessionState) -> None:
 def read_state(folder: Path) -> SessionState | None:
     """None where it is missing or not ours."""
     try:
-        return msgspec.json.decode((folder / STATE_FILE).read_bytes(), type=SessionState)
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+        return msgspec.json.decode(read_file(folder / STATE_FILE, _LIMIT_BYTES), type=SessionState)
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
 
 
@@ -106,7 +107,7 @@ def clear_active(root: Path) -> None:
 def interrupted_session(root: Path) -> tuple[Path, SessionState] | None:
     """The session that was running when the daemon last ended without sealing it."""
     try:
-        name = (root / _ACTIVE).read_text()
+        name = read_file(root / _ACTIVE, _LIMIT_BYTES).decode()
     except (OSError, UnicodeDecodeError):
         return None
     if session_name_from(name) != name:
@@ -127,7 +128,8 @@ def list_sessions(root: Path) -> list[SessionSummary]:
 
 def _described(folder: Path) -> SessionSummary:
     state = read_state(folder)
-    files = [*folder.glob("*.mcap"), *folder.glob(f"*.mcap{PART_SUFFIX}")]
+    named = [*folder.glob("*.mcap"), *folder.glob(f"*.mcap{PART_SUFFIX}")]
+    files = [file for file in named if file.is_file()]
     calibration = folder / CALIBRATION_FILE
     return SessionSummary(
         name=folder.name,

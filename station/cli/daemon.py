@@ -17,7 +17,7 @@ from typing import Annotated
 
 import typer
 
-from recordings.files import state_root
+from recordings.files import LOG_LIMIT_BYTES, open_regular, read_file, state_root
 from station.cell.errors import StationError
 from station.cell.socket_folder import default_socket, peer_of
 from station.cli.console import Socket
@@ -93,7 +93,7 @@ def own_daemon(arguments: Sequence[str], log: Path) -> Iterator[Path]:
 
 def _started(arguments: Sequence[str], log: Path, channel: int) -> subprocess.Popen[bytes]:
     """A session of its own: Ctrl-C in this terminal is not meant for it."""
-    with log.open("ab") as words:
+    with os.fdopen(open_regular(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab") as words:
         return subprocess.Popen(
             [sys.executable, "-m", "station.cli", "serve", *arguments],
             stdin=channel,
@@ -104,7 +104,7 @@ def _started(arguments: Sequence[str], log: Path, channel: int) -> subprocess.Po
 
 
 def _not_started(log: Path) -> StationError:
-    tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
+    tail = "\n".join(read_file(log, LOG_LIMIT_BYTES).decode(errors="replace").splitlines()[-3:])
     return StationError(f"The daemon did not start; {log} ends with:\n{tail}", code="no-daemon")
 
 

@@ -19,6 +19,7 @@ from typing import BinaryIO
 import msgspec
 
 from recordings.errors import ErrorData
+from recordings.files import open_regular
 from station.cell.config import ControlPath
 from station.cell.errors import RobotError
 from station.devices.ur_condition import APPROVE_AGAIN
@@ -304,4 +305,4 @@ def _log(path: Path) -> BinaryIO:
     with contextlib.suppress(FileNotFoundError):
         if path.stat().st_size > LOG_LIMIT_BYTES:
             path.replace(path.with_suffix(".log.1"))
-    return path.open("ab")
+    return os.fdopen(open_regular(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab")

@@ -9,9 +9,10 @@ from typing import Protocol
 
 import msgspec
 
-from recordings.files import ASKED_FOR, write_atomically
+from recordings.files import ASKED_FOR, read_file, write_atomically
 from recordings.schema.messages import BoardSpec, Image, Matrix4, Mount, RobotIdentity, RobotState, Vector6
 
+_LIMIT_BYTES = 1024 * 1024
 DRAFT_FILE = "new-cell.json"
 
 
@@ -125,7 +126,7 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
 def load_draft(root: Path) -> Draft:
     """Load what was found before; an empty one where there is nothing, or nothing readable."""
     with contextlib.suppress(OSError, msgspec.DecodeError):
-        return msgspec.json.decode((root / DRAFT_FILE).read_bytes(), type=Draft)
+        return msgspec.json.decode(read_file(root / DRAFT_FILE, _LIMIT_BYTES), type=Draft)
     return Draft()
 
 

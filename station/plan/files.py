@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ import yaml
 from calibrate.geometry import Array, pose_from_quaternion
 from calibrate.kinematics import MODELS, inverse_nearest
 from recordings import strict_yaml
-from recordings.files import ASKED_FOR, write_atomically
+from recordings.files import ASKED_FOR, read_file, write_atomically
 from recordings.reader import open_recording
 from recordings.schema.messages import Mount, Vector6
 from station.cell.config import vector6
@@ -92,17 +93,11 @@ def _bad_list(text: str, remedy: str = "") -> ConfigError:
 
 def _read(path: Path) -> bytes:
     try:
-        if path.stat().st_size > strict_yaml.LIMIT_BYTES:
-            raise ConfigError(
-                f"{path} is larger than {strict_yaml.LIMIT_BYTES // 1024} kB: not a plan",
-                code="plan-too-large",
-                remedy="Check that it is the right file.",
-                limit_bytes=strict_yaml.LIMIT_BYTES,
-            )
-        return path.read_bytes()
+        return read_file(path, strict_yaml.LIMIT_BYTES)
     except OSError as error:
+        code = "plan-too-large" if error.errno == errno.EFBIG else "unreadable-plan"
         text = f"cannot read {path}: {error.strerror}"
-        raise ConfigError(text, code="unreadable-plan", remedy="Check the name.") from None
+        raise ConfigError(text, code=code, remedy="Check the name.") from None
 
 
 def _value_problems(plan: Plan) -> list[str]:

@@ -11,9 +11,11 @@ from typing import Literal
 
 import msgspec
 
+from recordings.files import read_file
 from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
 from station.cell.errors import ConfigError
 
+_LIMIT_BYTES = 1024 * 1024
 SceneName = Literal["paper", "blog", "paper-binned"]
 NoiseLevel = Literal["low", "mid", "high"]
 
@@ -65,7 +67,7 @@ def write_truth(truth: CellTruth, path: Path) -> None:
 def read_truth(path: Path) -> CellTruth:
     """Raises ConfigError where it is missing or no truth."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=CellTruth)
+        return msgspec.json.decode(read_file(path, _LIMIT_BYTES), type=CellTruth)
     except (OSError, msgspec.DecodeError) as error:
         raise ConfigError(
             f"{path}: no truth of a simulated cell ({error})",

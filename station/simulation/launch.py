@@ -13,6 +13,7 @@ import threading
 from pathlib import Path
 from typing import Any, Self
 
+from recordings.files import open_regular
 from station.cell.errors import CameraError, RobotError
 from station.simulation.netns import is_isolated
 
@@ -138,7 +139,8 @@ def start_controller(
 
 def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subprocess.Popen[bytes], str]:
     """The child, and why it is not ready and has been ended ("" = it is)."""
-    with log.open("a+b") if log is not None else tempfile.TemporaryFile() as stderr:
+    kept = None if log is None else open_regular(log, os.O_RDWR | os.O_APPEND | os.O_CREAT)
+    with tempfile.TemporaryFile() if kept is None else os.fdopen(kept, "a+b") as stderr:
         said_before = stderr.seek(0, os.SEEK_END)
         child = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, start_new_session=True

@@ -1,0 +1,176 @@
+"""Whatever lies where a file should be is refused at once: a pipe, a device, a folder, a loop, 20 GB.
+
+Nobody answers while a file is opened or read that never ends.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from calibrate.cli import main as calibrate
+from calibrate.files.loader import load_installed
+from calibrate.files.versions import installed_versions, read_log
+from calibrate.quality.checks import read_checks
+from recordings.cli import main as recordings
+from recordings.errors import CodedError
+from station.cell.acceptance import read_acceptance
+from station.cell.session_folder import interrupted_session, list_sessions
+from station.cli import main as station
+from station.operate.draft import Draft, load_draft
+from tests.command_line import call
+
+SAMPLE = Path(__file__).parents[1] / "recordings" / "samples" / "paper-640.mcap"
+MOST_CPU_S, MOST_BYTES, GIVE_UP_S = 2.0, 3 * 2**30, 60
+
+
+def _sparse(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 20_000_000_000)
+
+
+KINDS: dict[str, Callable[[Path], None]] = {
+    "pipe": os.mkfifo,
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "terminal": lambda path: path.symlink_to("/dev/tty"),
+    "folder": Path.mkdir,
+    "loop": lambda path: path.symlink_to(path.name),
+    "20 GB": _sparse,
+}
+
+Place = tuple[str, Callable[[Path], object]]
+"""Where the file lies below a folder, and what reads it there."""
+
+
+def _command(main: Callable[[], None], *arguments: str | Path) -> Callable[[Path], object]:
+    """A command that ends with an error and its remedy; FILE and ROOT stand for the file and the folder."""
+
+    def run(path: Path) -> None:
+        names = {"FILE": path, "ROOT": path.parent, "NEW": path.parent / "new"}
+        done = call(main, *(names.get(str(argument), argument) for argument in arguments))
+        assert done.returncode in (1, 2, 3) and "Traceback" not in done.stderr
+        said = "".join(done.stderr.split())
+        assert path.name in said or Path(os.path.realpath(path)).name in said  # not of `usage`
+
+    return run
+
+
+def _nothing(found: object) -> None:
+    assert not found
+
+
+def _of_session(root: Path) -> None:
+    """The session is listed, without what its file would tell."""
+    (found,) = list_sessions(root)
+    assert found.source == "" and found.views == 0
+
+
+PLACES: dict[str, Place] = {
+    "configuration, doctor": ("station.yaml", _command(station, "doctor", "--config", "FILE")),
+    "configuration, serve": ("station.yaml", _command(station, "serve", "--config", "FILE", "--root", "NEW")),
+    "configuration, plan": ("station.yaml", _command(station, "plan", "--config", "FILE", "-o", "NEW")),
+    "calibration, install": ("cell.yaml", _command(calibrate, "install", "FILE", "--root", "NEW")),
+    "plan": ("plan.yaml", _command(station, "plan", "--check", "FILE")),
+    "list of poses": ("poses.csv", _command(station, "plan", "--from-list", "FILE", "-o", "NEW")),
+    "taught recording": ("taught.mcap", _command(station, "plan", "--taught", "FILE", "-o", "NEW")),
+    "plan to capture": ("plan.yaml", _command(station, "capture", "--plan", "FILE", "--socket", "NEW")),
+    "replay": ("session.mcap", _command(station, "serve", "--replay", "FILE", "--root", "NEW")),
+    "session.json": ("sessions/one/session.json", lambda path: _of_session(path.parents[2])),
+    "recording of a session": ("sessions/one/session.mcap", lambda path: _of_session(path.parents[2])),
+    "active": ("active", lambda path: _nothing(interrupted_session(path.parent))),
+    "session.json, interrupted": (
+        "sessions/one/session.json",
+        lambda path: (
+            (path.parents[2] / "active").write_text("one"),
+            _nothing(interrupted_session(path.parents[2])),
+        ),
+    ),
+    "acceptance.json": ("acceptance.json", lambda path: _nothing(read_acceptance(path.parent))),
+    "draft of a cell": ("new-cell.json", lambda path: _nothing(load_draft(path.parent) != Draft())),
+    "calibration": ("cell.yaml", _command(calibrate, "show", "FILE")),
+    "calibration, diff": ("cell.yaml", _command(calibrate, "diff", "FILE", "FILE")),
+    "calibration, export": ("cell.yaml", _command(calibrate, "export", "--to", "ros-camera-info", "FILE")),
+    "calibration, annotate": ("cell.yaml", _command(calibrate, "annotate", SAMPLE, "FILE", "-o", "NEW")),
+    "installed version": (
+        "calibrations/gen/0001-00000000.yaml",
+        lambda path: _nothing([v.calibration for v in installed_versions(path.parents[2]) if v.calibration]),
+    ),
+    "current": ("calibrations/current", lambda path: load_installed(path.parents[1])),
+    "log of installs": ("calibrations/log.jsonl", lambda path: read_log(path.parents[1])),
+    "validity": ("calibrations/validity.jsonl", lambda path: installed_versions(path.parents[1])),
+    "log of checks": ("calibrations/checks.jsonl", lambda path: read_checks(path.parents[1])),
+    "recording": ("session.mcap", _command(recordings, "info", "FILE")),
+    "recording to recover": ("session.mcap.part", _command(recordings, "recover", "FILE")),
+    "recording to solve": ("session.mcap", _command(calibrate, "solve", "FILE", "-o", "NEW")),
+    "recordings to solve": ("session.mcap", _command(calibrate, "batch", "FILE", "-o", "NEW")),
+    "list of segments": ("parts.json", _command(recordings, "info", "ROOT")),
+    "board": ("board.yaml", _command(calibrate, "solve", SAMPLE, "--board", "FILE", "-o", "NEW")),
+    "camera": ("camera.yaml", _command(calibrate, "solve", SAMPLE, "--camera", "FILE", "-o", "NEW")),
+    "limits": ("gates.yaml", _command(calibrate, "solve", SAMPLE, "--gates", "FILE", "-o", "NEW")),
+    "time offset": (
+        "offset.yaml",
+        _command(calibrate, "solve", SAMPLE, "--time-offset", "FILE", "-o", "NEW"),
+    ),
+    "scheduler": (
+        "scheduler.json",
+        _command(calibrate, "batch", SAMPLE, "-o", "NEW", "--scheduler-file", "FILE"),
+    ),
+    "bag": ("bag.mcap", _command(recordings, "import", "FILE", "-o", "NEW.mcap")),
+    "bag of ROS 2": ("bag.db3", _command(recordings, "import", "FILE", "-o", "NEW.mcap")),
+    "dataset.yaml": ("dataset.yaml", _command(recordings, "import", "ROOT", "-o", "NEW.mcap")),
+}
+
+
+CASES = [
+    (place, kind) for place in PLACES for kind in KINDS if (place, kind) != ("recording to recover", "20 GB")
+]
+"""`recover` looks for whole records in every byte."""
+
+
+@contextmanager
+def at_once() -> Iterator[None]:
+    """Fails where the block waits for ever, takes all the memory, or computes for long."""
+
+    def give_up(number: int, frame: object) -> None:
+        pytest.fail("it waits for ever")
+
+    before, limits = signal.signal(signal.SIGALRM, give_up), resource.getrlimit(resource.RLIMIT_DATA)
+    signal.alarm(GIVE_UP_S)
+    resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, limits[1]))
+    cpu_s = time.process_time()
+    try:
+        yield
+        assert time.process_time() - cpu_s < MOST_CPU_S
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, limits)
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize(("place", "kind"), CASES)
+def test_nothing_in_place_of_a_file_is_waited_for(
+    place: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    name, read = PLACES[place]
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    KINDS[kind](path)
+    with at_once():
+        try:
+            read(path)
+        except CodedError as error:
+            assert error.code
+        except OSError:
+            assert place in (
+                "log of installs",
+                "log of checks",
+                "validity",
+            )  # the commands name the file, too

@@ -48,8 +48,8 @@ from station.tui.results import (
     export_result,
     install_result,
     recover_session,
-    roll_back,
     solve_session,
+    undo_install,
 )
 from station.tui.screen import Ask, StationScreen
 from station.tui.sessions import SessionsScreen, SessionWish
@@ -378,7 +378,7 @@ class StationApp(KnowingApp):
             "install": install_result,
             "touch test": self._touch_test,
             "export": export_result,
-            "roll back": roll_back,
+            "undo": undo_install,
             "discard": discard,
         }
         if (path := await works[what](self.desk, result, result.calibration)) is not None:

@@ -150,24 +150,22 @@ class ChooseFormat(Question[str | None]):
 
 
 class Reason(Question[str]):
-    """A person's reason to install a calibration that is refused; empty: they do not."""
+    """A person's reason to do something all the same; empty: they do not."""
 
-    TITLE = "Not installed"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape", "dismiss('')", "Cancel", tooltip="Install nothing")
+        Binding("escape", "dismiss('')", "Cancel", tooltip="Change nothing")
     ]
 
-    def __init__(self, refusal: str) -> None:
+    def __init__(self, title: str, body: str, keys: str) -> None:
+        """`keys`: what becomes of the reason, and what Enter does."""
         super().__init__()
-        self._refusal = refusal
+        self.title, self._body, self._keys = title, body, keys
 
     def body(self) -> ComposeResult:
-        yield Static(self._refusal, markup=False)
-        yield Input(id="reason", placeholder="to override: your reason, in words", compact=True)
+        yield Static(self._body, markup=False)
+        yield Input(id="reason", placeholder="your reason, in words", compact=True)
         yield Label("", id="dialog-problem", markup=False)
-        yield Label(
-            "Your name and the reason go into the file. Enter installs, Escape does not.", id="dialog-keys"
-        )
+        yield Label(self._keys, id="dialog-keys")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         if problem := reason_problem(event.value):

@@ -61,6 +61,11 @@ class Installed:
             return "INSTALLED"
         return f"INSTALLED, {self.validity.state.replace('-', ' ')}"
 
+    @property
+    def withdrawn(self) -> bool:
+        """A person took `now` out of use."""
+        return self.validity is not None and self.validity.state is ValidityState.WITHDRAWN
+
     def end_of(self, calibration: Calibration) -> Ended | None:
         return next((end for end in self.ended if same_solve(end.calibration, calibration)), None)
 

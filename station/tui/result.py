@@ -200,9 +200,9 @@ class ResultScreen(StationScreen):
         ),
         Binding(
             "b",
-            "app.on_result('roll back')",
-            "Roll back",
-            tooltip="Back to the calibration that was installed before",
+            "app.on_result('undo')",
+            "Undo",
+            tooltip="Back to the calibration before; the first one is taken out of use",
         ),
         Binding(
             "x", "app.on_result('discard')", "Discard", tooltip="Delete this result; the recording stays"
@@ -348,7 +348,7 @@ class InstallScreen(ResultScreen):
     """Comparison with the installed one, what speaks against this one, and every version before."""
 
     MODE, TIP = "install", "What is installed, and what would change"
-    HELP = "i installs the shown calibration, b goes back to the one before; e writes it for other programs."
+    HELP = "i installs the shown calibration, b undoes that; e writes it for other programs."
 
     def evidence(self) -> ComposeResult:
         with Horizontal(id="install"):
@@ -357,7 +357,7 @@ class InstallScreen(ResultScreen):
                 "What installing does",
                 lambda r, c, w, h: install_lines(r, c),
                 id="change",
-                below="i installs  b rolls back",
+                below="i installs  b undoes it",
             )
         yield _panel("Installed so far", lambda r, c, w, h: log_lines(r.log, h), id="versions")
 

@@ -14,7 +14,8 @@ from pathlib import Path
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration
 from calibrate.files.exports import FORMATS, FrameNames, export, follow_command
-from calibrate.files.install import Cell, install, rollback
+from calibrate.files.install import Cell, install, rollback, withdraw
+from calibrate.files.validity import ValidityState
 from calibrate.files.versions import InstalledVersion, before_current, installed_versions
 from recordings.files import ASKED_FOR, write_atomically
 from station.cell.session_folder import CALIBRATION_FILE
@@ -26,6 +27,8 @@ from station.tui.installed import Result, local, read_result, state_root
 
 OVERRIDABLE = ("gate-failed", "objection")
 """Codes of refusals that a person may override with a reason."""
+OVERRIDES = "Your name and the reason go into the file. Enter installs, Escape does not."
+WITHDRAWS = "Your name and the reason are kept. Enter takes it out of use, Escape does not."
 NO_VERDICT = "Another plan was loaded: the drift check has no verdict. Its views, if any, are on 7 (k)."
 
 
@@ -67,7 +70,13 @@ async def check_drift(desk: Desk, approves: Approve) -> None:
 async def install_result(desk: Desk, result: Result, calibration: Calibration) -> None:
     """Ask, then install below the daemon's root. A simulated result only on a simulated cell's root."""
     ended = result.state.end_of(calibration)
-    body = f"{result.path}\nbecomes what every program of this cell reads. b on 6 undoes it."
+    known = installed_versions(state_root(result.path), calibration.camera_name)
+    undo = (
+        "It is the first here: b on 6 takes it out of use."
+        if before_next(known, calibration) is None
+        else "b on 6 goes back to the one before."
+    )
+    body = f"{result.path}\nbecomes what every program of this cell reads. {undo}"
     body += "" if ended is None else f"\n\nIt was installed before, and {ended.how} by {ended.by}."
     if not await desk.question(Confirm("Install this calibration?", body, yes="Install")):
         return
@@ -80,25 +89,33 @@ async def install_result(desk: Desk, result: Result, calibration: Calibration) -
         except CalibrationError as refusal:
             if refusal.code not in OVERRIDABLE:
                 raise
-            if not (reason := await desk.question(Reason(refusal.text))):
+            if not (reason := await desk.question(Reason("Not installed", refusal.text, OVERRIDES))):
                 desk.app.notify("Nothing was installed.")
                 return
             made = await asyncio.to_thread(put, override=reason)
     except CalibrationError as refusal:
         desk.app.notify(str(refusal), title="Not installed", severity="error", timeout=20, markup=False)
         return
-    _say_installed(desk, "Installed. b on 6 goes back to the one before.", made)
+    _say_installed(desk, f"Installed. {undo}", made)
 
 
-async def roll_back(desk: Desk, result: Result, calibration: Calibration) -> None:
-    """Ask, naming both, then switch back to the calibration before the installed one."""
+def before_next(known: list[InstalledVersion], coming: Calibration) -> InstalledVersion | None:
+    """The version that is gone back to once `coming` is installed; None: none."""
+    number = known[-1].number + 1 if known else 1
+    return before_current([InstalledVersion(number, Path(), True, coming), *known])
+
+
+async def undo_install(desk: Desk, result: Result, calibration: Calibration) -> None:
+    """Ask, naming both, then switch back to the calibration before; without one, take it out of use."""
     root, camera = state_root(result.path), calibration.camera_name
     known = installed_versions(root, camera)
     current = next((g for g in known if g.current), None)
     older = before_current(known)
-    if current is None or older is None:
-        there = "nothing is" if current is None else "only one was ever"
-        desk.app.notify(f"There is no older calibration to go back to: {there} installed.")
+    if current is None:
+        desk.app.notify("Nothing is installed.")
+        return
+    if older is None:
+        await _withdraw(desk, root, camera, current)
         return
     body = f"Now: {_named(current)}\nBefore: {_named(older)}\nPrograms then read the one before."
     if await desk.question(Confirm("Go back to the calibration before?", body, yes="Go back")):
@@ -106,6 +123,21 @@ async def roll_back(desk: Desk, result: Result, calibration: Calibration) -> Non
         if made is not None:
             said = "The calibration before is installed again; a drift check proves it (7, k)."
             _say_installed(desk, said, made)
+
+
+async def _withdraw(desk: Desk, root: Path, camera: str, current: InstalledVersion) -> None:
+    """Ask why, then let no program use what is installed."""
+    if current.validity is not None and current.validity.state is ValidityState.WITHDRAWN:
+        desk.app.notify("It is out of use already, and there is none before it to go back to.")
+        return
+    body = (
+        f"{_named(current)}\nThere is none before it to go back to. Programs of this cell are refused it "
+        "from then on, until a calibration is installed."
+    )
+    if not (reason := await desk.question(Reason("Take it out of use?", body, WITHDRAWS))):
+        return
+    if await desk.attempt(asyncio.to_thread(withdraw, root, reason, camera=camera)) is not None:
+        desk.app.notify("Out of use: programs are refused it. i installs a calibration.")
 
 
 def _say_installed(desk: Desk, said: str, version: InstalledVersion) -> None:

@@ -187,7 +187,8 @@ def _results(known: Known) -> tuple[Step, Step, Step]:
         bad = end.way is Way.LOOK_FOR and not failed
         verified = Step("verify", "look" if bad else "done", many(len(touches), "corner") + " touched")
     if result.installed:
-        return solved, verified, Step("install", "done", "installed")
+        kind: Mark = "look" if result.state.withdrawn else "done"
+        return solved, verified, Step("install", kind, result.state.held.lower())
     return solved, verified, Step("install", "todo", "not installed")
 
 
@@ -264,6 +265,9 @@ def _with_result(result: Result, status: StationStatus) -> Action:
     if calibration is None:
         return Action("7", "Choose a session", result.problem, look=True)
     end = after_solve(calibration, () if result.installed else result.objections)
+    if result.state.withdrawn and result.installed:
+        why = "This calibration was taken out of use; programs are refused it. i on 6 installs it again."
+        return Action("n", "Plan 25 poses", why, at="plan", look=True)
     if result.installed:
         return Action("d", "Drift check", "Installed. Check in some days that it still holds.", at="sessions")
     if end.way is Way.INSTALL:

@@ -14,6 +14,7 @@ from textual.widgets import Input, OptionList, Static
 
 from calibrate.files.calibration import Override, write_calibration
 from calibrate.files.exports import FORMATS
+from calibrate.files.folders import calibrations_folder, current_validity
 from calibrate.files.formatting import figures, summary
 from calibrate.files.install import install, installed_calibration
 from calibrate.files.touch import Touch
@@ -23,6 +24,8 @@ from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.tui.dialogs import ChooseFormat, Confirm, Reason
 from station.tui.installed import Installed, Result, local
 from station.tui.result import card, verdict_lines
+from station.tui.results import before_next
+from station.tui.task import next_action
 from tests.station.hover_cell import calibration_of
 from tests.station.session_rig import TRUTH
 from tests.tui.conftest import FakeLink, app_on, opened, text_of, until
@@ -120,7 +123,7 @@ async def test_who_does_not_installs_nothing(link: FakeLink, calibration: Path) 
 async def test_going_back_names_both_and_asks(link: FakeLink, calibration: Path) -> None:
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await press_on_result(pilot, calibration, "b")
-        await until(pilot, lambda: "no older calibration" in said(pilot))
+        await until(pilot, lambda: "Nothing is installed" in said(pilot))
         for path, made in ((calibration.with_name("a.yaml"), GOOD), (calibration.with_name("b.yaml"), LATER)):
             write_calibration(made, path)
             install(path, calibration.parents[2], cell="simulated")
@@ -133,6 +136,42 @@ async def test_going_back_names_both_and_asks(link: FakeLink, calibration: Path)
         await pilot.press("tab", "enter")
         await until(pilot, lambda: "installed again" in said(pilot))
     assert installed_calibration(calibration.parents[2]) == GOOD
+
+
+async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
+    link: FakeLink, calibration: Path
+) -> None:
+    root = calibration.parents[2]
+    write_calibration(GOOD, calibration)
+    install(calibration, root, cell="simulated")
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
+        await pilot.press("6")
+        for answer in ("escape", "enter"):
+            await until(pilot, lambda: "INSTALLED" in text_of(pilot.app, "#verdict"))
+            assert current_validity(calibrations_folder(root)).state == "valid"
+            await pilot.press("b")
+            await until(pilot, lambda: isinstance(pilot.app.screen, Reason) and pilot.app.screen.query(Input))
+            pilot.app.screen.query_one(Input).value = "the bracket was loose"
+            await pilot.press(answer)
+            await until(pilot, lambda: not isinstance(pilot.app.screen, Reason))
+        await until(pilot, lambda: current_validity(calibrations_folder(root)).state == "withdrawn")
+        await until(pilot, lambda: "withdrawn" in text_of(pilot.app, "#verdict"))
+        assert next_action(pilot.app.known).key != "d"  # type: ignore[attr-defined]
+        await pilot.press("b")
+        await until(pilot, lambda: "out of use" in said(pilot))
+        assert not isinstance(pilot.app.screen, Reason)
+
+
+def test_only_another_solve_is_gone_back_to_from_what_is_installed_next(calibration: Path) -> None:
+    root = calibration.parents[2]
+    assert before_next(installed_versions(root), GOOD) is None
+    write_calibration(GOOD, calibration)
+    install(calibration, root, cell="simulated")
+    assert before_next(installed_versions(root), GOOD) is None
+    older = before_next(installed_versions(root), LATER)
+    assert older is not None and older.calibration == GOOD
 
 
 def test_a_calibration_that_was_installed_all_the_same_says_by_whom_and_why() -> None:

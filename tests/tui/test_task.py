@@ -139,7 +139,7 @@ WINDOWS = [
     lambda: Confirm("Finish?", "words", "Finish"),
     lambda: ConfirmMotion(SUMMARY),
     lambda: ChooseFormat(),
-    lambda: Reason("a gate failed"),
+    lambda: Reason("Not installed", "a gate failed", "Enter installs it."),
     lambda: Help("Plan", "about", []),
 ]
 

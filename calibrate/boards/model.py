@@ -21,6 +21,8 @@ from recordings.schema.messages import (
 )
 
 APRIL_DICTIONARY = "DICT_APRILTAG_36h11"
+FEWEST_CORNERS = 3
+"""Inner corners on a side of a chessboard that OpenCV finds."""
 _LARGEST_SIDE = 200
 _WITH_MARKERS = (BoardKind.CHARUCO, BoardKind.APRIL_GRID)
 
@@ -53,6 +55,8 @@ def check_board(spec: BoardSpec) -> None:
     """Raise BoardError where the numbers cannot belong to a real board."""
     tag, charuco, april = (spec.kind in SINGLE_TAGS, *(spec.kind is kind for kind in _WITH_MARKERS))
     columns, rows, smallest = spec.columns, spec.rows, 1 if april or tag else 2
+    if spec.kind is BoardKind.CHESSBOARD:
+        smallest = FEWEST_CORNERS
     _require(
         all(smallest <= side <= _LARGEST_SIDE for side in (columns, rows)),
         "board-columns-rows",

@@ -154,13 +154,13 @@ def _top(curves: Sequence[Array]) -> float:
 @drawn(10, 0.95, grid=False)
 def error_shares(axis: Axes, shares: Mapping[str, float]) -> None:
     """One bar: where the error of X comes from."""
-    colours = (_BLUE, _ORANGE, "#1a7f37", "#8250df", _GREY)
+    colours = (_BLUE, _ORANGE, "#1a7f37", "#8250df", _GREY, "#d4a72c")[: len(shares)]
     left = 0.0
-    for (name, share), colour in zip(shares.items(), colours, strict=False):
+    for (name, share), colour in zip(shares.items(), colours, strict=True):
         axis.barh([0], [share], left=[left], color=colour, label=f"{name.replace('_', ' ')} {share:.0%}")
         left += share
     axis.set_axis_off()
-    axis.figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    axis.figure.legend(loc="outside lower center", ncols=6, fontsize=8, frameon=False)
 
 
 @drawn(10, 3.4, 2, grid=False)

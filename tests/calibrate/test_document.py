@@ -8,6 +8,7 @@ import pytest
 from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import view_rms_px
 from calibrate.projection import intrinsics_names
+from calibrate.report import plots
 
 
 def test_result_and_sigmas(solved_real: SolvedRecording) -> None:
@@ -46,6 +47,8 @@ def test_noise_and_the_shares_of_the_error(solved_real: SolvedRecording) -> None
     assert quality.noise["robot_deg"] == pytest.approx(np.degrees(found.noise.robot_rad))
     assert quality.error_shares == found.error_shares
     assert sum(quality.error_shares.values()) == pytest.approx(1.0)
+    drawn = plots.error_shares(quality.error_shares)
+    assert [name for name in quality.error_shares if name.replace("_", " ") not in drawn] == []
 
 
 def test_left_out_views_against_what_is_claimed_of_them(solved_real: SolvedRecording) -> None:

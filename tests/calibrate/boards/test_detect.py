@@ -193,14 +193,15 @@ def test_the_cause_is_told_where_no_board_is_found() -> None:
     assert detect(np.full_like(image, 120), PAPER_BOARD).cause == "empty"
     assert detect(glare, PAPER_BOARD).cause == "over-exposed"
     assert detect(np.full_like(image, 4), PAPER_BOARD).cause == "too-dark"
-    assert detect(image, BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025)).cause == "other-board"
+    for columns, rows in ((9, 6), (9, 3), (3, 9)):
+        assert detect(image, BoardSpec(BoardKind.CHESSBOARD, columns, rows, 0.025)).cause == "other-board"
     assert not detect(hidden, PAPER_BOARD).found
 
 
 @pytest.mark.parametrize(
     ("spec", "code"),
     [
-        (BoardSpec(BoardKind.CHESSBOARD, 1, 6, 0.025), "board-columns-rows"),
+        (BoardSpec(BoardKind.CHESSBOARD, 2, 6, 0.025), "board-columns-rows"),
         (BoardSpec(BoardKind.CHESSBOARD, 7, 6, 25.0), "board-square"),
         (BoardSpec(BoardKind.CHESSBOARD, 7, 6, float("nan")), "board-square"),
         (BoardSpec(BoardKind.CHARUCO, 7, 6, 0.025, 0.03, "DICT_5X5_100"), "board-marker"),

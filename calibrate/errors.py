@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from recordings.errors import CodedError
 
 
@@ -18,6 +20,19 @@ class UsageError(CalibrationError):
 
     code = "output"
     exit_code = 2
+
+
+def require_choice(name: str, given: object, choices: Iterable[str]) -> None:
+    """Raise UsageError (`choice`) where `given` is none of the choices."""
+    known = list(choices)
+    if given not in known:
+        raise UsageError(
+            f"{name} is {given!r}.",
+            code="choice",
+            remedy=f"Write {' or '.join(known)}.",
+            name=name,
+            given=str(given),
+        )
 
 
 class TooFewViewsError(CalibrationError):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 
+from calibrate.errors import require_choice
 from calibrate.files.calibration import Calibration
 from calibrate.files.gate import Gate
 from calibrate.handeye.solution import Profile, Solution, Verification
@@ -46,6 +47,10 @@ class JobOptions:
     """Poses are read from the robot states so much later than the frames' times."""
     threads: int | None = None
     """Threads of the board detection; the result does not depend on it."""
+
+    def __post_init__(self) -> None:
+        require_choice("profile", self.profile, get_args(Profile))
+        require_choice("lens_model", self.lens_model, get_args(LensModel))
 
     @property
     def chosen(self) -> dict[str, Any]:

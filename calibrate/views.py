@@ -4,17 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from calibrate.errors import BadViewsError
+from calibrate.errors import BadViewsError, require_choice
 from calibrate.geometry import Array, inverse
 from calibrate.kinematics import RobotModel
 from recordings.schema.messages import CameraModel, Mount
 
 _NOMINAL_MATRIX = ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0))
+
+
+def array_of(values: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
+    """Take numbers of this shape, -1: any length. BadViewsError (`shape`) says what was given."""
+    try:
+        found = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        found = np.zeros(())
+    if not found.size:
+        found = found.reshape([max(size, 0) for size in shape]) if -1 in shape else found
+    if found.ndim != len(shape) or any(a not in (-1, b) for a, b in zip(shape, found.shape, strict=True)):
+        given, wanted = (str(s).replace("-1", "n") for s in (found.shape, shape))
+        raise BadViewsError(
+            f"{what} has shape {given}.", code="shape", remedy=f"Give {wanted}.", given=given, wanted=wanted
+        )
+    return found
+
+
+def require_mount(mount: object) -> None:
+    require_choice("mount", mount, get_args(Mount))
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +55,21 @@ class BoardView:
     camera_from_board: Array | None = None
     """(4, 4) PnP, once intrinsics are known."""
 
+    def __post_init__(self) -> None:
+        for name, shape in _SHAPES.items():
+            if (given := getattr(self, name)) is not None:
+                taken = array_of(given, shape, f"{name} of view {self.index + 1} ({self.name})")
+                object.__setattr__(self, name, taken)
+
+
+_SHAPES = {
+    "base_from_flange": (4, 4),
+    "board_points": (-1, 3),
+    "pixels": (-1, 2),
+    "joints_rad": (6,),
+    "camera_from_board": (4, 4),
+}
+
 
 @dataclass(frozen=True, eq=False)
 class ViewSet:
@@ -48,13 +83,18 @@ class ViewSet:
     arm: RobotModel | None = None
     """The arm's table as its maker calibrated it; None: the published one of `robot_model`."""
 
+    def __post_init__(self) -> None:
+        require_mount(self.mount)
+
     @classmethod
-    def from_poses(cls, mount: Mount, base_from_flange: Array, camera_from_board: Array) -> ViewSet:
+    def from_poses(cls, mount: Mount, base_from_flange: ArrayLike, camera_from_board: ArrayLike) -> ViewSet:
         """Make views without corners from poses (n, 4, 4); a nominal camera stands in for the real one."""
+        flange = array_of(base_from_flange, (-1, 4, 4), "base_from_flange")
+        boards = array_of(camera_from_board, flange.shape, "camera_from_board")
         nothing = np.zeros((0, 3)), np.zeros((0, 2))
         views = (
             BoardView(i, f"view {i}", F, *nothing, camera_from_board=C)
-            for i, (F, C) in enumerate(zip(base_from_flange, camera_from_board, strict=True))
+            for i, (F, C) in enumerate(zip(flange, boards, strict=True))
         )
         return cls(mount, tuple(views), CameraModel(640, 480, _NOMINAL_MATRIX))
 

@@ -8,12 +8,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import msgspec
 import numpy as np
 
-from calibrate.errors import GateFailedError, InstallError
+from calibrate.errors import GateFailedError, InstallError, require_choice
 from calibrate.files.calibration import Calibration, Override, read_calibration
 from calibrate.files.folders import (
     calibrations_folder,
@@ -96,6 +96,7 @@ def install(
 
     Raises InstallError (also as exit code 4 for a gate) or CalibrationFileError.
     """
+    require_choice("cell", cell, get_args(Cell))
     calibration = read_calibration(path)
     camera = camera or calibration.camera_name
     folder = calibrations_folder(root, camera)
@@ -255,7 +256,8 @@ def set_validity(
     (`other-version`) where another is installed by now, and `nothing-installed` where nothing is. VALID makes
     now the time of the last proof.
     """
-    now = time_text()
+    require_choice("state", state, ValidityState)
+    state, now = ValidityState(state), time_text()
 
     def change(before: Validity) -> Validity:
         since = before.since if before.state is state else now

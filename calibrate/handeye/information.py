@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calibrate.geometry import Array
 from calibrate.handeye.arm import PARAMETERS
@@ -21,7 +22,7 @@ from calibrate.handeye.linear import Linear
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.projection import camera_matrix
 from calibrate.results import SHAPE
-from calibrate.views import Observations, board_in_camera, extent_of
+from calibrate.views import Observations, array_of, board_in_camera, extent_of, require_mount
 from recordings.schema.messages import CameraModel, Mount
 
 _FOCAL_SHARE = 0.05
@@ -45,10 +46,10 @@ USUAL_NOISE = MeasurementNoise()
 def view_information(
     mount: Mount,
     camera: CameraModel,
-    base_from_flange: Array,
-    X: Array,
-    Y: Array,
-    board_points: Array,
+    base_from_flange: ArrayLike,
+    X: ArrayLike,
+    Y: ArrayLike,
+    board_points: ArrayLike,
     noise: MeasurementNoise,
     table: Array | None = None,
 ) -> Array:
@@ -57,16 +58,20 @@ def view_information(
     The view's own robot error is marginalised, so views simply add. `table`: (n, 6, q) motion of the flange
     by each error of the arm's table.
     """
-    n, k = len(base_from_flange), len(board_points)
-    C = board_in_camera(mount, base_from_flange, X, Y)
+    require_mount(mount)
+    flange = array_of(base_from_flange, (-1, 4, 4), "base_from_flange")
+    points = array_of(board_points, (-1, 3), "board_points")
+    X, Y = array_of(X, (4, 4), "X"), array_of(Y, (4, 4), "Y")
+    n, k = len(flange), len(points)
+    C = board_in_camera(mount, flange, X, Y)
     observed = Observations(
         mount,
-        base_from_flange,
-        np.broadcast_to(board_points, (n, k, 3)),
+        flange,
+        np.broadcast_to(points, (n, k, 3)),
         np.zeros((n, k, 2)),
         np.ones((n, k)),
         table,
-        extent_of(board_points),
+        extent_of(points),
     )
     errors = np.zeros(0 if table is None else table.shape[2])
     state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), errors)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
+from calibrate.errors import require_choice
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.axxb.certificate import Certificate
 from calibrate.handeye.metrics import Observability
@@ -55,6 +56,9 @@ class SolveOptions:
     holdout: bool = True
     folds: bool = True
     """Cross-validate."""
+
+    def __post_init__(self) -> None:
+        require_choice("profile", self.profile, get_args(Profile))
 
 
 @dataclass(frozen=True)

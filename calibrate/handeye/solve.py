@@ -54,8 +54,9 @@ from calibrate.handeye.solution import (
     board_frames,
     camera_frames,
 )
+from calibrate.projection import intrinsics_names
 from calibrate.results import BoardShape, HoldoutScore
-from calibrate.views import Moved, ViewSet
+from calibrate.views import Moved, ViewSet, array_of
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
 
@@ -124,8 +125,9 @@ _MOVED: dict[Reading, Moved] = {Reading.BOARD_MOVED: "board", Reading.CAMERA_MOV
 def _priors(views: ViewSet, options: SolveOptions) -> Priors:
     if options.intrinsics_from_same_pictures:
         return Priors(LensPrior.unknown(views.camera), options.board)
-    sigma = None if options.lens_sigma is None else np.array(options.lens_sigma)
-    return Priors(LensPrior.given(views.camera, sigma), options.board)
+    sigma, names = options.lens_sigma, intrinsics_names(views.camera)
+    given = None if sigma is None else array_of(sigma, (len(names),), "lens_sigma")
+    return Priors(LensPrior.given(views.camera, given), options.board)
 
 
 def _doubtful(solution: Solution) -> bool:

@@ -18,7 +18,7 @@ import pytest
 import calibrate
 import recordings
 from calibrate.cli import main
-from calibrate.errors import CalibrationFileError, GateFailedError, InstallError
+from calibrate.errors import CalibrationFileError, GateFailedError, InstallError, UsageError
 from calibrate.files.calibration import read_calibration
 from calibrate.files.gate import Gate
 from calibrate.files.install import (
@@ -116,6 +116,8 @@ def test_kinds_of_cells_do_not_mix(make_file, tmp_path: Path) -> None:  # type: 
         install(make_file(source="simulated"), root, cell="simulated")
     simulated = tmp_path / "simulated"
     install(make_file(source="simulated"), simulated, cell="simulated")
+    with raises_code(UsageError, "choice", given="reel"):
+        install(make_file(), root, cell="reel")  # type: ignore[arg-type]
     with raises_code(InstallError, "not-real", source="simulated"):
         load_installed(simulated)
     assert load_installed(simulated, allow_simulated=True).source == "simulated"

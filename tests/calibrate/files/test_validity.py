@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibrate import load_installed, watch
-from calibrate.errors import CalibrationFileError, InstallError
+from calibrate.errors import CalibrationFileError, InstallError, UsageError
 from calibrate.files import hooks
 from calibrate.files.folders import cameras
 from calibrate.files.hooks import HookRun
@@ -161,6 +161,14 @@ def test_a_check_judges_the_version_that_it_was_made_on(root: Path, make_file: M
     with raises_code(InstallError, "other-version", version=2, judged=1):
         set_validity(root, D, MOVED, version=1)
     assert load_installed(root).validity.state is V
+
+
+def test_a_state_may_be_given_by_its_name_and_no_other_one(root: Path) -> None:
+    set_validity(root, D, MOVED)
+    assert set_validity(root, "valid", MOVED).state is V  # type: ignore[arg-type]
+    assert load_installed(root).validity.verified != load_installed(root).created
+    with raises_code(UsageError, "choice", given="validd"):
+        set_validity(root, "validd", MOVED)  # type: ignore[arg-type]
 
 
 def test_nothing_is_made_where_nothing_is_installed(tmp_path: Path) -> None:

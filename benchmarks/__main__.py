@@ -52,7 +52,7 @@ SHOWN: dict[str, str] = {
     "screen_stop": "F12",
     "daemon_stream": r"^\| (75 \| 10|150) ",
     "state_reader": "samples|fitted|share",
-    "recorder": r"plain write\(\) of|Recorder \(",
+    "recorder": r"plain write\(\) of|Recorder \(|^A session",
     "time_sync": "",
     "frame_time": r"\+0 ms \| \+0|-1 ms",
     "operator_mistakes": "of 25 named",

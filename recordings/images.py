@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 import struct
+import zlib
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from recordings.mcap import checksum
 
 IMAGE_LIMIT_BYTES = 36 * 1024 * 1024
 """Decoded size above which no image is read or written: bounds the reader's memory."""
@@ -119,7 +118,7 @@ def _check_png_chunks(data: bytes) -> None:
         end = position + 8 + length
         if end + 4 > len(data):
             break
-        if checksum.crc32(memoryview(data)[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+        if zlib.crc32(memoryview(data)[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
             raise ImageError(f"the PNG is damaged (checksum of the block at byte {position})")
         if data[position + 4 : position + 8] == b"IEND":
             return

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+from mcap.writer import Writer
 
 from recordings.errors import (
     CorruptRecordingError,
@@ -25,9 +27,9 @@ from recordings.files import (
     sync_folder,
 )
 from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
-from recordings.mcap.records import MESSAGE_HEAD, Opcode, with_crc
+from recordings.mcap.output import OutputFile
+from recordings.mcap.records import with_crc
 from recordings.mcap.salvage import Salvage, salvage
-from recordings.mcap.writer import McapFile
 from recordings.schema.definitions import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
 from recordings.schema.messages import SessionInfo, View
 from recordings.schema.topics import Topic, identify
@@ -47,7 +49,7 @@ class Recovery:
     pictures: int
     robot_states: int
     lost_bytes: int
-    losses: tuple[str, ...] = ()
+    losses: Sequence[str] = ()
 
     @property
     def rebuilt(self) -> bool:
@@ -148,7 +150,7 @@ def _recover_file(source: Path, output: Path | None) -> tuple[Recovery, SessionI
 
 
 def _report(
-    path: Path, segment: RecordingSegment, original: Path | None, lost_bytes: int, losses: tuple[str, ...]
+    path: Path, segment: RecordingSegment, original: Path | None, lost_bytes: int, losses: Sequence[str]
 ) -> tuple[Recovery, SessionInfo]:
     done = Recovery(
         path=path,
@@ -208,15 +210,14 @@ class _NothingToSaveError(RecordingError):
     code = "nothing-to-save"
 
 
-def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment, int, tuple[str, ...]]:
+def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment, int, list[str]]:
     """The open file `source` → the new file `target`, on the disk and read strictly; lost bytes; losses.
 
     Raises _NothingToSaveError, RecordingError, or OSError when the disk fails.
     """
     found = salvage(descriptor, identify)
-    session = next(
-        (found.contents.metadata[n] for n in SESSION_RECORDS if n in found.contents.metadata), None
-    )
+    metadata = found.contents.metadata
+    session = next((metadata[name] for name in SESSION_RECORDS if name in metadata), None)
     if session is None:
         size = os.fstat(descriptor).st_size
         raise _NothingToSaveError(
@@ -224,79 +225,74 @@ def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment
             remedy="Look for another copy; this file is unchanged.",
             size_bytes=size,
         )
-    dropped, reasons = _orphans(found)
-    losses = (*(f"bytes {start} to {end}: {why}" for start, end, why in found.lost), *reasons)
-    file = McapFile(target)
+    dropped = _orphans(found)
+    file = OutputFile(target)
     try:
-        _write(file, found, session, dropped, losses)
+        _write(file.writer(), found, session, dropped)
         os.fsync(file.descriptor)
     finally:
         file.close()
     try:
-        return RecordingSegment(target), found.lost_bytes, losses
+        return RecordingSegment(target), found.lost_bytes, found.losses
     except RecordingError as error:
         text = f"{source} cannot be recovered and is unchanged: {error.text}"
         raise RecordingError(text, code="unrecoverable") from error
 
 
-def _orphans(found: Salvage) -> tuple[set[int], list[str]]:
-    """Addresses of messages that lost their partner: an image its facts, a view its image."""
-    contents, source = found.contents, found.source
-    index = {channel.topic: contents.messages[number] for number, channel in contents.channels.items()}
-
-    def places(topic: Topic) -> dict[int, int]:
-        addresses = index[topic.value].addresses if topic.value in index else ()
-        return {source.head(address)[2]: address for address in addresses}
-
-    facts = places(Topic.PICTURE_FACTS)
-    images = places(Topic.RAW_IMAGE) | places(Topic.COMPRESSED_IMAGE)
-    whole = facts.keys() & images.keys()
-    dropped = {
-        place for table in (facts, images) for sequence, place in table.items() if sequence not in whole
-    }
-    reasons = [f"image {sequence} is incomplete" for sequence in sorted(facts.keys() ^ images.keys())]
-    for address in index[Topic.VIEW.value].addresses if Topic.VIEW.value in index else ():
+def _orphans(found: Salvage) -> set[int]:
+    """Places of messages that lost their partner, an image its facts or a view its image: told as losses."""
+    topics = {number: channel.topic for number, channel in found.contents.channels.items()}
+    facts: dict[int, int] = {}
+    images: dict[int, int] = {}
+    views: list[tuple[int, bytes]] = []
+    for place, message in found.messages():
+        match topics.get(message.channel_id):
+            case Topic.PICTURE_FACTS:
+                facts[message.sequence] = place
+            case Topic.RAW_IMAGE | Topic.COMPRESSED_IMAGE:
+                images[message.sequence] = place
+            case Topic.VIEW:
+                views.append((place, message.data))
+    halves = facts.keys() ^ images.keys()
+    dropped = {table[sequence] for table in (facts, images) for sequence in halves & table.keys()}
+    found.losses += [f"image {sequence} is incomplete" for sequence in sorted(halves)]
+    for place, data in views:
         try:
-            view = decode(View, source.message(address).data)
+            view = decode(View, data)
         except SchemaError:
-            dropped.add(address)
-            reasons.append(f"a view at byte {source.place(address)} cannot be read")
+            dropped.add(place)
+            found.losses.append(f"a view at byte {place} cannot be read")
             continue
-        if view.picture_sequence not in whole:
-            dropped.add(address)
-            reasons.append(f"pose {view.index + 1} (attempt {view.attempt}) lost its image")
-    return dropped, reasons
+        if view.picture_sequence not in facts.keys() & images.keys():
+            dropped.add(place)
+            found.losses.append(f"pose {view.index + 1} (attempt {view.attempt}) lost its image")
+    return dropped
 
 
-def _write(
-    file: McapFile, found: Salvage, session: dict[str, str], dropped: set[int], losses: tuple[str, ...]
-) -> None:
-    """The good chunks' messages, as they were, into a new finished file."""
-    file.start()
+def _write(writer: Writer, found: Salvage, session: dict[str, str], dropped: set[int]) -> None:
+    """The whole chunks' messages, as they were, into a new finished file."""
+    writer.start()
     contents = found.contents
     for name in SESSION_RECORDS:
-        file.metadata(name, session)
+        writer.add_metadata(name, session)
     before = contents.metadata.get(RECOVERY_RECORD, {}).get("lost_bytes", "0")  # of an earlier recovery
     lost_bytes = found.lost_bytes + (int(before) if before.isdecimal() else 0)
-    note = {"lost_bytes": str(lost_bytes), "losses": msgspec.json.encode(losses[:100]).decode()}
-    file.metadata(RECOVERY_RECORD, with_crc(note))
-    for name, data in contents.attachments.items():
-        file.attachment(name, contents.media_types[name], data, 0)
+    note = {"lost_bytes": str(lost_bytes), "losses": msgspec.json.encode(found.losses[:100]).decode()}
+    writer.add_metadata(RECOVERY_RECORD, with_crc(note))
+    for kept in contents.attachments.values():
+        writer.add_attachment(kept.create_time, kept.log_time, kept.name, kept.media_type, kept.data)
     numbers: dict[int, int] = {}
-    for chunk in found.chunks:
-        for address, opcode, content in found.records(chunk):
-            if opcode != Opcode.MESSAGE or address in dropped:
-                continue
-            number, sequence, time_ns, _ = MESSAGE_HEAD.unpack_from(content)
-            if number not in contents.channels:
-                continue
-            if number not in numbers:
-                channel = contents.channels[number]
-                schema = contents.schema_of(channel)
-                declared = (schema.name, schema.encoding, schema.data)
-                numbers[number] = file.register(
-                    channel.topic, channel.encoding, declared, dict(channel.metadata)
-                )
-            file.message(numbers[number], [content[MESSAGE_HEAD.size :]], time_ns, sequence, more=True)
-        file.end_chunk()
-    file.finish()
+    for place, message in found.messages():
+        channel = contents.channels.get(message.channel_id)
+        if channel is None or place in dropped:
+            continue
+        if channel.id not in numbers:
+            schema = contents.schema_of(channel)
+            number = writer.register_schema(schema.name, schema.encoding, schema.data)
+            numbers[channel.id] = writer.register_channel(
+                channel.topic, channel.message_encoding, number, channel.metadata
+            )
+        writer.add_message(
+            numbers[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+        )
+    writer.finish()

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
+from mcap.records import Message
 
 from recordings.errors import BadImageError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name, open_file
@@ -19,7 +19,7 @@ from recordings.manifest import PARTS_LIMIT
 from recordings.mcap.contents import MessageIndex, joined
 from recordings.mcap.records import BadRecordError, require_crc
 from recordings.mcap.scan import scan_file
-from recordings.mcap.source import Message, ShortFileError
+from recordings.mcap.source import ShortFileError
 from recordings.schema.definitions import (
     FORMATS,
     RECOVERY_RECORD,
@@ -64,7 +64,6 @@ class RecordingSegment:
             self._topics = self._check_channels()
             self.lost_bytes = self._recovery_loss()
             self.attachments = self._checked_attachments()
-            self.media_types = dict(self._contents.media_types)
             self._facts = self._index_images(Topic.PICTURE_FACTS)
             self._raw = self._index_images(Topic.RAW_IMAGE)
             self._compressed = self._index_images(Topic.COMPRESSED_IMAGE)
@@ -170,10 +169,6 @@ class RecordingSegment:
         """A topic's protobuf messages, in file order; their values are not checked."""
         return (self.parsed_at(topic, address) for address in self.messages(topic).addresses)
 
-    def beginnings(self, topic: Topic, length: int) -> Iterator[tuple[list[int], NDArray[np.uint8]]]:
-        """(addresses, first bytes (n, length)) of messages, until one lies in a compressed chunk."""
-        return self._source.beginnings(self.messages(topic).addresses, length)
-
     def parsed_at(self, topic: Topic, address: int) -> Any:
         try:
             return parse(topic, self._read(topic, address).data)
@@ -214,7 +209,7 @@ class RecordingSegment:
                 self.foreign[channel.topic] = index
                 continue
             schema = self._contents.schema_of(channel)
-            meaning = (channel.encoding, schema.encoding, schema.name)
+            meaning = (channel.message_encoding, schema.encoding, schema.name)
             if meaning != ("protobuf", "protobuf", schema_name(topic)):
                 text = f"topic {topic.value} holds {schema.name[:60]}, not {schema_name(topic)}"
                 raise self._unusable(text, "other-schema")
@@ -263,13 +258,18 @@ class RecordingSegment:
         for name in self._contents.attachments:
             if not is_attachment_name(name):
                 raise self._unusable(f"an attachment is named '{name[:60]}'")
-        return dict(self._contents.attachments)
+        return {name: record.data for name, record in self._contents.attachments.items()}
+
+    @property
+    def media_types(self) -> dict[str, str]:
+        """Media types of the attachments."""
+        return {name: record.media_type for name, record in self._contents.attachments.items()}
 
     def _index_images(self, topic: Topic) -> dict[int, int]:
         """Sequence → address of the message."""
         found: dict[int, int] = {}
         for address in self.messages(topic).addresses:
-            _, _, sequence = self._source.head(address)
+            sequence = self._source.sequence(address)
             if found.setdefault(sequence, address) != address:
                 raise self._corrupt(topic, address, f"image {sequence} stands twice in the file")
         return found

@@ -16,10 +16,6 @@ from recordings.segment import RecordingSegment
 
 _BATCH = 16_384
 """Messages whose clocks are in memory at once."""
-_STAMPS_BYTES = 64
-"""What is looked at of a message: a tag, a length, three numbers of at most 11 bytes, one of 9, and some."""
-_FIELD_BYTES = 11
-_FIRST_FIELD, _CONTROLLER_S = 0x0A, 3
 _CLOCKS = np.dtype([("host_monotonic_ns", "i8"), ("controller_s", "f8"), ("device_ns", "i8")])
 LARGEST_STAMP_S = 1e12
 """30 000 years: what is more, or no number, is no time."""
@@ -30,16 +26,8 @@ Times = NDArray[np.float64]
 
 
 def stamps_tables(segment: RecordingSegment, topic: Topic) -> Iterator[NDArray[np.void]]:
-    """Clocks of messages that begin with their `stamps`, many rows at once."""
-    done = 0
-    for places, data in segment.beginnings(topic, _STAMPS_BYTES):
-        table, read = _stamps(data)
-        for row in np.flatnonzero(~read).tolist():
-            table[row] = _clocks(segment.parsed_at(topic, places[row]))
-        done += len(table)
-        yield table
-    rest = iter(segment.messages(topic).addresses[done:])
-    rows = (_clocks(segment.parsed_at(topic, address)) for address in rest)
+    """Clocks of a topic's messages, many rows at once."""
+    rows = map(_clocks, segment.parsed(topic))
     while len(table := np.fromiter(islice(rows, _BATCH), _CLOCKS)):
         yield table
 
@@ -47,48 +35,6 @@ def stamps_tables(segment: RecordingSegment, topic: Topic) -> Iterator[NDArray[n
 def _clocks(message: Any) -> tuple[int, float, int]:
     stamps = message.stamps
     return stamps.host_monotonic_ns, stamps.controller_s, stamps.device_ns
-
-
-def _stamps(data: NDArray[np.uint8]) -> tuple[NDArray[np.void], NDArray[np.bool_]]:
-    """Messages' first bytes (n, length) → their clocks, and which rows were written as protobuf writes them.
-
-    That is: the stamps first, their fields in order, each at most once (protobuf.dev, "Encoding").
-    """
-    ends = 2 + data[:, 1].astype(np.int64)
-    read = (data[:, 0] == _FIRST_FIELD) & (ends <= _STAMPS_BYTES - _FIELD_BYTES)
-    at = np.where(read, 2, 0)
-    found: list[NDArray[np.int64]] = []
-    for number in (1, 2, 3, 4):
-        is_double = number == _CONTROLLER_S
-        field = _columns(data, at)
-        there = read & (at < ends) & (field[:, 0] == (number << 3 | is_double))
-        if is_double:
-            value, size = field[:, 1:9].copy().view(np.int64)[:, 0], np.full(len(data), 8)
-        else:
-            value, size = _varints(field[:, 1:])
-        found.append(np.where(there, value, 0))
-        at = np.where(there, at + 1 + size, at)
-    table = np.empty(len(data), _CLOCKS)
-    table["host_monotonic_ns"], table["device_ns"] = found[0], found[3]
-    table["controller_s"] = found[2].view(np.float64)
-    return table, read & (at == ends)
-
-
-def _columns(data: NDArray[np.uint8], at: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """A field's bytes of each row, from `at` on; most often all rows have it in one place."""
-    if (at == at[0]).all():
-        return data[:, at[0] : at[0] + _FIELD_BYTES]
-    return np.asarray(data[np.arange(len(data))[:, None], at[:, None] + np.arange(_FIELD_BYTES)])
-
-
-def _varints(field: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(numbers, how many bytes each has), of rows that begin with one; no row reads on over all its bytes."""
-    size = (field < 128).argmax(axis=1) + 1
-    value = np.zeros(len(field), np.uint64)
-    for place in range(int(size.max())):
-        bits = (field[:, place] & 127).astype(np.uint64) << np.uint64(7 * place)
-        value |= np.where(place < size, bits, np.uint64(0))
-    return value.view(np.int64), size
 
 
 class Steps:

@@ -1,7 +1,6 @@
 """Writes one recording file, synchronously: `.mcap.part` until it is finished, synced and renamed.
 
-Layout: one MCAP, chunks of 1 MiB without compression, checksums of every chunk, of the data section and of
-the summary. Raw values and all clocks go in; geometry is applied by the reader's users.
+Raw values and all clocks go in; geometry is applied by the reader's users.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from types import TracebackType
 from typing import Any, Self
 
 import msgspec
+from mcap.records import Message
 
 from recordings.errors import RecordingError, disk_error, exists_error, recover_line
 from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, rename_new, sync_folder
 from recordings.images import ImageError, encode_png, read_header
-from recordings.mcap.records import Piece, with_crc
-from recordings.mcap.source import Message
-from recordings.mcap.writer import McapFile
+from recordings.mcap.output import OutputFile
+from recordings.mcap.records import with_crc
 from recordings.scene import Entity, scene_update
 from recordings.schema import viewing
 from recordings.schema.definitions import FORMATS, SESSION_RECORDS, PictureFacts, encode
@@ -77,13 +76,14 @@ class RecordingWriter:
         self._shown_ns = 0
         """Time of the newest state that viewers get."""
         self._attachments: set[str] = set()
-        self._file = McapFile(self.part_path)
+        self._file = OutputFile(self.part_path)
+        self._mcap = self._file.writer()
         self._background = BackgroundSync(self._file.descriptor)
         try:
-            self._file.start()
+            self._mcap.start(library="calibration-station")
             content = with_crc({"format": FORMATS[-1], "session": msgspec.json.encode(info).decode()})
             for name in SESSION_RECORDS:
-                self._file.metadata(name, content)
+                self._mcap.add_metadata(name, content)
             sync_folder(path.parent)
         except OSError as error:
             self._file.close()
@@ -95,7 +95,7 @@ class RecordingWriter:
 
     def robot_state(self, state: RobotState) -> None:
         time_ns = self._time_ns(state.stamps)
-        self._add(Topic.ROBOT_STATE, [encode(state)], time_ns)
+        self._add(Topic.ROBOT_STATE, encode(state), time_ns)
         due = not 0 <= time_ns - self._shown_ns < SHOWN_PERIOD_NS  # a clock that was set back counts, too
         if due and all(map(math.isfinite, state.tcp_pose)):
             self._shown_ns = time_ns
@@ -123,25 +123,22 @@ class RecordingWriter:
         facts = PictureFacts(width=width, height=height, **told)
         time_ns = self._time_ns(image.stamps, image.sequence)
         try:
-            topic, pieces = self._image(image, encoded, time_ns)
+            topic, message = self._image(image, encoded, time_ns)
         except ImageError as error:
             raise RecordingError(f"Image {image.sequence} {error}", code="bad-image") from error
         for reading in image.clock_readings:
             self.clock_reading(reading)
-        for part_of_it in (Topic.PICTURE_FACTS, topic):  # declared first: the two lie in one chunk
-            self._channel(part_of_it)
-        self._add(Topic.PICTURE_FACTS, [encode(facts)], time_ns, image.sequence, more=True)
-        self._add(topic, pieces, time_ns, image.sequence)
+        self._add(Topic.PICTURE_FACTS, encode(facts), time_ns, image.sequence)
+        self._show(topic, message, time_ns, image.sequence)
         self._images[image.sequence] = time_ns
         self.flush()
 
     def clock_reading(self, reading: ClockReading) -> None:
         """Write a reading of the camera's clock; those that an image brings along come with the image."""
-        self._add(
-            Topic.CLOCK_READING, [encode(reading)], self._time_ns(Stamps(host_wall_ns=reading.host_wall_ns))
-        )
+        time_ns = self._time_ns(Stamps(host_wall_ns=reading.host_wall_ns))
+        self._add(Topic.CLOCK_READING, encode(reading), time_ns)
 
-    def _image(self, image: Image, encoded: bytes | None, time_ns: int) -> tuple[Topic, list[Piece]]:
+    def _image(self, image: Image, encoded: bytes | None, time_ns: int) -> tuple[Topic, Any]:
         if encoded is None and self._lossless_png:
             encoded = encode_png(image.pixels)
         if encoded is None:
@@ -157,7 +154,7 @@ class RecordingWriter:
                 remedy="Retake the pose.",
             )
         time_ns = self._time_ns(view.stamps, view.picture_sequence)
-        self._add(Topic.VIEW, [encode(view)], time_ns)
+        self._add(Topic.VIEW, encode(view), time_ns)
         if not self._shown_ns:  # imported, say: nothing else tells viewers where the flange is
             T = view.base_from_flange
             self._show(Topic.TRANSFORM, viewing.frame_transform("base", "flange", T, time_ns), time_ns)
@@ -171,7 +168,7 @@ class RecordingWriter:
     def drawn_image(self, sequence: int, jpeg: bytes) -> None:
         """A recorded image with something drawn into it, for viewers that draw nothing over images."""
         time_ns = self._images[sequence]
-        self._add(Topic.DRAWN_IMAGE, viewing.compressed_image(jpeg, "jpeg", time_ns), time_ns)
+        self._show(Topic.DRAWN_IMAGE, viewing.compressed_image(jpeg, "jpeg", time_ns), time_ns)
 
     def scene(self, sequence: int, entities: Sequence[Entity]) -> None:
         """Shapes in space as they are at a recorded image's time, for viewers."""
@@ -188,14 +185,14 @@ class RecordingWriter:
 
     def shown(self, topic: Topic, message: Message) -> None:
         """What another recording of the session shows viewers, as it stands there."""
-        self._add(topic, [message.data], message.time_ns)
+        self._add(topic, message.data, message.log_time)
 
-    def _show(self, topic: Topic, message: Any, time_ns: int) -> None:
-        self._add(topic, [message.SerializeToString()], time_ns)
+    def _show(self, topic: Topic, message: Any, time_ns: int, sequence: int | None = None) -> None:
+        self._add(topic, message.SerializeToString(), time_ns, sequence)
 
     def event(self, event: CaptureEvent) -> None:
         time_ns = self._time_ns(event.stamps)
-        self._add(Topic.EVENT, [encode(event)], time_ns)
+        self._add(Topic.EVENT, encode(event), time_ns)
         self._show(Topic.LOG, viewing.log_line(event, time_ns), time_ns)
 
     def camera_model(self, model: CameraModel) -> None:
@@ -213,13 +210,13 @@ class RecordingWriter:
             text = f"Attachment {name} is larger than {ATTACHMENT_LIMIT_BYTES >> 20} MiB"
             raise RecordingError(text, code="attachment-size", size_bytes=len(content))
         with self._disk():
-            self._file.attachment(name, media_type, content, self._start_ns)
+            self._mcap.add_attachment(self._start_ns, self._start_ns, name, media_type, content)
         self._attachments.add(name)
 
     def flush(self) -> None:
         """Ends the open chunk and hands everything to the operating system: survives a killed process."""
         with self._disk():
-            self._file.end_chunk()
+            self._mcap.flush()
 
     def sync(self) -> None:
         """Everything so far is on the disk when this returns: survives a power loss."""
@@ -241,7 +238,7 @@ class RecordingWriter:
     def finish(self) -> Path:
         """Finishes the file, renames it, and returns its final path."""
         with self._disk():
-            self._file.finish()
+            self._mcap.finish()
             self._background.wait()
             os.fsync(self._file.descriptor)
             rename_new(self.part_path, self.path)
@@ -274,23 +271,18 @@ class RecordingWriter:
         """Wall time where there is one; imported images have none and follow each other by a second."""
         return stamps.host_wall_ns or self._start_ns + place * _SECOND_NS
 
-    def _add(
-        self, topic: Topic, pieces: list[Piece], time_ns: int, sequence: int | None = None, more: bool = False
-    ) -> None:
-        channel = self._channels.get(topic) or self._channel(topic)
-        if sequence is None:
-            sequence = channel.messages
-            channel.messages += 1
-        self._check_usable()
-        try:
-            self._file.message(channel.number, pieces, time_ns, sequence, more=more)
-        except OSError as error:
-            raise self._failed(error) from error
+    def _add(self, topic: Topic, data: bytes, time_ns: int, sequence: int | None = None) -> None:
+        with self._disk():
+            channel = self._channels.get(topic) or self._channel(topic)
+            if sequence is None:
+                sequence = channel.messages
+                channel.messages += 1
+            self._mcap.add_message(channel.number, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
 
     def _channel(self, topic: Topic) -> _Channel:
-        if topic not in self._channels:
-            schema = (schema_name(topic), "protobuf", schema_bytes(topic))
-            self._channels[topic] = _Channel(self._file.register(topic.value, "protobuf", schema))
+        schema = self._mcap.register_schema(schema_name(topic), "protobuf", schema_bytes(topic))
+        number = self._mcap.register_channel(topic.value, "protobuf", schema)
+        self._channels[topic] = _Channel(number)
         return self._channels[topic]
 
     @contextmanager

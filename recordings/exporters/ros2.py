@@ -71,7 +71,7 @@ def write_ros2(recording: Recording, folder: Path) -> None:
 def _entries(messages: _Messages, recording: Recording, segment: RecordingSegment) -> Iterator[_Entry]:
     """List the entries in time order."""
     counted = {view.picture_sequence: view for view in recording.views() if view.part == segment.info.part}
-    stored = {message.sequence: message.time_ns for message in segment.stored(Topic.PICTURE_FACTS)}
+    stored = {message.sequence: message.log_time for message in segment.stored(Topic.PICTURE_FACTS)}
     facts = {facts.sequence: facts for facts in segment.image_facts()}
     times = {
         number: _mid_exposure_ns(counted.get(number), facts[number], time_ns)
@@ -108,7 +108,7 @@ def _fixed_frames(messages: _Messages, segment: RecordingSegment, time_ns: int) 
 def _arm(messages: _Messages, segment: RecordingSegment) -> Iterator[_Entry]:
     shown_ns = -FRAME_PERIOD_NS
     for stored, state in zip(segment.stored(Topic.ROBOT_STATE), segment.robot_states(), strict=True):
-        time_ns = stored.time_ns
+        time_ns = stored.log_time
         joints = messages.make(
             "sensor_msgs/msg/JointState",
             messages.header(time_ns, ""),

@@ -158,11 +158,11 @@ class _McapBag:
                         f"{path} is a recording already", code="a-recording", remedy=remedy
                     )
                 for number, channel in contents.channels.items():
-                    schema = contents.schema_of(channel).name
-                    if channel.encoding == CDR and "/msg/" not in schema:  # as some bridges write it
+                    schema, encoding = contents.schema_of(channel).name, channel.message_encoding
+                    if encoding == CDR and "/msg/" not in schema:  # as some bridges write it
                         schema = "/msg/".join(schema.split("/", 1))
                     count = len(contents.messages[number])
-                    self.declared.append((channel.topic, channel.encoding, schema, count))
+                    self.declared.append((channel.topic, encoding, schema, count))
         except BaseException:
             self.close()
             raise
@@ -179,10 +179,8 @@ class _McapBag:
                 chosen = [addresses[place - first] for place in wanted if place < first + len(addresses)]
                 wanted, first = wanted[len(chosen) :], first + len(addresses)
             for address in chosen:
-                found = (
-                    source.message(address) if limit_bytes is None else source.beginning(address, limit_bytes)
-                )
-                yield found.time_ns, found.data
+                found = source.message(address, limit_bytes)
+                yield found.log_time, found.data
 
     def _addresses(self, topic: str) -> Iterator[tuple[Source, array[int]]]:
         for contents, source in self._files:

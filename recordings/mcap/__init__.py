@@ -1,4 +1,4 @@
-"""MCAP as bytes: writing it, proving it in one pass, and finding what is whole in a damaged file.
+"""MCAP by the `mcap` library, with the limits and checks that it leaves to its caller.
 
-Nothing here knows what a recording is. Source: the MCAP format specification, version 0 (mcap.dev/spec).
+Nothing here knows what a recording is.
 """

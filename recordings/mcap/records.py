@@ -1,44 +1,34 @@
-"""The records of an MCAP file: every length is checked before it is believed.
+"""Records of an MCAP file as the library's types: every length is checked before it is believed.
 
-Source: the MCAP format specification, version 0 (mcap.dev/spec). A record may be longer than its fields:
-later versions of the specification append new ones. `exact` refuses that, where a wrong length must not pass.
+The library itself returns a field that is cut, passes over the checksum of an attachment, and unpacks
+whatever a chunk holds.
 """
 
 from __future__ import annotations
 
+import io
 import struct
+import zlib
 from collections.abc import Iterator
-from enum import IntEnum
-from typing import NamedTuple
+from typing import TypeVar
 
-from recordings.mcap import checksum
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.records import Attachment, Chunk, McapRecord
+from mcap.writer import MCAP0_MAGIC
 
-MAGIC = b"\x89MCAP0\r\n"
+MAGIC = MCAP0_MAGIC
 RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode, length of the content."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
-FOOTER = struct.Struct("<QQI")
-_CHUNK_HEAD = struct.Struct("<QQQI")
-FOOTER_BYTES = RECORD_HEAD.size + FOOTER.size
-
-Piece = bytes | bytearray | memoryview
-
-
-class Opcode(IntEnum):
-    HEADER = 0x01
-    FOOTER = 0x02
-    SCHEMA = 0x03
-    CHANNEL = 0x04
-    MESSAGE = 0x05
-    CHUNK = 0x06
-    MESSAGE_INDEX = 0x07
-    CHUNK_INDEX = 0x08
-    ATTACHMENT = 0x09
-    ATTACHMENT_INDEX = 0x0A
-    STATISTICS = 0x0B
-    METADATA = 0x0C
-    METADATA_INDEX = 0x0D
-    SUMMARY_OFFSET = 0x0E
-    DATA_END = 0x0F
+"""Channel, sequence, log time, publish time; the data follow."""
+FOOTER_BYTES = RECORD_HEAD.size + 20
+RECORD_LIMIT_BYTES = 40 * 1024 * 1024
+"""Packed or unpacked: the largest image of a recording and a little more."""
+_ZSTD_WINDOW_LIMIT_BYTES = 64 * 1024 * 1024
+"""Look-back that packed data may ask for."""
+R = TypeVar("R", bound=McapRecord)
 
 
 class BadRecordError(ValueError):
@@ -49,184 +39,85 @@ class TooLargeError(BadRecordError):
     """More than is read here, which bounds memory; the file may be whole."""
 
 
-class Schema(NamedTuple):
-    id: int
-    name: str
-    encoding: str
-    data: bytes
+class _Fields(ReadDataStream):
+    """The fields of one record, and nothing behind its end."""
 
+    def __init__(self, content: bytes) -> None:
+        super().__init__(io.BytesIO(content))
+        self._size = len(content)
 
-class Channel(NamedTuple):
-    id: int
-    schema_id: int
-    topic: str
-    encoding: str
-    metadata: tuple[tuple[str, str], ...]
-
-
-class ChunkHead(NamedTuple):
-    uncompressed_size: int
-    crc: int
-    compression: str
-    data_offset: int
-    """Place of the records inside the chunk record's content."""
-
-
-class Attachment(NamedTuple):
-    name: str
-    media_type: str
-    data: bytes
-    crc: int
-    crc_covers: int
-    """The checksum is of this many first bytes of the record's content."""
-
-
-class Metadata(NamedTuple):
-    name: str
-    content: dict[str, str]
-
-
-class Statistics(NamedTuple):
-    messages: int
-    schemas: int
-    channels: int
-    attachments: int
-    metadata: int
-    chunks: int
-    start_ns: int
-    end_ns: int
-    channel_messages: dict[int, int]
-
-
-class Cursor:
-    """Reads fields off a record's content and never past its end."""
-
-    def __init__(self, content: memoryview) -> None:
-        self._content = content
-        self.position = 0
-
-    def bytes(self, length: int) -> memoryview:
-        end = self.position + length
-        if end > len(self._content):
+    def read(self, length: int) -> bytes:
+        if length > self._size - self.count:
             raise BadRecordError(f"a field of {length} bytes reaches over the end of its record")
-        part = self._content[self.position : end]
-        self.position = end
-        return part
-
-    def uint(self, size: int) -> int:
-        return int.from_bytes(self.bytes(size), "little")
-
-    def text(self) -> str:
-        raw = self.bytes(self.uint(4))
-        try:
-            return str(raw, "utf-8")
-        except UnicodeDecodeError as error:
-            raise BadRecordError("a text is not valid UTF-8") from error
-
-    def text_map(self) -> dict[str, str]:
-        end = self.position + self.uint(4) + 4
-        content: dict[str, str] = {}
-        while self.position < end:
-            key = self.text()
-            if key in content:
-                raise BadRecordError(f"the key '{key}' stands twice in one map")
-            content[key] = self.text()
-        if self.position != end:
-            raise BadRecordError("a map does not end where it says")
-        return content
-
-    def end(self, exact: bool = True) -> None:
-        """BadRecordError when bytes are left over and nothing may follow."""
-        if exact and self.position != len(self._content):
-            raise BadRecordError(f"{len(self._content) - self.position} bytes are left over in the record")
+        return super().read(length)
 
 
-def parse_header(content: memoryview, exact: bool = False) -> str:
-    """Returns the profile."""
-    cursor = Cursor(content)
-    profile, _ = cursor.text(), cursor.text()
-    cursor.end(exact)
-    return profile
-
-
-def parse_schema(content: memoryview) -> Schema:
-    cursor = Cursor(content)
-    number, name, encoding = cursor.uint(2), cursor.text(), cursor.text()
-    record = Schema(number, name, encoding, bytes(cursor.bytes(cursor.uint(4))))
-    if record.id == 0:
-        raise BadRecordError("schema 0 is not allowed")
+def parse(kind: type[R], content: bytes, exact: bool = False) -> R:
+    """The record of this kind. `exact`: no fields of later specifications may follow."""
+    fields = _Fields(content)
+    try:
+        record: R = kind.read(fields)  # type: ignore[attr-defined]
+    except UnicodeDecodeError as error:
+        raise BadRecordError("a text is not valid UTF-8") from error
+    if exact and fields.count != len(content):
+        raise BadRecordError(f"{len(content) - fields.count} bytes are left over in a record")
     return record
 
 
-def parse_channel(content: memoryview) -> Channel:
-    cursor = Cursor(content)
-    number, schema_id, topic, encoding = cursor.uint(2), cursor.uint(2), cursor.text(), cursor.text()
-    return Channel(number, schema_id, topic, encoding, tuple(cursor.text_map().items()))
-
-
-def parse_chunk_head(content: memoryview) -> ChunkHead:
-    """Everything before the records; they must fill the rest of the content exactly."""
-    cursor = Cursor(content)
-    _, _, size, crc = _CHUNK_HEAD.unpack(cursor.bytes(_CHUNK_HEAD.size))
-    compression = cursor.text()
-    stored = cursor.uint(8)
-    offset = cursor.position
-    cursor.bytes(stored)
-    cursor.end()
-    return ChunkHead(size, crc, compression, offset)
-
-
-def parse_attachment(content: memoryview, exact: bool = False) -> Attachment:
-    cursor = Cursor(content)
-    cursor.bytes(16)  # log time, creation time
-    name, media_type = cursor.text(), cursor.text()
-    data = bytes(cursor.bytes(cursor.uint(8)))
-    covers = cursor.position
-    record = Attachment(name, media_type, data, cursor.uint(4), covers)
-    cursor.end(exact)
+def parse_attachment(content: bytes, exact: bool = False) -> Attachment:
+    record = parse(Attachment, content, exact)
+    texts = len(record.name.encode()) + len(record.media_type.encode())
+    end = 8 + 8 + 4 + 4 + texts + 8 + len(record.data)
+    (crc,) = struct.unpack_from("<I", content, end)
+    if crc and zlib.crc32(content[:end]) != crc:
+        raise BadRecordError(f"the checksum of attachment '{record.name[:40]}' does not fit")
     return record
 
 
-def parse_metadata(content: memoryview, exact: bool = False) -> Metadata:
-    cursor = Cursor(content)
-    record = Metadata(cursor.text(), cursor.text_map())
-    cursor.end(exact)
-    return record
+def parse_chunk(content: bytes) -> tuple[Chunk, bytes]:
+    """(the chunk, the records inside, unpacked and checked)."""
+    chunk = parse(Chunk, content, exact=True)
+    records, size = _unpacked(chunk), chunk.uncompressed_size
+    if len(records) != size:
+        more = "more" if len(records) > size else str(len(records))
+        raise BadRecordError(f"a chunk says it unpacks to {size} bytes, it gives {more}")
+    if chunk.uncompressed_crc and zlib.crc32(records) != chunk.uncompressed_crc:
+        raise BadRecordError("the checksum of a chunk does not fit its content")
+    return chunk, records
 
 
-def parse_statistics(content: memoryview) -> Statistics:
-    cursor = Cursor(content)
-    messages, schemas = cursor.uint(8), cursor.uint(2)
-    channels, attachments, metadata, chunks = (cursor.uint(4) for _ in range(4))
-    start, end = cursor.uint(8), cursor.uint(8)
-    pairs = cursor.bytes(cursor.uint(4))
-    if len(pairs) % 10:
-        raise BadRecordError("the message counts do not end where they say")
-    counts = dict(struct.iter_unpack("<HQ", pairs))
-    return Statistics(messages, schemas, channels, attachments, metadata, chunks, start, end, counts)
+def _unpacked(chunk: Chunk) -> bytes:
+    """At most one byte more than the chunk claims, which is within the limit."""
+    size = chunk.uncompressed_size
+    if size > RECORD_LIMIT_BYTES:
+        raise BadRecordError(f"a chunk says it unpacks to {size} bytes: more than is read here")
+    try:
+        match chunk.compression:
+            case "":
+                return chunk.data
+            case "zstd":
+                packed = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW_LIMIT_BYTES)
+                stream = packed.stream_reader(io.BytesIO(chunk.data), read_across_frames=True)
+                return bytes(stream.read(size + 1))
+            case "lz4":
+                return bytes(lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1))
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise BadRecordError(f"a chunk cannot be unpacked ({error})") from error
+    raise BadRecordError(f"the compression '{chunk.compression[:20]}' is unknown (known: zstd, lz4)")
 
 
-def check_message_index(content: memoryview) -> None:
-    """Nothing follows these, but a damaged chunk must not pass for one."""
-    cursor = Cursor(content)
-    cursor.uint(2)
-    if len(cursor.bytes(cursor.uint(4))) % 16:
-        raise BadRecordError("a message index does not end where it says")
-    cursor.end()
-
-
-def split_records(content: memoryview) -> Iterator[tuple[int, int, memoryview]]:
-    """The records inside a chunk or a summary: (offset of the record, opcode, its content)."""
-    position, end = 0, len(content)
-    while position < end:
-        if end - position < RECORD_HEAD.size:
-            raise BadRecordError(f"a record head is cut {end - position} bytes before the end")
-        opcode, length = RECORD_HEAD.unpack_from(content, position)
-        start = position + RECORD_HEAD.size
-        if length > end - start:
-            raise BadRecordError(f"a record says it has {length} bytes, {end - start} are left")
-        yield position, opcode, content[start : start + length]
-        position = start + length
+def split(records: bytes) -> Iterator[tuple[int, int, int, int]]:
+    """(place, opcode, start and end of the content) of each record in a chunk or a summary."""
+    place, size = 0, len(records)
+    while place < size:
+        start = place + RECORD_HEAD.size
+        if start > size:
+            raise BadRecordError(f"a record head is cut {size - place} bytes before the end")
+        opcode, length = RECORD_HEAD.unpack_from(records, place)
+        if length > size - start:
+            raise BadRecordError(f"a record says it has {length} bytes, {size - start} are left")
+        yield place, opcode, start, start + length
+        place = start + length
 
 
 def with_crc(content: dict[str, str]) -> dict[str, str]:
@@ -241,4 +132,4 @@ def require_crc(content: dict[str, str]) -> None:
 
 
 def _map_crc(content: dict[str, str]) -> str:
-    return f"{checksum.crc32(repr(sorted(content.items())).encode()):08x}"
+    return f"{zlib.crc32(repr(sorted(content.items())).encode()):08x}"

@@ -21,7 +21,6 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
 
 from recordings.images import Pixels, raw_encoding
-from recordings.mcap.records import Piece
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
@@ -54,34 +53,27 @@ def _stamp(message: Any, time_ns: int) -> None:
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _NS)
 
 
-def raw_image(image: Pixels, pixel_format: str, time_ns: int) -> list[Piece]:
-    """An image as it came: the message in pieces, the pixels not copied. ImageError for odd arrays."""
-    encoding = raw_encoding(image, pixel_format)
-    pixels = np.ascontiguousarray(image).data.cast("B")
+def raw_image(image: Pixels, pixel_format: str, time_ns: int) -> Any:
+    """An image as it came. ImageError for odd arrays."""
     height, width = image.shape[:2]
+    data = image.tobytes()
     message = RawImage(
-        frame_id=CAMERA_FRAME, width=width, height=height, encoding=encoding, step=len(pixels) // height
+        frame_id=CAMERA_FRAME,
+        width=width,
+        height=height,
+        encoding=raw_encoding(image, pixel_format),
+        step=len(data) // height,
+        data=data,
     )
     _stamp(message, time_ns)
-    return _with_data(message, pixels)
+    return message
 
 
-def compressed_image(data: bytes, format: str, time_ns: int) -> list[Piece]:
-    """An image file: the message in pieces."""
-    message = CompressedImage(frame_id=CAMERA_FRAME, format=format)
+def compressed_image(data: bytes, format: str, time_ns: int) -> Any:
+    """An image file."""
+    message = CompressedImage(frame_id=CAMERA_FRAME, format=format, data=data)
     _stamp(message, time_ns)
-    return _with_data(message, data)
-
-
-def _with_data(message: Any, data: Piece) -> list[Piece]:
-    """The message's bytes with its `data` field behind the others, where protobuf allows it to stand."""
-    tag = message.DESCRIPTOR.fields_by_name["data"].number << 3 | 2
-    length, rest = bytearray(), len(data)
-    while rest > 127:
-        length.append(rest & 127 | 128)
-        rest >>= 7
-    length.append(rest)
-    return [message.SerializeToString() + bytes([tag]) + length, data]
+    return message
 
 
 def camera_calibration(model: CameraModel, time_ns: int) -> Any:

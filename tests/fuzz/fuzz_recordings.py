@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import resource
 import sys
+import zlib
 from contextlib import suppress
 from pathlib import Path
 
@@ -23,7 +24,6 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 with atheris.instrument_imports(include=["recordings"]):
     from recordings.errors import RecordingError
-    from recordings.mcap import checksum
     from recordings.reader import open_recording
     from recordings.recover import recover_recording
     from recordings.writer import RecordingWriter
@@ -35,7 +35,7 @@ from tests.recordings.small_recording import (  # after instrumentation
     write_small,
 )
 
-checksum.crc32 = lambda data, value=0: 0
+zlib.crc32 = lambda data, value=0: 0
 SCRATCH = Path("/dev/shm") / f"fuzz-recordings-{os.getpid()}"
 MEMORY_LIMIT_BYTES = 256 * 1024 * 1024
 

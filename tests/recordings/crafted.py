@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
+from mcap.opcode import Opcode
 
-from recordings.mcap.records import MAGIC, Opcode, with_crc
+from recordings.mcap.records import MAGIC, with_crc
 from recordings.schema.definitions import FORMATS
 from recordings.schema.messages import SessionInfo
 from recordings.schema.topics import Topic, schema_bytes, schema_name

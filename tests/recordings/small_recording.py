@@ -31,10 +31,10 @@ TURNED = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.2), (0.0, 0.0, 1.0, 0.3), (0.
 
 
 @contextmanager
-def refused(code: str, **values: object) -> Iterator[None]:
+def refused(code: str, **values: object) -> Iterator[pytest.ExceptionInfo[RecordingError]]:
     """A RecordingError with this code, and these among its values."""
     with pytest.raises(RecordingError) as caught:
-        yield
+        yield caught
     assert (caught.value.code, caught.value.values) == (code, caught.value.values | values)
 
 

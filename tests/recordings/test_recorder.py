@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from recordings import recorder as recorder_module
+from recordings.mcap.output import OutputFile
 from recordings.reader import open_recording
 from recordings.recorder import Recorder
 from recordings.schema.definitions import encode
@@ -206,18 +207,11 @@ def test_the_callers_never_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest
     recorder.close()
 
 
-def break_disk_after(monkeypatch: pytest.MonkeyPatch, good_writes: int) -> None:
-    real_write = os.writev
-    count = 0
+def break_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    def write(file: OutputFile, data: bytes) -> int:
+        raise OSError(28, "No space left on device")
 
-    def write(descriptor: int, data: list[bytes]) -> int:
-        nonlocal count
-        count += 1
-        if count > good_writes:
-            raise OSError(28, "No space left on device")
-        return real_write(descriptor, data)
-
-    monkeypatch.setattr("recordings.mcap.writer.os.writev", write)
+    monkeypatch.setattr(OutputFile, "write", write)
 
 
 def test_the_first_write_error_is_final_and_said_to_everyone(
@@ -228,7 +222,7 @@ def test_the_first_write_error_is_final_and_said_to_everyone(
     recorder.view(make_view(0))
     recorder.sync().result(TIMEOUT_S)
     safe = recorder.part_path.read_bytes()
-    break_disk_after(monkeypatch, 0)
+    break_disk(monkeypatch)
     recorder.image(make_picture(1))
     with refused("disk", errno=errno.ENOSPC):
         recorder.sync().result(TIMEOUT_S)
@@ -256,7 +250,7 @@ def test_waiting_syncs_fail_with_the_error_and_nobody_hangs(
     recorder.image(make_picture(0))
     waiting = [recorder.sync() for _ in range(3)]
     finishing = recorder.finish()
-    break_disk_after(monkeypatch, 0)
+    break_disk(monkeypatch)
     gate.opened.set()
     for future in (*waiting, finishing):
         with refused("disk", errno=errno.ENOSPC):

@@ -99,7 +99,7 @@ async def stops_on_a_full_disk(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Non
     def full(*_: object) -> int:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("recordings.mcap.writer.os.writev", full)
+    monkeypatch.setattr("recordings.mcap.output.OutputFile.write", full)
     await rig.until(S.FAULT)
     assert "No space left" in rig.session.store.status.reason
     await rig.until_true(lambda: "stop" in rig.arm.log)

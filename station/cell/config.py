@@ -150,6 +150,11 @@ SPEED_CAP_M_S = 0.25
 """Of any modelled point, in code: no configuration raises it."""
 
 
+SLOWEST_RAD_S, SLOWEST_RAD_S2 = 0.001, 0.01
+"""Least speed and acceleration of a joint move. Half a turn takes 50 minutes, or 35 s: less is an error in
+writing, and soon the driver cannot tell it from an arm that does not move."""
+
+
 class LimitsConfig(Section, frozen=True):
     speed_m_s: float = 0.25
     """Speed of any modelled point of arm, tool or camera; code caps it at 0.25."""

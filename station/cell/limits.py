@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from calibrate.geometry import Array, difference
 from calibrate.kinematics import JOINT_NAMES, forward
 from station.cell.collision import SPACING_M, CellGeometry, Contact, margins, moving_points, surface_speeds
-from station.cell.config import SPEED_CAP_M_S, LimitsConfig
+from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2, SPEED_CAP_M_S, LimitsConfig
 from station.cell.plan import Plan, PlannedPose
 
 JOINT_SPEED_CAP_RAD_S = 1.05
@@ -138,6 +138,12 @@ def check_path(
     gaps, contacts = margins(geometry, samples)
     problems += _margin_problems(leaving(gaps - SPACING_M / 2), contacts, name)
     speed, acceleration, duration, peak = allowed_speed(geometry, samples)
+    if speed < SLOWEST_RAD_S or acceleration < SLOWEST_RAD_S2:
+        text = (
+            f"its joints would go {speed:.2g} rad/s, at {acceleration:.2g} rad/s² (at least "
+            f"{SLOWEST_RAD_S:g} rad/s, {SLOWEST_RAD_S2:g} rad/s²). Raise the speed limits"
+        )
+        problems.append(Problem(name, "speed", text))
     flange = forward(geometry.model, samples)[:, :3, 3]
     return MoveCheck(
         name=name,
@@ -268,8 +274,9 @@ def _plan_problems(plan: Plan, geometry: CellGeometry) -> list[Problem]:
     wrong = []
     if not plan.poses:
         wrong.append(("poses", "it has no poses"))
-    if not (plan.joint_speed_rad_s > 0 and plan.joint_acceleration_rad_s2 > 0):
-        wrong.append(("speed", "its joint speed and acceleration must be above zero"))
+    if not (plan.joint_speed_rad_s >= SLOWEST_RAD_S and plan.joint_acceleration_rad_s2 >= SLOWEST_RAD_S2):
+        least = f"{SLOWEST_RAD_S:g} rad/s and {SLOWEST_RAD_S2:g} rad/s²"
+        wrong.append(("speed", f"its joint speed and acceleration must be at least {least}"))
     if plan.robot != geometry.model.name:
         wrong.append(
             ("robot", f"made for a {plan.robot}, the cell has a {geometry.model.name}. Make a new plan")

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from recordings.schema.messages import RobotState, Vector6
+from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2
 from station.cell.errors import RobotError, StaleStateError
 from station.devices.ur_condition import (
     APPROVE_AGAIN,
@@ -44,16 +45,17 @@ def check_goal(
             code="bad-goal",
             limit_rad=limit_rad,
         )
-    if not 0 < speed_rad_s <= JOINT_SPEED_LIMIT_RAD_S:
+    if not SLOWEST_RAD_S <= speed_rad_s <= JOINT_SPEED_LIMIT_RAD_S:
         raise RobotError(
-            f"joint speed {speed_rad_s} rad/s is not within 0…{JOINT_SPEED_LIMIT_RAD_S}",
+            f"joint speed {speed_rad_s} rad/s is not within {SLOWEST_RAD_S}…{JOINT_SPEED_LIMIT_RAD_S}",
             code="bad-goal",
             speed_rad_s=speed_rad_s,
             limit_rad_s=JOINT_SPEED_LIMIT_RAD_S,
         )
-    if not 0 < acceleration_rad_s2 <= JOINT_ACCELERATION_LIMIT_RAD_S2:
+    if not SLOWEST_RAD_S2 <= acceleration_rad_s2 <= JOINT_ACCELERATION_LIMIT_RAD_S2:
         raise RobotError(
-            f"acceleration {acceleration_rad_s2} rad/s² is not within 0…{JOINT_ACCELERATION_LIMIT_RAD_S2}",
+            f"acceleration {acceleration_rad_s2} rad/s² is not within "
+            f"{SLOWEST_RAD_S2}…{JOINT_ACCELERATION_LIMIT_RAD_S2}",
             code="bad-goal",
             acceleration_rad_s2=acceleration_rad_s2,
             limit_rad_s2=JOINT_ACCELERATION_LIMIT_RAD_S2,

@@ -18,7 +18,7 @@ from recordings import strict_yaml
 from recordings.files import ASKED_FOR, read_file, write_atomically
 from recordings.reader import open_recording
 from recordings.schema.messages import Mount, Vector6
-from station.cell.config import vector6
+from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2, vector6
 from station.cell.errors import ConfigError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import pose_at
@@ -107,10 +107,13 @@ def _value_problems(plan: Plan) -> list[str]:
         problems.append(f"robot '{plan.robot}' is unknown; known are {', '.join(MODELS)}")
     if not 1 <= len(plan.poses) <= _POSE_LIMIT:
         problems.append(f"{len(plan.poses)} poses; 1 to {_POSE_LIMIT} are possible")
-    for limit in ("joint_speed_rad_s", "joint_acceleration_rad_s2"):
+    for limit, least in (
+        ("joint_speed_rad_s", SLOWEST_RAD_S),
+        ("joint_acceleration_rad_s2", SLOWEST_RAD_S2),
+    ):
         value = getattr(plan, limit)
-        if not (math.isfinite(value) and value > 0):
-            problems.append(f"{limit} is {value}; it must be a positive number")
+        if not (math.isfinite(value) and value >= least):
+            problems.append(f"{limit} is {value}; it must be a number of at least {least:g}")
     names = [pose.name for pose in plan.poses]
     for number, pose in enumerate(plan.poses):
         where = f"poses[{number}] ({pose.name})"

@@ -74,6 +74,20 @@ def test_a_plan_may_be_slower_than_the_configuration_but_not_faster():
     assert hard.joint_acceleration_rad_s2 == FREE.limits.joint_acceleration_rad_s2
 
 
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"speed_m_s": 1e-6},
+        {"joint_speed_rad_s": 1e-9},
+        {"joint_acceleration_rad_s2": 1e-300},
+    ],
+)
+def test_a_move_too_slow_to_be_told_from_none_is_refused(limits):
+    geometry = CellGeometry(MODELS["UR10"], LimitsConfig(**limits))
+    move = check_path(geometry, REST, REST + np.array([0.8, 0, 0, 0, 0, 0]))
+    assert {problem.limit for problem in move.problems} == {"speed"}
+
+
 def test_an_obstacle_between_two_good_poses_is_found():
     left, right = REST + np.array([0.5, 0, 0, 0, 0, 0]), REST - np.array([0.5, 0, 0, 0, 0, 0])
     at = forward(MODELS["UR10"], REST)[:3, 3]

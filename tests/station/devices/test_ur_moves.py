@@ -44,7 +44,8 @@ def watch() -> MoveWatch:
 
 
 def test_goals_within_the_caps_are_let_through() -> None:
-    check_goal((0.0, -1.0, 2.0, -6.28, 6.28, 0.1), 1.05, 1.5, limit_rad=6.2832)
+    for speed, acceleration in ((1.05, 1.5), (0.001, 0.01)):
+        check_goal((0.0, -1.0, 2.0, -6.28, 6.28, 0.1), speed, acceleration, limit_rad=6.2832)
 
 
 @pytest.mark.parametrize(
@@ -53,8 +54,14 @@ def test_goals_within_the_caps_are_let_through() -> None:
         ((0.0,) * 5, 0.5, 0.5, {"limit_rad": 6.2832}),
         ((0.0,) * 7, 0.5, 0.5, {"limit_rad": 6.2832}),
         *(((*START[:5], last), 0.5, 0.5, {"limit_rad": 6.2832}) for last in (6.3, -6.3, float("nan"))),
-        *((START, speed, 0.5, {"limit_rad_s": 1.05}) for speed in (0.0, -0.1, 1.06, float("nan"))),
-        *((START, 0.5, value, {"limit_rad_s2": 1.5}) for value in (0.0, -0.1, 1.51, float("nan"))),
+        *(
+            (START, speed, 0.5, {"limit_rad_s": 1.05})
+            for speed in (0.0, -0.1, 1e-300, 1e-4, 1.06, float("nan"))
+        ),
+        *(
+            (START, 0.5, value, {"limit_rad_s2": 1.5})
+            for value in (0.0, -0.1, 1e-300, 1e-3, 1.51, float("nan"))
+        ),
     ],
 )
 def test_the_driver_itself_refuses_what_is_beyond_its_caps(

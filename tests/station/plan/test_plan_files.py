@@ -52,6 +52,7 @@ def test_saving_into_a_missing_folder_says_so(tmp_path):
         ("[0.1,", "[x,", "line"),
         ("distance_m: 0.45", "distance_m: .inf", "finite"),
         ("mount: eye-in-hand", "mount: eye-in-foot", "mount"),
+        ("mount: eye-in-hand", "mount: eye-in-hand\njoint_acceleration_rad_s2: 1.0e-300", "0.01"),
     ],
 )
 def test_a_wrong_value_is_named_with_its_line(tmp_path, old, new, told):

@@ -242,7 +242,15 @@ async def test_a_disk_that_hangs_does_not_hang_the_station(rig: Rig, monkeypatch
     assert rig.session.supervisor.lag_ms() < 300
 
 
-@pytest.mark.parametrize("speeds", [{"joint_speed_rad_s": -0.5}, {"joint_acceleration_rad_s2": 0.0}])
+@pytest.mark.parametrize(
+    "speeds",
+    [
+        {"joint_speed_rad_s": -0.5},
+        {"joint_speed_rad_s": 1e-300},
+        {"joint_acceleration_rad_s2": 0.0},
+        {"joint_acceleration_rad_s2": 1e-300},
+    ],
+)
 async def test_speeds_that_are_none_are_refused_before_a_go(
     rig: Rig, small_plan: Plan, speeds: dict[str, float]
 ) -> None:

@@ -32,6 +32,7 @@ from station.devices.ur_condition import (
     not_powered,
     program_ended,
     program_not_running,
+    program_replaced,
     safety_stop,
     watchdog_cause,
 )
@@ -53,6 +54,10 @@ UNANSWERED_S = 0.1
 OUTLIVED_S: dict[ControlPath, float] = {"ur_rtde": 0.3, "script": 0.6}
 """A program that still plays so long after a pause began did not stop for it. Our script plays until the arm
 rests: at its fastest it brakes for 0.26 s."""
+OUR_PROGRAMS = ("rtde_control", "station_control")
+REPLACED_S = 0.1
+"""A program that replaces ours plays so soon after ours ended."""
+MAY_BE_REPLACED = ("program-ended", "watchdog", "off-path", "ended-short", "no-progress")
 PROGRAM_START_NS = 200_000_000
 LEFTOVER_WAIT_NS = 2_000_000_000
 NEWS_WAIT_NS = 250_000_000
@@ -156,6 +161,8 @@ class UrRobot(UrLink):
         if self.remote is False:
             raise _local_control()
         program = await fresh.ask("programState")
+        if self._primary is not None:
+            self._primary.started = ""
         trouble = safety_stop(state) or not_powered(state) or foreign_program(state, program)
         if trouble is not None:
             raise trouble
@@ -282,7 +289,33 @@ class UrRobot(UrLink):
             with contextlib.suppress(RobotError, TimeoutError):
                 async with asyncio.timeout(0.3):
                     self.remote = await self.dashboard.remote()
-        return _local_control() if self.remote is False else error
+        if self.remote is False:
+            return _local_control()
+        wait_s = REPLACED_S if unsure else 0.0
+        other = await self._other_program(wait_s) if error.code in MAY_BE_REPLACED else None
+        return error if other is None else program_replaced(other)
+
+    async def _other_program(self, wait_s: float) -> str | None:
+        """Name of another program that began to play since ours was last seen playing; '' if it has none.
+
+        None: none did. It may have been ended by our own stop already.
+        """
+        give_up_s = time.monotonic() + wait_s
+        while True:
+            name = self._primary.started if self._primary is not None else ""
+            if name and name not in OUR_PROGRAMS:
+                return name
+            if not name and self._plays_again():
+                return ""
+            if time.monotonic() > give_up_s:
+                return None
+            await asyncio.sleep(POLL_S)
+
+    def _plays_again(self) -> bool:
+        """A program stopped and one played since ours was last seen playing."""
+        states = self.reader.history.copy() if self.reader is not None else ()
+        since = [s.runtime_state for s in states if s.stamps.host_monotonic_ns > self._played_s * 1e9]
+        return RuntimeState.STOPPED in since and since[-1] == RuntimeState.PLAYING
 
     async def stop(self, reason: str) -> None:
         """Decelerates now, by both paths; idempotent, in any state, never raises. Control ends with it.
@@ -394,7 +427,7 @@ class UrRobot(UrLink):
                 raise trouble
         except RobotError as error:
             await self.stop(str(error))
-            raise
+            raise await self._look_again(error) from None
 
     def _program_trouble(self) -> RobotError | None:
         """Say what state and dashboard hold against the control program; StaleStateError without news."""

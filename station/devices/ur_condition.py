@@ -142,7 +142,10 @@ def watchdog_cause(pause_s: float, gap_s: float) -> RobotError | None:
 
 def program_ended(runtime_state: int) -> RobotError:
     """Our own control script plays no more."""
-    by = "on the pendant, by the switch to local control, or by its watchdog (network or computer too slow)"
+    by = (
+        "on the pendant, by another client, by the switch to local control, or by its watchdog (network or "
+        "computer too slow)"
+    )
     if runtime_state in (RuntimeState.PAUSED, RuntimeState.PAUSING):
         by = "on the pendant"
     return RobotError(
@@ -150,6 +153,16 @@ def program_ended(runtime_state: int) -> RobotError:
         code="program-ended",
         remedy="Look at the cell, acknowledge here and approve motion again.",
         runtime_state=runtime_state,
+    )
+
+
+def program_replaced(name: str) -> RobotError:
+    """Another client's program took the place of our own."""
+    return RobotError(
+        f"another client's program {f'({name}) ' if name else ''}replaced the control program",
+        code="program-replaced",
+        remedy="Keep that client from sending programs, acknowledge here and approve motion again.",
+        program=name,
     )
 
 

@@ -35,6 +35,9 @@ log = logging.getLogger(__name__)
 
 PORT = 30001
 ROBOT_STATE = 16
+ROBOT_MESSAGE = 20
+KEY_MESSAGE = 7
+PROGRAM_STARTED = b"PROGRAM_XXX_STARTED"
 CARTESIAN_INFO = 4
 KINEMATICS_INFO = 5
 MESSAGE_LIMIT = 64 * 1024
@@ -45,6 +48,8 @@ _CARTESIAN = struct.Struct(">12d")
 """TCP pose, then TCP offset: x y z [m], rotation vector [rad] each"""
 _KINEMATICS = struct.Struct(">6I24dI")
 """Checksum per joint; theta, a, d, alpha of all joints; calibration status"""
+_KEY = struct.Struct(">QbBiiB")
+"""Time, source, kind, code, argument, length of the title; title and text follow"""
 NOMINAL_TOLERANCE = (0.006, math.radians(1.0))
 CALIBRATED_TOLERANCE = (0.0005, math.radians(0.1))
 STATED_TOLERANCE = (1e-6, 1e-6)
@@ -93,6 +98,16 @@ def read_state(payload: bytes) -> Installation:
     return Installation(offset, dh)
 
 
+def program_started(payload: bytes) -> str:
+    """Name of the program whose start a robot message tells; empty for any other message."""
+    if len(payload) < _KEY.size:
+        return ""
+    *_, kind, _, _, length = _KEY.unpack_from(payload)
+    title, text = payload[_KEY.size : _KEY.size + length], payload[_KEY.size + length :]
+    named = kind == KEY_MESSAGE and title == PROGRAM_STARTED
+    return text.decode("utf-8", errors="replace") if named else ""
+
+
 def _six(values: Sequence[float]) -> Vector6:
     if not all(map(math.isfinite, values)):
         raise PrimaryError("the robot state holds a number that is not finite")
@@ -105,6 +120,8 @@ class PrimaryReader:
     def __init__(self, host: str) -> None:
         self.installation = Installation()
         self.dead = ""
+        self.started = ""
+        """The program that last started."""
         self._host = host
         self._first = asyncio.Event()
         self._task = asyncio.create_task(self._run(), name=f"installation of {host}")
@@ -126,6 +143,8 @@ class PrimaryReader:
                     kind, payload = await _message(reader)
                 if kind == ROBOT_STATE:
                     self._learn(read_state(payload))
+                elif kind == ROBOT_MESSAGE:
+                    self.started = program_started(payload) or self.started
         except TimeoutError:
             self.dead = f"nothing came from {self._host}:{PORT} for {SILENCE_S:g} s"
         except (OSError, EOFError, PrimaryError) as error:

@@ -101,6 +101,27 @@ async def test_the_switch_to_local_is_named_although_the_supervision_saw_it_firs
     assert outcome.error.code == "local-control"
 
 
+@pytest.mark.parametrize(("told", "program"), [(True, "palletising.urp"), (False, "")])
+async def test_another_clients_program_in_the_place_of_ours_is_named(
+    cell: Callable[..., Awaitable[Any]], told: bool, program: str
+) -> None:
+    """By its name, where the primary interface tells it; else by a program that plays after ours ended."""
+    c = await cell(control=False)
+    if not told:
+        c.admin.ask("mute", ports=["script30001"])
+    await c.robot.start_control()
+
+    def replace() -> None:
+        c.admin.ask("stall_dash")  # whose stop would end that program before it begins
+        c.admin.ask("foreign", name="palletising.urp")
+
+    outcome = await c.strike(replace)
+    assert outcome.error.code == "program-replaced"
+    assert outcome.error.values["program"] == program
+    assert outcome.stopped_s < 0.6
+    await c.stays_at_rest()
+
+
 async def test_a_program_paused_on_the_pendant_does_not_go_on_when_play_is_pressed(strike: Strike) -> None:
     c, _ = await strike(lambda c: c.admin.ask("pause"))
     await c.until(lambda: c.admin.ask("state")["runtime_state"] == "STOPPED")

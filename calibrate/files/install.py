@@ -316,7 +316,7 @@ def reason_problem(reason: str) -> str:
     """Problem with a person's reason for people; empty when it is accepted."""
     if len({letter for letter in reason.casefold() if letter.isalpha()}) >= REASON_LETTERS:
         return ""
-    return f"Override reason “{reason.strip()}” is too short. State the cause."
+    return "Say why, in a few words."
 
 
 def _require_words(reason: str) -> None:

@@ -155,7 +155,7 @@ def _run(
     with simulated_daemon(folder, arguments) as socket:
         outcome = asyncio.run(_captured(socket, MakePlan(poses, seed, aim=aim), progress))
     if not outcome.session.recording:
-        raise DemoError(f"No recording: {outcome.reason or outcome.state.value}")
+        raise unfinished(outcome)
     recording, session = Path(outcome.session.recording), Path(outcome.session.folder)
     calibration, report = session / CALIBRATION_FILE, session / "report.html"
     progress.say("solving the recording, in a process of its own")
@@ -205,6 +205,14 @@ def simulated_daemon(root: Path, arguments: Sequence[str]) -> AbstractContextMan
     """`station serve --simulate` as a child of this process; its socket."""
     root.mkdir(parents=True, exist_ok=True)
     return own_daemon(["--simulate", "--root", str(root), *arguments], root / "daemon.log")
+
+
+def unfinished(outcome: StationStatus) -> DemoError:
+    """Why there is no recording, and where the poses are that were saved."""
+    session, why = outcome.session, outcome.reason or outcome.state.value
+    count = f"{session.captured} of {len(session.poses)} poses"
+    saved = f", saved in {session.folder}" if session.captured else ""
+    return DemoError(f"Stopped after {count}{saved}: {why}", remedy="Run it again.")
 
 
 def _solve(recording: Path, calibration: Path, report: Path) -> SolveJson:

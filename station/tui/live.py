@@ -41,6 +41,12 @@ CHIPS: dict[str, tuple[str, str]] = {
     "skipped": ("-", "$dim"),
     "failed": ("✗", "bold $bad on $badbg"),
 }
+STOPPED_BY = {
+    "protective-stop": "The robot stopped itself (protective stop): it probably touched something.",
+    "emergency-stop": "An emergency stop is pressed.",
+    "safeguard-stop": "A guard or a scanner stopped the arm.",
+}
+"""By the cause of a stop that a person clears at the pendant."""
 LEGEND = "✓ saved  ! saved, look  ▶ now  · to come  - skipped  ✗ failed"
 
 
@@ -318,8 +324,9 @@ def stopped_text(status: StationStatus) -> Content:
     )
     pendant = mark("look", robot.held) if robot.held else mark("done", "nothing to clear there")
     safety = Content.assemble(("safety ", "$dim"), (robot.safety or UNKNOWN, "bold $strong"))
+    told = "The arm was told to stop. " if status.cause == "stop" else ""
     return lines(
-        Content.styled(f"The arm was told to stop. {status.reason}", "bold $strong"),
+        Content.styled(STOPPED_BY.get(status.cause, told + status.reason), "bold $strong"),
         Content(""),
         Content(saved),
         Content(""),

@@ -199,7 +199,7 @@ def next_action(known: Known) -> Action:
         why = f"No answer for {known.silent_s:.0f} s: the data below are old. {SILENT}"
         return Action("", "EMERGENCY STOP if it moves", why, look=True)
     if status is None:
-        return Action("", "Wait", known.gone or "Connecting …", look=bool(known.gone))
+        return _without_daemon(known)
     if status.playback:
         return Action("Space", "Pause or play", status.reason)
     latched = status.state in LATCHED or status.state is StationState.DISCONNECTED
@@ -209,6 +209,16 @@ def next_action(known: Known) -> Action:
     if (action := _by_state(known, status)) is not None:
         return action
     return _at_rest(known, status)
+
+
+def _without_daemon(known: Known) -> Action:
+    if known.status is None:
+        return Action("", "Wait", known.gone or "Connecting …", look=bool(known.gone))
+    session, safe = known.status.session, ""
+    if session.name and session.captured and not session.recording:
+        safe = f"Your {many(session.captured, 'pose')} {'is' if session.captured == 1 else 'are'} safe. "
+    why = f"{safe}The daemon ended: the controller stops the arm."
+    return Action("Ctrl-Q", "Close, then run station", why, look=True)
 
 
 def _by_state(known: Known, status: StationStatus) -> Action | None:

@@ -18,6 +18,7 @@ from station.tui.live import (
     error_lines,
     event_text,
     pose_line,
+    stopped_text,
 )
 from station.tui.task import Known
 from station.tui.widgets.canvas import Canvas, Series, curve
@@ -95,6 +96,15 @@ def test_clocks_are_judged_by_the_limit_of_this_cell(limit_s: float, marked: str
     status = msgspec.structs.replace(idle(), clock=ClockStatus(camera_bound_ms=45.0, camera_source="arrival"))
     cell = msgspec.structs.replace(CELL, capture=CaptureConfig(time_bound_s=limit_s))
     assert marked in device_lines(Known(status, configuration=cell), 80, 4).plain
+
+
+@pytest.mark.parametrize(
+    ("cause", "told"), [("stop", True), ("protective-stop", False), ("stale-state", False)]
+)
+def test_only_who_pressed_stop_told_the_arm_to_stop(cause: str, told: bool) -> None:
+    status = msgspec.structs.replace(idle(StationState.STOPPED, "why it stands"), cause=cause)
+    said = stopped_text(status).plain.splitlines()[0]
+    assert ("told to stop" in said) is told and ("why it stands" in said) is (cause != "protective-stop")
 
 
 def test_the_error_falls_towards_its_goal() -> None:

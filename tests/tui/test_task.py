@@ -40,6 +40,8 @@ CASES = [
     (Known(), ""),
     (Known(idle(), silent_s=3.0), ""),
     (Known(idle(), busy="Planning"), ""),
+    (Known(gone="nobody serves there"), ""),
+    (Known(idle(), gone="nobody serves there"), "Ctrl-Q"),
     (Known(idle(StationState.STOPPED)), "F8"),
     (Known(idle(StationState.FAULT)), "F8"),
     (Known(idle(StationState.DISCONNECTED)), "1"),
@@ -100,6 +102,13 @@ def test_the_bar_fits_and_keeps_state_and_simulated_first(
     assert len(line) <= width
     assert line.startswith(" Capture ")
     assert "SIMULATED" in line
+
+
+def test_who_lost_the_daemon_in_a_session_reads_how_many_poses_are_safe() -> None:
+    unfinished = resting(StationState.MOVING, captured=12)
+    assert "12 poses are safe" in next_action(Known(unfinished, gone="nobody serves there")).why
+    for done in (resting(recording="/r", captured=12), resting(captured=0), resting(name="", captured=0)):
+        assert "safe" not in next_action(Known(done, gone="nobody serves there")).why
 
 
 @pytest.mark.parametrize("width", [60, 80, 160])

@@ -109,7 +109,7 @@ async def test_a_robot_that_only_lacks_its_stream_is_told_by_name(
         ("latched", True, 0.0005, 0, "ok"),
         ("ptp", True, 0.0005, 0, "ok"),
         ("latched", True, 0.0005, 3, "warning"),
-        ("latched", True, 0.009, 0, "warning"),
+        ("latched", True, 0.009, 0, "ok"),  # a busy computer, within the limit
         ("latched", True, 0.03, 0, "failed"),
         ("arrival", False, 0.0005, 0, "warning"),  # it has no clock: never ok
         ("arrival", False, 0.025, 0, "failed"),

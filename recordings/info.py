@@ -1,19 +1,24 @@
-"""Contents, rates, gaps, clock quality and size of a recording as plain data."""
+"""Contents, rates, gaps and size of a recording as plain data."""
 
 from __future__ import annotations
 
 import math
 from typing import TypedDict
 
+import numpy as np
+from numpy.typing import NDArray
+
 from recordings.mcap.contents import MessageIndex
 from recordings.reader import Recording
 from recordings.schema.frame_ids import frames_between, guess_ids
 from recordings.schema.messages import SINGLE_TAGS, BoardSpec, Mount, Source
 from recordings.schema.topics import Topic
-from recordings.streams import Arrivals, Steps, stamps_tables
+from recordings.segment import RecordingSegment
 
 _SHORTEST_SPAN_S = 0.01
 """Messages that all came at once have no rate."""
+_LARGEST_STAMP_S = 1e12
+"""30 000 years: what is more, or no number, is no time."""
 _SETTINGS_LIMIT = 1000
 """Different exposures or gains that are listed."""
 
@@ -83,7 +88,6 @@ class RecordingInfoJson(TypedDict):
     topics: list[TopicInfoJson]
     robot_states: RobotStatesInfoJson | None
     pictures: PicturesInfoJson | None
-    clocks: dict[str, dict[str, float | None] | None]
     attachments: dict[str, int]
     software: dict[str, str]
     note: str
@@ -92,17 +96,6 @@ class RecordingInfoJson(TypedDict):
 def recording_info(recording: Recording) -> RecordingInfoJson:
     """Everything `recordings info` says, one JSON-ready object. Times in seconds, sizes in bytes."""
     info = recording.info
-    arrivals = {segment: Arrivals() for segment in recording.segments}
-    steps = Steps()
-    for segment in recording.segments:
-        steps.begin()
-        for table in stamps_tables(segment, Topic.ROBOT_STATE):
-            steps.add(table["controller_s"])
-            arrivals[segment].add(table["controller_s"], table["host_monotonic_ns"])
-    longest = max(recording.segments, key=lambda segment: len(segment.messages(Topic.ROBOT_STATE)))
-    camera_clock = Arrivals()
-    for table in stamps_tables(longest, Topic.PICTURE_FACTS):
-        camera_clock.add(table["device_ns"] / 1e9, table["host_monotonic_ns"])
     attempts = sum(len(segment.views) for segment in recording.segments)
     views = recording.views()
     return {
@@ -127,9 +120,8 @@ def recording_info(recording: Recording) -> RecordingInfoJson:
         "robot": {"model": info.robot.model, "serial": info.robot.serial},
         "views": {"poses": len(views), "attempts": attempts, "names": [view.name for view in views]},
         "topics": _topics(recording),
-        "robot_states": _robot_stream(steps),
+        "robot_states": _robot_stream(recording),
         "pictures": _image_stream(recording),
-        "clocks": {"controller": arrivals[longest].fit(), "camera": camera_clock.fit()},
         "attachments": {name: len(content) for name, content in sorted(recording.attachments().items())},
         "software": dict(info.software),
         "note": info.note,
@@ -168,22 +160,29 @@ def _topic(name: str, indexes: list[MessageIndex], foreign: bool) -> TopicInfoJs
     }
 
 
-def _robot_stream(steps: Steps) -> RobotStatesInfoJson | None:
+def _robot_stream(recording: Recording) -> RobotStatesInfoJson | None:
     """Rate and gaps by the controller's own clock, so that the network's delay does not count.
 
     The time between two parts is no gap.
     """
-    if not steps.count:
+    steps_s = np.concatenate([np.diff(_controller_s(segment)) for segment in recording.segments])
+    if not len(steps_s):
         return None
-    period = steps.median_s()
-    gaps, largest_s = steps.longer_than(1.5 * period) if period > 0 else (0, 0.0)
+    period_s = float(np.median(np.maximum(steps_s, 0.0)))
+    gaps_s = steps_s[steps_s > 1.5 * period_s] if period_s > 0 else steps_s[:0]
     return {
-        "count": steps.messages,
-        "rate_hz": 1 / period if period > 0 else None,
-        "gaps": gaps,
-        "largest_gap_s": largest_s,
-        "backward": steps.backward,
+        "count": sum(len(segment.messages(Topic.ROBOT_STATE)) for segment in recording.segments),
+        "rate_hz": 1 / period_s if period_s > 0 else None,
+        "gaps": len(gaps_s),
+        "largest_gap_s": float(gaps_s.max(initial=0.0)),
+        "backward": int((steps_s < 0).sum()),
     }
+
+
+def _controller_s(segment: RecordingSegment) -> NDArray[np.float64]:
+    """The controller's clock of each state, (n,), where it is a time."""
+    stamps_s = np.fromiter((state.stamps.controller_s for state in segment.parsed(Topic.ROBOT_STATE)), float)
+    return np.asarray(stamps_s[np.abs(stamps_s) < _LARGEST_STAMP_S])
 
 
 def _image_stream(recording: Recording) -> PicturesInfoJson | None:

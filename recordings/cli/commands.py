@@ -25,7 +25,7 @@ _STYLES = {"MISSING": "red", "lost": "yellow"}
 
 
 def info_command(recording: Rec, as_json: AsJson = False) -> None:
-    """Show contents, rates, gaps and clock quality. Exit 3: segment missing."""
+    """Show contents, rates and gaps. Exit 3: segment missing."""
     from recordings.info import recording_info
 
     facts = recording_info(open_recording(recording, incomplete=True))
@@ -144,9 +144,6 @@ def _info_rows(facts: RecordingInfoJson) -> Iterator[tuple[str, str]]:
         yield "images", _images_text(images)
         for source, bound_s in images["time_bounds_s"].items():
             yield "image time", f"by {source}, within {1000 * bound_s:.2f} ms of mid-exposure"
-    for name, clock in facts["clocks"].items():
-        if clock:
-            yield f"{name} clock", _clock_text(clock)
     if facts["attachments"]:
         yield "attached", ", ".join(f"{name} ({size} B)" for name, size in facts["attachments"].items())
     if facts["note"]:
@@ -161,13 +158,6 @@ def _images_text(images: PicturesInfoJson) -> str:
     if jumps:  # between triggered images a camera may go on counting
         order = f"frame ids jump {jumps} time{'s' * (jumps > 1)}"
     return ", ".join([str(images["count"]), *images["pixel_formats"], *settings, order])
-
-
-def _clock_text(clock: dict[str, float | None]) -> str:
-    within = f"95 % within {clock['spread_p95_ms']:.2f} ms, all within {clock['spread_max_ms']:.2f} ms"
-    if clock["drift_ppm"] is None:
-        return f"too short for a drift, {within}"
-    return f"drift {clock['drift_ppm']:+.1f} ppm against the host, {within}"
 
 
 def _print_recovery(result: Recovery) -> None:

@@ -116,17 +116,6 @@ class ClockEstimator:
             elif gap_ns < self._bins[-1][1]:
                 self._bins[-1] = (device_s, gap_ns)
 
-    def add_many(self, device_s: Array, host_monotonic_ns: NDArray[np.int64]) -> None:
-        """Feeds arrivals in order; of each stretch of time only the earliest, like `add`."""
-        gaps_ns = host_monotonic_ns - device_s * 1e9
-        backward = np.flatnonzero(np.diff(device_s) < 0) + 1
-        for first, last in zip([0, *backward], [*backward, len(device_s)], strict=True):
-            stretch = np.floor((device_s[first:last] - device_s[first]) / self._bin_s)
-            order = np.lexsort((gaps_ns[first:last], stretch))
-            _, earliest = np.unique(stretch[order], return_index=True)
-            for place in (first + order[earliest]).tolist():
-                self.add(float(device_s[place]), int(host_monotonic_ns[place]))
-
     def reset(self) -> None:
         with self._lock:
             self._forget()

@@ -36,6 +36,8 @@ class YamlProblem:
     """'limits.speed_m_s'"""
     text: str
     remedy: str = ""
+    harmless: bool = False
+    """The file is read all the same."""
 
     def __str__(self) -> str:
         place = f"line {self.line}: " if self.line else ""
@@ -124,6 +126,8 @@ class Examined:
     lines: dict[str, int]
     """'limits.speed_m_s' to its line"""
     problems: list[YamlProblem]
+    ignored: list[YamlProblem]
+    """Keys of earlier releases that are without effect."""
 
 
 def examine(content: bytes, kind: type[Any]) -> Examined:
@@ -139,6 +143,7 @@ def examine(content: bytes, kind: type[Any]) -> Examined:
     try:
         loader = _loader()(content)
         node = loader.get_single_node()
+        ignored = [problem for problem in _problems(node, kind, "") if problem.harmless] if node else []
         plain = loader.construct_document(node)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, OverflowError):
         raise StrictYamlError(problems) from None
@@ -151,7 +156,7 @@ def examine(content: bytes, kind: type[Any]) -> Examined:
             inside.pop(key.partition(".")[0], None)
         else:
             plain.pop(section, None)
-    return Examined(plain, dict(_lines(node, "")), problems)
+    return Examined(plain, dict(_lines(node, "")), problems, ignored)
 
 
 def _lines(node: yaml.Node, where: str) -> Iterator[tuple[str, int]]:
@@ -169,7 +174,8 @@ def _lines(node: yaml.Node, where: str) -> Iterator[tuple[str, int]]:
 def load(content: bytes, kind: type[T], under: str = "") -> T:
     """The file's content as `kind`, a msgspec struct. Raises StrictYamlError with all problems and lines.
 
-    `under`: where the file has this key, only what stands below it is read.
+    A struct's `GONE` names keys of earlier releases, which are ignored. `under`: where the file has this key,
+    only what stands below it is read.
     """
     import msgspec
 
@@ -179,8 +185,8 @@ def load(content: bytes, kind: type[T], under: str = "") -> T:
         loader = _loader()(content)
         node, where = _below(loader.get_single_node(), under)
         problems = list(_problems(node, kind, where)) if node else [YamlProblem(0, "", "the file is empty")]
-        if problems:
-            raise StrictYamlError(problems)
+        if wrong := [problem for problem in problems if not problem.harmless]:
+            raise StrictYamlError(wrong)
         plain = loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 0
@@ -237,11 +243,14 @@ def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: 
     hints = get_type_hints(kind, include_extras=True)  # with the limits of numbers
     fields = {f.encode_name: f for f in fields_of(kind)}
     seen: set[str] = set()
-    for key, value in node.value:
+    for key, value in list(node.value):
         name, line = str(key.value), key.start_mark.line + 1
         inside = f"{where}.{name}" if where else name
         if name in seen:
             yield YamlProblem(line, inside, "stands here twice")
+        elif name in getattr(kind, "GONE", ()):
+            yield YamlProblem(line, inside, "has no effect any more", "Delete it.", harmless=True)
+            node.value.remove((key, value))
         elif name not in fields:
             import difflib
 

@@ -75,11 +75,12 @@ def _commands() -> Iterator[int]:
         yield len(_loaded(f"{program}.cli.app", program.upper()).commands) if grouped else 1
 
 
-def _keys(struct: type) -> Iterator[tuple[type, str]]:
+def _keys(struct: type[msgspec.Struct]) -> Iterator[tuple[type, str]]:
     """Keys of a section and of the sections in it; one in several places counts once."""
-    for name, kind in get_type_hints(struct).items():
+    kinds = get_type_hints(struct)
+    for name in struct.__struct_fields__:
         yield struct, name
-        for part in _parts(kind):
+        for part in _parts(kinds[name]):
             if isinstance(part, type) and issubclass(part, msgspec.Struct):
                 yield from _keys(part)
 

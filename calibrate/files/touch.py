@@ -1,7 +1,6 @@
-"""Touch test: a tip brought over a corner of the board, and its offset told by a person.
+"""Touch test: a tip that a person brought onto a corner of the board, and the calibration's offset there.
 
-The station puts the tip above the place where the calibration says a corner is; a person guides it down and
-tells the offset. The entries live in the calibration file.
+The entries live in the calibration file.
 """
 
 from __future__ import annotations
@@ -14,21 +13,20 @@ import numpy as np
 
 
 class Touch(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The tip was brought down by hand where the calibration says that a corner is."""
+    """How far the calibration puts a corner from where a person touched it."""
 
     corner: int
     """Row of `board.board_points`."""
     corner_mm: tuple[float, float]
     """x, y on the board."""
     offset_mm: tuple[float, float]
-    """Tip minus true corner along the board's x and y, when the tip is lowered straight down."""
+    """Tip minus true corner along the board's x and y, had the calibration sent the tip there."""
     sigma_mm: tuple[float, float]
     """1 sigma of it that calibration, picture and robot predict."""
     found: Literal["told by a person", "read from the arm"]
     who: str
     wall: str
     pointer: str = ""
-    standoff_mm: float = 0.0
     note: str = ""
 
 

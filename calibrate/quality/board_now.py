@@ -33,10 +33,6 @@ class BoardNow:
     base_from_board: Array
     """(4, 4)"""
     camera_from_board: Array
-    outward: Array
-    """(3,) unit normal in `board`, towards the camera."""
-    moved_m: float
-    """Distance of the board's origin from its pose in the calibration; eye-in-hand only, else 0."""
 
 
 def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) -> BoardNow:
@@ -63,14 +59,7 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
             remedy="Bring the camera nearer, or look at the board from more to the side.",
         )
     best = same[0] if same else 0
-    seen = readings[best].camera_from_board
-    towards_camera = float(np.sign(inverse(seen)[2, 3]))
-    return BoardNow(
-        np.asarray(at[best]),
-        seen,
-        np.array([0.0, 0.0, towards_camera]),
-        float(np.linalg.norm(misses[best][:3])) if in_hand else 0.0,
-    )
+    return BoardNow(np.asarray(at[best]), readings[best].camera_from_board)
 
 
 def _shaped(reading: Candidate, view: BoardView, calibration: Calibration) -> Candidate:

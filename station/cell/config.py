@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
@@ -177,10 +177,8 @@ class LimitsConfig(Section, frozen=True):
 class PointerConfig(Section, frozen=True):
     """A tool whose tip a person brings onto a corner (`station touch-test`); in `flange`."""
 
+    GONE: ClassVar = frozenset({"along", "radius_m"})
     tip_m: Vector3
-    along: Vector3 = (0.0, 0.0, 1.0)
-    """Where it points to."""
-    radius_m: Positive = 0.01
 
 
 class StillnessConfig(Section, frozen=True):
@@ -238,7 +236,7 @@ class StationConfig(Section, frozen=True):
     validity: ValidityConfig = ValidityConfig()
     working_distance_m: float = 0.5
     pointer: PointerConfig | None = None
-    """None = the pendant's tool centre point, along its z axis."""
+    """None = the pendant's tool centre point."""
 
 
 PAPER_BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=7, rows=6, square_m=0.025)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,6 +20,8 @@ from recordings.schema.messages import BoardSpec
 from recordings.strict_yaml import YamlProblem
 from station.cell.config import REAL_DRIVERS, SPEED_CAP_M_S, CameraConfig, Plane, PoseGuess, StationConfig
 from station.cell.errors import ConfigError
+
+log = logging.getLogger(__name__)
 
 LARGEST_SQUARE_M, LARGEST_REACH_M = 0.5, 5.0
 """Beyond these somebody wrote millimetres."""
@@ -45,6 +48,8 @@ class ConfigReport:
     """With these nothing is started."""
     missing: tuple[YamlProblem, ...]
     """Keys that planned capture with a real arm needs besides."""
+    ignored: tuple[YamlProblem, ...] = ()
+    """Keys of earlier releases."""
 
 
 def load_config(path: Path) -> tuple[StationConfig, bytes]:
@@ -52,6 +57,8 @@ def load_config(path: Path) -> tuple[StationConfig, bytes]:
     report = examine_config(path)
     if report.config is None:
         raise config_error(path, report.wrong)
+    for problem in report.ignored:
+        log.warning("%s: %s", path, problem)
     return report.config, report.content
 
 
@@ -86,7 +93,7 @@ def examine_config(path: Path) -> ConfigReport:
     told = {problem.where for problem in found.problems}
     wrong = (*found.problems, *(problem for problem in meant if problem.where not in told))
     wrong = tuple(sorted(wrong, key=lambda problem: problem.line))
-    return ConfigReport(content, None if wrong else config, wrong, missing)
+    return ConfigReport(content, None if wrong else config, wrong, missing, tuple(found.ignored))
 
 
 def _section(problem: YamlProblem) -> str:
@@ -294,7 +301,5 @@ def _solid_problems(config: StationConfig) -> Iterator[YamlProblem]:
         if np.abs([*solid.from_m, *solid.to_m, solid.radius_m]).max() > LARGEST_REACH_M:
             yield YamlProblem(0, where, f"'{solid.name}' reaches further than {LARGEST_REACH_M} m", METRES)
     pointer = config.pointer
-    if pointer is not None and np.linalg.norm(pointer.along) < 1e-6:
-        yield YamlProblem(0, "pointer.along", "its length is zero")
     if pointer is not None and np.linalg.norm(pointer.tip_m) > LARGEST_REACH_M:
         yield YamlProblem(0, "pointer.tip_m", f"further than {LARGEST_REACH_M} m; lengths are in metres")

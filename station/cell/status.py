@@ -244,26 +244,6 @@ class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
     start_joints_rad: Vector6 | None = None
 
 
-class HoverOffer(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A way that puts the pointer's tip over a corner of the board, waiting for its go."""
-
-    go: MotionPreview
-    corner: int
-    """Row of `calibrate.boards.model.board_points`."""
-    corner_m: tuple[float, float]
-    """x, y on the board."""
-    standoff_m: float
-    tip_m: tuple[float, float, float]
-    """In `flange`."""
-    base_from_board: Matrix4
-    """By the calibration and the image."""
-    sigma_m: tuple[float, float]
-    """1 sigma of tip minus corner along the board's x and y."""
-    board_moved_m: float = 0.0
-    """Since it was calibrated with; eye-in-hand only."""
-    pointer: str = ""
-
-
 class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     state: StationState = StationState.DISCONNECTED
     reason: str = ""

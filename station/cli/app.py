@@ -66,6 +66,10 @@ STATION = LazyGroup(
                 "station touch-test --pointer-mm 120  # the installed one, over the four outermost corners",
                 "station touch-test cell.yaml --corner 0 --corner 20",
             ),
+            gone={
+                "--standoff-mm": "Bring the tip onto the corner by hand.",
+                "--json": "It needs a person at the arm.",
+            },
         ),
         "accept": LazyCommand(
             "station.cli.accept:accept_command",

@@ -179,6 +179,8 @@ def doctor_command(
         out.print(
             f"{config}: {state}; {found.robot.model} at {found.robot.host}, {found.mount}, control by {path}"
         )
+        for problem in report.ignored:
+            out.print(Text.assemble(("IGNORED", "yellow"), f" {problem}"))
         for problem in report.missing:
             out.print(Text.assemble(("MISSING", "red"), f" {problem}"))
         if words := ": ".join(filter(None, control_trouble(path))):

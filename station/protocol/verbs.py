@@ -21,7 +21,7 @@ from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.session_folder import SessionSummary
-from station.cell.status import HoverOffer, MotionPreview
+from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
 from station.protocol.states import LATCHED, RESTING, RUNNING
 
@@ -136,6 +136,8 @@ class Observation(msgspec.Struct, frozen=True, omit_defaults=True):
     joints_rad: Vector6
     width: int
     height: int
+    tcp_offset: Vector6 = (0.0,) * 6
+    """The pendant's tool centre point, in the flange."""
     corners: tuple[int, ...] = ()
     """Rows of `calibrate.boards.model.board_points` that were found."""
     pixels: tuple[tuple[float, float], ...] = ()
@@ -231,20 +233,6 @@ class Prepare(Verb[MotionPreview], frozen=True):
     purpose: Purpose = Purpose.RUN
     index: int | None = None
     """The pose to retake."""
-
-
-class Hover(Verb[HoverOffer], frozen=True):
-    """Check a slow path over a corner of the board and offer its approval."""
-
-    states = RESTING
-    calibration: str = ""
-    """A calibration file; empty: what is installed below the daemon's root."""
-    corner: int = 0
-    standoff_m: float = 0.08
-    pointer_m: float | None = None
-    """Length of a pointer along the flange's z axis; None: the configured one, or the pendant's tool."""
-    new_picture: bool = True
-    """False: the board as it was last seen for this calibration."""
 
 
 class StopTest(Verb[StopTestOffer], frozen=True):

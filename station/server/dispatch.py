@@ -14,7 +14,7 @@ from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionSummary, list_sessions
 from station.cell.socket_folder import user_name
-from station.cell.status import HoverOffer, LeaseStatus, MotionPreview
+from station.cell.status import LeaseStatus, MotionPreview
 from station.protocol import verbs
 from station.protocol.verbs import VERBS, Verb
 from station.server.approval import ApprovalRule, Peer, Process, process
@@ -129,10 +129,6 @@ class SessionDispatcher:
 
     async def _prepare(self, caller: Peer, args: verbs.Prepare) -> MotionPreview:
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
-
-    async def _hover(self, caller: Peer, args: verbs.Hover) -> HoverOffer:
-        self._rule.by_person(await self._asks(caller), "A move over the board")
-        return await self._session.prepare_hover(caller.client_id, args)
 
     async def _stop_test(self, caller: Peer, args: verbs.StopTest) -> StopTestOffer:
         self._rule.by_person(await self._asks(caller), "A stop test")

@@ -61,7 +61,7 @@ class MotionApproval:
     poses: tuple[int, ...] = ()
     """Pose numbers it covers, in order; more may not be driven to with it."""
     purpose: Purpose | None = None
-    """None: a touch test, or a stop test."""
+    """None: a stop test."""
     begins: OfferedPoses | None = None
     """Poses of the session that begins with this approval."""
     beside: Drive | None = None

@@ -354,6 +354,7 @@ class Previewer:
             joints_rad=state.joints_rad,
             width=image.pixels.shape[1],
             height=image.pixels.shape[0],
+            tcp_offset=robot.identity.tcp_offset,
             corners=tuple(found.indices.tolist()),
             pixels=tuple((float(u), float(v)) for u, v in found.pixels),
         )

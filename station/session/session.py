@@ -25,7 +25,7 @@ from station.cell.errors import RefusedError, RobotError
 from station.cell.plan import Plan
 from station.cell.scene import cell_geometry
 from station.cell.session_folder import interrupted_session
-from station.cell.status import HoverOffer, LeaseStatus, MotionPreview, StationState, StationStatus
+from station.cell.status import LeaseStatus, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
 from station.plan.choose import CRITERIA, Aim
@@ -44,7 +44,6 @@ from station.session.run import Run, SweepRun, close_or_seal, unmark_busy
 from station.session.stop_test import prepare_stop_test
 from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.session.supervisor import SessionSupervisor
-from station.session.touch_test import TouchTestPlanner
 
 R = TypeVar("R")
 END_RUN_S = 10.0
@@ -73,7 +72,6 @@ class Session:
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context)
         self._estimator = Estimator(self.context)
-        self._touch_tests = TouchTestPlanner(self.context)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._notes: tuple[str, ...] = ()
@@ -168,13 +166,6 @@ class Session:
         summary = await summarise(self.context, offered, self._notes)
         offer(MotionApproval(summary, client_id, offered.poses, purpose, begun))
         return summary
-
-    async def prepare_hover(self, client_id: int, request: verbs.Hover) -> HoverOffer:
-        """Offers a one-use approval for a slow path to a place over a corner of the board."""
-        offer = await self._begin_offer(verbs.Hover, client_id)
-        drive, found = await self._touch_tests.prepare(request)
-        offer(MotionApproval(found.go, client_id, beside=drive))
-        return found
 
     async def prepare_stop_test(self, client_id: int, request: verbs.StopTest) -> StopTestOffer:
         """Offers a one-use approval for a short move that is ended in one way."""

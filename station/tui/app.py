@@ -386,7 +386,7 @@ class StationApp(KnowingApp):
 
     async def _touch_test(self, desk: Desk, result: Result, calibration: Calibration) -> str | None:
         path = Path(result.path)
-        return result.path if await run_touch_test(desk, self.approves, path) else None
+        return result.path if await run_touch_test(desk, path) else None
 
     @work(exclusive=True, group="drift", exit_on_error=False)
     async def action_drift_check(self) -> None:

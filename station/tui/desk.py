@@ -250,6 +250,6 @@ def busy_words(verb: Verb[object]) -> str:
             return f"Planning {verb.poses} poses … Nothing moves."
         case verbs.Prepare():
             return "Checking the path … Nothing moves."
-        case verbs.Hover():
-            return f"Looking for a path over corner {verb.corner} … Nothing moves."
+        case verbs.Observe():
+            return "Looking for the board … Nothing moves."
     return ""

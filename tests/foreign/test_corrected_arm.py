@@ -20,7 +20,7 @@ from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.simulation.scenes import make_cell
 from tests.calibrate.files.test_exports import offered_arm
 from tests.foreign.judges import FOLDER, missing
-from tests.station.hover_cell import calibration_of
+from tests.station.calibrated_cell import calibration_of
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

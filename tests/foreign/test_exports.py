@@ -24,7 +24,7 @@ from station.simulation.scenes import make_cell
 from tests.calibrate.files.test_exports import offered_arm
 from tests.foreign.export_readers import READERS
 from tests.foreign.judges import FOLDER, missing
-from tests.station.hover_cell import calibration_of
+from tests.station.calibrated_cell import calibration_of
 
 R, t = Rotation.from_rotvec([0.4, -2.1, 1.3]).as_matrix(), np.array([0.123456789, -0.5, 1.75])
 K = np.array([[834.67, 0.0, 322.77], [0.0, 831.45, 247.61], [0.0, 0.0, 1.0]])

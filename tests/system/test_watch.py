@@ -27,7 +27,7 @@ from station.protocol.verbs import Observe
 from station.simulation.camera import RenderedCamera
 from station.simulation.scenes import cell_config
 from tests.conftest import asked
-from tests.station.hover_cell import calibration_of
+from tests.station.calibrated_cell import calibration_of
 from tests.system.conftest import TRUTH, SystemRig, status_when
 
 pytestmark = pytest.mark.process

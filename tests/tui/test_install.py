@@ -26,7 +26,7 @@ from station.tui.installed import Installed, Result, local
 from station.tui.result import card, verdict_lines
 from station.tui.results import before_next
 from station.tui.task import next_action
-from tests.station.hover_cell import calibration_of
+from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
 from tests.tui.conftest import FakeLink, app_on, opened, text_of, until
 

@@ -11,7 +11,6 @@ import pytest
 
 from station.cell import limits, stillness
 from station.devices import ur_child, ur_condition, ur_control, ur_moves, ur_script
-from station.plan import hover
 from station.session import lease, supervisor
 
 PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
@@ -34,7 +33,6 @@ PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
         (ur_moves.SLIDER_ZERO_S, 10.0, "after 10 s the move is given up"),
         (ur_child.STOP_DECELERATION, 4.0, "the joints brake with 4 rad/s²"),
         (ur_script.STOP_RAD_S2, 4.0, "the joints brake with 4 rad/s²"),
-        (hover.SPEED_M_S, 0.05, "faster than 0.05 m/s"),
         (lease.APPROVAL_LIFETIME_S, 120.0, "It is for one use"),
         (lease.START_TOLERANCE_RAD, 0.005, "from where the arm stood"),
     ],
@@ -42,12 +40,6 @@ PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
 def test_a_limit_is_the_one_that_is_promised(figure: float, most: float, promised: str) -> None:
     assert figure == pytest.approx(most)
     assert promised in PROMISES
-
-
-def test_the_distance_kept_over_the_board_is_the_one_that_is_promised() -> None:
-    assert hover.CLEARANCE_M == 0.05
-    assert hover._DOUBT_SIGMAS == 3.0
-    assert "at least 50 mm from the board" in PROMISES and "(3 sigma)" in PROMISES
 
 
 def test_a_heartbeat_reaches_the_controller_before_its_watchdog_bites() -> None:

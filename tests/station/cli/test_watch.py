@@ -26,7 +26,7 @@ from station.cli import main
 from station.cli import watch as station_watch
 from station.protocol.verbs import Observation, Observe, Verb
 from tests.command_line import call
-from tests.station.hover_cell import calibration_of
+from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
 
 TAG = BoardSpec(BoardKind.APRIL_TAG, square_m=0.05)

@@ -12,7 +12,7 @@ from calibrate.quality.checks import CheckEntry
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.status import PoseStatus, SessionStatus
 from station.operate.ending import Way, after_capture, after_drift_check, after_solve, after_touches
-from tests.station.hover_cell import calibration_of
+from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
 
 GOOD = calibration_of(TRUTH, RobotIdentity(serial="1", model="UR10"), CameraIdentity(serial="2"))

@@ -1,102 +1,203 @@
-"""What a hand finds at a corner becomes an offset in millimetres with the right sign."""
+"""What the arm's position at a corner becomes: an offset with the right sign, and how sure it is."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
+import msgspec
 import numpy as np
 import pytest
 
-from calibrate.geometry import Array, pose, rotation_exp
-from station.cell.errors import RefusedError, StationError
-from station.cell.status import HoverOffer, MotionPreview
-from station.operate.touch_test import (
-    Hovering,
-    read_offset_mm,
-    tip_on_board_m,
-    touch_of,
-    touch_told,
-    two_lengths_mm,
-)
+from calibrate.boards.model import board_points
+from calibrate.errors import CalibrationError
+from calibrate.files.calibration import write_calibration
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.kinematics import MODELS, forward
+from calibrate.quality.board_now import locate_board, offset_covariance
+from recordings.schema.messages import CameraIdentity, RobotIdentity
+from station.cell.config import PointerConfig, matrix4
+from station.cell.errors import RefusedError
+from station.cell.status import RobotStatus, StationStatus
+from station.operate.touch_test import SeenBoard, read_touch, see_board
+from station.protocol.verbs import Configuration, Observation, Observe
+from station.simulation.scenes import cell_config, make_cell
+from tests.codes import raises
+from tests.station.calibrated_cell import POINTER, ROBOT_M, ROBOT_RAD, calibration_of, seen_from
 
+ROBOT, CAMERA = RobotIdentity(model="UR10", serial="1"), CameraIdentity(serial="2")
 TIP = (0.01, -0.02, 0.15)
-BASE_FROM_BOARD = pose(rotation_exp([np.pi, 0.0, 0.3]), [0.6, 0.1, 0.05])
-OFFER = HoverOffer(
-    go=MotionPreview("t", "hover", "ab" * 32, 2, 1.0, 0.5, 0.05, 3.0, ""),
-    corner=7,
-    corner_m=(0.1, 0.05),
-    standoff_m=0.08,
-    tip_m=TIP,
-    base_from_board=tuple(map(tuple, BASE_FROM_BOARD.tolist())),  # type: ignore[arg-type]
-    sigma_m=(0.0001, 0.0002),
-    pointer="a needle",
-)
+CORNER = 7
 
 
-def flange_with_tip_at(place_m: tuple[float, float, float]) -> Array:
-    """base_from_flange that puts the pointer's tip there in `board`, however the flange is turned."""
-    R = rotation_exp([0.4, 2.8, -0.1])
-    return pose(R, (BASE_FROM_BOARD @ [*place_m, 1.0])[:3] - R @ TIP)
+class Daemon:
+    """Shows the board where it truly lies."""
+
+    root, camera = None, "main"
+
+    def __init__(self, mount: str = "eye-in-hand", **changes: object) -> None:
+        self.truth = make_cell("paper", 1, "low", mount)  # type: ignore[arg-type]
+        self.calibration = calibration_of(self.truth, ROBOT, CAMERA)
+        self.board = np.array(self.truth.board_place)
+        flange = forward(MODELS["UR10"], self.truth.start_joints_rad)
+        if mount == "eye-to-hand":  # taken off the flange, and laid down
+            self.board = flange @ self.board
+            flange = flange @ pose(np.eye(3), [0.0, 0.2, -0.3])
+        view = seen_from(self.truth, flange, self.board)
+        self.observation = Observation(
+            mount=self.truth.mount,
+            source="simulated",
+            robot_serial="1",
+            camera_serial="2",
+            wall_ns=0,
+            rested_s=1.0,
+            base_from_flange=matrix4(flange),
+            joints_rad=self.truth.start_joints_rad,
+            width=self.truth.camera.width,
+            height=self.truth.camera.height,
+            tcp_offset=(0.0, 0.0, 0.2, 0.0, 0.0, 0.0),
+            corners=tuple(range(len(view.pixels))),
+            pixels=tuple((float(u), float(v)) for u, v in view.pixels),
+        )
+        self.observation = msgspec.structs.replace(self.observation, **changes)
+        self.configuration = msgspec.structs.replace(
+            cell_config(self.truth), pointer=PointerConfig(TIP), board=self.truth.board
+        )
+
+    async def call(self, verb: Any, *, timeout_s: float = 0.0) -> Any:
+        assert isinstance(verb, (Observe, Configuration))
+        return self.observation if isinstance(verb, Observe) else self.configuration
+
+    async def seen(self, folder: Path) -> SeenBoard:
+        write_calibration(self.calibration, folder / "c.yaml")
+        return await see_board(self, folder / "c.yaml")  # type: ignore[arg-type]
+
+    def touching(self, place_m: Array, tip_m: tuple[float, ...] = TIP) -> StationStatus:
+        """The arm with the tip there in `board`, however the flange is turned."""
+        R = rotation_exp([0.4, 2.8, -0.1])
+        flange = pose(R, (self.board @ [*place_m, 1.0])[:3] - R @ tip_m)
+        return StationStatus(robot=RobotStatus(base_from_flange=matrix4(flange)))
 
 
-@pytest.mark.parametrize("place", [(0.1, 0.05, -0.08), (0.0, 0.0, 0.0), (-0.3, 0.2, 0.1)])
-def test_the_tip_is_found_on_the_board(place: tuple[float, float, float]) -> None:
-    assert tip_on_board_m(OFFER, flange_with_tip_at(place)) == pytest.approx(place, abs=1e-9)
-
-
-def test_a_tip_over_its_corner_has_arrived_and_knows_how_far_beside_it_stands() -> None:
-    hovering = Hovering.arrived(OFFER, flange_with_tip_at((0.1004, 0.0497, -0.08)), "")
-    assert hovering.beside_mm == pytest.approx([0.4, -0.3])
-    assert touch_told(hovering, "1, 1", None).offset_mm == pytest.approx((0.6, 1.3))
-
-
-@pytest.mark.parametrize("place", [(0.106, 0.05, -0.08), (0.1, 0.044, -0.08), (0.1, 0.05, -0.074)])
-def test_a_tip_that_is_elsewhere_did_not_come(place: tuple[float, float, float]) -> None:
-    with pytest.raises(StationError) as problem:
-        Hovering.arrived(OFFER, flange_with_tip_at(place), "STOP by anna")
-    assert problem.value.code == "not-over-corner" and "STOP by anna" in problem.value.text
-
-
-def test_the_tip_on_the_true_corner_tells_the_offset_the_other_way_round() -> None:
-    assert read_offset_mm(OFFER, np.array([0.1002, 0.0499, 0.001])) == pytest.approx([-0.2, 0.1])
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+async def test_the_tip_on_the_true_corner_tells_the_offset_the_other_way_round(
+    mount: str, tmp_path: Path
+) -> None:
+    daemon = Daemon(mount)
+    board = await daemon.seen(tmp_path)
+    corner = board_points(daemon.truth.board)[CORNER]
+    touch = read_touch(board, CORNER, daemon.touching(corner + np.array([2e-4, -1e-4, 1e-3])))
+    assert touch.offset_mm == pytest.approx((-0.2, 0.1), abs=0.02)
+    assert touch.corner_mm == pytest.approx(1000 * corner[:2])
+    assert (touch.corner, touch.found) == (CORNER, "read from the arm")
+    assert 0.01 < min(touch.sigma_mm) <= max(touch.sigma_mm) < 1
 
 
 @pytest.mark.parametrize(
-    ("touching", "code", "distance_m"),
+    ("configured", "length_m", "tip"),
+    [(True, None, TIP), (True, 0.12, (0.0, 0.0, 0.12)), (False, None, (0.0, 0.0, 0.2))],
+)
+async def test_the_pointer_is_the_one_asked_for_else_configured_else_the_pendants(
+    configured: bool, length_m: float | None, tip: tuple[float, ...], tmp_path: Path
+) -> None:
+    daemon = Daemon()
+    if not configured:
+        daemon.configuration = msgspec.structs.replace(daemon.configuration, pointer=None)
+    board = await daemon.seen(tmp_path)
+    corner = board_points(daemon.truth.board)[CORNER]
+    touch = read_touch(board, CORNER, daemon.touching(corner, tip), length_m)
+    assert touch.offset_mm == pytest.approx((0.0, 0.0), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("beside", "code"),
     [
-        ((0.1, 0.05, 0.011), "not-touching", 0.011),
-        ((0.1, 0.05, -0.011), "not-touching", 0.011),
-        ((0.16, 0.05, 0.0), "other-corner", 0.06),
+        ((0.0, 0.0, 0.011), "not-touching"),
+        ((0.0, 0.0, -0.011), "not-touching"),
+        ((0.06, 0.0, 0.0), "other-corner"),
     ],
 )
-def test_a_tip_off_the_board_or_at_another_corner_is_no_touch(
-    touching: tuple[float, float, float], code: str, distance_m: float
+async def test_a_tip_off_the_board_or_at_another_corner_is_no_touch(
+    beside: tuple[float, ...], code: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(RefusedError) as refused:
-        read_offset_mm(OFFER, np.array(touching))
-    assert refused.value.code == code
-    assert refused.value.values["distance_m"] == pytest.approx(distance_m)
+    daemon = Daemon()
+    board = await daemon.seen(tmp_path)
+    there = daemon.touching(board_points(daemon.truth.board)[CORNER] + beside)
+    with raises(code) as refused:
+        read_touch(board, CORNER, there)
+    assert refused.value.values["distance_m"] == pytest.approx(max(map(abs, beside)), abs=1e-4)
+
+
+async def test_what_is_not_known_is_refused(tmp_path: Path) -> None:
+    daemon = Daemon()
+    board = await daemon.seen(tmp_path)
+    there = daemon.touching(board_points(daemon.truth.board)[CORNER])
+    for code, words in (
+        ("no-robot-state", (CORNER, None, None)),
+        ("no-robot-state", (CORNER, StationStatus(), None)),
+        ("no-such-corner", (42, there, None)),
+        ("pointer-length", (CORNER, there, 1.5)),
+    ):
+        with raises(code):
+            read_touch(board, *words)
+    bare = Daemon(tcp_offset=(0.0,) * 6)
+    bare.configuration = msgspec.structs.replace(bare.configuration, pointer=None)
+    with raises("no-pointer"):
+        read_touch(await bare.seen(tmp_path), CORNER, there)
 
 
 @pytest.mark.parametrize(
-    "said", ["0.2,-0.1", " 0.2 ; -0.1 ", "0.2 mm, -0.1mm", "200 um, -100 µm", "0.02 CM,-.1"]
+    ("changes", "error"),
+    [({"corners": (), "pixels": ()}, RefusedError), ({"camera_serial": "3"}, CalibrationError)],
 )
-def test_two_lengths_as_people_type_them(said: str) -> None:
-    assert two_lengths_mm(said) == pytest.approx([0.2, -0.1])
+async def test_no_board_and_another_cell_are_refused(
+    changes: dict[str, object], error: type[Exception], tmp_path: Path
+) -> None:
+    with pytest.raises(error):
+        await Daemon(**changes).seen(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "said", ["", "0.2", "0.2,0.1,0", "a,b", "nan,0", "inf,0", "51,0", "0,-51", "6 cm, 0", "0.2 px, 0"]
-)
-def test_anything_else_is_refused(said: str) -> None:
-    with pytest.raises(RefusedError) as refused:
-        two_lengths_mm(said)
-    assert (refused.value.code, refused.value.values["limit_mm"]) == ("no-offset", 50.0)
+def test_the_predicted_offset_is_what_repetitions_show() -> None:
+    """The installed X, the picture and the robot err; the tip misses the corner by as much as was said."""
+    truth, rng = make_cell(seed=5), np.random.default_rng(3)
+    E, board = forward(MODELS["UR10"], truth.start_joints_rad), np.array(truth.board_place)
+    corner = board_points(truth.board)[0]
+    nominal = calibration_of(truth, ROBOT, CAMERA)
+    root = np.linalg.cholesky(np.array(nominal.covariance))
+    misses, distances = [], []
+    for _ in range(200):
+        calibration = calibration_of(truth, ROBOT, CAMERA, root @ rng.normal(size=6))
+
+        def robot_error() -> Array:
+            return np.r_[rng.normal(0, ROBOT_M, 3), rng.normal(0, ROBOT_RAD, 3)]
+
+        view = seen_from(truth, E, board, rng, told=perturb(E, robot_error()))
+        now = locate_board(calibration, view, truth.board)
+        covariance = offset_covariance(calibration, view, now, corner, POINTER.tip_m)
+        # The arm is sent where the tip would touch the corner, and misses by its own error.
+        target = transform_points(now.base_from_board, corner)
+        tip = np.array(POINTER.tip_m)
+        flange = pose(E[:3, :3], target - E[:3, :3] @ tip)
+        miss = transform_points(inverse(board) @ perturb(flange, robot_error()), tip) - corner
+        misses.append(miss)
+        distances.append(float(miss[:2] @ np.linalg.inv(covariance[:2, :2]) @ miss[:2]))
+    assert np.sqrt(np.mean(np.square(misses), axis=0))[:2] == pytest.approx(
+        np.sqrt(np.diag(covariance))[:2], rel=0.15
+    )
+    assert np.mean(np.array(distances) < 5.99) == pytest.approx(0.95, abs=0.04)
 
 
-def test_what_goes_into_the_file_is_in_millimetres() -> None:
-    hovering = Hovering.arrived(OFFER, flange_with_tip_at((0.1, 0.05, -0.08)), "")
-    touch = touch_of(hovering, np.array([0.12345, -0.2]), "told by a person")
-    assert (touch.corner, touch.pointer, touch.found) == (7, "a needle", "told by a person")
-    assert touch.corner_mm == pytest.approx((100, 50))
-    assert touch.offset_mm == (0.123, -0.2)
-    assert touch.sigma_mm == (0.1, 0.2)
-    assert touch.standoff_mm == pytest.approx(80)
+def test_a_board_still_on_the_flange_is_noticed() -> None:
+    truth = make_cell(mount="eye-to-hand")
+    E = forward(MODELS["UR10"], truth.start_joints_rad)
+    view = seen_from(truth, E, E @ np.array(truth.board_place))
+    with raises("board-on-flange"):
+        locate_board(calibration_of(truth, ROBOT, CAMERA), view, truth.board)
+
+
+def test_a_moved_board_is_found_where_it_is() -> None:
+    truth = make_cell()
+    E, moved = forward(MODELS["UR10"], truth.start_joints_rad), np.array(truth.board_place)
+    moved[:3, 3] += [0.03, -0.02, 0.01]
+    now = locate_board(calibration_of(truth, ROBOT, CAMERA), seen_from(truth, E, moved), truth.board)
+    assert now.base_from_board == pytest.approx(moved, abs=1e-6)

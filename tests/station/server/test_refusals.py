@@ -18,7 +18,7 @@ from tests.station.session_rig import POSES, Rig
 
 ANNA, BERT = Peer(1, 100, 0), Peer(2, 101, 0)
 ARGUMENTS: dict[str, dict[str, Any]] = {
-    "acknowledge": {}, "load_plan": {}, "make_plan": {}, "prepare": {}, "hover": {}, "go": {"token": "t"},
+    "acknowledge": {}, "load_plan": {}, "make_plan": {}, "prepare": {}, "go": {"token": "t"},
     "pause": {}, "finish": {}, "retake": {"index": 0}, "skip": {"index": 1},
     "reorder": {"order": [1, 0, *range(2, POSES)]}, "add": {}, "drop": {"index": 1},
     "free_drive": {"on": True}, "record": {}, "stop_test": {"way": "both"},

@@ -20,7 +20,7 @@ from station.protocol.verbs import Check
 from station.session.checklist import checklist
 from station.simulation.launch import SimulatedController
 from station.simulation.scenes import make_cell
-from tests.station.hover_cell import calibration_of
+from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import Rig
 
 

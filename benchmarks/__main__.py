@@ -50,11 +50,9 @@ SHOWN: dict[str, str] = {
     "stop_denied": "busy|fake",
     "daemon_latency": "",
     "screen_stop": "F12",
-    "daemon_stream": r"^\| (75 \| 10|150) ",
     "state_reader": "samples|fitted|share",
     "recorder": r"plain write\(\) of|Recorder \(|^A session",
     "time_sync": "",
-    "frame_time": r"\+0 ms \| \+0|-1 ms",
     "operator_mistakes": "of 25 named",
 }
 """The rows of each benchmark that the page shows, as a pattern; in the page's order."""

@@ -20,8 +20,6 @@ ROOT = Path(__file__).parents[1]
 NEEDS_A_CELL = (
     *(f"station {name}" for name in ("serve", "capture", "drift-check")),
     "station plan --config station.yaml --taught",
-    "calibrate sweep",
-    "calibrate solve session.mcap --time-offset",
 )
 """Run against a simulated cell by tests/system and tests/station/cli; parsed by tests/test_examples.py."""
 

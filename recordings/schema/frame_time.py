@@ -144,7 +144,7 @@ def derived_again(
     """(recorded, derived) times of the frames that a clock placed, from a recording's raw readings.
 
     `frames`: (camera's stamp ns, exposure µs, recorded time). Knows the readings after a frame as well as
-    those before, which the daemon did not; a correction by a sweep is not in it.
+    those before, which the daemon did not.
     """
     asked = [reading.asked_monotonic_ns for reading in readings]
     for device_ns, exposure_us, recorded in frames:

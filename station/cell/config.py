@@ -15,7 +15,6 @@ from recordings.schema.messages import (
     CameraModel,
     Matrix4,
     Mount,
-    TimeCorrection,
     Vector6,
 )
 
@@ -82,6 +81,8 @@ REAL_DRIVERS = ("aravis", "webcam")
 
 
 class CameraConfig(Section, frozen=True):
+    GONE: ClassVar = frozenset({"playback_pace", "time_offset"})
+
     name: str = MAIN_CAMERA
     """Name among the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""
     driver: Literal["aravis", "webcam", "playback", "rendered"] = "aravis"
@@ -112,10 +113,6 @@ class CameraConfig(Section, frozen=True):
     """Output that is active while the camera exposes; empty = none"""
     ptp: bool = False
     """The camera's clock follows the network's master (IEEE 1588)"""
-    time_offset: TimeCorrection | None = None
-    """Offset from a sweep (`calibrate sweep -o`), added to the frames' times of the same source."""
-    playback_pace: float = 0.0
-    """Has no effect."""
     model: CameraModel | None = None
     """Known intrinsics; None = found from the session's images."""
     model_is_rough: bool = False

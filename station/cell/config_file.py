@@ -33,6 +33,10 @@ _FIELD_OF_VIEW = (np.deg2rad(2.0), np.deg2rad(150.0))
 _FOCAL_LENGTH = (
     "Give pixels: the lens's focal length in mm / the pixel's size in mm (8 mm / 0.0048 mm = 1667)."
 )
+_REFUSED = {
+    "camera.time_offset": "frame times are not corrected any more; poses are taken at rest. Delete it."
+}
+"""Keys of earlier releases that the result hung on."""
 _FACING = 0.3
 """Cosine from which a printed side faces something."""
 
@@ -91,9 +95,11 @@ def examine_config(path: Path) -> ConfigReport:
 
     meant, missing = placed(_meaning_problems(config)), placed(_real_capture_problems(config))
     told = {problem.where for problem in found.problems}
-    wrong = (*found.problems, *(problem for problem in meant if problem.where not in told))
+    refused = [replace(p, text=_REFUSED[p.where], remedy="") for p in found.ignored if p.where in _REFUSED]
+    ignored = tuple(problem for problem in found.ignored if problem.where not in _REFUSED)
+    wrong = (*found.problems, *refused, *(problem for problem in meant if problem.where not in told))
     wrong = tuple(sorted(wrong, key=lambda problem: problem.line))
-    return ConfigReport(content, None if wrong else config, wrong, missing, tuple(found.ignored))
+    return ConfigReport(content, None if wrong else config, wrong, missing, ignored)
 
 
 def _section(problem: YamlProblem) -> str:

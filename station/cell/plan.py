@@ -53,7 +53,7 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     criterion: Criterion | None = None
     """Criterion by which the planner chose all poses; None: a person taught, listed or changed some."""
     motion: Literal["stops", "sweep"] = "stops"
-    """sweep: the arm swings through the poses without a stop for an image, while the camera runs."""
+    """sweep: of an earlier release; such a plan is read, and never driven."""
 
 
 def plan_sha256(plan: Plan) -> str:

@@ -36,9 +36,9 @@ STATION = LazyGroup(
             (
                 "station capture --plan plan.yaml",
                 "station capture --plan plan.yaml --headless --approve 0123456789ab",
-                "station capture --sweep",
             ),
             _APPROVED,
+            {"--sweep": "Frame times carry their own bound; `station doctor` shows it."},
         ),
         "status": LazyCommand(
             "station.cli.control:status_command", ("station status", "station status --json")

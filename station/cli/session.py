@@ -15,16 +15,13 @@ import msgspec
 import typer
 from rich.text import Text
 
-from recordings.schema.messages import Vector6
-from station.cell.errors import ConfigError, RefusedError
 from station.cell.plan import Plan
 from station.cell.status import StationState, StationStatus
 from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, Socket, err, out, print_json
 from station.operate.drift_check import POSES, check_arguments, judged, start_drift_check
 from station.operate.ending import after_capture
-from station.operate.motion import wait_until_idle
-from station.plan.files import load_plan, sweep_plan
+from station.plan.files import load_plan
 from station.protocol.client import Client
 from station.protocol.verbs import LoadPlan, Purpose
 
@@ -32,10 +29,7 @@ Approve = Annotated[str, typer.Option("--approve", help="Hash of the approved pl
 
 
 def capture_command(
-    plan: Annotated[Path | None, typer.Option(help="Pose plan from `station plan`")] = None,
-    sweep: Annotated[
-        bool, typer.Option("--sweep", help="Swing slowly about where the arm stands, camera running")
-    ] = False,
+    plan: Annotated[Path, typer.Option(help="Pose plan from `station plan`")],
     headless: Headless = False,
     approve: Approve = "",
     socket: Socket = None,
@@ -47,16 +41,11 @@ def capture_command(
     `--headless --approve HASH`: the hash that `station plan --json` prints, given as a user that the
     configuration names in approval.services.
 
-    With --sweep no poses are captured: the arm swings with the board in view, and `calibrate sweep RECORDING`
-    tells the time between camera and robot.
-
     Exit codes: 0 all poses captured, 1 failed or stopped, 2 usage, 3 poses missing.
     """
-    if (plan is None) != sweep:
-        raise ConfigError("Missing --plan or --sweep.", code="usage", remedy="Give one of them.")
-    before = load_sweep if plan is None else partial(load_into, plan=load_plan(plan))
+    before = partial(load_into, plan=load_plan(plan))
     outcome = asyncio.run(session(socket, Purpose.RUN, headless, approve, as_json, before))
-    _finish(outcome, as_json, "sweep" if sweep else "solve")
+    _finish(outcome, as_json)
 
 
 def resume_command(
@@ -111,21 +100,6 @@ async def load_into(client: Client, plan: Plan) -> None:
     await client.call(LoadPlan(plan))
 
 
-async def load_sweep(client: Client) -> None:
-    """A sweep about where the arm stands now."""
-    status = await wait_until_idle(client)
-    await load_into(client, sweep_plan(status.robot.model, status.mount, joints_of(status)))
-
-
-def joints_of(status: StationStatus) -> Vector6:
-    """Joints where the arm stands. Raises RefusedError."""
-    if status.robot.joints_rad is None:
-        raise RefusedError(
-            "The robot's joints are not known.", code="no-robot-state", remedy="`station doctor` says why."
-        )
-    return status.robot.joints_rad
-
-
 async def session(
     socket: Path | None,
     purpose: Purpose,
@@ -154,7 +128,7 @@ class SessionJson(msgspec.Struct, frozen=True):
     recording: str
 
 
-def _finish(outcome: StationStatus, as_json: bool, judge: str = "solve") -> None:
+def _finish(outcome: StationStatus, as_json: bool) -> None:
     session = outcome.session
     if as_json:
         poses = PosesJson(len(session.poses), session.captured)
@@ -163,7 +137,7 @@ def _finish(outcome: StationStatus, as_json: bool, judge: str = "solve") -> None
         out.print(f"{session.captured} of {len(session.poses)} poses, finished: {session.recording}")
         out.print(str(after_capture(session)))
         if not session.check:
-            out.print(f"Next: calibrate {judge} {shlex.quote(session.recording)}", soft_wrap=True)
+            out.print(f"Next: calibrate solve {shlex.quote(session.recording)}", soft_wrap=True)
     else:
         _say_state(outcome, outcome.reason)
     raise typer.Exit(1 if not session.recording else 3 if session.captured < len(session.poses) else 0)

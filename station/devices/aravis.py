@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
-from collections.abc import Callable
 from functools import partial
 
 import msgspec
@@ -28,10 +26,7 @@ from station.devices.frames import (
 from station.devices.genicam_settings import CHUNKS, TIME_CHUNKS
 
 _CLOCK_READINGS = 8
-_STREAM_POP_S = 0.1
 _GLIMPSE_S = 1.0
-_STREAM_CHECK_S = 1.0
-"""So often clock and settings are read while frames come by themselves."""
 
 
 class AravisCamera:
@@ -45,11 +40,12 @@ class AravisCamera:
                 remedy="Add `trigger: {port: /dev/ttyACM0}`, or choose camera.trigger: software.",
             )
         self._config = config
+        self._free_running = config.trigger == "free-running"
         self._trigger = trigger
         self._device: GenicamDevice | None = None
         self._worker = DeviceThread("aravis")
         self._busy = asyncio.Lock()
-        self._clock = FrameClock(config.time_offset, config.trigger_delay_us)
+        self._clock = FrameClock(config.trigger_delay_us)
         self._newest: Image | None = None
         self.identity = CameraIdentity(driver="aravis")
         self.counter = FrameCounter()
@@ -86,7 +82,7 @@ class AravisCamera:
     async def _one(self, timeout_s: float, *, sequenced: bool) -> Image:
         await self._worker.run(self._prepare)
         pulse: TriggerPulse | None = None
-        asked_ns = None if self.free_running else time.monotonic_ns()
+        asked_ns = None if self._free_running else time.monotonic_ns()
         if self._config.trigger == "hardware":
             assert self._trigger is not None
             pulse = await self._trigger.fire()
@@ -116,15 +112,6 @@ class AravisCamera:
                 self.counter.restart()
                 return None
 
-    @property
-    def free_running(self) -> bool:
-        return self._config.trigger == "free-running"
-
-    async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
-        """Free-running: every frame, in order, from the worker's thread, until `stop` is set."""
-        async with self._busy:
-            await self._worker.run(partial(self._stream_frames, callback, stop))
-
     async def close(self) -> None:
         device, self._device = self._device, None
         await self._worker.close(device.close if device is not None else lambda: None)
@@ -150,14 +137,14 @@ class AravisCamera:
 
     def _prepare(self) -> tuple[float, float]:
         device = self._live()
-        if not self.free_running and (extra := device.drain()):
+        if not self._free_running and (extra := device.drain()):
             raise self.counter.surplus(extra)
         device.latch(self._clock.readings)
         return device.check_settings()
 
     def _take(self, timeout_s: float) -> Image:
         device = self._live()
-        if self.free_running:
+        if self._free_running:
             self.counter.restart()
             picture = device.fresh_frame(timeout_s, partial(self._began_since, time.monotonic_ns()))
         else:
@@ -180,26 +167,3 @@ class AravisCamera:
         if fit is not None and picture.stamps.device_ns:
             told = by_clock(picture.stamps.device_ns, exposure_us, fit, "latched")
         return told.host_monotonic_ns - exposure_us * 500 - told.bound_s * 1e9 >= asked_ns
-
-    def _stream_frames(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
-        device = self._live()
-        self.counter.restart()
-        device.drain()
-        exposure_us, gain_db, checked_s = 0.0, 0.0, -_STREAM_CHECK_S
-        while not stop.is_set():
-            if time.monotonic() - checked_s >= _STREAM_CHECK_S:
-                (exposure_us, gain_db), checked_s = self._prepare(), time.monotonic()
-            try:
-                picture = device.frame(_STREAM_POP_S)
-            except CameraError:
-                if device.lost:
-                    raise
-                continue  # incomplete: the next frame's id shows the gap, and the counter counts it
-            if picture is not None:
-                sequence = self.counter.follow(picture.frame_id)
-                told = msgspec.structs.replace(picture, sequence=sequence)
-                chunk = device.chunks.issuperset(TIME_CHUNKS)
-                if not chunk:
-                    told = msgspec.structs.replace(told, exposure_us=exposure_us, gain_db=gain_db)
-                self._newest = self._clock.timed(told, chunk=chunk)
-                callback(self._newest)

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 BUFFERS = 12
-STREAM_BUFFERS = 128
-"""Free-running: what a loaded computer may be late by, at 150 fps most of a second."""
 FRAME_RETENTION_S = 0.5
 """So long a frame may wait for its last packets before it is given up as incomplete."""
 SOCKET_BUFFER_BYTES = 32 * 2**20
@@ -135,7 +133,7 @@ class GenicamDevice:
                 self._stream.set_property("socket-buffer", self._aravis.GvStreamSocketBuffer.FIXED)
                 self._stream.set_property("socket-buffer-size", SOCKET_BUFFER_BYTES)
             payload = self._camera.get_payload()
-            for _ in range(STREAM_BUFFERS if self._config.trigger == "free-running" else BUFFERS):
+            for _ in range(BUFFERS):
                 self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))
             self._camera.start_acquisition()
         self.check_settings()

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, TypeVar
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
@@ -158,18 +157,6 @@ class Camera(Protocol):
         """A recent image for the screen; None when there is none. Never recorded."""
 
     async def close(self) -> None: ...
-
-
-@runtime_checkable
-class StreamingCamera(Protocol):
-    """A camera that can also send images at its own pace."""
-
-    @property
-    def free_running(self) -> bool:
-        """It does so; else every image is triggered."""
-
-    async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
-        """Every frame, in order, from a thread of its own, until `stop` is set. Raises CameraError."""
 
 
 class Trigger(Protocol):

@@ -13,7 +13,7 @@ from recordings.schema.frame_time import (
     by_clock,
     by_trigger,
 )
-from recordings.schema.messages import FrameTime, Image, TimeCorrection, TimeSource
+from recordings.schema.messages import FrameTime, Image, TimeSource
 from station.cell.errors import CameraError
 
 RETAKE = "Retake this pose."
@@ -111,16 +111,6 @@ class FrameCounter:
         self.paired += pulse_count is not None
         return self.frames - 1
 
-    def follow(self, frame_id: int | None) -> int:
-        """Free-running: the sequence number; gaps are only counted."""
-        frames = self._step(self._last_id, frame_id)
-        self.missing += max(0, (frames or 0) - 1)
-        self.unexpected += frames is None
-        self._last_id = frame_id
-        self.frames += 1
-        self.seen += 1
-        return self.frames - 1
-
     def _step(self, last_id: int | None, frame_id: int | None) -> int | None:
         if last_id is None or frame_id is None:
             return 1
@@ -176,10 +166,10 @@ class FrameClock:
     For a camera's driver, which feeds it readings of the camera's clock where there is one.
     """
 
-    def __init__(self, correction: TimeCorrection | None = None, trigger_delay_us: float = 0.0) -> None:
-        """`correction`: of a sweep, for one source. `trigger_delay_us`: set in the camera."""
+    def __init__(self, trigger_delay_us: float = 0.0) -> None:
+        """`trigger_delay_us`: set in the camera."""
         self.readings = DeviceClock()
-        self._correction, self._delay_us = correction, trigger_delay_us
+        self._delay_us = trigger_delay_us
         self._newest: FrameTime | None = None
         self._impossible = 0
         self._opened = False
@@ -216,26 +206,17 @@ class FrameClock:
         self._newest = by_arrival(arrival_ns, image.exposure_us, asked_ns)
         if pulse is not None:
             fired = pulse.host_monotonic_ns, pulse.bound_s
-            by_box = by_trigger(*fired, self._delay_us, image.exposure_us, arrival_ns)
-            self._newest = self._corrected(by_box, known_bound_s=pulse.bound_s)
+            self._newest = by_trigger(*fired, self._delay_us, image.exposure_us, arrival_ns)
         if fit is not None and image.stamps.device_ns:
             source: TimeSource = "chunk" if chunk else "latched"
             if self.readings.synchronized:
                 source = "ptp"
-            told = self._corrected(by_clock(image.stamps.device_ns, image.exposure_us, fit, source))
+            told = by_clock(image.stamps.device_ns, image.exposure_us, fit, source)
             if _possible(told, image, asked_ns):
                 self._newest = told
             else:
                 self._impossible += 1
         return msgspec.structs.replace(image, time=self._newest, clock_readings=self.readings.take_fresh())
-
-    def _corrected(self, told: FrameTime, known_bound_s: float | None = None) -> FrameTime:
-        """`known_bound_s`: what is left of the bound once a sweep has measured the rest."""
-        measured = self._correction
-        if measured is None or measured.source != told.source:
-            return told
-        bound_s = (told.bound_s if known_bound_s is None else known_bound_s) + 2 * measured.sigma_s
-        return FrameTime(told.host_monotonic_ns + round(measured.offset_s * 1e9), bound_s, told.source)
 
 
 def _possible(told: FrameTime, image: Image, asked_ns: int | None) -> bool:

@@ -7,7 +7,6 @@ arrival, to ±0.1 s.
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -32,8 +31,6 @@ LATENCY_S = 0.2
 _GLIMPSE_S = 1.0
 _OPEN_S = 20.0
 _PATIENCE_S = 0.5
-_CHECK_S = 1.0
-"""So often settings are read while frames come by themselves."""
 _EXPOSURE_UNIT_US = 100.0
 """Unit of V4L2's absolute exposure"""
 _MANUAL_EXPOSURE = 1
@@ -43,7 +40,7 @@ _SYSTEM = Path("/sys/class/video4linux")
 
 
 class WebcamCamera:
-    """`station.devices.base.Camera` and `StreamingCamera` over `config.device`: a number or a path."""
+    """`station.devices.base.Camera` over `config.device`: a number or a path."""
 
     def __init__(self, config: CameraConfig) -> None:
         self._config = config
@@ -87,13 +84,6 @@ class WebcamCamera:
             return await self.glimpse()
         except CameraError:
             return self._newest
-
-    @property
-    def free_running(self) -> bool:
-        return self._config.trigger == "free-running"
-
-    async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
-        await self._run(partial(self._stream_frames, callback, stop))
 
     async def close(self) -> None:
         await self._worker.close(self._release)
@@ -254,17 +244,6 @@ class WebcamCamera:
     def _numbered(self, image: Image) -> Image:
         self._frames += 1
         return msgspec.structs.replace(image, sequence=self._frames - 1)
-
-    def _stream_frames(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
-        image, checked_s = self._fresh(_OPEN_S), time.monotonic()
-        while not stop.is_set():
-            self._newest = self._numbered(image)
-            callback(self._newest)
-            video = self._live()
-            if time.monotonic() - checked_s >= _CHECK_S:
-                self._check(video)
-                checked_s = time.monotonic()
-            image = self._image(video, self._grab(video))
 
 
 def _wanted_size(config: CameraConfig) -> tuple[int, int] | None:

@@ -17,8 +17,8 @@ from calibrate.kinematics import MODELS, inverse_nearest
 from recordings import strict_yaml
 from recordings.files import ASKED_FOR, read_file, write_atomically
 from recordings.reader import open_recording
-from recordings.schema.messages import Mount, Vector6
-from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2, vector6
+from recordings.schema.messages import Mount
+from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2
 from station.cell.errors import ConfigError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import pose_at
@@ -27,14 +27,6 @@ _POSE_LIMIT = 200
 _JOINTS_DEG = [f"j{i}_deg" for i in range(1, 7)]
 _JOINTS_RAD = [f"j{i}_rad" for i in range(1, 7)]
 _POSE = ["x", "y", "z", "qx", "qy", "qz", "qw"]
-SWINGS = 8
-JOINT_SPEED_RAD_S = 0.3
-JOINT_ACCELERATION_RAD_S2 = 0.6
-WRIST_SWING_RAD = 0.30
-"""Swing of wrist 3 to either side: it turns the image (or the board) nearly in its place."""
-_TILT_RAD = 0.05
-_SHARES = (1.0, -1.0, 0.6, -0.8, 1.0, -0.5, 0.8)
-"""Shares of the full swing; unequal ones, so that no offset looks like a period."""
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # yaml has no types
@@ -103,6 +95,8 @@ def _read(path: Path) -> bytes:
 def _value_problems(plan: Plan) -> list[str]:
     """Finds what types cannot say."""
     problems = []
+    if plan.motion != "stops":
+        problems.append("motion: sweeps are gone. Make a plan of poses: `station plan`")
     if plan.robot not in MODELS:
         problems.append(f"robot '{plan.robot}' is unknown; known are {', '.join(MODELS)}")
     if not 1 <= len(plan.poses) <= _POSE_LIMIT:
@@ -219,23 +213,3 @@ def _row_joints(values: list[float], columns: list[str], robot: str, near: Array
     if joints is None:
         raise _bad_list(f"{where}: the {robot} cannot reach this flange pose", "Write lengths in metres.")
     return joints
-
-
-def sweep_plan(robot: str, mount: Mount, joints_rad: Vector6) -> Plan:
-    """Swings about `joints_rad`, where they also end and where the camera must see the whole board."""
-    start = np.array(joints_rad)
-    poses = []
-    for number in range(SWINGS):
-        share = _SHARES[number] if number < SWINGS - 1 else 0.0
-        tilt = _TILT_RAD * share * np.array([0, 0, 0, 1, 1 if number % 2 else -1, 0])
-        target = start + tilt + WRIST_SWING_RAD * share * np.array([0, 0, 0, 0, 0, 1])
-        poses.append(PlannedPose(f"swing {number + 1}", vector6(target), why="turns, for the clocks"))
-    return Plan(
-        robot=robot,
-        mount=mount,
-        poses=tuple(poses),
-        motion="sweep",
-        joint_speed_rad_s=JOINT_SPEED_RAD_S,
-        joint_acceleration_rad_s2=JOINT_ACCELERATION_RAD_S2,
-        note="sweep about where the arm stood",
-    )

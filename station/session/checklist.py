@@ -201,7 +201,7 @@ def _clock_check(context: SessionContext) -> Check:
     )
     if frames.impossible:
         text += f", {frames.impossible} impossible stamps"
-        remedy = "the camera does not stamp the start of exposure: check its timestamp settings, then sweep"
+        remedy = "the camera does not stamp the start of exposure: check its timestamp settings"
         return Check("clocks", "warning", text, remedy)
     if bound_s > limit_s:
         if frames.clock is None:

@@ -1,20 +1,18 @@
-"""Carries out one approval: pose after pose, or swing after swing, until all are done or one fails."""
+"""Carries out one approval: pose after pose, until all are done or one fails."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import threading
 import time
 from collections.abc import Sequence
 
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.schema.messages import Image, Vector6
+from recordings.schema.messages import Vector6
 from station.cell.collision import CellGeometry
 from station.cell.errors import (
-    CameraError,
     LimitError,
     RobotError,
     SafetyStopError,
@@ -25,22 +23,17 @@ from station.cell.limits import check_path, with_plan_speeds
 from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError
-from station.devices.base import StreamingCamera
-from station.session.capture import PoseFailedError, show_frame, take_image, take_pose
+from station.session.capture import PoseFailedError, take_pose
 from station.session.context import RunRequests, SessionContext
 from station.session.lease import MotionApproval, require_start
 from station.session.queue import BUSY
-from station.session.recording import SessionRecording, to_the_end
+from station.session.recording import to_the_end
 
 log = logging.getLogger(__name__)
 
 ARRIVED_RAD = 1e-4
 """Nearer to its target than this the arm need not move."""
 FAILURES_IN_A_ROW = 3
-BREATH_S = 0.02
-"""Between two images of a sweep, for whatever else the loop has to do: the arm's heartbeat first of all."""
-SHOW_PERIOD_S = 0.1
-"""Period at which a streaming camera's newest image is shown."""
 
 
 class Run:
@@ -207,7 +200,7 @@ class Run:
             raise LimitError("; ".join(map(str, check.problems)), code="path")
         now = (await self._context.arm()).joints_rad
         moved_rad = float(np.abs(np.subtract(now, here)).max())
-        if moved_rad > JOGGED_RAD:  # after a swing it may settle by less than that
+        if moved_rad > JOGGED_RAD:  # less than that is settling
             text = f"The arm moved by {np.rad2deg(moved_rad):.1f}° while its path was checked."
             raise LimitError(text, code="arm-moved", moved_rad=moved_rad, limit_rad=JOGGED_RAD)
         await self._context.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
@@ -319,109 +312,3 @@ async def close_or_seal(context: SessionContext) -> None:
         context.store.problem(error, "error", said="not finished: {}")
         if context.store.state is not StationState.STOPPED:
             context.store.enter(StationState.FAULT, f"Recording: {error}", error.code)
-
-
-class SweepRun(Run):
-    """Swing after swing, images one after the other all the while.
-
-    Every swing is a pose of the plan: checked like one, and done once its images are on the disk.
-    """
-
-    def __init__(self, context: SessionContext, go: MotionApproval) -> None:
-        super().__init__(context, go)
-        self._taken, self._ended = 0, threading.Event()
-
-    async def _open_recording(self) -> None:
-        """StationError without the board in view: a sweep that sees none shows nothing."""
-        context = self._context
-        seen = await context.look_at(await take_image(context))
-        if not seen.status.found:
-            raise CameraError(
-                f"A sweep begins with the board in view: {seen.status.reason or 'no board in the image'}.",
-                code="no-board",
-                remedy="Move the arm to where the camera sees the whole board.",
-            )
-        await super()._open_recording()
-
-    async def _all_poses(self) -> None:
-        try:
-            async with asyncio.TaskGroup() as group:
-                group.create_task(self._take_pictures())
-                try:
-                    await super()._all_poses()
-                finally:
-                    self._ended.set()  # a camera may swallow being cancelled, just when its image comes
-        except ExceptionGroup as failed:
-            raise failed.exceptions[0] from None  # of two the first one tells the cause
-        if not self._context.requests.halt:
-            taken = self._taken
-            self._context.store.event("swept", f"{taken} images while the arm moved", images=taken)
-
-    async def _pose(self, index: int) -> None:
-        context, queue = self._context, self._context.require_queue()
-        queue.start_attempt(index)
-        try:
-            await self._move_to(index)
-        except LimitError as error:
-            self._give_up(error)
-            queue.mark(index, "failed", error)
-            return
-        context.store.enter(StationState.SETTLING)
-        await context.require_recording().sync()
-        queue.mark(index, "done")
-        await context.require_recording().save_state(queue)
-        context.show_poses(index)
-
-    async def _take_pictures(self) -> None:
-        """Until the arm rests, or the camera failed several times in a row."""
-        camera, recording, failures = self._context.cell.camera, self._context.require_recording(), 0
-        streaming = camera if isinstance(camera, StreamingCamera) and camera.free_running else None
-        while not self._ended.is_set():
-            if failures == FAILURES_IN_A_ROW:
-                text = "The camera fails again and again: the sweep ends with this swing."
-                self._give_up(CameraError(text, code="camera-fails", failures=failures))
-                return
-            before = self._taken
-            try:
-                if streaming is not None:
-                    await self._stream(streaming, recording)
-                else:
-                    show_frame(self._context, self._keep(recording, await camera.capture()))
-                    await asyncio.sleep(BREATH_S)
-            except CameraError as error:
-                failures = 1 if self._taken > before else failures + 1
-                self._context.store.problem(error, said="image: {}")
-            else:
-                failures = 0
-
-    def _keep(self, recording: SessionRecording, image: Image) -> Image:
-        """Numbered and handed to the recorder; RecordingError when that cannot keep up."""
-        numbered = recording.number(image)
-        recording.image(numbered)
-        self._taken += 1
-        return numbered
-
-    async def _stream(self, camera: StreamingCamera, recording: SessionRecording) -> None:
-        """Every frame, straight from the camera's thread; what is shown of them comes from the loop."""
-        newest: list[Image] = []
-
-        def keep(image: Image) -> None:
-            if not self._ended.is_set():  # the arm stopped while it was on its way
-                newest[:] = [self._keep(recording, image)]
-
-        async def show() -> None:
-            while True:
-                await asyncio.sleep(SHOW_PERIOD_S)
-                if newest:
-                    show_frame(self._context, newest[0])
-
-        showing = asyncio.create_task(show())
-        try:
-            await camera.stream(keep, self._ended)
-        finally:
-            showing.cancel()
-
-    def _give_up(self, error: StationError) -> None:
-        """The arm rests after this swing; a person decides."""
-        self._failures, self._why = FAILURES_IN_A_ROW, str(error)
-        self._context.store.problem(error, "error")

@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,7 +40,7 @@ from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
 from station.session.monitor import DeviceConnector, Previewer
 from station.session.queue import PoseQueue
 from station.session.recording import Logbook, SessionRecording
-from station.session.run import Run, SweepRun, close_or_seal, unmark_busy
+from station.session.run import Run, close_or_seal, unmark_busy
 from station.session.stop_test import prepare_stop_test
 from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.session.supervisor import SessionSupervisor
@@ -219,14 +219,10 @@ class Session:
         if go.begins is not None:
             context.queue = go.begins.queue
             context.show_poses()
-        drive = (go.beside or self._drive_poses)(go)
+        drive = go.beside(go) if go.beside else Run(context, go).drive()
         self.store.enter(StationState.CHECKING)
         self.store.event("approved", go.said, plan_sha256=go.summary.plan_sha256)
         self._run = asyncio.create_task(drive)
-
-    def _drive_poses(self, go: MotionApproval) -> Coroutine[object, object, None]:
-        sweeps = self.context.require_queue().plan.motion == "sweep"
-        return (SweepRun if sweeps else Run)(self.context, go).drive()
 
     def pause(self, who: str) -> None:
         """After this pose. Anyone may: it only ever makes the arm do less."""

@@ -62,6 +62,12 @@ def _open(queue: PoseQueue) -> tuple[int, ...]:
 
 async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple[str, ...]) -> MotionPreview:
     """Checks the whole path in the worker. LimitError: it is not free; RobotError: what the arm lacks."""
+    if offered.queue.plan.motion != "stops":
+        raise RefusedError(
+            "This plan is a sweep, and sweeps are gone.",
+            code="sweep",
+            remedy="Finish its session if one is open, then make a plan of poses.",
+        )
     try:
         require_free_space(context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
@@ -103,7 +109,7 @@ def motion_preview(
 async def _refused(context: SessionContext, plan: Plan, check: PlanCheck, start: Vector6) -> LimitError:
     """The plan is not free; where only the way to its first pose is not, it was made from another posture."""
     refused = LimitError(_problem_text(check), code="plan", problems=len(check.problems))
-    if plan.motion == "sweep" or not plan.poses or len(check.problems) > len(check.moves[0].problems):
+    if not plan.poses or len(check.problems) > len(check.moves[0].problems):
         return refused
     cell, first_rad = context.cell, plan.poses[0].joints_rad
     if (await context.workers.call(check_run, cell.config, plan, first_rad)).problems:
@@ -134,8 +140,6 @@ def _problem_text(check: PlanCheck) -> str:
 def _purpose_words(context: SessionContext, purpose: Purpose, poses: tuple[int, ...]) -> str:
     if purpose is Purpose.RETAKE:
         return f"retake pose {poses[0] + 1}"
-    if context.queue is not None and context.queue.plan.motion == "sweep":
-        return f"sweep: {len(poses)} slow swings without a stop, the camera running"
     if purpose is Purpose.DRIFT_CHECK:
         return "drift check of the installed calibration"
     if context.recording is None:

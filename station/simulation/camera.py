@@ -49,7 +49,7 @@ class RenderedCamera:
         self._frames: asyncio.Queue[Image | CameraError] = asyncio.Queue()
         self._answers: asyncio.Queue[Image | Json | CameraError] = asyncio.Queue()
         self._asking = asyncio.Lock()
-        self._clock = FrameClock(None if config is None else config.time_offset)
+        self._clock = FrameClock()
         self.counter = FrameCounter(FrameIds.BLOCK)
 
     @property

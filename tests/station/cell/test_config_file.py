@@ -108,6 +108,11 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
             f"board_guess: {{{PLACE}, sigma_rad: -0.1}}\nlimits:",
             "Expected `float` >= 0.0",
         ),
+        (
+            "device: KJ001",
+            "device: KJ001, time_offset: {offset_s: 0.002, sigma_s: 0.0001, source: latched}",
+            "camera.time_offset: frame times are not corrected",
+        ),
         ("limits:", "pointer: {tip_m: [0, 0, 200]}\nlimits:", "pointer.tip_m: further than"),
         ("limits:", "stillness: {timeout_s: 0}\nlimits:", "stillness.timeout_s"),
         ("limits:", "capture: {retries: -1}\nlimits:", "capture.retries: Expected `int` >= 0"),

@@ -141,7 +141,7 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
         (("serve",), 2, "usage"),
         (("serve", "--config", "absent.yaml"), 2, "unreadable-config"),
         (("status", "--socket", "/nowhere/s"), 1, "no-daemon"),
-        (("capture",), 2, "usage"),
+        (("capture", "--sweep"), 2, "gone"),
         (("capture", "--plan", "absent.yaml"), 2, "unreadable-plan"),
         (("tui",), 1, "no-terminal"),
         (("demo", "--out", __file__), 2, "not-a-folder"),

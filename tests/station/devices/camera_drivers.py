@@ -44,8 +44,6 @@ class Driver:
     """Opened before the camera, closed after it"""
     silence: Callable[[], AbstractAsyncContextManager[object]] | None = None
     """While it lasts the camera sends nothing; None: this one cannot be late"""
-    streams: Callable[[], Camera] | None = None
-    """Another camera over the same device, free-running; None: there is no such thing"""
     truth_ns: Callable[[Image], tuple[int, int]] | None = None
     """Host monotonic begin and end of its exposure, where what stands behind it knows"""
     ends: ExitStack = field(default_factory=ExitStack)
@@ -76,12 +74,10 @@ def aravis(request: pytest.FixtureRequest) -> Driver:
     ends = ExitStack()
     device = ends.enter_context(EmulatedCamera(size=SIZE))
     config = CameraConfig(device="127.0.0.1", exposure_us=1000.0)
-    free = msgspec.structs.replace(config, trigger="free-running", frame_rate_hz=100.0)
     return Driver(
         AravisCamera(config),
         None,
         lambda: silent(device),
-        lambda: AravisCamera(free),
         exposure_of(device),
         ends,
     )
@@ -95,9 +91,7 @@ def trigger_box(request: pytest.FixtureRequest) -> Driver:
     box = ends.enter_context(SimulatedTriggerBox(device.pulse))
     config = CameraConfig(device="127.0.0.1", exposure_us=1000.0, trigger="hardware")
     trigger = SerialTrigger(TriggerConfig(box.port))
-    return Driver(
-        AravisCamera(config, trigger), trigger, lambda: silent(device), None, exposure_of(device), ends
-    )
+    return Driver(AravisCamera(config, trigger), trigger, lambda: silent(device), exposure_of(device), ends)
 
 
 def exposure_of(device: EmulatedCamera) -> Callable[[Image], tuple[int, int]]:
@@ -154,14 +148,11 @@ def film(request: pytest.FixtureRequest) -> Driver:
         yield
         Film.stopped = False
 
-    def streams() -> Camera:
-        return WebcamCamera(msgspec.structs.replace(config, trigger="free-running"))
-
     def exposure(image: Image) -> tuple[int, int]:
         exposed_ns = int.from_bytes(image.pixels[0, :8].tobytes(), "little")
         return exposed_ns, exposed_ns
 
-    return Driver(WebcamCamera(config), None, silence, streams, exposure)
+    return Driver(WebcamCamera(config), None, silence, exposure)
 
 
 DRIVERS: dict[str, Callable[[pytest.FixtureRequest], Driver]] = {

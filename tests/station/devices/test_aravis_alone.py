@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import threading
 from types import SimpleNamespace
 from typing import Any
 
@@ -114,18 +112,6 @@ def opened(device: Device, config: CameraConfig, trigger: Any = None) -> AravisC
     camera: Any = AravisCamera(config, trigger)
     camera._device = device
     return camera  # type: ignore[no-any-return]
-
-
-async def test_a_stream_outlives_a_bad_frame_and_ends_with_its_camera() -> None:
-    device, stop = Device(), threading.Event()
-    camera = opened(device, CameraConfig(trigger="free-running"))
-    streaming = asyncio.ensure_future(camera.stream(lambda picture: None, stop))
-    await asyncio.sleep(0.05)
-    assert not streaming.done()
-    device.lost, device.close, camera._open = True, stop.set, lambda: None  # type: ignore[method-assign]
-    with pytest.raises(CameraError):
-        await asyncio.wait_for(streaming, 5.0)
-    await camera.close()
 
 
 async def test_a_preview_fires_no_trigger_box() -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, suppress
@@ -18,7 +17,7 @@ import pytest
 
 from recordings.schema.messages import Image
 from station.cell.errors import CameraError
-from station.devices.base import Camera, StreamingCamera
+from station.devices.base import Camera
 from station.simulation.launch import SimulatedController, start_controller
 from tests.station.devices.camera_drivers import DRIVERS, Driver
 
@@ -162,28 +161,3 @@ async def test_a_camera_that_was_closed_is_the_same_one_when_opened_again(driver
     async with opened(driver) as camera:
         image = await camera.capture()
         assert camera.identity.serial == serial and image.sequence == 1, "numbers go on"
-
-
-async def test_what_comes_by_itself_comes_in_order_until_told_to_end(driver: Driver) -> None:
-    if driver.streams is None:
-        pytest.skip("every picture of this one is triggered")
-    images: list[Image] = []
-    stop = threading.Event()
-
-    def keep(image: Image) -> None:
-        images.append(image)
-        if len(images) == 10:
-            stop.set()
-
-    async with opened(driver, driver.streams()) as camera:
-        assert isinstance(camera, StreamingCamera) and camera.free_running
-        await asyncio.wait_for(camera.stream(keep, stop), 20.0)
-        asked_ns = time.monotonic_ns()
-        newest = await camera.capture()
-        require_answer(driver, newest, asked_ns, time.monotonic_ns())
-    assert [image.sequence for image in images] == list(range(len(images))) and len(images) >= 10
-    assert newest.sequence == len(images)
-    for image in images:
-        require_sound(image)
-    arrivals = [image.stamps.host_monotonic_ns for image in images]
-    assert all(a < b for a, b in pairwise(arrivals))

@@ -21,8 +21,6 @@ WEAKNESSES = (
     "slow-braking",
     "stop-ignored-once",
     "swings-back",
-    "resumes-after-slider",
-    "goes-on-after-cut",
     "hidden-protective-stop",
     "drifts-at-rest",
     "too-fast",
@@ -61,13 +59,11 @@ class WeakArm(SimulatedArm):
 
 class WeakRobot(SimulatedRobot):
     weakness = ""
-    is_cut: Callable[[], bool] = staticmethod(lambda: False)
 
     def __init__(self, *settings: Any) -> None:
         super().__init__(*settings)
         self.arm.__class__ = WeakArm
         self.weak_arm.weakness = self.weakness
-        self._kept: tuple[MakePath, float, float] | None = None
 
     @property
     def weak_arm(self) -> WeakArm:
@@ -77,13 +73,8 @@ class WeakRobot(SimulatedRobot):
     def tick(self, monotonic_ns: int, late: bool = False) -> None:
         if self.weakness == "late-watchdog" and self.watchdog_s:
             self.watchdog_s = LATE_S
-        if self.weakness == "goes-on-after-cut" and self.is_cut():
-            self.watchdog_s = 0.0
         super().tick(monotonic_ns, late)
         arm = self.weak_arm
-        if self._kept is not None and self.slider > 0:
-            arm.start(*self._kept)
-            self._kept = None
         if arm.braked and not arm.moving:
             self._rests()
 
@@ -108,8 +99,6 @@ class WeakRobot(SimulatedRobot):
         moving = arm.motion
         if arm.moving:
             self.last_speed = arm.command_speed[0]
-        if self.weakness == "resumes-after-slider" and moving is not None and self.slider == 0:
-            self._kept = (moving.make_path, moving.speed, moving.acceleration)
         super().stop_program(reason)
         if self.weakness == "hidden-protective-stop" and moving is not None and self.safe:
             self.protective_stop(reason)
@@ -129,15 +118,7 @@ def main(arguments: list[str]) -> int:
     at = arguments.index("--weakness")
     kind = weak(arguments[at + 1])
 
-    class Machine(machine.Machine):
-        def __init__(self, *settings: Any) -> None:
-            super().__init__(*settings)
-            service = self.rtde.service
-            assert isinstance(self.robot, WeakRobot)
-            self.robot.is_cut = lambda: service.silent
-
     vars(machine)["SimulatedRobot"] = kind
-    vars(__main__)["Machine"] = Machine
     return __main__.main([*arguments[:at], *arguments[at + 2 :]])
 
 

@@ -27,26 +27,14 @@ PAYLOAD_TOLERANCE = 0.005
 class StopWay(StrEnum):
     """Ways to end a move of the acceptance test."""
 
-    ARRIVE = "arrive"
-    """Nothing: it arrives."""
     CONTROL = "control"
     """STOP by the control process alone."""
     DASHBOARD = "dashboard"
     """STOP by the dashboard alone."""
-    BOTH = "both"
-    """STOP by both at once, as the station does it."""
     KILLED = "control-killed"
     """The control process is killed."""
     FROZEN = "daemon-frozen"
     """The daemon's working loop stands still for a second: the watchdog alone is left."""
-    NETWORK = "network-cut"
-    """A person pulls the robot's network cable, and plugs it in again."""
-    SLIDER = "slider"
-    """The speed slider stands at 0 until the move is given up; then a person raises it."""
-
-
-BY_PERSON = frozenset({StopWay.NETWORK, StopWay.SLIDER})
-"""Ways that only a person at the robot can use."""
 
 
 class ArmSubject(msgspec.Struct, frozen=True):
@@ -93,7 +81,7 @@ class StopTestOffer(msgspec.Struct, frozen=True):
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """One measured figure of a stop against its limit."""
+    """One measured figure of a stop against the most that it may be."""
 
     name: str
     value: float | None
@@ -102,43 +90,44 @@ class Figure(msgspec.Struct, frozen=True):
     limit: float
     source: str
     """Where the limit comes from."""
-    least: bool = False
-    """The limit is the least that passes, not the most."""
 
     @property
     def passed(self) -> bool:
-        if self.value is None:
-            return False
-        return self.value >= self.limit if self.least else self.value <= self.limit
+        return self.value is not None and self.value <= self.limit
 
 
 class StopResult(msgspec.Struct, frozen=True):
     """One move of the test, and how it ended."""
 
-    way: StopWay
+    way: str
+    """A `StopWay`, or one of an earlier release."""
     speed_m_s: float
     """Speed of the fastest modelled point, as approved."""
     figures: tuple[Figure, ...]
     repeated: int = 0
-    """Moves before it that ended before their stop was given: the computer was too busy. Not judged."""
+    """Moves before it that were not measured."""
+    not_measured: str = ""
+    """Why it tells nothing of the arm; empty: it was measured."""
 
     @property
     def failed(self) -> tuple[Figure, ...]:
         return tuple(figure for figure in self.figures if not figure.passed)
 
+    @property
+    def passed(self) -> bool:
+        return not self.not_measured and not self.failed
 
-class Acceptance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+
+class Acceptance(msgspec.Struct, frozen=True):
     """One test of an arm, whether it passed or not."""
 
     subject: ArmSubject
     accepted: bool
     speed_m_s: float
-    """The fastest stage that passed; 0: none."""
+    """Speed up to which it is accepted."""
     wall_ns: int
     who: str
     results: tuple[StopResult, ...]
-    report: str = ""
-    """Its page, beside this file."""
     format: str = "arm-acceptance/1"
 
 

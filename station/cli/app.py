@@ -73,7 +73,7 @@ STATION = LazyGroup(
         ),
         "accept": LazyCommand(
             "station.cli.accept:accept_command",
-            ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.05"),
+            ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.25"),
         ),
         "new": LazyCommand("station.cli.new:new_command", ("station new", "station new -o station.yaml")),
         "doctor": LazyCommand(

@@ -108,12 +108,15 @@ class Attended:
 
 @contextlib.asynccontextmanager
 async def attended(
-    socket: Path | None, headless: bool = False, approved: str = "", quiet: bool = False
+    socket: Path | None, headless: bool = False, approved: str = "", quiet: bool = False, camera: bool = True
 ) -> AsyncIterator[Attended]:
-    """Control of the cell that serves `socket`, its devices connected. Ctrl-C stops what was approved."""
+    """Control of the cell that serves `socket`, its devices connected. Ctrl-C stops what was approved.
+
+    `camera`: it is needed, too.
+    """
     path = socket or default_socket()
     async with await Client.connect(path) as client:
-        simulated = (await wait_until_idle(client)).simulated
+        simulated = (await wait_until_idle(client, camera=camera)).simulated
         await client.call(Lease("take"))
         shell = Attended(path, client, simulated, headless, approved, quiet)
         try:

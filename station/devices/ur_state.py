@@ -307,15 +307,6 @@ class TraceRecorder:
         await self._close()
         return self._states
 
-    @property
-    def newest(self) -> RobotState | None:
-        return self._states[-1] if self._states else None
-
-    def silent_s(self) -> float:
-        """Time since the last sample came."""
-        newest = self.newest
-        return (time.monotonic_ns() - newest.stamps.host_monotonic_ns) / 1e9 if newest else 0.0
-
     async def _open(self) -> None:
         states = self._states
         self._reader = reader = StateReader(self._host, states.append, lambda _: None)

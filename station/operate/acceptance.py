@@ -1,7 +1,7 @@
-"""The acceptance test of an arm: one approved move after the other, each ended in one way and judged.
+"""The acceptance test of an arm: one approved move for each way to stop, judged by the controller's samples.
 
-It begins slowly, is faster only after all ways passed, and ends with the first figure beyond its limit. It
-clears nothing: after a protective stop a person stands at the pendant.
+It ends with the first figure beyond its limit, and clears nothing: after a protective stop a person stands at
+the pendant. A stop that could not be measured says nothing of the arm, and is told as that.
 """
 
 from __future__ import annotations
@@ -14,38 +14,21 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import (
-    BY_PERSON,
-    STOP_GIVEN,
-    STOP_TESTED,
-    Acceptance,
-    ArmSubject,
-    StopResult,
-    StopWay,
-)
+from station.cell.acceptance import STOP_GIVEN, Acceptance, ArmSubject, StopResult, StopWay
 from station.cell.errors import RefusedError, StationError
-from station.cell.status import MotionPreview, StationState
+from station.cell.status import MotionPreview
 from station.operate.motion import Link, approved_motion
 from station.operate.stop_judge import WATCHED_S, StopMove, judge
 from station.protocol.client import DaemonGoneError
 from station.protocol.states import RUNNING
 from station.protocol.verbs import StopTest
 
-SPEEDS_M_S = (0.05, 0.1, 0.25)
-"""Stages: the next one only after the slower one passed."""
-PERSON_SPEED_M_S = 0.03
-MOVE_S, PERSON_MOVE_S = 3.0, 10.0
-"""Durations of the moves; longer where a person must act in the middle of one."""
 AFTER_S = WATCHED_S + 1.0
 """The arm is watched for so long after the move's end."""
 PREPARE_S = 60.0
 END_S = 40.0
-BACK_S = 120.0
-"""A person has this long to plug the cable in again, or to raise the slider."""
 TRIES = 3
-BUSY = frozenset({"watchdog-computer", "no-heartbeat", "move-refused"})
-"""Causes that end a move when this computer is too busy."""
-_LOOK_S = 0.1
+"""Moves for one way, until one is measured."""
 
 
 class StateRecorder(Protocol):
@@ -54,11 +37,6 @@ class StateRecorder(Protocol):
     async def begin(self) -> None: ...
 
     async def end(self) -> list[RobotState]: ...
-
-    @property
-    def newest(self) -> RobotState | None: ...
-
-    def silent_s(self) -> float: ...
 
 
 class PersonAtArm(Protocol):
@@ -70,26 +48,8 @@ class PersonAtArm(Protocol):
     async def approves(self, preview: MotionPreview) -> bool:
         """One move."""
 
-    async def before(self, way: StopWay) -> None:
-        """Ask for what must be so before the move: the slider at 0."""
-
-    async def meanwhile(self, way: StopWay) -> None:
-        """The move is under way: the network cable is to be pulled now."""
-
-    async def afterwards(self, way: StopWay) -> None:
-        """Ask for the cable to be plugged in again, or the slider to be raised."""
-
-    def judged(self, tested: JudgedStop) -> None:
+    def judged(self, result: StopResult) -> None:
         """Tell how one move ended."""
-
-
-@dataclass(frozen=True, eq=False)
-class JudgedStop:
-    """One move: its result, and what it is judged by."""
-
-    result: StopResult
-    move: StopMove
-    states: Sequence[RobotState]
 
 
 @dataclass
@@ -99,62 +59,52 @@ class AcceptanceTest:
     link: Link
     person: PersonAtArm
     recorder: StateRecorder
+    speed_m_s: float
     joint: int = 0
-    speeds_m_s: Sequence[float] = SPEEDS_M_S
     ways: Sequence[StopWay] = tuple(StopWay)
-    stops: list[JudgedStop] = field(default_factory=list)
+    results: list[StopResult] = field(default_factory=list)
     subject: ArmSubject | None = None
     _forward: bool = True
-    _passed_m_s: float = 0.0
 
     async def run(self) -> Acceptance:
-        """Test until all passed, one failed, or the person ends it. StationError: no move was possible."""
+        """Test until all was tried, one failed, or the person ends it. StationError: no move was possible."""
         if not await self.person.holds_emergency_stop():
             raise RefusedError(
                 "Nothing moved: nobody holds the emergency stop.",
                 code="no-emergency-stop",
                 remedy="Take the pendant into your hand, then begin again.",
             )
-        for speed_m_s in self.speeds_m_s:
-            slowest = speed_m_s == self.speeds_m_s[0]
-            for way in self.ways:
-                if way in BY_PERSON and not slowest:
-                    continue  # a person's hand is no quicker
-                if not await self._tested(way, speed_m_s):
-                    return self.outcome(False)
-            self._passed_m_s = speed_m_s
-        return self.outcome(set(self.ways) == set(StopWay))
+        for way in self.ways:
+            if not await self._tested(way):
+                break
+        return self.outcome()
 
-    def outcome(self, accepted: bool) -> Acceptance:
+    def outcome(self) -> Acceptance:
         """All that was found until now. RefusedError when nothing was."""
         if self.subject is None:
             raise RefusedError("Nothing moved: no move was approved.", code="not-approved")
-        results = tuple(stop.result for stop in self.stops)
+        passed = {result.way for result in self.results if result.passed}
+        accepted = passed == set(StopWay)
+        speed_m_s = self.speed_m_s if accepted else 0.0
         who = getpass.getuser()
-        return Acceptance(self.subject, accepted, self._passed_m_s, time.time_ns(), who, results)
+        return Acceptance(self.subject, accepted, speed_m_s, time.time_ns(), who, tuple(self.results))
 
-    async def _tested(self, way: StopWay, speed_m_s: float) -> bool:
-        """False: it failed, or was not approved.
-
-        A move that ended before its stop was given says nothing of that stop: it is asked for once more.
-        """
+    async def _tested(self, way: StopWay) -> bool:
+        """False: it failed, or was not approved. What was not measured is asked for again, a few times."""
         for tries in range(TRIES):
-            passed = await self._move(way, speed_m_s, tries)
-            if passed is not None:
-                return passed
-        raise StationError(
-            f"{way.value}: {TRIES} moves ended before the stop was given.",
-            code="not-measured",
-            remedy="Reduce the load of this computer, then begin again.",
-            tries=TRIES,
-        )
+            result = await self._move(way, tries)
+            if result is None:
+                return False
+            if not result.not_measured or tries == TRIES - 1:
+                self.results.append(result)
+            self.person.judged(result)
+            if not result.not_measured:
+                return result.passed
+        return True
 
-    async def _move(self, way: StopWay, speed_m_s: float, tries: int) -> bool | None:
-        """None: it was not measured."""
-        await self.person.before(way)
-        by_person = way in BY_PERSON
-        slow_m_s, long_s = (PERSON_SPEED_M_S, PERSON_MOVE_S) if by_person else (speed_m_s, MOVE_S)
-        request = StopTest(way, self.joint, min(slow_m_s, speed_m_s), long_s, self._forward)
+    async def _move(self, way: StopWay, tries: int) -> StopResult | None:
+        """None: it was not approved."""
+        request = StopTest(way, self.speed_m_s, self.joint, self._forward)
         offer = await self.link.call(request, timeout_s=PREPARE_S)
         self._forward = not self._forward
         if self.subject is not None and (changed := self.subject.difference(offer.subject)):
@@ -172,38 +122,19 @@ class AcceptanceTest:
             return approved
 
         if not await approved_motion(self.link, offer.go, approves):
-            return False
+            return None
         try:
-            measured, moment_ns = await self._watched(way)
+            moment_ns = await self._ended(time.time_ns())
+            await asyncio.sleep(AFTER_S)
         finally:
             states = await self.recorder.end()
-        if not measured:
-            self._forward = not self._forward
-            return None
-        move = StopMove(way, offer.joint, offer.target_rad, offer.speed_rad_s, moment_ns)
-        result = StopResult(way, offer.go.top_speed_m_s, judge(states, move), tries)
-        stop = JudgedStop(result, move, states)
-        self.stops.append(stop)
-        self.person.judged(stop)
-        return not stop.result.failed
+        figures, not_measured = judge(
+            states, StopMove(way, offer.joint, offer.target_rad, offer.speed_rad_s, moment_ns)
+        )
+        return StopResult(way, offer.go.top_speed_m_s, figures, tries, not_measured)
 
-    async def _watched(self, way: StopWay) -> tuple[bool, int | None]:
-        """As `_ended`, once the arm was watched at rest."""
-        begun_ns = time.time_ns()
-        if way is StopWay.NETWORK:
-            await self.person.meanwhile(way)
-        end = await self._ended(way, begun_ns)
-        if way in BY_PERSON:
-            await self.person.afterwards(way)
-            await self._back(way)
-        await asyncio.sleep(AFTER_S)
-        return end
-
-    async def _ended(self, way: StopWay, begun_ns: int) -> tuple[bool, int | None]:
-        """By the station's account: whether it was measured, and when the stop was given (host monotonic).
-
-        What holds the arm is always measured, and so is every stop that was given.
-        """
+    async def _ended(self, begun_ns: int) -> int | None:
+        """When the stop was given (host monotonic), by the station's account; None: the move ended before."""
         moment_ns: int | None = None
         try:
             async with asyncio.timeout(END_S):
@@ -212,35 +143,9 @@ class AcceptanceTest:
                         if event.code == STOP_GIVEN and event.wall_ns >= begun_ns:
                             moment_ns = int(event.values["moment_ns"])  # type: ignore[arg-type]
                     if status.state not in RUNNING:
-                        mine = [e for e in status.events if e.code == STOP_TESTED and e.wall_ns >= begun_ns]
-                        if status.state is not StationState.IDLE or moment_ns is not None:
-                            return True, moment_ns
-                        ended = bool(mine) and mine[-1].values["ended_by"] not in BUSY
-                        return ended and way in (StopWay.ARRIVE, *BY_PERSON), None
+                        return moment_ns
         except TimeoutError:
             raise StationError(
                 "The move did not end.", code="no-end", remedy="Press the emergency stop.", limit_s=END_S
             ) from None
         raise DaemonGoneError("The daemon ended during the test.")
-
-    async def _back(self, way: StopWay) -> None:
-        """Waits until the network is there again, or the slider is up. RefusedError after a while."""
-        give_up_s = time.monotonic() + BACK_S
-        while time.monotonic() < give_up_s:
-            await asyncio.sleep(_LOOK_S)
-            newest = self.recorder.newest
-            if way is StopWay.SLIDER and newest is not None and newest.target_speed_fraction > 0.99:
-                return
-            if way is StopWay.NETWORK and self.recorder.silent_s() < _LOOK_S and await self._connected():
-                return
-        raise RefusedError(
-            f"{way.value}: the robot was not back within {BACK_S:.0f} s.",
-            code="not-back",
-            remedy="Check cable and slider, then begin again.",
-            limit_s=BACK_S,
-        )
-
-    async def _connected(self) -> bool:
-        async for status in self.link.statuses():
-            return status.state is StationState.IDLE and status.robot.connected
-        return False

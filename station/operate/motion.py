@@ -59,14 +59,15 @@ async def status_now(socket: Path) -> StationStatus:
     raise DaemonGoneError("The daemon ended before it told its status.", remedy="Start it again.")
 
 
-async def wait_until_idle(link: Link) -> StationStatus:
+async def wait_until_idle(link: Link, *, camera: bool = True) -> StationStatus:
     """The status once robot and camera are there. RefusedError names what does not come."""
     status, told = StationStatus(), False
     with contextlib.suppress(TimeoutError):
         async with timeout(CONNECT_WAIT_S):
             async for status in link.statuses():
                 told = status.playback or status.robot.joints_rad is not None
-                if status.state is not StationState.DISCONNECTED and status.camera.connected and told:
+                there = status.camera.connected or not camera
+                if status.state is not StationState.DISCONNECTED and there and told:
                     return status
     missing = "camera" if status.robot.connected and told else "robot"
     raise RefusedError(

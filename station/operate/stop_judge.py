@@ -35,20 +35,17 @@ _WATCHDOG_RULE = "0.2 s watchdog, kicked by a heartbeat of at most 0.1 s age, an
 REACTION_S: dict[StopWay, tuple[float, str]] = {
     StopWay.CONTROL: (0.1 + CONTROLLER_S, _STOP_RULE),
     StopWay.DASHBOARD: (0.1 + CONTROLLER_S, _STOP_RULE),
-    StopWay.BOTH: (0.1 + CONTROLLER_S, _STOP_RULE),
     StopWay.KILLED: (0.2 + CONTROLLER_S, "0.2 s watchdog, whatever else stops it, and 0.05 s"),
     StopWay.FROZEN: (0.3 + CONTROLLER_S, _WATCHDOG_RULE),
-    StopWay.NETWORK: (0.3 + CONTROLLER_S, _WATCHDOG_RULE),
 }
 """Longest time until the arm is slower, and why."""
 _BRAKES = "brakes with at least 2 rad/s², half of what the station asks for"
 ABRUPT = 8.0, "twice the 4 rad/s² that the station asks for"
 REPEATS_RAD = 0.001, "ten times a UR's repeatability (0.1 mm at 1.3 m)"
 BACK_RAD = 0.002, "twenty times a UR's repeatability"
-ARRIVED_RAD = 0.01, "the station's own word for arrived"
-GAP_S = 0.04, "five cycles of a CB3: what falls between is not judged"
-CUT_S = 1.0, "the watchdog must end the move while the network is cut"
-SLIDER_UP_S = 1.5, "it is watched after the slider was raised"
+GAP_S = 0.04
+"""Five cycles of a CB3: with less news than that a stop is not measured."""
+FEWEST_SAMPLES = 50
 
 
 @dataclass(frozen=True)
@@ -62,20 +59,8 @@ class StopMove:
     """Goal of that joint."""
     speed_rad_s: float
     """Planned speed of that joint."""
-    moment_ns: int | None = None
-    """Time of the stop (host monotonic); None: it is found in the trace."""
-
-
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """Motion of the joint that moved, for the judge and for the report."""
-
-    time_s: Array
-    """(n,) the controller's, 0 at the moment of the stop"""
-    angle_rad: Array
-    """(n,) from where it began, in the direction of the move"""
-    speed_rad_s: Array
-    """(n,) along the same"""
+    moment_ns: int | None
+    """Time of the stop (host monotonic); None: it was not given."""
 
 
 class Trace:
@@ -88,13 +73,9 @@ class Trace:
         self.ahead_s = float(np.min(host_s - self.time_s)) if len(states) else 0.0
         self.joints = np.array([s.joints_rad for s in states]).reshape(-1, 6)
         self.speeds = np.array([s.joint_speeds_rad_s for s in states]).reshape(-1, 6)
-        self.slider = np.array([s.target_speed_fraction for s in states])
         self.held = np.array([_held(s) for s in states], dtype=bool)
         self.direction = float(np.sign(move.target_rad - self.joints[0, move.joint])) if len(states) else 1.0
-        gaps = np.diff(self.time_s)
-        self.widest = int(np.argmax(gaps)) if len(gaps) else 0
-        """The sample before the longest gap."""
-        self.gap_s = float(gaps.max(initial=0.0))
+        self.gap_s = float(np.diff(self.time_s).max(initial=0.0))
 
     @property
     def fastest(self) -> Array:
@@ -104,39 +85,47 @@ class Trace:
     @property
     def moment_s(self) -> float:
         """Time of the stop on the controller's clock."""
-        if self.move.moment_ns is not None:
-            return self.move.moment_ns / 1e9 - self.ahead_s
-        if self.move.way is StopWay.NETWORK:
-            return float(self.time_s[self.widest])
-        return float(self.time_s[-1])
-
-    def curve(self) -> Curve:
-        joint = self.move.joint
-        gone = self.direction * (self.joints[:, joint] - self.joints[0, joint])
-        return Curve(self.time_s - self.moment_s, gone, self.direction * self.speeds[:, joint])
+        if self.move.moment_ns is None:
+            return float(self.time_s[-1])
+        return self.move.moment_ns / 1e9 - self.ahead_s
 
 
-def judge(states: Sequence[RobotState], move: StopMove) -> tuple[Figure, ...]:
-    """All figures of this move. No samples, or none where they are needed, is a failed figure too."""
-    figures = [Figure("samples", len(states), "", 50, "fewer tell nothing", least=True)]
-    if len(states) < 50:
-        return tuple(figures)
+def judge(states: Sequence[RobotState], move: StopMove) -> tuple[tuple[Figure, ...], str]:
+    """All figures of this move, or why it was not measured.
+
+    What a gap in the samples cannot feign fails all the same: safety that holds the arm, and too much speed.
+    """
+    if len(states) < FEWEST_SAMPLES:
+        return (), f"{len(states)} samples of the arm came (≥ {FEWEST_SAMPLES})"
     trace = Trace(states, move)
-    if move.way is not StopWay.NETWORK:
-        figures.append(Figure("longest gap", trace.gap_s, "s", *GAP_S))
-    figures.append(Figure("held by safety", float(trace.held.sum()), "samples", 0, "no stop may end in one"))
     top = float(np.abs(trace.speeds).max())
-    figures.append(
-        Figure("top speed", top, "rad/s", 1.1 * move.speed_rad_s + RESTING_RAD_S, "10 % above the approved")
+    always = (
+        Figure("held by safety", float(trace.held.sum()), "samples", 0, "no stop may end in one"),
+        Figure("top speed", top, "rad/s", 1.1 * move.speed_rad_s + RESTING_RAD_S, "10 % above the approved"),
     )
-    if move.way is StopWay.SLIDER:
-        figures += _slider(trace)
-    elif move.way is StopWay.ARRIVE:
-        short = float(abs(trace.joints[-1, move.joint] - move.target_rad))
-        figures += [Figure("short of the target", short, "rad", *ARRIVED_RAD), *_after_rest(trace, 0)]
-    else:
-        figures += _stop(trace)
-    return tuple(figures)
+    moment = min(int(np.searchsorted(trace.time_s, trace.moment_s)), len(trace.time_s) - 1)
+    rest = rest_index(trace.time_s, trace.fastest, moment)
+    if why := _not_measured(trace, moment, rest):
+        failed = tuple(figure for figure in always if not figure.passed)
+        return failed, "" if failed else why
+    return (*always, *_stop(trace, moment, rest)), ""
+
+
+def _not_measured(trace: Trace, moment: int, rest: int | None) -> str:
+    """Why this move says nothing of the stop; empty: it does."""
+    move = trace.move
+    if trace.gap_s > GAP_S:
+        return f"no news of the arm for {trace.gap_s:.3f} s (≤ {GAP_S:g}): computer or network is busy"
+    speed = _speed_at(trace, moment)
+    if move.moment_ns is None or speed < 0.5 * move.speed_rad_s:
+        return f"the arm turned with {speed:.2f} of {move.speed_rad_s:.2f} rad/s when it was stopped"
+    if rest is not None and (watched_s := float(trace.time_s[-1] - trace.time_s[rest])) < WATCHED_S:
+        return f"the arm was watched at rest for {watched_s:.1f} s (≥ {WATCHED_S:g})"
+    return ""
+
+
+def _speed_at(trace: Trace, moment: int) -> float:
+    return float(trace.fastest[max(0, moment - 2) : moment + 1].max())
 
 
 def _held(state: RobotState) -> bool:
@@ -145,35 +134,23 @@ def _held(state: RobotState) -> bool:
     return unsafe or state.robot_mode != RUNNING
 
 
-def _stop(trace: Trace) -> list[Figure]:
-    move, fastest = trace.move, trace.fastest
-    cut = move.way is StopWay.NETWORK
-    moment = min(int(np.searchsorted(trace.time_s, trace.moment_s)), len(fastest) - 1)
-    speed = float(fastest[max(0, moment - 2) : moment + 1].max())
-    slow = 0.5 * move.speed_rad_s
-    figures = [
-        Figure("speed at the stop", speed, "rad/s", slow, "half of the planned one: it moved", least=True)
-    ]
-    reaction_s, why = REACTION_S[move.way]
-    after = fastest[moment + cut :]
-    obeyed = np.flatnonzero(after < max(SLOWER * speed, RESTING_RAD_S))
-    obeyed_s = float(trace.time_s[moment + cut + obeyed[0]] - trace.moment_s) if len(obeyed) else None
-    rest = rest_index(trace.time_s, fastest, moment + cut)
+def _stop(trace: Trace, moment: int, rest: int | None) -> list[Figure]:
+    fastest, speed = trace.fastest, _speed_at(trace, moment)
+    reaction_s, why = REACTION_S[trace.move.way]
+    obeyed = np.flatnonzero(fastest[moment:] < max(SLOWER * speed, RESTING_RAD_S))
+    obeyed_s = float(trace.time_s[moment + obeyed[0]] - trace.moment_s) if len(obeyed) else None
     rest_s = float(trace.time_s[rest] - trace.moment_s) if rest is not None else None
-    if cut:
-        figures.append(Figure("cut", trace.gap_s, "s", *CUT_S, least=True))
-    else:
-        figures.append(Figure("reaction", obeyed_s, "s", reaction_s, why))
-        limit_s = reaction_s + speed / BRAKING_RAD_S2 + CONTROLLER_S
-        figures.append(Figure("rest", rest_s, "s", limit_s, f"the reaction's limit, then {_BRAKES}"))
-        figures.append(Figure("deceleration", _deceleration(trace, moment), "rad/s²", *ABRUPT))
+    limit_s = reaction_s + speed / BRAKING_RAD_S2 + CONTROLLER_S
     limit_rad = speed * reaction_s + speed**2 / (2 * BRAKING_RAD_S2) + BACK_RAD[0]
     gone = np.abs(trace.joints[moment:] - trace.joints[moment]).max(axis=1)
     source = f"{speed:.2f} rad/s for the reaction's limit, then {_BRAKES}"
-    figures.append(Figure("distance", float(gone.max()), "rad", limit_rad, source))
-    if rest is not None:
-        figures += _after_rest(trace, rest)
-    return figures
+    figures = [
+        Figure("reaction", obeyed_s, "s", reaction_s, why),
+        Figure("rest", rest_s, "s", limit_s, f"the reaction's limit, then {_BRAKES}"),
+        Figure("deceleration", _deceleration(trace, moment), "rad/s²", *ABRUPT),
+        Figure("distance", float(gone.max()), "rad", limit_rad, source),
+    ]
+    return figures if rest is None else [*figures, *_after_rest(trace, rest)]
 
 
 def rest_index(time_s: Array, fastest: Array, start: int) -> int | None:
@@ -200,30 +177,11 @@ def _deceleration(trace: Trace, moment: int) -> float:
 
 def _after_rest(trace: Trace, rest: int) -> list[Figure]:
     """Judge that it neither swings back nor drifts nor goes on, for as long as it is watched."""
-    if trace.move.way is StopWay.ARRIVE:
-        found = rest_index(trace.time_s, trace.fastest, int(np.argmax(trace.fastest)))
-        rest = len(trace.time_s) - 1 if found is None else found
-    watched_s = float(trace.time_s[-1] - trace.time_s[rest])
     settled = min(int(np.searchsorted(trace.time_s, trace.time_s[rest] + REST_S)), len(trace.time_s) - 1)
     drift = float(np.abs(trace.joints[settled:] - trace.joints[settled]).max())
-    gone = trace.curve().angle_rad
+    gone = trace.direction * trace.joints[:, trace.move.joint]
     back = float(gone[: settled + 1].max() - gone[settled])
     return [
-        Figure("watched at rest", watched_s, "s", WATCHED_S, "shorter tells no drift", least=True),
         Figure("back after the stop", back, "rad", *BACK_RAD),
         Figure("drift at rest", drift, "rad", *REPEATS_RAD),
-    ]
-
-
-def _slider(trace: Trace) -> list[Figure]:
-    """The arm stands while the slider does, and after it was raised."""
-    still = trace.slider <= 0.005
-    up = np.flatnonzero(~still)
-    raised_s = 0.0
-    if still.any() and len(up) and up[-1] > np.flatnonzero(still)[0]:
-        raised_s = float(trace.time_s[-1] - trace.time_s[up[up > np.flatnonzero(still)[0]][0]])
-    moved = float(np.abs(trace.joints - trace.joints[0]).max())
-    return [
-        Figure("slider raised", raised_s, "s", *SLIDER_UP_S, least=True),
-        Figure("moved", moved, "rad", *REPEATS_RAD),
     ]

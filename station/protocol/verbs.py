@@ -241,11 +241,9 @@ class StopTest(Verb[StopTestOffer], frozen=True):
     states = frozenset({S.IDLE})
     spoken = "a stop test"
     way: StopWay
-    joint: Annotated[int, msgspec.Meta(ge=0, le=5)] = 0
-    speed_m_s: Annotated[float, msgspec.Meta(gt=0, le=0.25)] = 0.05
+    speed_m_s: Annotated[float, msgspec.Meta(gt=0, le=0.25)]
     """Speed of the fastest modelled point."""
-    duration_s: Annotated[float, msgspec.Meta(ge=1, le=12)] = 3.0
-    """Duration of the whole move, as far as its path is free."""
+    joint: Annotated[int, msgspec.Meta(ge=0, le=5)] = 0
     forward: bool = True
     """The direction that is tried first."""
 

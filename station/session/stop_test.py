@@ -35,23 +35,27 @@ FROZEN_S = 1.0
 _MIDDLE = 0.5
 """Share of the turn after which the stop is given."""
 _LOOK_S = 0.002
-_SLIDER_ZERO, _SLIDER_FULL = 0.005, 0.99
+_SLIDER_FULL = 0.99
+MOVE_S = 3.0
+"""Duration of the whole move, as far as its path is free."""
 _WORDS = {
-    StopWay.ARRIVE: "arrives",
     StopWay.CONTROL: "is stopped by the control process alone",
     StopWay.DASHBOARD: "is stopped by the dashboard alone",
-    StopWay.BOTH: "is stopped by both at once",
     StopWay.KILLED: "ends as the control process is killed",
     StopWay.FROZEN: "ends as the daemon stands still for 1 s: the watchdog alone stops it",
-    StopWay.NETWORK: "ends as you pull the robot's network cable",
-    StopWay.SLIDER: "waits at slider 0 and is given up after 10 s",
 }
 
 
 async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) -> tuple[Drive, StopTestOffer]:
     """RefusedError, LimitError and RobotError say what is in the way. Nothing moves."""
     state = await context.arm()
-    _require_slider(request.way, state.target_speed_fraction)
+    if (fraction := state.target_speed_fraction) < _SLIDER_FULL:
+        raise RefusedError(
+            f"The speed slider stands at {100 * fraction:.0f} % (wanted: 100 %).",
+            code="slider-low",
+            remedy="Raise it to 100 %: the test itself is slow.",
+            fraction=fraction,
+        )
     start = state.joints_rad
     target, check, geometry, plan = await asyncio.to_thread(_free_move, context, request, start)
     move = check.moves[0]
@@ -69,24 +73,6 @@ async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) ->
         preview, context.cell.subject, request.joint, target[request.joint], move.joint_speed_rad_s
     )
     return lambda go: StopTestRun(context, go, geometry, request.way, target).drive(), offer
-
-
-def _require_slider(way: StopWay, fraction: float) -> None:
-    if way is StopWay.SLIDER:
-        if fraction > _SLIDER_ZERO:
-            raise RefusedError(
-                f"The speed slider stands at {100 * fraction:.0f} % (wanted: 0 %).",
-                code="slider-not-zero",
-                remedy="Draw it down to 0 on the pendant.",
-                fraction=fraction,
-            )
-    elif fraction < _SLIDER_FULL:
-        raise RefusedError(
-            f"The speed slider stands at {100 * fraction:.0f} % (wanted: 100 %).",
-            code="slider-low",
-            remedy="Raise it to 100 %: the test itself is slow.",
-            fraction=fraction,
-        )
 
 
 def _free_move(
@@ -125,7 +111,7 @@ def _turns(geometry: CellGeometry, request: verbs.StopTest, start: Vector6) -> I
     near = vector6(np.array(start) + sign * _PROBE_RAD * np.eye(6)[request.joint])
     speed = check_path(geometry, start, near).joint_speed_rad_s
     ramp_s = speed / geometry.limits.joint_acceleration_rad_s2
-    whole = float(np.clip(speed * (request.duration_s - ramp_s), _PROBE_RAD, LONGEST_TURN_RAD))
+    whole = float(np.clip(speed * (MOVE_S - ramp_s), _PROBE_RAD, LONGEST_TURN_RAD))
     for share in (1.0, 0.7):
         yield from (sign * share * whole, -sign * share * whole)
 
@@ -170,8 +156,6 @@ class StopTestRun(Run):
         """Give the stop in mid-move, timed to the microsecond. RobotError where a way is not there."""
         robot, way = self._context.cell.robot, self._way
         start, target = (np.array(q) for q in (self._go.start_joints_rad, self._target_rad))
-        if way in (StopWay.ARRIVE, StopWay.NETWORK, StopWay.SLIDER):
-            return
         while not driving.done():
             with contextlib.suppress(StaleStateError):  # the move itself says when that is too old
                 if np.abs(robot.latest().joints_rad - start).max() >= _MIDDLE * np.abs(target - start).max():
@@ -182,8 +166,6 @@ class StopTestRun(Run):
         moment_ns = time.monotonic_ns()
         if way is StopWay.FROZEN:
             time.sleep(FROZEN_S)  # on purpose: heartbeat, STOP and screen all hang on this loop
-        elif way is StopWay.BOTH:
-            await robot.stop("stop test")
         else:
             robot.stop_one_way(way)
         self._context.store.event(STOP_GIVEN, f"stop given: {way.value}", moment_ns=moment_ns)

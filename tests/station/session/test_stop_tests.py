@@ -16,7 +16,7 @@ from tests.station.session_rig import NewRig, Rig, sealed
 @pytest.mark.parametrize("speed_m_s", [0.02, 0.05, 0.25])
 @pytest.mark.parametrize("joint", [0, 2, 5])
 async def test_no_modelled_point_is_faster_than_asked_for(rig: Rig, joint: int, speed_m_s: float) -> None:
-    offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.BOTH, joint, speed_m_s))
+    offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, speed_m_s, joint))
     assert 0 < offer.go.top_speed_m_s <= speed_m_s
     assert offer.go.largest_step_rad <= 0.4 and offer.speed_rad_s <= 1.05
     assert rig.arm.log == [], "nothing moved"
@@ -24,7 +24,7 @@ async def test_no_modelled_point_is_faster_than_asked_for(rig: Rig, joint: int, 
 
 async def test_a_move_needs_its_own_approval_and_records_nothing(rig: Rig) -> None:
     for _ in range(2):
-        offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.ARRIVE))
+        offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, 0.05))
         rig.session.go(1, offer.go.token)
         await rig.until(S.IDLE)
         with pytest.raises(RefusedError) as refused:
@@ -35,19 +35,19 @@ async def test_a_move_needs_its_own_approval_and_records_nothing(rig: Rig) -> No
 
 
 async def test_stop_of_a_person_stays_latched(rig: Rig) -> None:
-    offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.NETWORK))
+    offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, 0.05))
     rig.arm.slow = True
     rig.session.go(1, offer.go.token)
     await rig.until(S.MOVING)
     await rig.session.stop("ben")
     assert rig.state is S.STOPPED
     with pytest.raises(RefusedError):
-        await rig.session.prepare_stop_test(1, StopTest(StopWay.BOTH))
+        await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, 0.05))
 
 
 async def test_whoever_has_no_control_gets_no_offer(rig: Rig) -> None:
     with pytest.raises(RefusedError):
-        await rig.session.prepare_stop_test(2, StopTest(StopWay.BOTH))
+        await rig.session.prepare_stop_test(2, StopTest(StopWay.CONTROL, 0.05))
 
 
 async def said(rig: Rig) -> list[bool]:

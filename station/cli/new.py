@@ -24,7 +24,7 @@ from station.devices.aravis_device import found_cameras
 from station.devices.ur_condition import what_holds
 from station.devices.ur_dashboard import STOP, DashboardError
 from station.devices.ur_link import UrLink
-from station.devices.ur_probe import probe
+from station.devices.ur_probe import probe, unsupported_model
 from station.operate.draft import ArmReader, CameraChoice, CameraReader
 
 SERVICES = (
@@ -96,13 +96,15 @@ class RealHardware:
                 remedy="Switch it on, plug in its cable, and compare its address (pendant: ☰ → About).",
             )
         if found.problems:
-            who = found.model or "something that is no UR robot"
+            who = found.model or "something"
             raise RobotError(
                 f"{who} answers at {address}, but not whole: {found.problems[0]}",
                 code="robot-incomplete",
                 remedy=SERVICES,
             )
         model = told or found.model
+        if found.model and found.model not in MODELS:
+            raise unsupported_model(found.model, address)
         if model not in MODELS:
             raise RobotError(
                 f"The controller at {address} does not tell its model",

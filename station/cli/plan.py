@@ -186,10 +186,11 @@ def asked_standing(cell: StationConfig, socket: Path) -> list[float] | None:
 
 async def _read_joints(cell: StationConfig) -> Vector6:
     """By the read-only half of the driver. Raises RobotError."""
+    from station.devices.rtde import PORT
     from station.devices.ur_link import UrLink
-    from station.devices.ur_probe import RTDE_PORT, check_port
+    from station.devices.ur_probe import check_port
 
-    await check_port(cell.robot.host, RTDE_PORT)
+    await check_port(cell.robot.host, PORT)
     link = UrLink(cell.robot)
     try:
         await link.connect()

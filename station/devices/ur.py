@@ -40,6 +40,7 @@ from station.devices.ur_control import LIBRARY_REMEDY
 from station.devices.ur_dashboard import STOP, Dashboard, came
 from station.devices.ur_link import UrLink, link_lost
 from station.devices.ur_moves import MoveWatch, check_goal
+from station.devices.ur_probe import SCRIPT_PORT, check_port
 
 log = logging.getLogger(__name__)
 
@@ -166,6 +167,7 @@ class UrRobot(UrLink):
         trouble = safety_stop(state) or not_powered(state) or foreign_program(state, program)
         if trouble is not None:
             raise trouble
+        await check_port(self.config.host, SCRIPT_PORT)
 
     def heartbeat(self) -> None:
         """Called by the session loop at least every 50 ms while control lives; without it the arm stops."""

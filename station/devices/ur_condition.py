@@ -16,6 +16,9 @@ WATCHDOG_S = 0.15
 """A silence that can have tripped the control program's watchdog (1/5 s, and ticks)."""
 WATCHDOG_LIMIT_MS = 200
 APPROVE_AGAIN = "then approve motion again"
+NOT_STARTED_REMEDY = (
+    "Clear the pendant's messages, and look there why programs from the network are not started."
+)
 _RELEASE = "Release the brakes on the pendant"
 # What holds the arm, the gravest first: bits, modes, code, what it is, what to do.
 _SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str, str, str], ...] = (
@@ -23,7 +26,14 @@ _SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str, str, str], ...] =
         SafetyStatus.EMERGENCY_STOPPED
         | SafetyStatus.ROBOT_EMERGENCY_STOPPED
         | SafetyStatus.SYSTEM_EMERGENCY_STOPPED,
-        frozenset({SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SYSTEM_EMERGENCY_STOP}),
+        frozenset(
+            {
+                SafetyMode.ROBOT_EMERGENCY_STOP,
+                SafetyMode.SYSTEM_EMERGENCY_STOP,
+                SafetyMode.IMMI_EMERGENCY_STOP,
+                SafetyMode.PROFISAFE_EMERGENCY_STOP,
+            }
+        ),
         "emergency-stop",
         "emergency stop",
         "Make the cell safe, release the button, then power on and release the brakes",
@@ -44,10 +54,28 @@ _SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str, str, str], ...] =
     ),
     (
         SafetyStatus.SAFEGUARD_STOPPED,
-        frozenset({SafetyMode.SAFEGUARD_STOP}),
+        frozenset(
+            {
+                SafetyMode.SAFEGUARD_STOP,
+                SafetyMode.AUTOMATIC_MODE_SAFEGUARD_STOP,
+                SafetyMode.IMMI_SAFEGUARD_STOP,
+                SafetyMode.PROFISAFE_AUTOMATIC_MODE_SAFEGUARD_STOP,
+                SafetyMode.PROFISAFE_SAFEGUARD_STOP,
+                SafetyMode.SAFETY_API_SAFEGUARD_STOP,
+            }
+        ),
         "safeguard-stop",
         "safeguard stop",
         "Close the guard (or clear the scanner) and reset it there",
+    ),
+    (
+        SafetyStatus(0),
+        frozenset(
+            {SafetyMode.SYSTEM_THREE_POSITION_ENABLING_STOP, SafetyMode.TP_THREE_POSITION_ENABLING_STOP}
+        ),
+        "enabling-stop",
+        "stopped by the three-position enabling switch",
+        "Switch the robot to automatic mode, or hold the switch in its middle position",
     ),
     (
         SafetyStatus.RECOVERY,
@@ -91,6 +119,8 @@ def _held(state: RobotState) -> tuple[str, str, str] | None:
     for bits, modes, *held in _SAFETY:
         if state.safety_status_bits & bits or state.safety_mode in modes:
             return held[0], held[1], held[2]
+    if state.safety_mode > SafetyMode.FAULT:  # all that came later are stops
+        return "safety-stop", f"held by safety mode {safety_word(state)}", "Read the pendant"
     return None
 
 

@@ -27,6 +27,7 @@ from typing import Any, NoReturn
 
 from station.cell.errors import RobotError
 from station.cell.process import DAEMON_NICENESS, die_with_parent, go_before_others
+from station.devices.ur_condition import NOT_STARTED_REMEDY
 
 BEAT_FRESH_NS = 100_000_000
 WATCHDOG_HZ = 5.0
@@ -46,7 +47,7 @@ LIBRARY_WORDS = {
     "start control script": (
         "script-not-started",
         "the control program did not start",
-        "Power on, release the brakes, clear the pendant's messages.",
+        NOT_STARTED_REMEDY,
     ),
 }
 """Words of ur_rtde's refusals, in small letters, as it has no codes: code, what it is, what to do."""

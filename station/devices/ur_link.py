@@ -11,6 +11,7 @@ import logging
 import time
 from collections.abc import Callable
 
+from calibrate.kinematics import MODELS
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState
 from station.cell.config import RobotConfig
@@ -19,7 +20,16 @@ from station.cell.process import waited_share
 from station.cell.scene import arm_model
 from station.devices.ur_condition import HICCUP_S, STALE_S, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
-from station.devices.ur_probe import SCRIPT_PORT, ProbeResult, RobotLock, check_port, identify, lock_name
+from station.devices.ur_probe import (
+    SCRIPT_PORT,
+    ProbeResult,
+    RobotLock,
+    check_port,
+    identify,
+    lock_name,
+    unsupported_model,
+    why_no_dashboard,
+)
 from station.devices.ur_state import Payload, Sample, StateReader, state_at
 from station.devices.ur_tool import Installation, PrimaryReader, TcpCheck, check_payload
 
@@ -79,7 +89,10 @@ class UrLink:
 
     async def _open(self) -> None:
         host = self.config.host
-        found = await identify(await self.renew_dashboard())
+        try:
+            found = await identify(await self.renew_dashboard())
+        except DashboardError as error:
+            raise await why_no_dashboard(host, error) from None
         self._check_identity(found)
         if self._lock is None:
             self._lock = RobotLock(lock_name(host, found.serial))
@@ -107,6 +120,8 @@ class UrLink:
 
     def _check_identity(self, found: ProbeResult) -> None:
         wanted, host = self.config, self.config.host
+        if found.model and found.model not in MODELS:
+            raise unsupported_model(found.model, host)
         if found.model and found.model != wanted.model:
             raise RobotError(
                 f"the robot at {host} is a {found.model}, the configuration says {wanted.model}",

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import ipaddress
 import re
 import socket
 from dataclasses import dataclass, field, replace
 
+from calibrate.kinematics import MODELS
 from station.cell.errors import RobotError
 from station.cell.socket_folder import peer_of, user_name
+from station.devices.rtde import PORT as RTDE_PORT
+from station.devices.rtde import RtdeError, RtdeLink
 from station.devices.ur_dashboard import Dashboard, DashboardError, connect_trouble
 
 SCRIPT_PORT = 30002
-RTDE_PORT = 30004
+POLYSCOPE_X = 10
+"""Its first major version. It has no dashboard server, the second way of every stop."""
 _SERVICES = {SCRIPT_PORT: "Secondary Client interface", RTDE_PORT: "RTDE service"}
 CONNECT_S = 2.0
+ASIDE_S = 0.7
+"""For a question that only makes an error clearer."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +45,7 @@ async def probe(host: str) -> ProbeResult:
         _ask_dashboard(host), _port_problem(host, SCRIPT_PORT), _port_problem(host, RTDE_PORT)
     )
     silent = bool(result.problems) and all(answers)
-    return replace(result, problems=(*result.problems, *(p for p in answers if p)), answers=not silent)
+    return replace(result, problems=(*result.problems, *(str(p) for p in answers if p)), answers=not silent)
 
 
 async def identify(dashboard: Dashboard) -> ProbeResult:
@@ -72,28 +79,77 @@ async def _ask_dashboard(host: str) -> ProbeResult:
         dashboard = await Dashboard.open(host, CONNECT_S)
         return await identify(dashboard)
     except DashboardError as error:
-        return ProbeResult(problems=(str(error),))
+        return ProbeResult(problems=(str(await why_no_dashboard(host, error)),))
     finally:
         if dashboard is not None:
             await dashboard.close()
 
 
+async def why_no_dashboard(host: str, error: DashboardError) -> RobotError:
+    """`error`, or that this controller has no dashboard server at all: RTDE tells its version, too."""
+    try:
+        async with asyncio.timeout(ASIDE_S):
+            version = await asyncio.to_thread(_rtde_version, host)
+    except (OSError, RtdeError):
+        return error
+    if version[0] < POLYSCOPE_X:
+        return error
+    told = ".".join(map(str, version[:3]))
+    return RobotError(
+        f"the controller at {host} runs PolyScope X ({told}), which has no dashboard server: this station "
+        "cannot stop it by two ways and does not drive it",
+        code="polyscope-x",
+        remedy="Use an arm with PolyScope 3 or 5 (docs: Install).",
+        major=version[0],
+    )
+
+
+def _rtde_version(host: str) -> tuple[int, int, int, int]:
+    with socket.create_connection((host, RTDE_PORT), CONNECT_S) as link:
+        return RtdeLink(link).version()
+
+
+def unsupported_model(model: str, host: str) -> RobotError:
+    return RobotError(
+        f"the robot at {host} is a {model}, which this station does not support",
+        code="unsupported-model",
+        remedy=f"Use one of {', '.join(MODELS)} (docs: Install).",
+        model=model,
+    )
+
+
 async def check_port(host: str, port: int) -> None:
-    """Raises RobotError unless something accepts a connection there within 2 s."""
+    """Raises RobotError unless something accepts a connection there, and greets where it must."""
     if problem := await _port_problem(host, port):
-        raise RobotError(problem, code="port-closed")
+        raise problem
 
 
-async def _port_problem(host: str, port: int) -> str:
+async def _port_problem(host: str, port: int) -> RobotError | None:
+    """Within 2 s. A controller tells its state on the script port as soon as a client is there."""
+    where, accepted = f"{host}:{port}", False
     try:
         async with asyncio.timeout(CONNECT_S):
-            _, writer = await asyncio.open_connection(host, port)
+            reader, writer = await asyncio.open_connection(host, port)
+            accepted = True
+            try:
+                if port == SCRIPT_PORT and not await reader.read(1):
+                    raise ConnectionResetError(errno.ECONNRESET, "closed at once")
+            finally:
+                writer.transport.abort()
     except TimeoutError:
-        return f"{host}:{port} did not answer within {CONNECT_S:g} s: check cable, address and firewall"
+        if accepted:
+            return RobotError(
+                f"{where} accepts connections and says nothing: programs sent there would be lost",
+                code="port-silent",
+                remedy=f"Switch the {_SERVICES[port]} on (PolyScope 5.17 and later: Settings → Security → "
+                "Services), and check what stands between: firewall, router, port forwarding.",
+                limit_s=CONNECT_S,
+            )
+        text = f"{where} did not answer within {CONNECT_S:g} s"
+        return RobotError(text, code="port-closed", remedy="Check cable, address and firewall.")
     except OSError as error:
-        return f"{host}:{port}: {connect_trouble(error, _SERVICES[port])}"
-    writer.transport.abort()
-    return ""
+        return RobotError(f"{where}: {connect_trouble(error, _SERVICES[port])}", code="port-closed")
+    return None
 
 
 def _version(text: str) -> tuple[int, ...]:

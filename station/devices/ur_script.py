@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 from station.cell.errors import RobotError
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, RtdeError, RtdeLink, RuntimeState
+from station.devices.ur_condition import NOT_STARTED_REMEDY
 from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
 
 SCRIPT_PORT = 30002
@@ -251,7 +252,7 @@ class ScriptControl:
                 raise RobotError(
                     "the control program did not start",
                     code="script-not-started",
-                    remedy="Power on, release the brakes, clear the pendant's messages.",
+                    remedy=NOT_STARTED_REMEDY,
                 )
 
     # -- the six calls ----------------------------------------------------------------------------------

@@ -77,7 +77,7 @@ async def _from_outside(host: str) -> str:
     found = await probe(host)
     if not found.answers:
         return f"switch the robot on, plug in its network cable, and check robot.host ({host})"
-    who = f"{found.model} {found.serial}" if found.model else "something that is no UR robot"
+    who = f"{found.model} {found.serial}" if found.model else "something"
     return "; ".join([f"{who} answers at {host}", *found.problems])
 
 

@@ -56,6 +56,7 @@ async def test_nobody_is_there(tmp_path: Path) -> None:
         ({"cmd": "stall"}, "rtde", 5.0),
         ({"cmd": "black_hole"}, "dashboard", 3.0),
         ({"cmd": "black_hole", "ports": ["script"]}, "port-closed", 4.0),
+        ({"cmd": "mute", "ports": ["script30002"]}, "port-silent", 4.0),
         ({"cmd": "black_hole", "ports": ["rtde"]}, "rtde", 5.0),
     ],
 )
@@ -121,6 +122,7 @@ async def test_connecting_is_read_only(cell: Make) -> None:
         ("UR10e", {"cmd": "remote", "on": False}, "local-control"),
         ("UR10", {"cmd": "pstop"}, "protective-stop"),
         ("UR10", {"cmd": "in_use", "inputs": OTHERS}, "registers-in-use"),
+        ("UR10", {"cmd": "mute", "ports": ["script30002"]}, "port-silent"),
     ],
 )
 async def test_a_go_is_refused(cell: Make, model: str, fault: dict[str, Any], code: str) -> None:

@@ -45,6 +45,29 @@ def test_an_arm_moves_in_normal_and_reduced_mode_only(mode: SafetyMode) -> None:
     assert stop is None or stop.remedy
 
 
+@pytest.mark.parametrize(
+    ("mode", "code"),
+    [
+        (10, "safety-stop"),
+        (11, "safety-stop"),
+        (12, "safeguard-stop"),
+        (13, "enabling-stop"),
+        (14, "enabling-stop"),
+        (15, "emergency-stop"),
+        (16, "safeguard-stop"),
+        (17, "safety-stop"),
+        (18, "safeguard-stop"),
+        (19, "safeguard-stop"),
+        (20, "emergency-stop"),
+        (21, "safeguard-stop"),
+        (99, "safety-stop"),
+    ],
+)
+def test_newer_safety_modes_hold_the_arm_each_by_its_name(mode: int, code: str) -> None:
+    stop = safety_stop(msgspec.structs.replace(STATE, safety_mode=mode))
+    assert stop is not None and stop.code == code and stop.remedy
+
+
 @pytest.mark.parametrize("bit", SafetyStatus)
 def test_each_bit_that_tells_of_a_stop_is_one(bit: SafetyStatus) -> None:
     stop = safety_stop(msgspec.structs.replace(STATE, safety_status_bits=SafetyStatus.NORMAL | bit))

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import random
 import socket
+import struct
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +16,7 @@ import pytest
 
 from station.cell.config import RobotConfig
 from station.cell.process import waited_share
+from station.devices.rtde import HEADER, PORT, PacketType, packet
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import ProbeResult, RobotLock
 from station.devices.ur_state import StateReader
@@ -44,6 +49,7 @@ def test_a_listener_that_fails_is_dropped_alone(link: Any) -> None:
     [
         (ProbeResult(model="UR5", serial="2016"), "other-model"),
         (ProbeResult(model="UR10", serial="1999"), "other-robot"),
+        *((ProbeResult(model=model), "unsupported-model") for model in ("UR20", "UR7e", "UR12e")),
     ],
 )
 def test_another_robot_than_configured_is_refused(link: Any, found: ProbeResult, code: str) -> None:
@@ -82,6 +88,28 @@ async def test_a_robot_that_cannot_be_asked_for_is_named(tmp_path: Path) -> None
         UrLink(RobotConfig(model="UR7", host="127.0.0.1"))  # type: ignore[arg-type]
     with raises("no-host"):
         await UrLink(RobotConfig(model="UR10", host="")).connect()
+
+
+@pytest.mark.parametrize(("major", "code"), [(10, "polyscope-x"), (5, "dashboard")])
+async def test_a_controller_that_has_no_dashboard_server_is_told_from_one_that_does_not_answer(
+    major: int, code: str
+) -> None:
+    """PolyScope X speaks RTDE, and tells its version there."""
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(asyncio.IncompleteReadError):
+            while True:
+                size, kind = HEADER.unpack(await reader.readexactly(HEADER.size))
+                await reader.readexactly(size - HEADER.size)
+                asked_version = kind == PacketType.CONTROLLER_VERSION
+                answer = struct.pack(">4I", major, 11, 0, 0) if asked_version else b"\x01"
+                writer.write(packet(PacketType(kind), answer))
+        writer.close()
+
+    host = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
+    async with await asyncio.start_server(talk, host, PORT):
+        with raises(code):
+            await UrLink(RobotConfig(model="UR10e", host=host)).connect()
 
 
 def test_news_that_wait_unread_are_no_matter_of_the_cable(link: Any) -> None:

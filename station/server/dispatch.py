@@ -21,6 +21,7 @@ from station.server.approval import ApprovalRule, Peer, Process, process
 from station.session.checklist import checklist
 from station.session.recording import software
 from station.session.session import Session
+from station.session.threads import ASKED, NAMES
 
 CONNECTION = {"watch", "stop", "part", "whole"}
 """Verbs that the connection itself carries out."""
@@ -34,6 +35,7 @@ class SessionDispatcher:
         self._session, self._see = session, see
         cell = session.context.cell
         self._rule = ApprovalRule(cell.config.approval, cell.simulated, see)
+        self._version = software()["calibration-station"]
         self._callers: dict[int, Peer] = {}
         self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
@@ -57,7 +59,7 @@ class SessionDispatcher:
     async def _name(self, uid: int) -> str:
         if uid not in self._names:
             # In a thread: where users come from the network, a name may take seconds.
-            self._names[uid] = await asyncio.to_thread(user_name, uid)
+            self._names[uid] = await NAMES.run(user_name, uid)
         return self._names[uid]
 
     def gone(self, peer: Peer) -> None:
@@ -97,9 +99,9 @@ class SessionDispatcher:
         said = "".join(c for c in args.who if c.isprintable())[:_WHO_LIMIT] or user
         caller.told = said if said.split(" ")[0] == user else f"{user} ({said})"
         context = self._session.context
-        config, version = context.cell.config, software()["calibration-station"]
+        config = context.cell.config
         rule_days = config.validity.max_age_days
-        return verbs.Welcome(version, os.getpid(), str(context.root), config.camera.name, rule_days)
+        return verbs.Welcome(self._version, os.getpid(), str(context.root), config.camera.name, rule_days)
 
     async def _lease(self, caller: Peer, args: verbs.Lease) -> LeaseStatus:
         if args.action == "take":
@@ -181,4 +183,4 @@ class SessionDispatcher:
 
     async def _sessions(self, caller: Peer, args: verbs.Sessions) -> list[SessionSummary]:
         # In a thread: hundreds of files are read, and the arm's heartbeat does not wait.
-        return await asyncio.to_thread(list_sessions, self._session.context.root)
+        return await ASKED.run(list_sessions, self._session.context.root)

@@ -18,6 +18,7 @@ from station.devices.ur_condition import mode_word, not_powered, safety_stop, sa
 from station.devices.ur_probe import probe
 from station.protocol.verbs import Check
 from station.session.context import SessionContext
+from station.session.threads import ASKED
 
 CLOCK_BOUND_S = 0.005
 NOT_ACCEPTED_REMEDY = "run `station accept`; until then: low speed slider, a hand on the emergency stop"
@@ -31,8 +32,8 @@ async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[C
         *await _wire_checks(context),
         _trigger_check(context, troubles),
         Check("board", "ok", describe_board(context.cell.config.board)),
-        await asyncio.to_thread(_calibration_check, context),
-        _disk_check(context),
+        await ASKED.run(_calibration_check, context),
+        await ASKED.run(_disk_check, context),
         _clock_check(context),
     ]
 
@@ -56,7 +57,7 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
     else:
         words = "remote" if robot.remote else "this controller has no remote switch"
         checks.append(Check("remote control", "ok", words))
-    checks.append(_control_check(context))
+    checks.append(await ASKED.run(_control_check, context))
     return checks
 
 
@@ -107,7 +108,7 @@ async def _wire_checks(context: SessionContext) -> list[Check]:
     """GenICam cameras on this computer's wires, and what keeps one from being used; no other driver's."""
     if context.cell.config.camera.driver != "aravis":
         return []
-    network, usb = await asyncio.gather(asyncio.to_thread(discover), asyncio.to_thread(discover_usb))
+    network, usb = await asyncio.gather(ASKED.run(discover), ASKED.run(discover_usb))
     return [
         _listed("network cameras", "no GigE camera answers", [_on_network(context, c) for c in network]),
         _listed("usb cameras", "no USB3 Vision camera", [_on_usb(c) for c in usb]),

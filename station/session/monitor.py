@@ -8,6 +8,7 @@ import logging
 import shutil
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -39,11 +40,12 @@ from station.protocol.states import RUNNING
 from station.protocol.verbs import Observation, Observe, PreviewImage
 from station.session.capture import at_exposure
 from station.session.context import SessionContext
+from station.session.threads import WATCH
 
 log = logging.getLogger(__name__)
 
 RETRY_S = 3.0
-DISK_PERIOD_S = 2.0
+DISK_PERIOD_S = 0.5
 FPS_PERIOD_S = 2.0
 PAUSES = "pauses after this pose"
 FINISHES = "finishes after this pose"
@@ -57,8 +59,9 @@ WALL_STEP_S = 0.5
 class Monitor:
     def __init__(self, context: SessionContext) -> None:
         self._context = context
-        self._free_bytes: int | None = None
-        self._free_checked_s = -DISK_PERIOD_S
+        self._files = _Files()
+        self._reading: asyncio.Task[_Files] | None = None
+        self._read_s = -DISK_PERIOD_S
         self._controller: tuple[float, float] | None = None
         self._states_seen = 0
         self._frames = (0.0, 0)
@@ -72,6 +75,7 @@ class Monitor:
 
     def refresh(self, lag_ms: float) -> None:
         self._watch_wall_clock()
+        self._watch_files()
         store, notice = self._context.store, self._context.cell.robot.notice
         if store.state is StationState.MOVING:
             store.update(reason=notice)  # 'speed slider at 5 %': no fault, but a person wants to know
@@ -112,9 +116,7 @@ class Monitor:
             remote=robot.remote,
             control=robot.control,
             control_path=robot.control_path,
-            not_accepted=context.store.status.robot.not_accepted  # no file is read while heartbeats flow
-            if context.store.state in RUNNING
-            else context.cell.acceptance_trouble(context.root),
+            not_accepted=self._files.not_accepted,
             speed_limit_m_s=limit,
             rate_hz=self._rate_hz(),
         )
@@ -170,29 +172,35 @@ class Monitor:
         return msgspec.structs.replace(shown, pulses=box.pulses, frames=paired)
 
     def _recorder(self) -> RecorderStatus:
-        now_s = time.monotonic()
-        if now_s - self._free_checked_s >= DISK_PERIOD_S:
-            self._free_checked_s = now_s
-            self._free_bytes = _free_bytes(self._context.root)
-            self._look_for_calibration()
+        free_bytes = self._files.free_bytes
         if (recorder := self._context.recorder) is None:
-            return RecorderStatus(free_bytes=self._free_bytes)
+            return RecorderStatus(free_bytes=free_bytes)
         return RecorderStatus(
             recording=True,
             path=str(recorder.part_path),
             bytes=recorder.bytes_written,
             drops=recorder.dropped,
             sync_ms=round(1000 * recorder.last_sync_s, 1),
-            free_bytes=self._free_bytes,
+            free_bytes=free_bytes,
             error=str(recorder.error or ""),
         )
 
-    def _look_for_calibration(self) -> None:
-        """A process of its own solves a finished session, and puts its calibration beside the recording."""
-        session = self._context.store.status.session
-        path = Path(session.folder) / CALIBRATION_FILE
-        solved = str(path) if session.recording and path.is_file() else ""
-        self._context.store.update_session(calibration=solved)
+    def _watch_files(self) -> None:
+        """In a thread, which a disk may hold as long as it likes: the heartbeat waits for no file."""
+        if self._reading is not None:
+            if not self._reading.done():
+                return
+            read, self._reading = self._reading, None
+            self._files = read.result()
+            session = self._context.store.status.session
+            solved = self._files.calibration if session.folder == self._files.session else ""
+            self._context.store.update_session(calibration=solved)
+        if (now_s := time.monotonic()) - self._read_s >= DISK_PERIOD_S:
+            self._read_s = now_s
+            session, context = self._context.store.status.session, self._context
+            self._reading = asyncio.create_task(
+                WATCH.run(_read_files, context, session.folder if session.recording else "")
+            )
 
     def _clock(self) -> ClockStatus:
         robot, frames = self._context.cell.robot.clock(), self._context.cell.camera.timing
@@ -205,6 +213,25 @@ class Monitor:
 
 def _wall_ahead_ns() -> int:
     return time.time_ns() - time.monotonic_ns()
+
+
+@dataclass(frozen=True)
+class _Files:
+    """What the disk tells of a cell that nobody asks: other programs write it."""
+
+    free_bytes: int | None = None
+    not_accepted: str = ""
+    session: str = ""
+    """Folder of the finished session that is shown."""
+    calibration: str = ""
+    """Made of it by a process of its own; empty: not yet."""
+
+
+def _read_files(context: SessionContext, folder: str) -> _Files:
+    path = Path(folder) / CALIBRATION_FILE
+    solved = str(path) if folder and path.is_file() else ""
+    trouble = context.cell.acceptance_trouble(context.root)
+    return _Files(_free_bytes(context.root), trouble, folder, solved)
 
 
 def _free_bytes(root: Path) -> int | None:

@@ -9,6 +9,7 @@ import platform
 import threading
 import time
 from collections.abc import Callable, Coroutine
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TypeVar
@@ -44,6 +45,7 @@ from station.cell.session_folder import (
 from station.cell.status import Level
 from station.devices.cell import Cell
 from station.session.queue import PoseQueue
+from station.session.threads import DISK
 
 _PACKAGES = (
     "calibration-station", "numpy", "scipy", "opencv-python-headless", "mcap", "ur-rtde",
@@ -57,6 +59,7 @@ _LOG_TEXT_LIMIT = 2000
 R = TypeVar("R")
 
 
+@cache
 def software() -> dict[str, str]:
     """Versions of what takes part in a capture."""
     found = {"python": platform.python_version()}
@@ -148,7 +151,7 @@ class SessionRecording:
             settings = await self._cell.camera.settings()
         except CameraError as error:
             settings = {"error": str(error)}  # its images will say the same
-        await to_the_end(asyncio.to_thread(self._open, queue.plan, queue.sha256, first_image, settings))
+        await to_the_end(DISK.run(self._open, queue.plan, queue.sha256, first_image, settings))
         await self.save_state(queue)
 
     def _open(
@@ -263,7 +266,7 @@ class SessionRecording:
             recording=str(recording or ""),
         )
         async with self._saving:
-            await to_the_end(asyncio.to_thread(self._write_state, state))  # the next one is newer
+            await to_the_end(DISK.run(self._write_state, state))  # the next one is newer
 
     def _write_state(self, state: SessionState) -> None:
         try:
@@ -297,7 +300,7 @@ class SessionRecording:
     async def released(self) -> None:
         """Returns when nobody writes to an abandoned file any more."""
         if self._closing is not None:
-            await asyncio.to_thread(self._closing.join)
+            await DISK.run(self._closing.join)
             self._closing = None
 
     def require_open(self) -> Recorder:

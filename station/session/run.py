@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import time
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from station.session.context import RunRequests, SessionContext
 from station.session.lease import MotionApproval, require_start
 from station.session.queue import BUSY
 from station.session.recording import to_the_end
+from station.session.threads import DISK, MOTION
 
 log = logging.getLogger(__name__)
 
@@ -137,7 +137,7 @@ class Run:
             if self._wants_rest() or not todo or self._failures >= FAILURES_IN_A_ROW:
                 break
             index = todo.pop(0)
-            context.require_recording().require_space()
+            await DISK.run(context.require_recording().require_space)
             await self._pose(index)
             taken += 1
             # By this run's average; elapsed: the session's runs before this one included.
@@ -195,7 +195,7 @@ class Run:
     async def _drive(self, here: Vector6, target: Vector6, name: str) -> None:
         """LimitError when the path from `here`, where the arm stands, is not free."""
         # In a thread: neither the heartbeat nor STOP waits for it.
-        check = await asyncio.to_thread(check_path, self._geometry, here, target, name)
+        check = await MOTION.run(check_path, self._geometry, here, target, name)
         if check.problems:
             raise LimitError("; ".join(map(str, check.problems)), code="path")
         now = (await self._context.arm()).joints_rad

@@ -27,6 +27,7 @@ from station.session.context import SessionContext, displacement
 from station.session.lease import Drive, MotionApproval
 from station.session.run import Run
 from station.session.summary import motion_preview, motion_warnings
+from station.session.threads import MOTION
 
 ACCELERATION_RAD_S2 = 1.4
 LONGEST_TURN_RAD = 0.4
@@ -57,7 +58,7 @@ async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) ->
             fraction=fraction,
         )
     start = state.joints_rad
-    target, check, geometry, plan = await asyncio.to_thread(_free_move, context, request, start)
+    target, check, geometry, plan = await MOTION.run(_free_move, context, request, start)
     move = check.moves[0]
     joint = JOINT_NAMES[request.joint]
     preview = motion_preview(
@@ -67,7 +68,7 @@ async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) ->
         plan_sha256=plan_sha256(plan),
         poses=1,
         first_move=displacement(context, start, target),
-        warnings=tuple(motion_warnings(context)),
+        warnings=tuple(await motion_warnings(context)),
     )
     offer = StopTestOffer(
         preview, context.cell.subject, request.joint, target[request.joint], move.joint_speed_rad_s

@@ -20,6 +20,7 @@ from station.cell.status import MotionPreview
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext, displacement
 from station.session.queue import OfferedPoses, PoseQueue
+from station.session.threads import DISK
 
 POSE_OVERHEAD_S = 0.8
 """Settle, expose, look, write: what a stop takes beside the move."""
@@ -69,7 +70,7 @@ async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple
             remedy="Finish its session if one is open, then make a plan of poses.",
         )
     try:
-        require_free_space(context.root, context.cell.config.capture.free_space_bytes)
+        await DISK.run(require_free_space, context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
         raise RefusedError(f"{full} Nothing moved.", code="disk-full") from None
     start = (await context.arm()).joints_rad
@@ -87,7 +88,7 @@ async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple
         plan_sha256=queue.sha256,
         poses=len(poses),
         first_move=f"{displacement(context, start, first)} to pose {poses[0] + 1}",
-        warnings=(*notes, *motion_warnings(context)),
+        warnings=(*notes, *await motion_warnings(context)),
     )
 
 
@@ -147,12 +148,12 @@ def _purpose_words(context: SessionContext, purpose: Purpose, poses: tuple[int, 
     return f"continue session {context.recording.name}"
 
 
-def motion_warnings(context: SessionContext) -> list[str]:
+async def motion_warnings(context: SessionContext) -> list[str]:
     warnings = []
     slider = context.cell.robot.latest().target_speed_fraction
     if slider < _SLOW_SLIDER:
         warnings.append(f"the speed slider stands at {100 * slider:.0f} %")
-    if trouble := context.cell.acceptance_trouble(context.root):
+    if trouble := await DISK.run(context.cell.acceptance_trouble, context.root):
         warnings.append(f"the arm's stops are {trouble}")
     if context.cell.simulated:
         warnings.append("SIMULATED cell: nothing real moves")

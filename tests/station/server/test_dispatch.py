@@ -9,6 +9,7 @@ import os
 import pty
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -71,6 +72,28 @@ async def test_a_capture_over_the_socket(served: Served, small_plan: Plan) -> No
         preview = await anna.request("preview", width=160, height=128)
         assert (preview["width"], preview["height"]) == (160, 128)
         assert all(0 <= x <= 1 and 0 <= y <= 1 for x, y in preview["corners"])
+
+
+async def test_requests_that_hang_hold_up_no_approved_motion(
+    served: Served, small_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file server that is gone: whoever asks for what lies there waits, and so does nobody else."""
+    answers = threading.Event()
+    monkeypatch.setattr(dispatch, "list_sessions", lambda root: answers.wait(60) and [])
+    see, session = SessionDispatcher(served.rig.session), served.rig.session
+    asking = [asyncio.create_task(see.handle(Peer(9, 0, 0), "sessions", {})) for _ in range(40)]
+    try:
+        session.take_lease(1, "anna")
+        session.load_plan(1, small_plan)
+        await served.rig.give_go()
+        await served.rig.until_true(lambda: bool(session.store.status.session.recording))
+        refused, _ = await asyncio.wait(asking, timeout=0)
+        assert {getattr(task.exception(), "code", "") for task in refused} == {"busy"}
+        assert len(refused) > 20
+    finally:
+        answers.set()
+        await asyncio.gather(*asking, return_exceptions=True)
+    assert await see.handle(Peer(9, 0, 0), "sessions", {}) == []
 
 
 async def test_poses_of_a_check_are_planned_for_a_known_lens(

@@ -53,12 +53,12 @@ async def test_whoever_has_no_control_gets_no_offer(rig: Rig) -> None:
 async def said(rig: Rig) -> list[bool]:
     """Whether doctor, status and the preview of an approval say that the arm is not accepted."""
     context = rig.session.context
-    rig.session.supervisor._look()
     control = next(check for check in await checklist(context, {}) if check.name == "control")
     preview = await rig.session.prepare(1, Purpose.RUN)
+    warned = control.state == "warning"
+    await rig.until_true(lambda: bool(rig.session.store.status.robot.not_accepted) == warned)
     return [
-        control.state == "warning",
-        bool(rig.session.store.status.robot.not_accepted),
+        warned,
         any("not accepted" in warning for warning in preview.warnings),
     ]
 

@@ -6,6 +6,7 @@ import contextlib
 import gc
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -24,12 +25,15 @@ from station.devices.ur import library_installed
 from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from tests.isolated_network import isolated_thread
+from tests.patience import PATIENCE_S
 
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
 
 # Hundreds of programs are started: without its byte code each of them compiles the source first.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # behind a shell's `&` programs would ignore it, too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 gc.set_threshold(10_000, 20, 20)  # the usual ones go through all that was imported every few tests
 for _size in ("COLUMNS", "LINES"):  # a shell may export them: what is printed would break elsewhere
     os.environ.pop(_size, None)
@@ -49,6 +53,7 @@ MAY_BE_SENT = {
 """Everything a station ever says to a controller; a change here is a change of the safety rules. (The last
 two are what ur_rtde's own script does when it starts.)"""
 
+AT_REST_RAD_S = 1e-3
 CONTROL_WORDS = {
     "upload": ("upload: rtde_control", "upload: station_control"),
     "move": ("script: movej",),
@@ -71,21 +76,42 @@ def asked(admin: AdminClient, what: str) -> int:
     return sum(int(counts.get(word, 0)) for word in CONTROL_WORDS.get(what, (what,)))
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--skipped-to", type=Path, help="write the names of the skipped tests into this file")
+    parser.addoption("--only-of", type=Path, help="run only the tests that this file names")
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    place: Path | None = config.getoption("--skipped-to")
+    if place is not None:
+        skipped = terminalreporter.stats.get("skipped", [])
+        place.write_text("".join(f"{report.nodeid}\n" for report in skipped))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    place: Path | None = config.getoption("--only-of")
+    if place is not None:
+        named = set(place.read_text().splitlines())  # a module that was skipped as a whole by its path
+        others = [item for item in items if not {item.nodeid, item.nodeid.partition("::")[0]} & named]
+        items[:] = [item for item in items if item not in others]
+        config.hook.pytest_deselected(items=others)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any, error: object) -> None:
     """A test process that died says by which signal; xdist itself says only that it is gone."""
     if error is not None:
         process = node.gateway._io.popen
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(5)
+            process.wait(PATIENCE_S)
         print(f"\n[{node.gateway.id}] ended with {process.returncode} (negative: killed by that signal)")
 
 
 @pytest.fixture
 def datasets() -> Path:
     """Folder of real recordings; the test is skipped, with the reason, where it is absent."""
-    if not DATASETS.is_dir():
-        pytest.skip(f"no real recordings at {DATASETS} (set STATION_DATASETS)")
+    if not os.access(DATASETS, os.R_OK | os.X_OK):
+        pytest.skip(f"no real recordings to be read at {DATASETS} (set STATION_DATASETS)")
     return DATASETS
 
 
@@ -93,6 +119,14 @@ def functions_called(text: str) -> set[str]:
     """By a URScript program, beside its own."""
     own = set(re.findall(r"\b(?:def|thread)\s+(\w+)", text))
     return set(re.findall(r"\b([A-Za-z_]\w*)\(", text)) - own
+
+
+def rests_short_of_its_goal(admin: AdminClient) -> None:
+    """By the controller's own account: it was stopped, it did not arrive. How soon: see the benchmarks."""
+    goal = [entry["goal"] for entry in admin.ask("log")["entries"] if entry["verb"] == "movej"][-1]
+    state = admin.ask("state")
+    assert max(map(abs, state["joint_speeds_rad_s"])) < AT_REST_RAD_S
+    assert max(abs(a - b) for a, b in zip(state["joints_rad"], goal, strict=True)) > 0.01
 
 
 def check_allow_list(host: str) -> None:

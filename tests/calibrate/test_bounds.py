@@ -20,6 +20,7 @@ from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.job import SolvedRecording
 from tests.calibrate.calling import raises_code
+from tests.patience import PATIENCE_S
 
 PROGRAM = (sys.executable, "-m", "calibrate.cli", "solve")
 
@@ -32,10 +33,8 @@ def old_file(solved_real: SolvedRecording, tmp_path: Path) -> Path:
 
 
 def test_what_takes_too_long_is_ended_with_a_name() -> None:
-    begun_s = time.monotonic()
     with raises_code(SolveLimitError, "time-limit", limit_s=0.1), bounded(0.1, 0):
-        _work(10)
-    assert time.monotonic() - begun_s < 5
+        _work(PATIENCE_S)
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
@@ -49,8 +48,8 @@ def _work(duration_s: float) -> None:
 def test_a_handler_that_swallows_the_first_alarm_meets_the_next() -> None:
     with pytest.raises(SolveLimitError), bounded(0.05, 0):
         with suppress(CalibrationError):
-            _work(10)
-        _work(10)
+            _work(PATIENCE_S)
+        _work(PATIENCE_S)
 
 
 def test_an_alarm_while_the_block_ends_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,7 +67,7 @@ def test_an_alarm_while_the_block_ends_leaves_nothing_behind(monkeypatch: pytest
             (own,) = _timers() - others
     assert signal.getsignal(signal.SIGALRM) == before
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
-    own.join(5)
+    own.join(PATIENCE_S)
     assert not own.is_alive()
 
 

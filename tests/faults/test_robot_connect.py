@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import sys
-import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from station.cell.errors import RobotError, StaleStateError
 from station.devices.ur import UrRobot
 from station.simulation.launch import SimulatedController
 from tests.codes import raises
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.process
 
@@ -49,28 +49,27 @@ async def test_nobody_is_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "code", "limit_s"),
+    ("fault", "code"),
     [
-        ({"cmd": "stall_dash"}, "dashboard", 3.0),
-        ({"cmd": "mute", "ports": ["rtde"]}, "rtde", 5.0),
-        ({"cmd": "stall"}, "rtde", 5.0),
-        ({"cmd": "black_hole"}, "dashboard", 3.0),
-        ({"cmd": "black_hole", "ports": ["script"]}, "port-closed", 4.0),
-        ({"cmd": "mute", "ports": ["script30002"]}, "port-silent", 4.0),
-        ({"cmd": "black_hole", "ports": ["rtde"]}, "rtde", 5.0),
+        ({"cmd": "stall_dash"}, "dashboard"),
+        ({"cmd": "mute", "ports": ["rtde"]}, "rtde"),
+        ({"cmd": "stall"}, "rtde"),
+        ({"cmd": "black_hole"}, "dashboard"),
+        ({"cmd": "black_hole", "ports": ["script"]}, "port-closed"),
+        ({"cmd": "mute", "ports": ["script30002"]}, "port-silent"),
+        ({"cmd": "black_hole", "ports": ["rtde"]}, "rtde"),
     ],
 )
 async def test_a_silent_controller_does_not_hang_the_station(
-    controller: Start, tmp_path: Path, fault: dict[str, Any], code: str, limit_s: float
+    controller: Start, tmp_path: Path, fault: dict[str, Any], code: str
 ) -> None:
     running = await asyncio.to_thread(controller)
     with running.admin() as admin:
         admin.ask(**fault)
         robot = robot_at(running.host, tmp_path)
-        begun = time.monotonic()
         with raises(code):
-            await robot.connect()
-        assert time.monotonic() - begun < limit_s
+            async with asyncio.timeout(PATIENCE_S):
+                await robot.connect()
         admin.ask(**fault, on=False)
         await robot.connect()  # nothing is left over from the failure
         await robot.close()
@@ -107,7 +106,7 @@ async def test_one_owner(controller: Start, tmp_path: Path) -> None:
 async def test_connecting_is_read_only(cell: Make) -> None:
     c = await cell(control=False)
     c.admin.ask("foreign", name="palletising.urp")
-    await c.until(lambda: c.admin.ask("state")["runtime_state"] == "PLAYING")
+    await until(lambda: c.admin.ask("state")["runtime_state"] == "PLAYING")
     await asyncio.sleep(0.5)
     assert c.admin.ask("state")["program"] == "palletising.urp"
     assert c.asked("upload") == 0
@@ -146,7 +145,7 @@ async def test_a_robot_switched_to_remote_after_connecting_can_be_driven(cell: M
 async def test_remote_control_lost_between_moves_ends_control(cell: Make) -> None:
     c = await cell("UR10e")
     c.admin.ask("remote", on=False)
-    assert await c.until(lambda: not c.robot.control) < 1.0
+    await until(lambda: not c.robot.control)
     await asyncio.sleep(0.3)
     with raises("local-control"):
         await c.robot.start_control()
@@ -161,15 +160,15 @@ async def test_old_news_is_not_taken_for_new(cell: Make, fault: dict[str, Any]) 
     with pytest.raises(StaleStateError):
         c.robot.latest()
     c.admin.ask(**fault, on=False)
-    await c.until(lambda: c.robot.age_s() < 0.05)
+    await until(lambda: c.robot.age_s() < 0.05)
     c.robot.latest()
 
 
 async def test_the_link_comes_back_by_itself_but_control_does_not(cell: Make) -> None:
     c = await cell()
     c.admin.ask("drop")
-    await c.until(lambda: not c.robot.control)
-    await c.until(lambda: c.robot.age_s() < 0.05)
+    await until(lambda: not c.robot.control)
+    await until(lambda: c.robot.age_s() < 0.05)
     await c.stays_at_rest()
     await c.robot.start_control()
     goal = c.joints_rad()
@@ -181,7 +180,7 @@ async def test_tcp_changed_on_the_pendant(cell: Make) -> None:
     c = await cell(control=True)
     c.robot.check()
     c.admin.ask("tcp", pose=[0.0, 0.0, 0.002, 0.0, 0.0, 0.0])
-    await c.until(lambda: (told := complaint(c.robot)) is not None and told.code == "tcp-changed")
+    await until(lambda: (told := complaint(c.robot)) is not None and told.code == "tcp-changed")
     told = complaint(c.robot)
     assert told is not None and told.values["shift_m"] == pytest.approx(0.002, abs=1e-4)
     goal = c.joints_rad()
@@ -195,14 +194,14 @@ async def test_payload_changed_on_the_pendant(cell: Make) -> None:
     c = await cell(control=True)
     c.robot.check()
     c.admin.ask("payload", kg=1.5, cog_m=[0.0, 0.0, 0.05])
-    await c.until(lambda: (told := complaint(c.robot)) is not None and told.code == "payload-changed")
+    await until(lambda: (told := complaint(c.robot)) is not None and told.code == "payload-changed")
     goal = c.joints_rad()
     goal[0] += 0.2
     with raises("payload-changed"):
         await c.robot.move(goal, 0.5, 1.0)
     await c.stays_at_rest()
     c.admin.ask("payload", kg=0.0, cog_m=[0.0, 0.0, 0.0])
-    await c.until(lambda: not complaint(c.robot))
+    await until(lambda: not complaint(c.robot))
 
 
 async def test_a_tool_on_the_pendant_is_reported_and_not_mixed_in(cell: Make) -> None:
@@ -235,7 +234,7 @@ async def test_an_impossible_goal_is_never_sent(cell: Make, goal: list[float]) -
 async def test_safety_stop_between_moves_ends_control(cell: Make) -> None:
     c = await cell()
     c.admin.ask("estop")
-    await c.until(lambda: not c.robot.control)
+    await until(lambda: not c.robot.control)
     with raises("emergency-stop"):
         c.robot.check()
 

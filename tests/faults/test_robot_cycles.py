@@ -15,11 +15,11 @@ import pytest
 
 from station.cell.errors import RobotError
 from station.simulation.launch import SimulatedController
+from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.process
 
 Make = Callable[..., Awaitable[Any]]
-CYCLE_LIMIT_S = 5.0
 WARM_UP = 6
 
 
@@ -41,7 +41,7 @@ async def drop(c: Any, how: str) -> None:
     """Asks again when the drop came before the controller had accepted the link that just came back."""
     lost, begun_s, asked_s = c.robot.lost, time.monotonic(), 0.0
     while c.robot.lost == lost:
-        assert time.monotonic() - begun_s < CYCLE_LIMIT_S, "the robot's loss was not noticed"
+        assert time.monotonic() - begun_s < PATIENCE_S, "the robot's loss was not noticed"
         if time.monotonic() - asked_s > 1.0:
             asked_s = time.monotonic()
             c.admin.ask("drop", how=how)
@@ -58,9 +58,9 @@ async def cycle(c: Any, number: int) -> None:
     await drop(c, "rst" if number % 2 else "fin")
     if move is not None:
         with pytest.raises(RobotError):
-            await asyncio.wait_for(move, CYCLE_LIMIT_S)
-    await c.until(lambda: c.robot.connected and not c.robot.control, CYCLE_LIMIT_S)
-    await asyncio.wait_for(c.robot.idle(), CYCLE_LIMIT_S)
+            await asyncio.wait_for(move, PATIENCE_S)
+    await until(lambda: c.robot.connected and not c.robot.control)
+    await asyncio.wait_for(c.robot.idle(), PATIENCE_S)
 
 
 async def run_cycles(c: Any, count: int) -> None:
@@ -106,7 +106,7 @@ def test_ten_minutes_at_full_rate_without_a_lost_sample(
 
     reader = StateReader(controller("UR10e").host, take, lambda _: None)
     reader.start()
-    reader.started.result(3.0)
+    reader.started.result(PATIENCE_S)
     cpu_s = time.process_time()
     time.sleep(seconds)
     cpu_s = time.process_time() - cpu_s

@@ -10,6 +10,7 @@ import pytest
 
 from station.devices import ur_moves
 from tests.codes import raises
+from tests.patience import until
 
 pytestmark = pytest.mark.process
 
@@ -22,7 +23,7 @@ async def test_at_five_percent_the_move_arrives(cell: Make) -> None:
     goal = c.joints_rad()
     goal[5] += 0.02
     move = asyncio.create_task(c.robot.move(goal, 0.8, 1.0))
-    await c.until(lambda: c.robot.notice == "speed slider at 5 %")
+    await until(lambda: c.robot.notice == "speed slider at 5 %")
     await move
     assert max(abs(a - b) for a, b in zip(c.joints_rad(), goal, strict=True)) < 1e-3
     assert c.robot.notice == ""
@@ -32,7 +33,7 @@ async def test_at_zero_the_arm_waits_and_the_operator_is_told(cell: Make) -> Non
     c = await cell()
     move = await c.cruising()
     c.admin.ask("slider", fraction=0.0)
-    await c.until(lambda: "slider on the pendant is at 0" in c.robot.notice)
+    await until(lambda: "slider on the pendant is at 0" in c.robot.notice)
     await asyncio.sleep(0.3)
     assert not move.done()
     c.admin.ask("slider", fraction=1.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -14,26 +13,23 @@ import pytest
 
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
-from station.devices.ur import STOP_WAIT_S, UrRobot
+from station.devices.ur import UrRobot
 from tests.codes import raises
+from tests.patience import until
 
 pytestmark = pytest.mark.process
 
 Make = Callable[..., Awaitable[Any]]
-PROMPT_S = STOP_WAIT_S + 1.0
-"""The longest wait for what hangs, and this computer's share; how fast STOP is stands in the benchmarks."""
 
 
 @pytest.mark.parametrize("model", ["UR10", "UR10e"])
 async def test_stop_in_mid_move(cell: Make, model: str) -> None:
     c = await cell(model)
     move = await c.cruising()
-    begun = time.monotonic()
     await c.robot.stop("operator")
-    assert time.monotonic() - begun < PROMPT_S
     with raises("stopped"):
         await move
-    assert await c.at_rest() < 0.5
+    await c.stops()
     await c.stays_at_rest()
     with raises("no-control"):
         await c.robot.move(c.joints_rad(), 0.5, 1.0)
@@ -45,7 +41,7 @@ async def test_both_paths_are_used(cell: Make) -> None:
     await c.robot.stop("operator")
     with pytest.raises(RobotError):
         await move
-    await c.until(lambda: c.asked("dashboard: stop") > 0)
+    await until(lambda: c.asked("dashboard: stop") > 0)
     # The script may have been ended by the dashboard's stop before it read the child's.
     assert c.asked("stop") + c.asked("controller: program stopped") > 0
 
@@ -62,10 +58,8 @@ async def test_with_a_hung_child_the_dashboard_stops_the_arm(
     monkeypatch.setattr(c.robot, "_dashboard_stop_anew", no_other)
     move = await c.cruising()
     os.kill(c.robot.control_pid, signal.SIGSTOP)
-    begun = time.monotonic()
     await c.robot.stop("operator")
-    assert time.monotonic() - begun < PROMPT_S
-    assert await c.at_rest() < 0.4
+    await c.stops()
     assert c.asked("stop") == 0 and c.asked("dashboard: stop") >= 1
     with pytest.raises(RobotError):
         await move
@@ -75,10 +69,8 @@ async def test_with_a_silent_dashboard_the_child_stops_the_arm(cell: Make) -> No
     c = await cell()
     c.admin.ask("stall_dash")
     move = await c.cruising()
-    begun = time.monotonic()
     await c.robot.stop("operator")
-    assert time.monotonic() - begun < PROMPT_S
-    assert await c.at_rest() < 0.5
+    await c.stops()
     assert c.asked("stop") == 1
     with pytest.raises(RobotError):
         await move
@@ -101,12 +93,12 @@ async def test_stop_is_welcome_in_any_state(cell: Make, tmp_path: Path) -> None:
 async def test_stop_while_control_starts(cell: Make) -> None:
     c = await cell(control=False)
     start = asyncio.create_task(c.robot.start_control())
-    await c.until(lambda: c.robot.control_pid is not None)
+    await until(lambda: c.robot.control_pid is not None)
     await c.robot.stop("changed my mind")
     with raises("stopped"):
         await start
     await asyncio.sleep(0.4)
-    await c.until(lambda: c.admin.ask("state")["program"] is None)
+    await until(lambda: c.admin.ask("state")["program"] is None)
     assert not c.robot.control and c.robot.control_pid is None
 
 
@@ -133,7 +125,7 @@ async def test_a_dashboard_connection_that_does_not_answer_is_replaced(
     monkeypatch.setattr(c.robot.dashboard, "send", lambda command: loop.create_future())
     os.kill(c.robot.control_pid, signal.SIGSTOP)
     await c.robot.stop("operator")
-    await c.until(lambda: c.asked("dashboard: stop") >= 1, timeout_s=1.0)
+    await until(lambda: c.asked("dashboard: stop") >= 1)
     with pytest.raises(RobotError):
         await move
 
@@ -158,5 +150,5 @@ async def test_a_cancelled_move_stops_the_arm(cell: Make) -> None:
     move.cancel()
     with pytest.raises(asyncio.CancelledError):
         await move
-    assert await c.at_rest() < 0.5
+    await c.stops()
     await c.stays_at_rest()

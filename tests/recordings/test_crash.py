@@ -17,6 +17,7 @@ import pytest
 
 from recordings.reader import open_recording
 from recordings.recover import recover_recording
+from tests.patience import PATIENCE_S
 from tests.recordings.small_recording import make_image
 
 ROOT = Path(__file__).parents[2]
@@ -110,7 +111,7 @@ def test_kill_9_at_a_hundred_moments(tmp_path: Path, seed: int) -> None:
 def fill_the_disk(folder: Path, limit_bytes: int) -> None:
     path = folder / "a.mcap"
     process = start(path, limit_bytes)
-    output = process.communicate(timeout=60)[0].splitlines()
+    output = process.communicate(timeout=PATIENCE_S)[0].splitlines()
     assert output[0] == "ready"
     assert output[-1] == f"error disk {errno.EFBIG}"
     assert not path.exists()
@@ -129,7 +130,7 @@ def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, limit_bytes: int
 @pytest.mark.parametrize("limit_bytes", [0, 100])
 def test_a_disk_that_is_full_at_the_beginning_leaves_the_name_free(tmp_path: Path, limit_bytes: int) -> None:
     process = start(tmp_path / "a.mcap", limit_bytes)
-    said = process.communicate(timeout=60)[0]
+    said = process.communicate(timeout=PATIENCE_S)[0]
     assert said == f"error disk {errno.EFBIG}\n"
     assert not list(tmp_path.iterdir())
 

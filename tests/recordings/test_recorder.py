@@ -6,7 +6,6 @@ import asyncio
 import errno
 import os
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,9 +17,8 @@ from recordings.recorder import Recorder
 from recordings.schema.definitions import encode
 from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
+from tests.patience import PATIENCE_S, wait_until
 from tests.recordings.small_recording import make_info, make_picture, make_state, make_view, refused
-
-TIMEOUT_S = 20.0
 
 
 class Gate:
@@ -33,7 +31,7 @@ class Gate:
 
         def slow_event(writer: RecordingWriter, event: CaptureEvent) -> None:
             self.reached.set()
-            assert self.opened.wait(TIMEOUT_S)
+            assert self.opened.wait(PATIENCE_S)
             original(writer, event)
 
         monkeypatch.setattr(RecordingWriter, "event", slow_event)
@@ -55,10 +53,10 @@ def test_a_session_from_several_threads_comes_back_complete(tmp_path: Path) -> N
     for index in range(10):
         assert recorder.image(make_picture(index))
         recorder.view(make_view(index))
-        recorder.sync().result(TIMEOUT_S)
+        recorder.sync().result(PATIENCE_S)
     robot.join()
     recorder.attach("plan.yaml", "application/yaml", b"x")
-    recording = open_recording(recorder.finish().result(TIMEOUT_S))
+    recording = open_recording(recorder.finish().result(PATIENCE_S))
     assert list(recording.robot_states()) == [make_state(i) for i in range(2000)]
     assert [view.index for view in recording.views()] == list(range(10))
     assert recorder.dropped == 0
@@ -83,7 +81,7 @@ def test_sync_resolves_only_after_fdatasync_of_what_came_before(
     recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: 0.0)
     recorder.image(make_picture(0))
     recorder.view(make_view(0))
-    recorder.sync().result(TIMEOUT_S)
+    recorder.sync().result(PATIENCE_S)
     size = recorder.part_path.stat().st_size
     assert order == [f"view {size}", f"sync {size}"]
     recorder.close()
@@ -108,7 +106,7 @@ def test_data_reach_the_system_and_the_disk_without_being_asked(
     wait_until(lambda: encode(make_state(0)) in recorder.part_path.read_bytes())
     assert not synced.is_set()
     now_s = recorder_module.SYNC_PERIOD_S * 1.01
-    assert synced.wait(TIMEOUT_S)
+    assert synced.wait(PATIENCE_S)
     recorder.close()
 
 
@@ -122,7 +120,7 @@ class SlowSync:
 
     def _sync(self, _: int) -> None:
         self.reached.set()
-        assert self.opened.wait(TIMEOUT_S)
+        assert self.opened.wait(PATIENCE_S)
         if self._failures:
             raise self._failures.pop()  # as the kernel does: it tells an error once
 
@@ -132,7 +130,7 @@ def test_pictures_go_on_while_the_disk_syncs(tmp_path: Path, monkeypatch: pytest
     disk = SlowSync(monkeypatch)
     recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: now_s)
     now_s = recorder_module.SYNC_PERIOD_S * 1.01
-    assert disk.reached.wait(TIMEOUT_S)
+    assert disk.reached.wait(PATIENCE_S)
     size, sequence = recorder.part_path.stat().st_size, 0
     for sequence in range(3):
         now_s += recorder_module.SYNC_PERIOD_S * 1.01
@@ -142,7 +140,7 @@ def test_pictures_go_on_while_the_disk_syncs(tmp_path: Path, monkeypatch: pytest
     acknowledged = recorder.sync()
     assert not acknowledged.done()
     disk.opened.set()
-    acknowledged.result(TIMEOUT_S)
+    acknowledged.result(PATIENCE_S)
     recorder.close()
 
 
@@ -153,21 +151,12 @@ def test_nothing_is_acknowledged_after_a_regular_sync_failed(
     disk = SlowSync(monkeypatch, OSError(5, "Input/output error"))
     recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: now_s)
     now_s = recorder_module.SYNC_PERIOD_S * 1.01
-    assert disk.reached.wait(TIMEOUT_S)
+    assert disk.reached.wait(PATIENCE_S)
     acknowledged = recorder.sync()  # its own fdatasync would succeed
     disk.opened.set()
     with refused("disk", errno=errno.EIO):
-        acknowledged.result(TIMEOUT_S)
+        acknowledged.result(PATIENCE_S)
     assert recorder.error is not None
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    pause = threading.Event()
-    for _ in range(int(TIMEOUT_S / 0.01)):
-        if condition():
-            return
-        pause.wait(0.01)
-    raise AssertionError("it never came true")
 
 
 def test_a_slow_disk_costs_counted_pictures_and_never_a_view(
@@ -177,7 +166,7 @@ def test_a_slow_disk_costs_counted_pictures_and_never_a_view(
     size = make_picture(0).pixels.nbytes
     recorder = Recorder(tmp_path / "a.mcap", make_info(), queue_limit_bytes=3 * size + 500)
     recorder.event(event())
-    assert gate.reached.wait(TIMEOUT_S)
+    assert gate.reached.wait(PATIENCE_S)
     kept = [recorder.image(make_picture(sequence)) for sequence in range(5)]
     assert kept == [True, True, True, False, False]
     assert recorder.queued_bytes >= 3 * size
@@ -186,7 +175,7 @@ def test_a_slow_disk_costs_counted_pictures_and_never_a_view(
     with refused("image-dropped"):
         recorder.view(make_view(4))
     gate.opened.set()
-    recording = open_recording(recorder.finish().result(TIMEOUT_S))
+    recording = open_recording(recorder.finish().result(PATIENCE_S))
     assert recording.segments[0].image_sequences() == [0, 1, 2]
     assert [view.index for view in recording.views()] == [0]
 
@@ -195,7 +184,7 @@ def test_the_callers_never_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest
     gate = Gate(monkeypatch)
     recorder = Recorder(tmp_path / "a.mcap", make_info())
     recorder.event(event())
-    assert gate.reached.wait(TIMEOUT_S)
+    assert gate.reached.wait(PATIENCE_S)
     for count in range(recorder_module.QUEUE_LIMIT_MESSAGES + 7):  # returns although nothing is written
         recorder.robot_state(make_state(count))
     recorder.event(event())
@@ -203,7 +192,7 @@ def test_the_callers_never_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest
     assert not done.done()
     assert recorder.dropped == 7
     gate.opened.set()
-    done.result(TIMEOUT_S)
+    done.result(PATIENCE_S)
     recorder.close()
 
 
@@ -220,12 +209,12 @@ def test_the_first_write_error_is_final_and_said_to_everyone(
     recorder = Recorder(tmp_path / "a.mcap", make_info())
     recorder.image(make_picture(0))
     recorder.view(make_view(0))
-    recorder.sync().result(TIMEOUT_S)
+    recorder.sync().result(PATIENCE_S)
     safe = recorder.part_path.read_bytes()
     break_disk(monkeypatch)
     recorder.image(make_picture(1))
     with refused("disk", errno=errno.ENOSPC):
-        recorder.sync().result(TIMEOUT_S)
+        recorder.sync().result(PATIENCE_S)
     assert recorder.error is not None
     monkeypatch.undo()  # space is free again, and still nothing more is written
     assert not recorder.image(make_picture(2))
@@ -233,9 +222,9 @@ def test_the_first_write_error_is_final_and_said_to_everyone(
         with refused("disk", errno=errno.ENOSPC):
             call()
     with refused("disk", errno=errno.ENOSPC):
-        recorder.sync().result(TIMEOUT_S)
+        recorder.sync().result(PATIENCE_S)
     with refused("disk", errno=errno.ENOSPC):
-        recorder.finish().result(TIMEOUT_S)
+        recorder.finish().result(PATIENCE_S)
     assert recorder.part_path.read_bytes() == safe
     assert not (tmp_path / "a.mcap").exists()
 
@@ -246,7 +235,7 @@ def test_waiting_syncs_fail_with_the_error_and_nobody_hangs(
     gate = Gate(monkeypatch)
     recorder = Recorder(tmp_path / "a.mcap", make_info())
     recorder.event(event())
-    assert gate.reached.wait(TIMEOUT_S)
+    assert gate.reached.wait(PATIENCE_S)
     recorder.image(make_picture(0))
     waiting = [recorder.sync() for _ in range(3)]
     finishing = recorder.finish()
@@ -254,7 +243,7 @@ def test_waiting_syncs_fail_with_the_error_and_nobody_hangs(
     gate.opened.set()
     for future in (*waiting, finishing):
         with refused("disk", errno=errno.ENOSPC):
-            future.result(TIMEOUT_S)
+            future.result(PATIENCE_S)
 
 
 @pytest.mark.parametrize("call", ["fdatasync", "fsync"])
@@ -270,9 +259,9 @@ def test_an_error_of_the_sync_itself_is_as_final(
     monkeypatch.setattr(os, call, fail)
     if call == "fdatasync":
         with refused("disk", errno=errno.EIO):
-            recorder.sync().result(TIMEOUT_S)
+            recorder.sync().result(PATIENCE_S)
     with refused("disk", errno=errno.EIO):
-        recorder.finish().result(TIMEOUT_S)
+        recorder.finish().result(PATIENCE_S)
     assert not (tmp_path / "a.mcap").exists()
 
 
@@ -292,7 +281,7 @@ async def test_a_task_that_stops_waiting_does_not_harm_the_recording(
 def test_what_comes_after_the_end_is_not_kept_and_not_counted_as_lost(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "a.mcap", make_info())
     assert recorder.robot_state(make_state(0))
-    recorder.finish().result(TIMEOUT_S)
+    recorder.finish().result(PATIENCE_S)
     assert not recorder.robot_state(make_state(1))
     assert recorder.dropped == 0
 
@@ -311,7 +300,7 @@ def test_finishing_what_was_closed_is_refused_at_once(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "a.mcap", make_info())
     recorder.close()
     with refused("unfinished-recording"):
-        recorder.finish().result(TIMEOUT_S)
+        recorder.finish().result(PATIENCE_S)
 
 
 def test_lossless_png_is_smaller_and_the_same(tmp_path: Path) -> None:
@@ -322,7 +311,7 @@ def test_lossless_png_is_smaller_and_the_same(tmp_path: Path) -> None:
         recorder = Recorder(tmp_path / f"{lossless}.mcap", make_info(), lossless_png=lossless)
         recorder.image(smooth)
         recorder.view(make_view(0))
-        path = recorder.finish().result(TIMEOUT_S)
+        path = recorder.finish().result(PATIENCE_S)
         ((_, picture),) = open_recording(path).images()
         assert (picture.pixels == 7).all()
         sizes.append(path.stat().st_size)

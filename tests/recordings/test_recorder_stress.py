@@ -18,6 +18,7 @@ from recordings.recorder import Recorder
 from recordings.schema.definitions import encode
 from recordings.schema.messages import CameraModel, CaptureEvent, Image, RobotState, Stamps, View
 from recordings.schema.topics import Topic
+from tests.patience import PATIENCE_S
 from tests.recordings.small_recording import START_NS, make_info, make_picture, make_state, make_view
 
 WIDTH, HEIGHT, STATES_A_SECOND, VIEW_PERIOD_S = 1280, 1024, 500, 0.3
@@ -69,8 +70,8 @@ def test_what_two_threads_record_comes_back_bit_for_bit(
         recorder.view(views[-1])
         recorder.corners(sequence, np.full((42, 2), float(sequence)))
         recorder.event(CaptureEvent(Stamps(len(views), START_NS), "taken", pose_index=len(views)))
-        recorder.sync().result(20)
-    path = recorder.finish().result(20)
+        recorder.sync().result(PATIENCE_S)
+    path = recorder.finish().result(PATIENCE_S)
     assert recorder.dropped == 0
 
     part = open_recording(path).segments[0]

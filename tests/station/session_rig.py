@@ -35,12 +35,11 @@ from station.devices.frames import CameraCounts, FrameTiming
 from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.scenes import cell_config, make_cell
+from tests.patience import until
 
 TRUTH = make_cell("paper-binned")
 POSES = 4
 GLIMPSED = np.random.default_rng(1).integers(0, 255, (64, 80), dtype=np.uint8)
-PATIENCE_S = 30.0
-"""A test fails by what is wrong, not because the computer has much else to do."""
 RUNNING, NORMAL, STOPPED = 7, 1, 1
 
 
@@ -292,18 +291,11 @@ class Rig:
 
     async def until(self, *states: StationState) -> None:
         """A slow arm that is `moving` is under way: its way was checked."""
-        async with asyncio.timeout(PATIENCE_S):
-            while self.state not in states or self._waits_for_its_check:
-                await asyncio.sleep(0.002)
+        await until(lambda: self.state in states and not self._waits_for_its_check)
 
     @property
     def _waits_for_its_check(self) -> bool:
         return self.state is StationState.MOVING and self.arm.slow and not self.arm.under_way
-
-    async def until_true(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(PATIENCE_S):
-            while not condition():
-                await asyncio.sleep(0.002)
 
     async def give_go(self, purpose: Purpose = Purpose.RUN) -> None:
         summary = await self.session.prepare(1, purpose)

@@ -11,9 +11,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
-import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
@@ -26,12 +23,11 @@ from station.protocol.client import Client
 from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
 from station.simulation.scenes import cell_config, make_cell
-from tests.conftest import CONTROL_PATHS
+from tests.conftest import AT_REST_RAD_S, CONTROL_PATHS, rests_short_of_its_goal
+from tests.patience import PATIENCE_S, until
 from tests.station.quick_plan import quick_plan
 
 TRUTH = make_cell(seed=5)
-AT_REST_RAD_S = 1e-3
-LOOK_S = 0.01
 both_paths = pytest.mark.parametrize("rig", CONTROL_PATHS, indirect=True)
 PROGRAM = (sys.executable, "-m", "tests.system.cell_daemon")
 
@@ -88,7 +84,7 @@ class DaemonProcess:
 
     async def ready(self) -> None:
         assert self.process.stdout is not None
-        line = await asyncio.wait_for(asyncio.to_thread(self.process.stdout.readline), 30)
+        line = await asyncio.wait_for(asyncio.to_thread(self.process.stdout.readline), PATIENCE_S)
         assert line, "the daemon ended at once; see its log"
 
     async def client(self) -> Client:
@@ -101,7 +97,7 @@ class DaemonProcess:
             assert self.process.stdin is not None
             self.process.stdin.close()
             try:
-                self.process.wait(10)
+                self.process.wait(PATIENCE_S)
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait()
@@ -110,31 +106,6 @@ class DaemonProcess:
                 pipe.close()
         if self.notified is not None:
             self.notified.close()
-
-
-class Stopwatch(threading.Thread):
-    """Measures how late this computer itself is: a sleep of 10 ms is over after 10 ms, or it is busy."""
-
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self._late: deque[tuple[float, float]] = deque(maxlen=3000)
-        self._end = threading.Event()
-        self.start()
-
-    def run(self) -> None:
-        before_s = time.monotonic()
-        while not self._end.wait(LOOK_S):
-            now_s = time.monotonic()
-            self._late.append((now_s, max(0.0, now_s - before_s - LOOK_S)))
-            before_s = now_s
-
-    def late_s(self, since_s: float) -> float:
-        """All of it since then (host monotonic)."""
-        return sum(late_s for at_s, late_s in list(self._late) if at_s >= since_s)
-
-    def end(self) -> None:
-        self._end.set()
-        self.join()
 
 
 class SystemRig:
@@ -146,7 +117,6 @@ class SystemRig:
         """Control path that drives the arm; empty: the installed one."""
         self.admin: AdminClient = controller.admin()
         self.daemons: list[DaemonProcess] = []
-        self._watch = Stopwatch()
 
     async def daemon(self) -> DaemonProcess:
         number = len(self.daemons) + 1
@@ -158,25 +128,16 @@ class SystemRig:
     def speed_rad_s(self) -> float:
         return float(max(map(abs, self.admin.ask("state")["joint_speeds_rad_s"])))
 
-    async def until(self, condition: Callable[[], bool], timeout_s: float = 60.0) -> float:
-        """Seconds until it holds."""
-        begun_s = time.monotonic()
-        while not condition():
-            assert time.monotonic() - begun_s < timeout_s, "it did not come about in time"
-            await asyncio.sleep(0.005)
-        return time.monotonic() - begun_s
-
     async def moving(self) -> None:
-        await self.until(lambda: self.speed_rad_s() > 0.1)
+        await until(lambda: self.speed_rad_s() > 0.1)
 
-    async def at_rest(self, timeout_s: float = 10.0) -> float:
-        """Seconds until the arm stands, without those by which this computer itself was late meanwhile."""
-        begun_s = time.monotonic()
-        took_s = await self.until(lambda: self.speed_rad_s() < AT_REST_RAD_S, timeout_s)
-        return took_s - self.late_s(begun_s)
+    async def rests(self) -> None:
+        await until(lambda: self.speed_rad_s() < AT_REST_RAD_S)
 
-    def late_s(self, since_s: float) -> float:
-        return self._watch.late_s(since_s)
+    async def stops(self) -> None:
+        """Before it has arrived."""
+        await self.rests()
+        rests_short_of_its_goal(self.admin)
 
     async def stays_at_rest(self, seconds: float = 0.5) -> None:
         before = self.admin.ask("state")["joints_rad"]
@@ -188,14 +149,11 @@ class SystemRig:
         for daemon in self.daemons:
             daemon.end()
         self.admin.close()
-        self._watch.end()
 
 
-async def status_when(
-    client: Client, condition: Callable[[StationStatus], bool], timeout_s: float = 90.0
-) -> StationStatus:
+async def status_when(client: Client, condition: Callable[[StationStatus], bool]) -> StationStatus:
     """The first status for which it holds."""
-    async with asyncio.timeout(timeout_s):
+    async with asyncio.timeout(PATIENCE_S):
         async for status in client.statuses():
             if condition(status):
                 return status

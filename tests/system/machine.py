@@ -11,14 +11,14 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
+
+from tests.patience import PATIENCE_S, wait_until
 
 REPOSITORY = Path(__file__).parents[2]
 PREFIX = Path("/opt/station")
 CHECKOUT, VENV = Path("/opt/checkout"), Path("/opt/venv")
-BOOT_S = 30.0
 FOLDERS = ("usr", "etc", "var/lib", "var/tmp", "run", "tmp", "dev", "proc", "sys", "opt/checkout", "opt/venv")
 _OWN_ETC = ("passwd", "group", "nsswitch.conf", "ld.so.conf", "ld.so.conf.d", "ld.so.cache", "alternatives")
 
@@ -91,8 +91,8 @@ class Machine:
                 env=os.environ | {"SYSTEMD_NSPAWN_UNIFIED_HIERARCHY": "1"},
             )
         try:
-            self.until(lambda: self._leader() is not None and self._up(), BOOT_S)
-        except TimeoutError:
+            self.until(lambda: self._leader() is not None and self._up())
+        except AssertionError:
             said = self._log.read_text()[-500:]
             self.end()
             raise CannotBootError(f"systemd did not come up in a container: {said}") from None
@@ -106,19 +106,19 @@ class Machine:
     def _up(self) -> bool:
         return self.run("systemctl", "is-active", "basic.target", check=False).strip() == "active"
 
-    def until(self, condition: Callable[[], object], timeout_s: float) -> None:
-        give_up_s = time.monotonic() + timeout_s
-        while self._nspawn.poll() is None and time.monotonic() < give_up_s:
+    def until(self, condition: Callable[[], object]) -> None:
+        def holds() -> object:
+            assert self._nspawn.poll() is None, "the machine ended"
             with contextlib.suppress(OSError):
-                if condition():
-                    return
-            time.sleep(0.1)
-        raise TimeoutError("it did not come about in time")
+                return condition()
+            return False
+
+        wait_until(holds)
 
     def run(self, *command: str, check: bool = True) -> str:
         """Run a command in the container; give what it prints."""
         enter = ["nsenter", "--target", str(self._leader()), "--all"]
-        done = subprocess.run([*enter, *command], capture_output=True, text=True, timeout=60)
+        done = subprocess.run([*enter, *command], capture_output=True, text=True, timeout=PATIENCE_S)
         assert done.returncode == 0 or not check, f"{command}: {done.stdout}{done.stderr}\n{self.journal()}"
         return done.stdout
 
@@ -144,7 +144,7 @@ class Machine:
         if self._nspawn.poll() is None:
             self._nspawn.terminate()  # nspawn asks its systemd to switch off
             try:
-                self._nspawn.wait(15)
+                self._nspawn.wait(PATIENCE_S)
             except subprocess.TimeoutExpired:
                 self._nspawn.kill()
                 self._nspawn.wait()

@@ -69,7 +69,7 @@ async def test_a_sound_arm_passes_and_every_move_was_approved_by_itself(rig: Sys
     await client.close()
     assert [result.way for result in test.results] == list(ways)
     assert all(result.passed for result in test.results), test.results
-    assert len({preview.token for preview in tester.approved}) == len(ways)
+    assert len({preview.token for preview in tester.approved}) == len(tester.approved) >= len(ways)
     assert all(preview.top_speed_m_s <= SLOW_M_S for preview in tester.approved)
     assert not found.accepted, "some ways only were tested"
     assert found.speed_m_s == 0 and found.subject.source == "simulated"

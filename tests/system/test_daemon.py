@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -18,6 +17,7 @@ from station.cell.plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.client import Client, DaemonGoneError
 from station.protocol.stop_client import Outcome, stop
+from tests.patience import PATIENCE_S, until
 from tests.system.conftest import SystemRig, both_paths, go, status_when
 
 pytestmark = pytest.mark.process
@@ -33,19 +33,15 @@ async def test_a_killed_operator_stops_the_arm_and_stop_from_a_watcher_is_latche
         await go(anna, short_plan)
         await rig.moving()
         anna._writer.transport.abort()  # what the kernel does to a killed screen
-        assert await rig.at_rest() < 1.0
+        await rig.stops()
         status = await status_when(bert, lambda s: s.state is S.PAUSED)
         assert (status.cause, status.lease.holder) == ("control-lost", "")
         await rig.stays_at_rest()
         async with await daemon.client() as cleo:
             await go(cleo, None, "resume")
             await rig.moving()
-            pressed_s = time.monotonic()
             await bert.request("stop")
-            answered_s = time.monotonic() - pressed_s - rig.late_s(pressed_s)
-            stopped_s = await rig.at_rest()
-            assert answered_s < 0.3
-            assert stopped_s < 1.0
+            await rig.stops()
             status = await status_when(cleo, lambda s: s.state is S.STOPPED)
             assert status.cause == "stop"
             await rig.stays_at_rest()
@@ -76,7 +72,7 @@ async def test_a_daemon_that_hangs_is_killed_or_told_to_end_stops_the_arm(
         assert "READY=1" in heard and "WATCHDOG=1" in heard
         # It hangs: no word to systemd, and it waits for a person when it goes on.
         first.process.send_signal(signal.SIGSTOP)
-        assert await rig.at_rest() < 1.5
+        await rig.stops()
         first.notified.heard()
         await asyncio.sleep(1.2)
         assert "WATCHDOG=1" not in first.notified.heard()
@@ -90,10 +86,8 @@ async def test_a_daemon_that_hangs_is_killed_or_told_to_end_stops_the_arm(
         children = children_of(first.process.pid)
         assert len(children) >= 2, "worker and control process"
         first.process.kill()
-        assert await rig.at_rest() < 1.5
-        async with asyncio.timeout(5):
-            while any(child.is_dir() for child in children):
-                await asyncio.sleep(0.05)
+        await rig.stops()
+        await until(lambda: not any(child.is_dir() for child in children))
     # The next one waits for a person, goes on with the same session, and seals it when it is told to end.
     second = await rig.daemon()
     async with await second.client() as anna:
@@ -106,11 +100,9 @@ async def test_a_daemon_that_hangs_is_killed_or_told_to_end_stops_the_arm(
         await anna.request("acknowledge")
         await go(anna, None, "resume")
         await rig.moving()
-        begun_s = time.monotonic()
         second.process.terminate()
-        assert await rig.at_rest() < 1.0
-        await asyncio.to_thread(second.process.wait, 20)
-        assert time.monotonic() - begun_s - rig.late_s(begun_s) < 5.0
+        await rig.stops()
+        await asyncio.to_thread(second.process.wait, PATIENCE_S)
     assert second.process.returncode == 0
     folder = Path(status.session.folder)
     assert not list(folder.glob("*.part"))
@@ -123,7 +115,7 @@ async def test_one_station_per_socket_and_per_robot(rig: SystemRig) -> None:
     command = [sys.executable, "-m", "tests.system.cell_daemon", rig.controller.host]
     command += [str(rig.folder / "truth.json"), str(rig.root), str(daemon.socket)]
     twin = await asyncio.to_thread(
-        subprocess.run, command, input="", capture_output=True, text=True, timeout=40
+        subprocess.run, command, input="", capture_output=True, text=True, timeout=PATIENCE_S
     )
     assert twin.returncode != 0
     assert "already serves" in twin.stderr
@@ -148,7 +140,7 @@ async def test_a_crowd_does_not_keep_stop_out(rig: SystemRig, short_plan: Plan) 
             crowd.append(link)
         await rig.moving()
         assert (await asyncio.to_thread(stop, daemon.socket))[0] is Outcome.RESTS
-        assert await rig.at_rest() < 1.0
+        await rig.stops()
         for link in crowd:
             link.close()
 

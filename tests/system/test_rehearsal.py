@@ -29,6 +29,7 @@ from station.protocol.verbs import GetPlan, Lease, MakePlan, Purpose
 from station.simulation.cell import read_truth
 from station.simulation.scenes import make_cell
 from tests.command_line import call
+from tests.patience import PATIENCE_S
 from tests.station.operate.guided_views import draft_of
 
 pytestmark = pytest.mark.process
@@ -79,7 +80,7 @@ def rehearsing(config: Path, root: Path) -> Iterator[Path]:
         assert b"ready" in daemon.stdout.readline()
         yield control
     finally:
-        daemon.communicate(timeout=20)
+        daemon.communicate(timeout=PATIENCE_S)
 
 
 async def test_nothing_of_the_configuration_is_connected_to(

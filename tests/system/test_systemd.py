@@ -12,7 +12,6 @@ import signal
 import struct
 import subprocess
 import termios
-import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from station.cell.plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.client import Client
 from station.tui.words import STATE_WORDS
+from tests.patience import until
 from tests.system.conftest import SystemRig, go, status_when
 from tests.system.machine import CHECKOUT, PREFIX, REPOSITORY, VENV, CannotBootError, Machine
 from tests.tui.terminal import KEYS, Glass
@@ -32,7 +32,6 @@ from tests.tui.terminal import KEYS, Glass
 pytestmark = [pytest.mark.process, pytest.mark.timeout(240)]
 SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 SOCKET = "/run/station/control.sock"
-WATCHDOG_S = 4
 """Shorter than the unit's 10 s, so that the test is."""
 
 
@@ -92,7 +91,7 @@ async def station(machine: Machine, rig: SystemRig) -> AsyncIterator[Machine]:
         f"Environment=PYTHONPATH={CHECKOUT}",
         "ExecStart=",
         f"ExecStart={VENV}/bin/python -m tests.system.cell_daemon {cell}",
-        f"WatchdogSec={WATCHDOG_S}",
+        "WatchdogSec=4",
     )
     await asyncio.to_thread(machine.run, "systemctl", "start", "station")  # returns when it said READY=1
     yield machine
@@ -115,11 +114,9 @@ async def test_stopping_the_service_stops_the_arm_seals_and_ends(
         await status_when(anna, lambda s: s.session.captured >= 1)
         assert "pose" in station.show("station", "StatusText")
         await rig.moving()
-        begun_s = time.monotonic()
         stopping = asyncio.create_task(asyncio.to_thread(station.run, "systemctl", "stop", "station"))
-        await rig.at_rest(1.5)
+        await rig.stops()
         await stopping
-        assert time.monotonic() - begun_s < 8.0
     assert station.show("station", "Result") == "success"
     assert station.show("station", "ExecMainStatus") == "0"
     assert not station.path(SOCKET).exists()
@@ -134,13 +131,13 @@ async def test_the_screen_comes_up_on_a_console_and_its_stop_key_reaches_the_dae
 ) -> None:
     station.run("systemctl", "start", "station-tui@tty1")
     connected = STATE_WORDS[S.IDLE]
-    await rig.until(lambda: all(word in console.text() for word in ("STOP", "F12", connected)), 40)
+    await until(lambda: all(word in console.text() for word in ("STOP", "F12", connected)))
     async with await client_of(station) as anna:
         await status_when(anna, lambda s: s.state is S.IDLE)
         console.press("f12")
         status = await status_when(anna, lambda s: s.state is S.STOPPED)
         assert "STOP by station-screen on tty1" in status.reason
-    await rig.until(lambda: "STOPPED" in console.text())
+    await until(lambda: "STOPPED" in console.text())
     screen = station.show("station-tui@tty1", "MainPID")
     as_screen = (
         f"nsenter -t {screen} -m setpriv --reuid station-screen --regid station-operator --clear-groups"
@@ -155,16 +152,16 @@ async def test_a_hung_daemon_is_killed_and_the_next_one_waits_for_a_person(
     station: Machine, rig: SystemRig, short_plan: Plan
 ) -> None:
     pinged = station.show("station", "WatchdogTimestampMonotonic")
-    await rig.until(lambda: station.show("station", "WatchdogTimestampMonotonic") != pinged)
+    await until(lambda: station.show("station", "WatchdogTimestampMonotonic") != pinged)
     async with await client_of(station) as anna:
         await go(anna, short_plan)
         await status_when(anna, lambda s: s.session.captured >= 1)
         await rig.moving()
         first = station.show("station", "MainPID")
         station.run("kill", f"-{signal.SIGSTOP.name}", first)
-        await rig.at_rest(1.5)
-    await rig.until(lambda: station.show("station", "NRestarts") == "1", WATCHDOG_S + 10)
-    await rig.until(lambda: station.show("station", "ActiveState") == "active", 30)
+        await rig.stops()
+    await until(lambda: station.show("station", "NRestarts") == "1")
+    await until(lambda: station.show("station", "ActiveState") == "active")
     assert station.show("station", "MainPID") != first
     async with await client_of(station) as anna:
         status = await status_when(anna, lambda s: s.robot.connected)
@@ -184,7 +181,7 @@ def test_a_finished_session_is_solved_without_network_or_devices(machine: Machin
     shutil.copy(SAMPLE, folder / "session.mcap")
     machine.run("chown", "-R", "station:station-operator", "/var/lib/station/sessions")
     machine.run("systemctl", "start", "calibrate@s-0-paper")
-    machine.until(lambda: machine.show("calibrate@s-0-paper", "ActiveState") in ("inactive", "failed"), 90)
+    machine.until(lambda: machine.show("calibrate@s-0-paper", "ActiveState") in ("inactive", "failed"))
     assert machine.show("calibrate@s-0-paper", "Result") == "success", machine.journal()
     calibration = read_calibration(folder / "calibration.yaml")
     assert calibration.provenance.recording_sha256
@@ -193,7 +190,7 @@ def test_a_finished_session_is_solved_without_network_or_devices(machine: Machin
 
 
 async def until_state(machine: Machine, unit: str, *states: str) -> None:
-    await asyncio.to_thread(machine.until, lambda: machine.show(unit, "ActiveState") in states, 30)
+    await asyncio.to_thread(machine.until, lambda: machine.show(unit, "ActiveState") in states)
 
 
 async def test_a_missing_configuration_is_said_once_and_not_started_again(machine: Machine) -> None:

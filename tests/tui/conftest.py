@@ -34,6 +34,7 @@ from station.cell.status import (
 from station.protocol.verbs import Configuration, Done, Preview, PreviewImage, Sessions, Verb, Watch
 from station.simulation.placement import cell_description
 from station.tui.app import StationApp
+from tests.patience import PATIENCE_S
 
 SUMMARY = MotionPreview(
     token="t-1",
@@ -56,12 +57,11 @@ CELL = cell_description(
     PoseGuess((0.6, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.01, 0.05),
 )
 """A UR10 on a table, a camera on its flange, the board before it."""
-UNTIL_S = 40.0
 
 
 async def until(pilot: Pilot[None], condition: Callable[[], object]) -> None:
-    """Wait until the condition holds, however busy the computer is."""
-    give_up_s = time.monotonic() + UNTIL_S
+    """Wait until the condition holds, while the screen goes on."""
+    give_up_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < give_up_s, "it did not come to that"
         await pilot.pause(0.02)

@@ -17,6 +17,8 @@ import time
 from collections import deque
 from pathlib import Path
 
+from tests.patience import PATIENCE_S
+
 KEYS = {
     "f5": "\x1b[15~",
     "f6": "\x1b[17~",
@@ -140,9 +142,9 @@ class ScreenProcess:
     def press_now(self, key: str) -> None:
         os.write(self._master, KEYS.get(key, key).encode())
 
-    def wait_for(self, pattern: str, timeout_s: float = 120.0) -> str:
+    def wait_for(self, pattern: str, give_up_after_s: float = PATIENCE_S) -> str:
         """The glass when `pattern` is on it."""
-        give_up_s = time.monotonic() + timeout_s
+        give_up_s = time.monotonic() + give_up_after_s
         while not re.search(pattern, text := self.glass.text):
             assert time.monotonic() < give_up_s, f"'{pattern}' never came:\n{text}"
             assert self.process.poll() is None, f"the screen ended:\n{text}"

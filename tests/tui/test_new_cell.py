@@ -31,7 +31,7 @@ from tests.station.operate.guided_views import guided_joints
 from tests.tui.new_cell_rig import SimulatedHardware
 
 pytestmark = pytest.mark.process
-UNTIL_S = 120.0
+PATIENCE_S = 120.0
 
 
 def other_cell() -> CellTruth:
@@ -42,7 +42,7 @@ def other_cell() -> CellTruth:
 
 
 async def until(pilot: Pilot[object], condition: Callable[[], object], what: str) -> None:
-    give_up_s = time.monotonic() + UNTIL_S
+    give_up_s = time.monotonic() + PATIENCE_S
     while not condition():
         if time.monotonic() > give_up_s:
             app = pilot.app

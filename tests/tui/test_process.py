@@ -18,6 +18,7 @@ from station.plan.planner import make_plan
 from station.simulation.cell import write_truth
 from station.simulation.launch import SimulatedController
 from station.simulation.scenes import cell_config
+from tests.patience import until
 from tests.system.conftest import TRUTH, SystemRig, short_folder, short_plan
 from tests.tui.terminal import ScreenProcess
 
@@ -80,8 +81,8 @@ async def desk_with(
         await asyncio.to_thread(desk.end)
 
 
-async def shows(screen: ScreenProcess, pattern: str, timeout_s: float = 120.0) -> str:
-    return await asyncio.to_thread(screen.wait_for, pattern, timeout_s)
+async def shows(screen: ScreenProcess, pattern: str) -> str:
+    return await asyncio.to_thread(screen.wait_for, pattern)
 
 
 async def go(screen: ScreenProcess) -> None:
@@ -89,10 +90,8 @@ async def go(screen: ScreenProcess) -> None:
     await asyncio.to_thread(screen.press, "f5")
     await shows(screen, "The arm will move")
     await asyncio.to_thread(screen.press, "tab", "enter")
-    async with asyncio.timeout(120):
-        # Until the screen has heard of it: a second F5 would be refused.
-        while re.search("‖ PAUSED|● IDLE", screen.glass.text):
-            await asyncio.sleep(0.05)
+    # Until the screen has heard of it: a second F5 would be refused.
+    await until(lambda: not re.search("‖ PAUSED|● IDLE", screen.glass.text))
 
 
 def captured(text: str) -> int:
@@ -100,9 +99,9 @@ def captured(text: str) -> int:
     return int(found.group(1)) if found else 0
 
 
-async def captured_at_least(screen: ScreenProcess, count: int, timeout_s: float = 250.0) -> None:
+async def captured_at_least(screen: ScreenProcess, count: int) -> None:
     """On a busy machine poses may fail and the session pause: a person would give a new go."""
-    async with asyncio.timeout(timeout_s):
+    async with asyncio.timeout(250):
         while captured(screen.glass.text) < count:
             if "‖ PAUSED" in screen.glass.text:
                 await go(screen)
@@ -120,7 +119,7 @@ async def test_run_stop_resume_finish_solve_install(desk_with: MakeDesk) -> None
 
     await desk.rig.moving()
     screen.press("f12")
-    await desk.rig.at_rest()
+    await desk.rig.rests()
     await shows(screen, "■ STOPPED")
     await desk.rig.stays_at_rest()
     screen.press("f5")
@@ -137,11 +136,11 @@ async def test_run_stop_resume_finish_solve_install(desk_with: MakeDesk) -> None
     screen.press("tab", "enter")
     await shows(screen, "● IDLE")
     screen.press("f9")
-    await shows(screen, "ready to install", 120.0)
+    await shows(screen, "ready to install")
     screen.press("i")
     await shows(screen, "Install this calibration")
     screen.press("tab", "enter")
-    await shows(screen, "Installed", 60.0)
+    await shows(screen, "Installed")
 
     installed = installed_calibration(desk.rig.root)
     assert installed.source == "simulated"
@@ -161,7 +160,7 @@ async def test_a_lost_screen_a_hung_and_a_killed_daemon_leave_the_session_whole(
     await desk.rig.moving()
 
     screen.process.kill()
-    await desk.rig.at_rest()
+    await desk.rig.stops()
     await desk.rig.stays_at_rest()
     second = desk.screen()
     await shows(second, "‖ PAUSED")
@@ -172,7 +171,7 @@ async def test_a_lost_screen_a_hung_and_a_killed_daemon_leave_the_session_whole(
     await go(second)
     await desk.rig.moving()
     desk.rig.daemons[-1].process.send_signal(signal.SIGSTOP)
-    await desk.rig.at_rest()
+    await desk.rig.stops()
     await shows(second, "NO ANSWER for(?s:.*)EMERGENCY STOP")
     await shows(second, "Daemon not")
     second.press("f12")
@@ -187,7 +186,7 @@ async def test_a_lost_screen_a_hung_and_a_killed_daemon_leave_the_session_whole(
     await desk.rig.moving()
     kept = captured(second.glass.text)
     desk.rig.daemons[-1].process.kill()
-    await desk.rig.at_rest()
+    await desk.rig.stops()
     await shows(second, "NO DAEMON")
     second.press("f12")
     await shows(second, "nothing was sent")

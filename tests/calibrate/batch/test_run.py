@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +19,7 @@ from calibrate.batch.storage import BatchResult, Results
 from calibrate.batch.workers import Lost, R, T, pool
 from calibrate.bounds import Limits
 from calibrate.job import JobOptions
+from tests.patience import PATIENCE_S, wait_until
 
 
 def in_this_process(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
@@ -136,11 +136,11 @@ def test_a_killed_batch_leaves_no_process_and_goes_on(
     command = [sys.executable, "-m", "calibrate.cli", "batch", *many, "-o", tmp_path / "out", "--workers", 2]
     with subprocess.Popen([str(word) for word in command], start_new_session=True) as batch:
         try:
-            wait_until(lambda: log.exists() and log.stat().st_size > 0, 60)
+            wait_until(lambda: log.exists() and log.stat().st_size > 0)
             assert len(of_session(batch.pid)) >= 3, "no worker beside it"
             os.kill(batch.pid, number)
-            assert batch.wait(10) in (-number, 128 + number, 1)
-            wait_until(lambda: not of_session(batch.pid), 5)
+            assert batch.wait(PATIENCE_S) in (-number, 128 + number, 1)
+            wait_until(lambda: not of_session(batch.pid))
         finally:
             for pid in of_session(batch.pid):
                 os.kill(pid, signal.SIGKILL)
@@ -154,13 +154,6 @@ def test_a_killed_batch_leaves_no_process_and_goes_on(
     run_batch(many, tmp_path / "out", workers=nobody)
     assert 1 <= len(kept) < len(many)
     assert asked == {str(path) for path in many} - kept
-
-
-def wait_until(condition: Callable[[], bool], timeout_s: float) -> None:
-    end_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
 
 
 def dies_at_three(task: int) -> int:

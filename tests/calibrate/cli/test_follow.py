@@ -16,6 +16,7 @@ import pytest
 from calibrate.files.install import install, set_validity
 from calibrate.files.validity import ValidityReason, ValidityState
 from tests.calibrate.calling import run
+from tests.patience import PATIENCE_S
 
 FAKES = {
     "rclpy/__init__.py": """
@@ -105,7 +106,7 @@ def test_it_ends_when_nobody_reads(ended: list[subprocess.Popen[str]], root: Pat
     next(lines(process))
     assert process.stdout is not None
     process.stdout.close()
-    assert process.wait(timeout=10) == 0
+    assert process.wait(PATIENCE_S) == 0
 
 
 def test_the_launch_file_sends_what_holds_and_nothing_else(
@@ -139,4 +140,4 @@ def test_the_launch_file_sends_what_holds_and_nothing_else(
     assert next(sent)["transform"] != place
     assert node.stderr.readline().split(":")[0] == "info calibration version 2"
     node.send_signal(signal.SIGINT)
-    assert node.wait(timeout=10) == 0
+    assert node.wait(PATIENCE_S) == 0

@@ -23,6 +23,7 @@ from station.session.queue import PoseQueue
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import write_truth
 from station.simulation.launch import SimulatedController
+from tests.patience import until
 from tests.station.session_rig import POSES, TRUTH, Rig
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(4).normal(128, 150, (600, 760)), (0, 0), 1.5)
@@ -97,7 +98,7 @@ async def test_a_moving_picture_is_not_captured_although_the_joints_rest(rig: Ri
 async def test_it_is_captured_as_soon_as_the_picture_rests(rig: Rig) -> None:
     rig.camera.jumps = 3
     await rig.give_go()
-    await rig.until_true(lambda: rig.camera.glimpses > 3)
+    await until(lambda: rig.camera.glimpses > 3)
     assert rig.camera.taken == 0
     rig.camera.jumps = 0
     await rig.until(S.IDLE)

@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from station.plan.files import load_plan
 from station.protocol.client import NoAnswerError
 from station.protocol.states import RUNNING
 from tests.command_line import call
+from tests.patience import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
@@ -96,11 +96,9 @@ def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pyte
     capture = subprocess.Popen(
         [*command, "--socket", str(shell.socket)], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
-    give_up_s = time.monotonic() + 60
-    while shell.state()["state"] not in RUNNING:
-        assert time.monotonic() < give_up_s
+    wait_until(lambda: shell.state()["state"] in RUNNING)
     capture.send_signal(signal.SIGINT)
-    said = capture.communicate(timeout=20)[1]
+    said = capture.communicate(timeout=PATIENCE_S)[1]
     assert capture.returncode == 130 and "station acknowledge" in said
     status = shell.state()
     assert (status["state"], status["cause"]) == ("stopped", "stop")

@@ -16,10 +16,8 @@ from station.devices.rtde import RuntimeState
 from station.devices.ur_control import WATCHDOG_HZ
 from station.devices.ur_moves import JOINT_SPEED_LIMIT_RAD_S
 from station.devices.ur_script import (
-    END_S,
     FIRST_REGISTER,
     SILENCE_S,
-    STALE_S,
     Command,
     ScriptControl,
     State,
@@ -31,6 +29,7 @@ from station.simulation.controller.state import Journal, Settings
 from station.simulation.controller.urscript import ScriptRun
 from station.simulation.controller.urscript_parser import ScriptSyntaxError
 from station.simulation.launch import AdminClient, SimulatedController
+from tests.patience import wait_until
 
 HOME = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
 GOAL = (0.6, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
@@ -266,9 +265,7 @@ def test_the_calls_mean_what_they_mean_in_ur_rtde(
     for _ in range(10):
         assert control.kickWatchdog()
         time.sleep(0.03)
-    begun_s = time.monotonic()
     control.stopJ(2.0, True)
-    assert time.monotonic() - begun_s < 0.1
     assert not control.kickWatchdog() and not control.setWatchdog(WATCHDOG_HZ)
     assert not control.moveJ(GOAL, 0.5, 1.0, True)
     assert uploads(admin) == 1
@@ -277,9 +274,7 @@ def test_the_calls_mean_what_they_mean_in_ur_rtde(
 @pytest.mark.process
 def test_the_end_of_the_script(running: SimulatedController, connect: Connect, admin: AdminClient) -> None:
     control = connect(running.host)
-    begun_s = time.monotonic()
     control.stopScript()
-    assert time.monotonic() - begun_s < END_S
     assert admin.ask("state")["runtime_state"] == "STOPPED"
 
 
@@ -308,10 +303,7 @@ def test_a_script_that_is_lost_stays_lost(
     control = connect(running.host)
     assert control.setWatchdog(WATCHDOG_HZ) and control.kickWatchdog()
     admin.ask(fault)
-    deadline_s = time.monotonic() + STALE_S + 0.5
-    while control.kickWatchdog():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
+    wait_until(lambda: not control.kickWatchdog())
     if fault == "stall":
         admin.ask("stall", on=False)
     time.sleep(0.4)

@@ -19,6 +19,7 @@ from station.cell.errors import StationError
 from station.devices.ur_link import UrLink
 from station.devices.ur_state import StateReader
 from station.simulation.launch import SimulatedController
+from tests.patience import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
@@ -31,7 +32,7 @@ class Stream:
         self.ends: list[str] = []
         self.reader = StateReader(host, self.states.append, self.ends.append)
         self.reader.start()
-        self.reader.started.result(3.0)
+        self.reader.started.result(PATIENCE_S)
 
     def collect(self, seconds: float) -> list[RobotState]:
         time.sleep(seconds)
@@ -90,8 +91,7 @@ def test_lost_samples_are_counted(controller: Start, stream: Callable[..., Strea
     s = stream(running)
     with running.admin() as admin:
         admin.ask("lose", packets=7)
-        s.collect(0.3)
-        assert s.reader.lost == 7
+        wait_until(lambda: s.reader.lost == 7)
 
 
 def test_frozen_data_are_no_samples(controller: Start, stream: Callable[..., Stream]) -> None:
@@ -99,11 +99,10 @@ def test_frozen_data_are_no_samples(controller: Start, stream: Callable[..., Str
     s = stream(running)
     with running.admin() as admin:
         admin.ask("freeze")
-        time.sleep(0.1)
+        wait_until(lambda: s.reader.frozen > 0)
         count = len(s.states)
-        time.sleep(0.3)
+        wait_until(lambda: s.reader.frozen > 10)
         assert len(s.states) == count
-        assert s.reader.frozen > 10
 
 
 @pytest.mark.parametrize(("how", "words"), [("fin", "the robot closed"), ("rst", "the robot reset")])
@@ -114,7 +113,7 @@ def test_the_end_of_a_link_is_told_at_once(
     s = stream(running)
     with running.admin() as admin:
         admin.ask("drop", how=how)
-    s.reader.join(1.0)
+    s.reader.join(PATIENCE_S)
     assert not s.reader.is_alive()
     assert words in s.ends[0] and s.reader.ended == s.ends[0]
 
@@ -124,7 +123,7 @@ def test_a_silent_link_is_given_up(controller: Start, stream: Callable[..., Stre
     s = stream(running)
     with running.admin() as admin:
         admin.ask("stall")
-    s.reader.join(3.0)
+    s.reader.join(PATIENCE_S)
     assert s.ends == ["no data from the robot for 2 s"]
 
 

@@ -30,6 +30,7 @@ from station.protocol.messages import (
 from station.protocol.verbs import Go
 from station.server.approval import Peer
 from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer
+from tests.patience import PATIENCE_S, until
 
 
 class RecordingHandler:
@@ -169,7 +170,7 @@ async def test_an_endless_line_costs_no_memory(server: Served) -> None:
     with pytest.raises(OSError):
         while sent < 1_000_000_000:
             writer.write(b"x" * 65536)
-            await asyncio.wait_for(writer.drain(), 5)
+            await asyncio.wait_for(writer.drain(), PATIENCE_S)
             sent += 65536
     assert sent < 10_000_000
 
@@ -184,7 +185,7 @@ async def test_of_too_many_questions_at_once_the_last_are_turned_away_but_never_
     ]
     reader, writer = await asyncio.open_unix_connection(str(path))
     writer.write(b"".join(waiting) + b'{"id": 99, "verb": "stop", "args": {}}\n')
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(PATIENCE_S):
         first, second = [json.loads(await reader.readline()) for _ in range(2)]
     assert first["id"] == OPEN_REQUESTS_LIMIT and first["problem"]["code"] == "too-many-requests"
     assert (second["id"], second["ok"]) == (99, True)
@@ -207,7 +208,7 @@ async def test_a_flood_of_lines_holds_up_neither_stop_nor_the_heartbeat(
             link.setblocking(False)
             link.connect(str(path))
             assert link.send(lines) == len(lines)
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(PATIENCE_S):
             while "stop" not in handler.order:
                 await asyncio.sleep(0)
     assert len(answered) < 100
@@ -270,9 +271,7 @@ async def test_a_lost_connection_is_told_to_the_handler(server: Served, handler:
     _, path = server
     client = await Client.connect(path)
     await client.close()
-    async with asyncio.timeout(2):
-        while not handler.lost:
-            await asyncio.sleep(0.01)
+    await until(lambda: handler.lost)
 
 
 async def test_a_stale_socket_is_replaced_a_living_one_is_not(server: Served, tmp_path: Path) -> None:
@@ -309,7 +308,7 @@ async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None
     with pytest.raises(DaemonGoneError) as gone:
         await client.request("go", token="")
     assert gone.value.code == "no-daemon"
-    async with asyncio.timeout(2):
+    async with asyncio.timeout(PATIENCE_S):
         assert len([s async for s in statuses]) <= 1
     await client.close()
 

@@ -10,7 +10,6 @@ import pty
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from station.server.approval import Peer, Process, process
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
 from tests.codes import raises
+from tests.patience import PATIENCE_S, until
 from tests.station.session_rig import POSES, NewRig, Rig
 
 See = Callable[[int], Process | None]
@@ -64,7 +64,7 @@ async def test_a_capture_over_the_socket(served: Served, small_plan: Plan) -> No
         assert summary["poses"] == POSES
         assert any("SIMULATED" in warning for warning in summary["warnings"])
         await anna.request("go", token=summary["token"])
-        await served.rig.until_true(lambda: bool(served.rig.session.store.status.session.recording))
+        await until(lambda: bool(served.rig.session.store.status.session.recording))
         sessions = await anna.request("sessions")
         assert sessions[0]["sealed"] and sessions[0]["views"] == POSES
         checks = {check["name"]: check for check in await anna.request("doctor")}
@@ -86,7 +86,7 @@ async def test_requests_that_hang_hold_up_no_approved_motion(
         session.take_lease(1, "anna")
         session.load_plan(1, small_plan)
         await served.rig.give_go()
-        await served.rig.until_true(lambda: bool(session.store.status.session.recording))
+        await until(lambda: bool(session.store.status.session.recording))
         refused, _ = await asyncio.wait(asking, timeout=0)
         assert {getattr(task.exception(), "code", "") for task in refused} == {"busy"}
         assert len(refused) > 20
@@ -230,7 +230,7 @@ async def test_a_named_service_approves_by_the_plans_hash_and_is_written_down(
         assert "move" not in served.rig.arm.log
         summary = await offered(program, small_plan)
         await program.request("go", token=summary["token"], plan_sha256=plan_sha256(small_plan))
-        await served.rig.until_true(lambda: bool(session.store.status.session.recording))
+        await until(lambda: bool(session.store.status.session.recording))
     told = [event.text for event in served.rig.told("approved")]
     recording = open_recording(Path(session.store.status.session.recording))
     recorded = [event.detail for event in recording.events() if "approved by" in event.detail]
@@ -317,8 +317,12 @@ def test_a_process_is_seen_at_its_terminal_only_in_the_foreground() -> None:
 async def test_neither_a_long_list_of_sessions_nor_a_slow_name_holds_the_loop_up(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    loop, held = asyncio.get_running_loop(), []
+
     def slow(_: object) -> Any:
-        time.sleep(0.4)
+        went_on = threading.Event()
+        loop.call_soon_threadsafe(went_on.set)
+        held.append(went_on.wait(PATIENCE_S))
         return []
 
     monkeypatch.setattr(dispatch, "list_sessions", slow)
@@ -326,8 +330,7 @@ async def test_neither_a_long_list_of_sessions_nor_a_slow_name_holds_the_loop_up
     async with await served.client() as anna:
         assert await anna.request("sessions") == []
         await anna.request("stop")
-        await asyncio.sleep(0.1)  # a frozen loop shows in the round after
-    assert served.rig.session.supervisor.lag_ms() < 300
+    assert len(held) == 2 and all(held), "the loop stands still meanwhile"
 
 
 async def test_who_is_turned_away_is_not_kept(served: Served) -> None:
@@ -342,7 +345,7 @@ async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
         await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
         summary = await anna.request("prepare")
     async with await served.client() as bert:
-        await served.rig.until_true(lambda: not served.rig.session.store.status.lease.holder)
+        await until(lambda: not served.rig.session.store.status.lease.holder)
         await bert.request("lease", action="take")
         with raises("approval-used"):
             await bert.request("go", token=summary["token"])

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Skip
+from tests.patience import until
 from tests.station.session_rig import POSES, Rig, sealed
 
 
 async def _sealed_session(rig: Rig) -> None:
     await rig.give_go()
-    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    await until(lambda: bool(rig.session.store.status.session.recording))
     await rig.until(S.IDLE)
 
 

@@ -22,6 +22,7 @@ from station.protocol.verbs import Purpose
 from station.session import session
 from station.session.recording import SessionRecording
 from tests.codes import raises
+from tests.patience import PATIENCE_S, until
 from tests.station.session_rig import POSES, HeldDisk, Rig
 
 
@@ -135,7 +136,7 @@ async def test_stop_is_answered_before_a_slow_disk_has_the_picture(rig: Rig, hel
     await asyncio.wait_for(rig.session.stop("bert"), STOP_ANSWER_S)  # else `station capture` says: no answer
     assert "stop" in rig.arm.log
     held_disk.set()
-    await rig.until_true(lambda: "done" in rig.pose_states)
+    await until(lambda: "done" in rig.pose_states)
 
 
 async def test_of_two_states_of_a_session_the_newer_one_stays_on_the_disk(
@@ -148,7 +149,7 @@ async def test_of_two_states_of_a_session_the_newer_one_stays_on_the_disk(
     def slow(self: SessionRecording, state: SessionState) -> None:
         begun.append(1)
         if len(begun) == 1:
-            disk.wait(5)
+            disk.wait(PATIENCE_S)
         written.append(len(state.poses))
 
     monkeypatch.setattr(SessionRecording, "_write_state", slow)
@@ -218,7 +219,7 @@ async def test_a_fault_between_moves_stops_the_arm_by_both_ways(rig: Rig, held_d
     rig.arm.trouble = RobotError("the program was stopped")
     held_disk.set()
     await rig.until(S.FAULT)
-    await rig.until_true(lambda: "end control" in rig.arm.log)
+    await until(lambda: "end control" in rig.arm.log)
     assert "stop" in rig.arm.log
 
 
@@ -234,7 +235,7 @@ async def test_a_defect_in_the_estimate_costs_one_estimate(rig: Rig, monkeypatch
     monkeypatch.setattr(rig.worker, "call", broken)
     await rig.give_go()
     await rig.until(S.IDLE)
-    await rig.until_true(lambda: len(asked) > 1)
+    await until(lambda: len(asked) > 1)
     assert rig.pose_states == ["done"] * POSES
 
 
@@ -248,12 +249,11 @@ async def test_a_worker_that_hangs_is_ended_without_holding_up_the_loop(
     workers = Workers(start_worker, warm_up)
     await workers.call(_hang, 0.0)
     assert workers._pool is not None
-    ended = threading.Event()
-    for process in workers._pool._processes.values():
-        monkeypatch.setattr(process, "join", lambda *_: ended.wait(20))  # one that takes its time to end
-    begun_s = time.monotonic()
+    ended, waited = threading.Event(), list[bool]()
+    for process in workers._pool._processes.values():  # ones that take their time to end
+        monkeypatch.setattr(process, "join", lambda *_: waited.append(ended.wait(PATIENCE_S)))
     with pytest.raises(WorkerError):
-        await workers.call(_hang, 30.0, timeout_s=0.1)
-    assert time.monotonic() - begun_s < 10
+        await workers.call(_hang, PATIENCE_S, timeout_s=0.1)
+    assert not waited
     ended.set()
     workers.close()

@@ -22,6 +22,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Skip
 from station.session.queue import PoseQueue
 from tests.codes import raises
+from tests.patience import until
 from tests.station.quick_plan import quick_plan
 from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, crash, memory_config, sealed
 
@@ -97,7 +98,7 @@ class WorkerThatLooksBack(WorkerInThisProcess):
 async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate(
     half_way: Rig, new_rig: NewRig
 ) -> None:
-    await half_way.until_true(lambda: half_way.session.store.status.estimate.views == BEFORE)
+    await until(lambda: half_way.session.store.status.estimate.views == BEFORE)
     known = half_way.session.store.status
     crash(half_way)
     again = await new_rig(with_plan=False)
@@ -107,7 +108,7 @@ async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate(
     again.session.take_lease(1, "anna")
     again.session.acknowledge("anna")
     await again.session.prepare(1, Purpose.RESUME)
-    await again.until_true(lambda: again.session.store.status.estimate.views == BEFORE)
+    await until(lambda: again.session.store.status.estimate.views == BEFORE)
     assert again.session.store.status.estimate.translation_mm == known.estimate.translation_mm
     await again.give_go(Purpose.RESUME)
     await again.until(S.IDLE)
@@ -125,7 +126,7 @@ async def test_nothing_moves_by_poses_that_the_disk_did_not_take(
     summary = await half_way.session.prepare(1, Purpose.RESUME)
     monkeypatch.setattr("station.session.recording.write_state", full)
     half_way.session.go(1, summary.token)
-    await half_way.until_true(lambda: "No space left" in half_way.session.store.status.reason)
+    await until(lambda: "No space left" in half_way.session.store.status.reason)
     assert half_way.state is S.PAUSED
     assert half_way.arm.log.count("move") == moves
 

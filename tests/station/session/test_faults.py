@@ -14,6 +14,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
 from station.session.recording import SessionRecording
 from tests.codes import raises
+from tests.patience import until
 from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
 
 
@@ -57,7 +58,7 @@ async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
     rig.arm.arrive.set()
     await rig.until(S.STOPPED)
     assert rig.cause == "safety-stop"
-    await rig.until_true(lambda: not rig.arm.control)
+    await until(lambda: not rig.arm.control)
     assert set(rig.arm.log) <= {"start control", "move", "end control"}
     rig.session.acknowledge("anna")
     with pytest.raises(SafetyStopError):
@@ -124,7 +125,7 @@ async def test_a_jogged_arm_is_named_and_its_go_is_void(rig: Rig) -> None:
     summary = await rig.session.prepare(1, Purpose.RESUME)
     await asyncio.sleep(0.3)
     rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.3)
-    await rig.until_true(lambda: any("0 mm and 17°" in e.text for e in rig.told("jogged")))
+    await until(lambda: any("0 mm and 17°" in e.text for e in rig.told("jogged")))
     with raises("approval-used"):
         rig.session.go(1, summary.token)
     again = await rig.session.prepare(1, Purpose.RESUME)

@@ -17,6 +17,7 @@ from station.session import freedrive
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from tests.codes import raises
+from tests.patience import until
 from tests.station.session_rig import POSES, Rig, sealed
 
 
@@ -47,12 +48,12 @@ async def test_a_dropped_pose_does_not_take_the_name_of_the_next_picture(rig: Ri
 async def test_auto_record_takes_a_new_place_once(bare_rig: Rig) -> None:
     bare_rig.arm.rest()
     await bare_rig.session.switch_free_drive(1, True, auto=True)
-    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 1)
+    await until(lambda: bare_rig.session.store.status.session.captured == 1)
     await asyncio.sleep(0.3)
     assert bare_rig.session.store.status.session.captured == 1
     bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
     bare_rig.arm.rest()
-    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 2)
+    await until(lambda: bare_rig.session.store.status.session.captured == 2)
     await bare_rig.session.stop("anna")
     assert bare_rig.state is S.STOPPED
 
@@ -68,19 +69,19 @@ async def test_auto_record_waits_for_an_arm_that_is_still_guided(
     assert rig.state is S.FREE_DRIVE and rig.pose_states == []
     rig.arm.rest()
     monkeypatch.setattr(StillnessMonitor, "at_rest", True)
-    await rig.until_true(lambda: rig.session.store.status.session.captured == 1)
+    await until(lambda: rig.session.store.status.session.captured == 1)
 
 
 async def test_auto_record_outlives_a_moment_without_news(bare_rig: Rig) -> None:
     bare_rig.arm.rest()
     await bare_rig.session.switch_free_drive(1, True, auto=True)
-    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 1)
+    await until(lambda: bare_rig.session.store.status.session.captured == 1)
     bare_rig.arm.stale = True
     bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
     await asyncio.sleep(0.25)  # two rounds of its watch
     bare_rig.arm.stale = False
     bare_rig.arm.rest()
-    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 2)
+    await until(lambda: bare_rig.session.store.status.session.captured == 2)
 
 
 @pytest.mark.parametrize("broken", [TriggerError("the trigger box is gone"), ZeroDivisionError("a defect")])

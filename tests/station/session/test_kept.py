@@ -13,6 +13,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Retake, Skip
 from tests.codes import raises
 from tests.durability import disk_order
+from tests.patience import until
 from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
 
 
@@ -25,9 +26,9 @@ async def test_a_pose_that_failed_is_known_after_a_crash(new_rig: NewRig) -> Non
     first.camera.fail = ["frame lost"] * 3
     first.arm.slow = True
     await first.give_go()
-    await first.until_true(lambda: under_way(first, 1))
+    await until(lambda: under_way(first, 1))
     first.arm.arrive.set()
-    await first.until_true(lambda: under_way(first, 2))
+    await until(lambda: under_way(first, 2))
     crash(first)
     second = await new_rig(with_plan=False)
     assert second.pose_states == ["failed", "planned", "planned", "planned"]
@@ -90,7 +91,7 @@ async def test_an_arm_that_stands_at_its_pose_is_not_moved(rig: Rig) -> None:
     summary = await rig.session.prepare(1, Purpose.RETAKE, 0)
     rig.session.go(1, summary.token)
     poses = rig.session.store
-    await rig.until_true(lambda: rig.state is S.PAUSED and poses.status.session.poses[0].attempt == 2)
+    await until(lambda: rig.state is S.PAUSED and poses.status.session.poses[0].attempt == 2)
     assert rig.pose_states[0] == "done"
     assert rig.arm.log.count("move") == 1
 
@@ -114,7 +115,7 @@ async def test_the_name_of_a_sessions_folder_is_on_the_disk_before_its_first_pos
     """Data that no name leads to after a power loss would be lost with it."""
     with disk_order(monkeypatch) as order:
         await rig.give_go()
-        await rig.until_true(lambda: rig.pose_states[0] == "done")
+        await until(lambda: rig.pose_states[0] == "done")
         until_then = list(order)
         await rig.until(S.IDLE)
     assert {"sync sessions", f"sync {rig.session.context.root.name}"} <= set(until_then)

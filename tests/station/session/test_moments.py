@@ -14,6 +14,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Drop, Purpose
 from station.session import run, session
 from tests.codes import raises
+from tests.patience import PATIENCE_S, until
 from tests.station.session_rig import POSES, HeldDisk, Rig
 
 
@@ -33,7 +34,7 @@ class HeldStart:
 async def test_a_pose_dropped_while_control_starts_is_not_driven(rig: Rig) -> None:
     held = HeldStart(rig)
     await rig.give_go()
-    await rig.until_true(lambda: rig.arm.control)
+    await until(lambda: rig.arm.control)
     await rig.session.edit(Drop, 1, lambda queue: queue.drop(1))
     held.go_on.set()
     await rig.until(S.IDLE, S.FAULT)
@@ -44,7 +45,7 @@ async def test_a_pose_dropped_while_control_starts_is_not_driven(rig: Rig) -> No
 async def test_finish_while_control_starts_seals_without_a_move(rig: Rig) -> None:
     held = HeldStart(rig)
     await rig.give_go()
-    await rig.until_true(lambda: rig.arm.control)
+    await until(lambda: rig.arm.control)
     await rig.session.finish(1)
     held.go_on.set()
     await rig.until(S.IDLE, S.FAULT)
@@ -57,7 +58,7 @@ async def test_a_lost_lease_before_anything_is_recorded_leaves_no_paused_session
 ) -> None:
     HeldStart(rig)
     await rig.give_go()
-    await rig.until_true(lambda: rig.arm.control)
+    await until(lambda: rig.arm.control)
     await rig.session.lease_lost(1)
     assert rig.state is S.IDLE and "stop" in rig.arm.log
     assert rig.cause == "control-lost"
@@ -87,7 +88,7 @@ class SlowCheck:
 
     def __call__(self, *args: Any) -> Any:
         self.looks.set()
-        assert self.go_on.wait(5.0)
+        assert self.go_on.wait(PATIENCE_S)
         return self._check(*args)
 
 
@@ -96,12 +97,12 @@ async def test_neither_heartbeat_nor_stop_waits_for_the_check_of_a_way(
 ) -> None:
     slow = SlowCheck(monkeypatch)
     await rig.give_go()
-    await rig.until_true(slow.looks.is_set)
+    await until(slow.looks.is_set)
     before = rig.arm.beats
-    await rig.until_true(lambda: rig.arm.beats > before + 3)
+    await until(lambda: rig.arm.beats > before + 3)
     await rig.session.stop("bert")
     slow.go_on.set()
-    await rig.until_true(lambda: rig.arm.log[-1:] == ["end control"])
+    await until(lambda: rig.arm.log[-1:] == ["end control"])
     assert rig.state is S.STOPPED and "move" not in rig.arm.log
 
 
@@ -110,7 +111,7 @@ async def test_an_arm_that_moved_while_its_way_was_checked_is_not_driven(
 ) -> None:
     slow = SlowCheck(monkeypatch)
     await rig.give_go()
-    await rig.until_true(slow.looks.is_set)
+    await until(slow.looks.is_set)
     first, *rest = rig.arm.joints
     rig.arm.joints = (first + 0.02, *rest)  # type: ignore[assignment]
     logs: list[list[str]] = []
@@ -122,7 +123,7 @@ async def test_an_arm_that_moved_while_its_way_was_checked_is_not_driven(
 
     rig.session.store.watch(look)
     slow.go_on.set()
-    await rig.until_true(lambda: bool(logs))
+    await until(lambda: bool(logs))
     failed = rig.session.store.status.session.poses[0]
     assert failed.cause == "arm-moved" and "1.1°" in failed.reason
     assert "move" not in logs[0]
@@ -160,5 +161,5 @@ async def test_nothing_new_begins_beside_a_run_that_does_not_end(
             await what()
     assert rig.session.context.requests.halt
     held_disk.set()
-    await rig.until_true(lambda: rig.session._run is not None and rig.session._run.done())
+    await until(lambda: rig.session._run is not None and rig.session._run.done())
     assert rig.arm.log.count("move") == 1

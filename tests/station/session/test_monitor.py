@@ -11,6 +11,7 @@ from station.cell.status import StationState as S
 from station.devices.rtde import RobotMode, SafetyMode
 from station.protocol.verbs import Purpose
 from station.session import monitor
+from tests.patience import until
 from tests.station.session_rig import NewRig, Rig
 
 
@@ -18,14 +19,14 @@ async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(ri
     await rig.go_until_it_moves()
     assert rig.session.store.status.pending == ""
     rig.session.pause("anna")
-    await rig.until_true(lambda: rig.session.store.status.pending == monitor.PAUSES)
+    await until(lambda: rig.session.store.status.pending == monitor.PAUSES)
     rig.arm.arrive.set()
     await rig.until(S.PAUSED)
-    await rig.until_true(lambda: rig.session.store.status.pending == "")
+    await until(lambda: rig.session.store.status.pending == "")
     await rig.give_go(Purpose.RESUME)
     await rig.until(S.MOVING)
     await rig.session.finish(1)
-    await rig.until_true(lambda: rig.session.store.status.pending == monitor.FINISHES)
+    await until(lambda: rig.session.store.status.pending == monitor.FINISHES)
 
 
 async def test_what_holds_an_arm_at_rest_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,13 +37,13 @@ async def test_what_holds_an_arm_at_rest_is_told(rig: Rig, monkeypatch: pytest.M
     assert held() == ""
     stopped = msgspec.structs.replace(good(), safety_mode=SafetyMode.PROTECTIVE_STOP)
     monkeypatch.setattr(rig.arm, "latest", lambda: stopped)
-    await rig.until_true(lambda: held().startswith("protective stop:"))
+    await until(lambda: held().startswith("protective stop:"))
     assert "acknowledge" not in held()  # nothing is latched here
     off = msgspec.structs.replace(good(), robot_mode=RobotMode.POWER_OFF)
     monkeypatch.setattr(rig.arm, "latest", lambda: off)
-    await rig.until_true(lambda: "has no power" in held())
+    await until(lambda: "has no power" in held())
     monkeypatch.setattr(rig.arm, "latest", good)
-    await rig.until_true(lambda: held() == "")
+    await until(lambda: held() == "")
 
 
 async def test_a_session_is_told_as_solved_while_its_calibration_is_there(
@@ -50,16 +51,16 @@ async def test_a_session_is_told_as_solved_while_its_calibration_is_there(
 ) -> None:
     monkeypatch.setattr(monitor, "DISK_PERIOD_S", 0.0)
     await rig.give_go()
-    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    await until(lambda: bool(rig.session.store.status.session.recording))
     session = rig.session.store.status.session
     assert session.calibration == ""
     path = Path(session.folder) / "calibration.yaml"
     path.write_text("a process of its own writes it")
-    await rig.until_true(lambda: rig.session.store.status.session.calibration == str(path))
+    await until(lambda: rig.session.store.status.session.calibration == str(path))
     path.unlink()
-    await rig.until_true(lambda: rig.session.store.status.session.calibration == "")
+    await until(lambda: rig.session.store.status.session.calibration == "")
     path.write_text("")
-    await rig.until_true(lambda: rig.session.store.status.session.calibration == str(path))
+    await until(lambda: rig.session.store.status.session.calibration == str(path))
     rig.arm.slow = True
     await rig.give_go()
     assert rig.session.store.status.session.calibration == ""
@@ -74,7 +75,7 @@ async def test_the_question_says_that_a_playback_moves_nothing(new_rig: NewRig) 
 
 async def test_a_drift_check_is_told_as_one_until_the_next_run(rig: Rig) -> None:
     await rig.give_go(Purpose.DRIFT_CHECK)
-    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    await until(lambda: bool(rig.session.store.status.session.recording))
     assert rig.session.store.status.session.check
     rig.arm.slow = True
     await rig.give_go()

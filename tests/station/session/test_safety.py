@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from station.server.dispatch import SessionDispatcher
 from station.session import monitor, supervisor
 from station.session.recording import SessionRecording
 from tests.codes import raises
+from tests.patience import PATIENCE_S, until
 from tests.station.session_rig import POSES, HeldDisk, NewRig, Rig
 
 
@@ -52,7 +54,7 @@ async def test_an_unforeseen_error_stops_the_arm_and_is_a_fault(
     await rig.until(S.FAULT)
     assert rig.cause == "internal"
     assert "stop" in rig.arm.log
-    await rig.until_true(lambda: rig.arm.log[-1:] == ["end control"])
+    await until(lambda: rig.arm.log[-1:] == ["end control"])
     assert "move" not in rig.arm.log
 
 
@@ -116,7 +118,7 @@ async def test_an_arm_moved_while_control_started_is_not_driven(
 
     monkeypatch.setattr(rig.arm, "start_control", jogged)
     await rig.give_go()
-    await rig.until_true(lambda: rig.arm.log[-1:] == ["end control"])
+    await until(lambda: rig.arm.log[-1:] == ["end control"])
     assert rig.state is S.IDLE
     assert rig.cause == "arm-moved"
     assert "move" not in rig.arm.log
@@ -179,7 +181,7 @@ async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_p
             rig.session.leases.lease = msgspec.structs.replace(rig.session.leases.lease, client_id=1)
         args = {"action": "release"} if verb == "lease" else {}
         client.send(msgspec.json.encode({"id": 1, "verb": verb, "args": args}) + b"\n")
-        await rig.until_true(lambda: "stop" in rig.arm.log)
+        await until(lambda: "stop" in rig.arm.log)
     await asyncio.sleep(0.15)
     assert rig.pose_states == ["planned"] * POSES
     await control.close()
@@ -230,16 +232,18 @@ async def test_a_disk_that_hangs_does_not_hang_the_station(rig: Rig, monkeypatch
 
     close = Recorder.close
 
+    loop, went_on = asyncio.get_running_loop(), threading.Event()
+
     def slow_close(self: Recorder) -> None:
-        time.sleep(0.5)
+        loop.call_soon_threadsafe(went_on.set)
+        assert went_on.wait(PATIENCE_S), "the loop stands still meanwhile"
         close(self)
 
     monkeypatch.setattr(SessionRecording, "sync", no_sync)
     monkeypatch.setattr(Recorder, "close", slow_close)
     await rig.give_go()
     await rig.until(S.FAULT)
-    await asyncio.sleep(0.1)  # a frozen loop shows in the round after
-    assert rig.session.supervisor.lag_ms() < 300
+    await until(went_on.is_set)
 
 
 @pytest.mark.parametrize(
@@ -295,7 +299,7 @@ async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> 
     rig.session.context.queue = None
     async with await Client.connect(tmp_path / "s", "tty1") as anna:
         await anna.request("lease", action="take")
-        async with asyncio.timeout(3):
+        async with asyncio.timeout(PATIENCE_S):
             with pytest.raises(StationError):
                 await anna.request("go", token="made up")
     await control.close()

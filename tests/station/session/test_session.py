@@ -22,7 +22,8 @@ from station.cell.plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Add, Drop, Purpose, Reorder, Retake, Skip
 from tests.codes import raises
-from tests.station.session_rig import PATIENCE_S, POSES, HeldDisk, Rig, sealed
+from tests.patience import PATIENCE_S, until
+from tests.station.session_rig import POSES, HeldDisk, Rig, sealed
 
 WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
 
@@ -66,7 +67,7 @@ async def test_control_lives_only_for_a_go(rig: Rig) -> None:
     assert "start control" not in rig.arm.log
     await rig.give_go()
     await rig.until(S.IDLE)
-    await rig.until_true(lambda: rig.arm.log[-1] == "end control")
+    await until(lambda: rig.arm.log[-1] == "end control")
     assert rig.arm.log.count("start control") == 1
     assert not rig.arm.control
 
@@ -75,7 +76,7 @@ async def test_the_heart_beats_only_while_a_go_is_carried_out(rig: Rig) -> None:
     await asyncio.sleep(0.1)
     assert rig.arm.beats == 0
     await rig.go_until_it_moves()
-    await rig.until_true(lambda: rig.arm.beats > 3)
+    await until(lambda: rig.arm.beats > 3)
     await rig.session.stop("anna")
     beats = rig.arm.beats
     await asyncio.sleep(0.1)
@@ -84,7 +85,7 @@ async def test_the_heart_beats_only_while_a_go_is_carried_out(rig: Rig) -> None:
 
 async def test_a_pose_counts_only_once_it_is_on_the_disk(rig: Rig, held_disk: HeldDisk) -> None:
     await rig.give_go()
-    await rig.until_true(lambda: held_disk.asked > 0 or rig.session.store.status.session.captured > 0)
+    await until(lambda: held_disk.asked > 0 or rig.session.store.status.session.captured > 0)
     assert rig.state is S.WRITING
     assert rig.pose_states[0] == "writing"
     assert rig.session.store.status.session.captured == 0
@@ -217,7 +218,7 @@ async def test_a_retake_supersedes(rig: Rig) -> None:
     assert summary.poses == 1
     rig.session.go(1, summary.token)
     store = rig.session.store
-    await rig.until_true(lambda: rig.state is S.PAUSED and store.status.session.poses[0].attempt == 2)
+    await until(lambda: rig.state is S.PAUSED and store.status.session.poses[0].attempt == 2)
     assert rig.pose_states.count("done") == done
     await rig.session.finish(1)
     assert sealed(rig).views()[0].attempt == 2
@@ -258,7 +259,7 @@ async def test_a_refused_control_leaves_everything_as_it_was(rig: Rig, tmp_path:
     assert not list(tmp_path.rglob("*.part"))
     rig.arm.refuse_control = None
     await rig.give_go()
-    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    await until(lambda: bool(rig.session.store.status.session.recording))
 
 
 async def test_the_end_of_the_daemon_stops_then_seals(rig: Rig) -> None:
@@ -304,7 +305,7 @@ async def test_a_notice_of_the_arm_is_shown_while_it_moves(rig: Rig) -> None:
     rig.arm.slow = True
     rig.arm.notice = "speed slider at 5 %"
     await rig.give_go()
-    await rig.until_true(lambda: rig.session.store.status.reason == "speed slider at 5 %")
+    await until(lambda: rig.session.store.status.reason == "speed slider at 5 %")
     rig.arm.slow = False
     rig.arm.arrive.set()
     await rig.until(S.IDLE)
@@ -314,7 +315,7 @@ async def test_a_notice_of_the_arm_is_shown_while_it_moves(rig: Rig) -> None:
 @pytest.mark.parametrize("purpose", ["resume", "retake"])
 async def test_a_sealed_session_is_not_added_to(rig: Rig, purpose: str) -> None:
     await rig.give_go()
-    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    await until(lambda: bool(rig.session.store.status.session.recording))
     await rig.until(S.IDLE)
     with raises("no-session"):
         await rig.session.prepare(1, purpose, 0)

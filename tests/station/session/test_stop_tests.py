@@ -10,6 +10,7 @@ from station.cell.errors import RefusedError
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, StopTest
 from station.session.checklist import checklist
+from tests.patience import until
 from tests.station.session_rig import NewRig, Rig, sealed
 
 
@@ -56,7 +57,7 @@ async def said(rig: Rig) -> list[bool]:
     control = next(check for check in await checklist(context, {}) if check.name == "control")
     preview = await rig.session.prepare(1, Purpose.RUN)
     warned = control.state == "warning"
-    await rig.until_true(lambda: bool(rig.session.store.status.robot.not_accepted) == warned)
+    await until(lambda: bool(rig.session.store.status.robot.not_accepted) == warned)
     return [
         warned,
         any("not accepted" in warning for warning in preview.warnings),
@@ -86,7 +87,7 @@ async def test_until_accepted_and_after_a_change_everything_says_so(new_rig: New
 async def test_the_recording_says_it_too(new_rig: NewRig) -> None:
     rig = await new_rig(source="real")
     await rig.give_go()
-    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    await until(lambda: bool(rig.session.store.status.session.recording))
     assert "not accepted" in sealed(rig).info.software["robot stops"]
 
 

@@ -9,6 +9,7 @@ import pytest
 from recordings.reader import open_recording
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Retake
+from tests.patience import until
 from tests.station.session_rig import POSES, Rig
 
 SHAKY = 1
@@ -76,7 +77,7 @@ async def test_a_person_is_asked(rig: Rig, shaken: list[int]) -> None:
 async def test_nothing_is_tried_again_once_the_go_is_over(rig: Rig, shaken: list[int], end: str) -> None:
     shaken[:] = [1] * 99
     await give_headless_go(rig)
-    await rig.until_true(lambda: rig.pose_states[SHAKY] == "failed")
+    await until(lambda: rig.pose_states[SHAKY] == "failed")
     if end == "pause":
         rig.session.pause("bert")
     elif end == "stop":

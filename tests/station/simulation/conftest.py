@@ -31,27 +31,27 @@ from station.simulation.controller.programs import Upload
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
+from tests.patience import PATIENCE_S
 
 _BEFORE = """
 import json, math, os, sys, threading, time
 import rtde_control, rtde_receive, rtde_io, dashboard_client
 from station.simulation.launch import AdminClient
+from tests.patience import wait_until as until
 host = sys.argv[1]
 admin = AdminClient(host)
 result = {}
 HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
 NEAR = [0.2, -1.5, 1.5, -1.5, -1.5, 0.1]
 FAR = [1.2, -1.5, 1.5, -1.5, -1.5, 0.1]
-def until(what, timeout_s=10.0):
-    end = time.monotonic() + timeout_s
-    while not what():
-        if time.monotonic() > end:
-            raise TimeoutError("condition not met")
-        time.sleep(0.005)
 def near(q, goal):
     return max(abs(a - b) for a, b in zip(q, goal)) < 1e-6
 def fastest(speeds):
     return max(map(abs, speeds))
+def told(receive):
+    # what was done before has reached the wheel
+    done_s = admin.ask("state")["timestamp_s"]
+    until(lambda: receive.getTimestamp() > done_s)
 def finished(control):
     return control.getAsyncOperationProgress() < 0
 """
@@ -88,14 +88,12 @@ def admin() -> Iterator[Callable[[SimulatedController], AdminClient]]:
         client.close()
 
 
-def run_wheel(
-    running: SimulatedController, code: str, timeout_s: float = 25.0, ends: bool = True
-) -> dict[str, Any]:
+def run_wheel(running: SimulatedController, code: str, ends: bool = True) -> dict[str, Any]:
     """Runs code against the unmodified ur_rtde wheel in a process of its own; its `result` comes back.
     ends=False: the code kills its process instead."""
     source = _BEFORE + textwrap.dedent(code) + _AFTER
     child = subprocess.run(
-        [sys.executable, "-c", source, running.host], capture_output=True, text=True, timeout=timeout_s
+        [sys.executable, "-c", source, running.host], capture_output=True, text=True, timeout=PATIENCE_S
     )
     for line in child.stdout.splitlines():
         if line.startswith("RESULT "):
@@ -117,7 +115,7 @@ def wheel() -> Callable[..., dict[str, Any]]:
 class RtdeClient:
     """A raw client of port 30004, blocking, with a timeout."""
 
-    def __init__(self, host: str, timeout_s: float = 3.0) -> None:
+    def __init__(self, host: str, timeout_s: float = PATIENCE_S) -> None:
         self._socket = socket.create_connection((host, PORT), timeout_s)
         self._reader = PacketReader()
         self._waiting: deque[tuple[int, bytes]] = deque()
@@ -172,7 +170,7 @@ def rtde() -> Iterator[Callable[..., RtdeClient]]:
     """Opens raw RTDE connections."""
     clients: list[RtdeClient] = []
 
-    def connect(running: SimulatedController, timeout_s: float = 3.0) -> RtdeClient:
+    def connect(running: SimulatedController, timeout_s: float = PATIENCE_S) -> RtdeClient:
         clients.append(RtdeClient(running.host, timeout_s))
         return clients[-1]
 

@@ -10,6 +10,7 @@ import pytest
 
 from station.simulation.launch import AdminClient
 from tests.codes import raises
+from tests.patience import wait_until
 
 pytestmark = pytest.mark.process
 HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
@@ -47,18 +48,13 @@ def test_truth_waits_for_the_near_future_and_refuses_the_rest(controller, admin)
 def test_the_arm_is_led_by_hand_only_when_it_is_free(controller, admin) -> None:
     ask = admin(controller("UR10"))
     ask.ask("foreign")
-    deadline = time.monotonic() + 30
-    while ask.ask("state")["runtime_state"] != "PLAYING":
-        assert time.monotonic() < deadline
+    wait_until(lambda: ask.ask("state")["runtime_state"] == "PLAYING")
     with raises("simulation-refused"):
         ask.ask("jog", joints_rad=HOME)
     ask.ask("stop_program")
     corners = [[0.1, *HOME[1:]], [0.1, -1.4, *HOME[2:]]]
     assert ask.ask("hand_move", path=corners, speed_rad_s=2.0)["length_rad"] == pytest.approx(0.1 + 0.1708)
-    deadline = time.monotonic() + 30
-    while ask.ask("state")["moving"]:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: not ask.ask("state")["moving"])
     assert ask.ask("state")["target_joints_rad"] == pytest.approx(corners[1])
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import socket
-import time
 
 import pytest
 
 from station.simulation.controller.dashboard import GREETING, LOCAL_REFUSAL
+from tests.patience import wait_until
 
 pytestmark = pytest.mark.process
 
@@ -77,14 +77,8 @@ def test_a_bare_line_on_a_script_port_replaces_the_program(controller, admin) ->
     ask.ask("foreign", name="job.urp")
     with socket.create_connection((running.host, 30001), 3) as link:
         link.sendall(b"textmsg(1)\n")
-        deadline = time.monotonic() + 2
-        while "upload: textmsg(1)" not in ask.ask("log")["counts"]:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-    deadline = time.monotonic() + 2
-    while ask.ask("state")["program"] == "job.urp":
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+        wait_until(lambda: "upload: textmsg(1)" in ask.ask("log")["counts"])
+    wait_until(lambda: ask.ask("state")["program"] != "job.urp")
 
 
 def test_a_program_of_the_pendant_is_loaded_and_played(controller, admin) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from station.devices.rtde import PacketType, packet
 from tests.codes import raises
+from tests.patience import wait_until
 
 pytestmark = pytest.mark.process
 HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
@@ -98,9 +99,7 @@ def test_inputs_are_claimed_until_the_link_ends(controller, rtde, admin) -> None
         second.inputs("input_int_register_0", "input_int_register_1")
     first.close()
     ask = admin(running)
-    deadline = time.monotonic() + 30
-    while ask.ask("state")["connections"]["rtde"] > 1 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_until(lambda: ask.ask("state")["connections"]["rtde"] == 1)
     assert second.inputs("input_int_register_0").id == 1
 
 
@@ -153,9 +152,7 @@ def test_hundreds_of_links_leave_nothing_behind(controller, rtde, admin) -> None
             link.recv(100)
 
     def files_when_quiet() -> int:
-        deadline = time.monotonic() + 30
-        while ask.ask("state")["connections"]["rtde"] and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_until(lambda: not ask.ask("state")["connections"]["rtde"])
         time.sleep(0.05)
         return len(list((folder / "fd").iterdir()))
 
@@ -186,11 +183,7 @@ def test_a_client_that_does_not_read_loses_packets_and_slows_nobody(controller, 
     names = ["timestamp", *[f"output_double_register_{i}" for i in range(48)] * 4]
     deaf.start(*names)
     good.start("timestamp")
-    deadline = time.monotonic() + 30
-    while ask.ask("stats")["packets_skipped"] == 0 and time.monotonic() < deadline:
-        for _ in range(100):
-            good.sample()
-    assert ask.ask("stats")["packets_skipped"] > 0
+    wait_until(lambda: [good.sample() for _ in range(100)] and ask.ask("stats")["packets_skipped"] > 0)
     stamps = [good.sample()["timestamp"] for _ in range(50)]
     assert max(b - a for a, b in pairwise(stamps)) < 0.0021
 

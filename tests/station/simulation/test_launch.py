@@ -6,28 +6,16 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from station.simulation.launch import start_controller
 from tests.codes import raises
+from tests.patience import wait_until
+from tests.station.cell.test_parent import gone
 
 pytestmark = pytest.mark.process
-
-
-def gone(pid: int, timeout_s: float = 5.0) -> bool:
-    """The process has ended (a zombie that nobody reaps here counts as ended)."""
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
-        try:
-            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
-                return True
-        except FileNotFoundError:
-            return True
-        time.sleep(0.02)
-    return False
 
 
 def test_it_is_ready_when_the_call_returns_and_gone_after_the_block() -> None:
@@ -77,7 +65,7 @@ def test_it_dies_with_its_parent(number: int) -> None:
     os.kill(parent.pid, number)
     parent.wait()
     parent.stdout.close()
-    assert gone(child)
+    wait_until(lambda: gone(child))
 
 
 def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe() -> None:
@@ -95,7 +83,7 @@ def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe() -> None:
     try:
         parent.kill()
         parent.wait()
-        assert gone(child)
+        wait_until(lambda: gone(child))
     finally:
         os.kill(sibling, signal.SIGKILL)
         parent.stdout.close()

@@ -98,6 +98,11 @@ class Cell:
             await self.robot.start_control()
         raise AssertionError("the arm arrived, again and again, before it was at full speed")
 
+    async def told(self) -> None:
+        """What was done before has reached the driver."""
+        done_s = self.admin.ask("state")["timestamp_s"]
+        await until(lambda: (self.robot.newest().state.stamps.controller_s or 0.0) > done_s)
+
     async def stops(self) -> None:
         """Before it has arrived."""
         await until(lambda: self.speed_rad_s() < AT_REST_RAD_S)

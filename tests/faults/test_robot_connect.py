@@ -127,7 +127,9 @@ async def test_connecting_is_read_only(cell: Make) -> None:
 async def test_a_go_is_refused(cell: Make, model: str, fault: dict[str, Any], code: str) -> None:
     c = await cell(model, control=False)
     c.admin.ask(**fault)
-    await asyncio.sleep(0.2)
+    if fault["cmd"] == "foreign":
+        await until(lambda: c.admin.ask("state")["runtime_state"] == "PLAYING")
+    await c.told()
     with raises(code):
         await c.robot.start_control()
     assert c.asked("upload") == 0

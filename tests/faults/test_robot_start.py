@@ -125,7 +125,7 @@ async def test_stop_while_no_heartbeat_was_heard(unheard: Start) -> None:
 async def test_a_protective_stop_while_no_heartbeat_was_heard(unheard: Start, beating: bool) -> None:
     c, starting = await unheard()
     c.admin.ask("pstop")
-    await asyncio.sleep(0.05)
+    await c.told()
     c.beating = beating
     assert await ends(starting) == "protective-stop"
     await gone(c)
@@ -184,7 +184,7 @@ async def test_the_pendant_before_the_first_heartbeat(
 ) -> None:
     c, starting = await unheard("UR10e")
     c.admin.ask(**fault)
-    await asyncio.sleep(0.05)
+    await c.told()
     c.beating = True
     assert await ends(starting) == code
     await gone(c)

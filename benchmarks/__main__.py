@@ -27,33 +27,16 @@ measures anew. Robot and camera are simulated unless said otherwise.
 """
 SHOWN: dict[str, str] = {
     "real": r"^\| (ours /|the same|sets|split|good views)",
-    "paper": r"true X|DE, paper|Zhao CO, 18|\| ours|Daniilidis",
-    "blog": "",
-    "certainty": "20 mm|nearly one|swapped",
-    "floor": r"^\| (mid|high) \| same pictures \| 25 \| measured",
     "coverage": r"^\| (clean|size 0.5 %|bent 0.5 mm|arm 0.4 mm, arm unknown) \| eye-to",
     "outliers": r"^\| (far|shuffled) \| 40 % \| eye-in|moved \| 35 % \| eye-in",
-    "kinematics": r"^\| (0|0.5) \|",
     "arm_table": r"^\| 0.3 mm, (measured|usual), 50 planned \| \d+ \|",
     "mistakes": r"^\*\*",
-    "constants": r"FULL` × 0|BENDS|CLEARLY` × 0|STUDENT|ROBOT_PRIOR_M|ASPECT",
-    "detection": r"^\| (good|20°) ",
-    "speed": r"^\| (18|4950) \|",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
-    "batch": "speed-up|bits",
-    "fleet": "process|Dask",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
     "watch": r"^\| (repeated|any) .* of ",
-    "watch_real": "",
     "drift": r"planned \| [38] \|",
     "stop_latency": r"^\| both \| (first|bytes).* 200 \||no heartbeat \| rest",
     "stop_denied": "busy|fake",
-    "daemon_latency": "",
-    "screen_stop": "F12",
-    "state_reader": "samples|fitted|share",
-    "recorder": r"plain write\(\) of|Recorder \(|^A session",
-    "time_sync": "",
-    "operator_mistakes": "of 25 named",
 }
 """The rows of each benchmark that the page shows, as a pattern; in the page's order."""
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")

@@ -13,11 +13,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.detection import Case, scene
+from calibrate.boards.model import board_points
+from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.job import JobOptions
 from calibrate.pipeline import solve_recording
+from recordings.images import Pixels
 from recordings.reader import open_recording
 from recordings.schema.messages import (
+    BoardSpec,
     CameraIdentity,
     CameraModel,
     Image,
@@ -28,10 +31,11 @@ from recordings.schema.messages import (
 )
 from recordings.writer import RecordingWriter
 from station.simulation.cell import CellTruth
-from station.simulation.renderer import scaled
+from station.simulation.renderer import Light, render, scaled
 from station.simulation.scenes import make_cell
 
 REPEATS = 15
+_TILT_DEG, _AWAY_M = 25.0, 0.45
 _PEAK = """
 import json, resource, sys
 from pathlib import Path
@@ -96,12 +100,23 @@ def make_recording(path: Path, views: int = 25, factor: float = 1.0, seed: int =
     )
     with RecordingWriter(path, info) as writer:
         for k in range(views):
-            image, seen = scene(truth.board, Case(tilt_deg=25.0), 1000 * seed + k, camera)
+            image, seen = _picture(truth.board, camera, 1000 * seed + k)
             stamps = Stamps(k * 10**9, 10**18 + k * 10**9)
             writer.image(Image(image, stamps, frame_id=k, sequence=k))
             flange = P @ np.linalg.inv(seen) @ np.linalg.inv(X)
             writer.view(View(k, f"pose-{k}", k, tuple(tuple(row) for row in flange.tolist()), stamps=stamps))
         return writer.finish()
+
+
+def _picture(spec: BoardSpec, camera: CameraModel, seed: int) -> tuple[Pixels, Array]:
+    """A picture, (h, w) uint8, and its camera_from_board: the board near the middle, turned at random."""
+    rng = np.random.default_rng(seed)
+    about, roll = rng.uniform(0, 2 * np.pi), rng.uniform(-0.7, 0.7)
+    tilt = np.radians(_TILT_DEG)
+    R = rotation_exp([tilt * np.cos(about), tilt * np.sin(about), 0]) @ rotation_exp([0, 0, roll])
+    centre = (board_points(spec).min(axis=0) + board_points(spec).max(axis=0)) / 2
+    seen = pose(R, np.array([*rng.uniform(-0.02, 0.02, 2), _AWAY_M]) - R @ centre)
+    return render(camera, spec, seen, Light(), rng).astype(np.uint8), seen
 
 
 def _opencv_ms(path: Path) -> float:

@@ -22,7 +22,6 @@ from calibrate.geometry import (
     random_rotation,
     rotation_exp,
 )
-from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.projection import camera_matrix, project
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
@@ -38,7 +37,6 @@ class CellNoise:
 LOW = CellNoise(0.1, 0.05e-3, np.radians(0.005))
 MID = CellNoise(0.2, 0.3e-3, np.radians(0.03))
 HIGH = CellNoise(0.5, 1e-3, np.radians(0.1))
-LEVELS = {"low": LOW, "mid": MID, "high": HIGH}
 
 PAPER_CAMERA = CameraModel(
     1280, 1024, ((8e-3 / 4.8e-6, 0.0, 639.5), (0.0, 8e-3 / 4.8e-6, 511.5), (0.0, 0.0, 1.0)), (0.0,) * 5
@@ -119,11 +117,6 @@ def view_set(
         C = np.array([pnp(board, seen, camera) for seen in pixels])
     found = [BoardView(i, f"view {i}", flange[i], board, pixels[i], None, C[i]) for i in range(len(flange))]
     return ViewSet(mount, tuple(found), camera)
-
-
-def pose_arrays(views: ViewSet) -> tuple[Array, Array]:
-    """H and C of `pairs`' convention, (n, 4, 4) each."""
-    return mount_poses(views.base_from_flange, views.mount), views.camera_from_board
 
 
 def pnp(board: Array, pixels: Array, camera: CameraModel) -> Array:

@@ -13,13 +13,23 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.batch import worker_pids
 from calibrate.batch.run import RESULTS, batch_key, run_batch
 from calibrate.batch.storage import BatchResult, Results
 from calibrate.batch.workers import Lost, R, T, pool
 from calibrate.bounds import Limits
 from calibrate.job import JobOptions
 from tests.patience import PATIENCE_S, wait_until
+
+
+def worker_pids() -> list[int]:
+    """List the pool's processes: the fork server, a child of this process, started them."""
+    parents: dict[int, int] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+    return [pid for pid, parent in parents.items() if parents.get(parent) == os.getpid()]
 
 
 def in_this_process(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:

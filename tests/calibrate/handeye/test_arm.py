@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from benchmarks.kinematics import worn_cell
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
 from calibrate.handeye.arm import PARAMETERS, arm_postures, by_parameters
 from calibrate.handeye.estimate import MeanParts
@@ -18,6 +17,7 @@ from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.kinematics import MODELS, forward, link_frames
 from calibrate.views import ViewSet
 from tests.calibrate.cells import changed, inside
+from tests.calibrate.worn_cell import worn_cell
 
 WITH = SolveOptions(holdout=False, folds=False)
 WITHOUT = replace(WITH, model_arm=False)

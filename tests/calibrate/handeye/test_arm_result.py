@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.kinematics import Worn, worn_cell
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb, pose, random_rotation
 from calibrate.handeye.arm import HELD, PARAMETERS, by_parameters, corrected_model
@@ -22,6 +21,7 @@ from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import MODELS, forward, with_near_axes
 from calibrate.views import BoardView, ViewSet
+from tests.calibrate.worn_cell import Worn, worn_cell
 
 UR10 = MODELS["UR10"]
 FACTORY = UR10.calibrated(

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
 
-from benchmarks.operator_mistakes import MISTAKES, Mistake
-from calibrate.geometry import difference
-from recordings.schema.messages import BoardKind, Mount
+from calibrate.boards.detect import detect
+from calibrate.geometry import difference, inverse
+from calibrate.kinematics import MODELS, forward
+from recordings.schema.messages import BoardKind, BoardSpec, Image, Mount, Stamps
 from station.cell.config import matrix4
 from station.cell.config_file import load_config
 from station.cell.scene import scene_of
@@ -19,6 +21,7 @@ from station.operate import guided_views
 from station.operate import new_cell as flow
 from station.operate.draft import CellStep, Draft
 from station.plan.planner import PlanOptions, candidate_pool
+from station.simulation.renderer import Light, render
 from station.simulation.scenes import make_cell
 from tests.codes import raises
 from tests.station.operate.guided_views import draft_of
@@ -137,10 +140,36 @@ def test_a_cell_is_found_and_planned_with_every_board(words: str, tmp_path: Path
     assert load_config(tmp_path / "station.yaml")[0].board == board
 
 
+PICTURED = make_cell("paper-binned", seed=3, noise="mid")
+"""Small images: the board is looked for in a fourth of the time."""
+COUNTED = BoardSpec(kind=BoardKind.CHESSBOARD, columns=8, rows=7, square_m=0.025)
+OTHER = BoardSpec(kind=BoardKind.CHESSBOARD, columns=9, rows=6, square_m=0.025)
+
+
 @pytest.mark.parametrize(
-    ("mistake"),
-    [m for m in MISTAKES if {"too-dark", "not-found", "squares-counted", "blurred"} & set(m.causes)],
-    ids=lambda mistake: mistake.name,
+    ("fault", "causes"),
+    [
+        ("lens covered", {"too-dark"}),
+        ("board not in view", {"empty", "not-found"}),
+        ("squares counted", {"squares-counted"}),
+        ("another board lies there", {"other-board"}),
+        ("out of focus", {"blurred"}),
+        ("over-exposed", {"over-exposed"}),
+        ("under-exposed", {"under-exposed"}),
+    ],
 )
-async def test_a_fault_of_the_picture_is_named(mistake: Mistake) -> None:
-    assert (await mistake.plant()).code in mistake.causes
+def test_a_fault_of_the_picture_is_named(fault: str, causes: set[str]) -> None:
+    flange = forward(MODELS[PICTURED.robot_model], np.array(PICTURED.start_joints_rad))
+    seen = inverse(flange @ np.array(PICTURED.camera_mount)) @ np.array(PICTURED.board_place)
+    if fault == "board not in view":
+        seen[0, 3] += 2.0
+    exposure_us = {"over-exposed": 60_000.0, "under-exposed": 1_500.0}.get(fault)
+    light = None if exposure_us is None else Light(exposure_us=exposure_us)
+    pixels = render(PICTURED.camera, PICTURED.board, seen, light, np.random.default_rng(0)).astype(np.uint8)
+    if fault == "lens covered":
+        pixels = np.full_like(pixels, 4)
+    elif fault == "out of focus":
+        pixels = np.asarray(cv2.GaussianBlur(pixels, (0, 0), 6.0), dtype=np.uint8)
+    board = {"squares counted": COUNTED, "another board lies there": OTHER}.get(fault, PICTURED.board)
+    image = Image(pixels, Stamps(), None, 0, exposure_us=10_000.0)
+    assert guided_views.image_trouble(image, detect(pixels, board))[0] in causes

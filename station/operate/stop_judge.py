@@ -64,17 +64,17 @@ class StopMove:
 
 
 class Trace:
-    """Samples of one move as arrays; n of them."""
+    """Samples of one move as arrays; n of them, at least one."""
 
     def __init__(self, states: Sequence[RobotState], move: StopMove) -> None:
         self.move = move
         self.time_s = np.array([s.stamps.controller_s for s in states])
         host_s = np.array([s.stamps.host_monotonic_ns for s in states]) / 1e9
-        self.ahead_s = float(np.min(host_s - self.time_s)) if len(states) else 0.0
+        self.ahead_s = float(np.min(host_s - self.time_s))
         self.joints = np.array([s.joints_rad for s in states]).reshape(-1, 6)
         self.speeds = np.array([s.joint_speeds_rad_s for s in states]).reshape(-1, 6)
         self.held = np.array([_held(s) for s in states], dtype=bool)
-        self.direction = float(np.sign(move.target_rad - self.joints[0, move.joint])) if len(states) else 1.0
+        self.direction = float(np.sign(move.target_rad - self.joints[0, move.joint]))
         self.gap_s = float(np.diff(self.time_s).max(initial=0.0))
 
     @property

@@ -292,7 +292,7 @@ class VerifyScreen(ResultScreen):
     """Proofs apart from the images it was made of: the touch test, and drift checks over time."""
 
     MODE, TIP = "verify", "Touch test and drift checks"
-    HELP = "h starts the touch test: a tip over corners of the board, by hand. d on 7 captures a drift check."
+    HELP = "h starts the touch test: a tip on corners of the board, by hand. d on 7 captures a drift check."
 
     def evidence(self) -> ComposeResult:
         with Horizontal(id="verify"):

@@ -59,7 +59,10 @@ def watchdog_period_s() -> float | None:
 
 
 class Daemon:
-    def __init__(self, cell: Cell, root: Path, control: Path) -> None:
+    def __init__(
+        self, cell: Cell, root: Path, control: Path, told_to_end: Callable[[], None] = lambda: None
+    ) -> None:
+        """`told_to_end` is called when SIGTERM, SIGINT or `end` begins the end."""
         self.session = Session(cell, root)
         dispatcher = SessionDispatcher(self.session)
         self._control = ControlServer(control, dispatcher, newest=lambda: self.session.store.status)
@@ -68,7 +71,7 @@ class Daemon:
         self.session.supervisor.ticked = self._ping
         self._watchdog_s, self._pinged_s = watchdog_period_s(), 0.0
         self._changed = asyncio.Event()
-        self._ending = asyncio.Event()
+        self._ending, self._told_to_end = asyncio.Event(), told_to_end
         self._served_s = time.monotonic()
         self._said = ""
 
@@ -97,7 +100,9 @@ class Daemon:
             log.info("ended")
 
     def end(self) -> None:
-        self._ending.set()
+        if not self._ending.is_set():
+            self._ending.set()
+            self._told_to_end()
 
     def _latched(self) -> bool:
         return self.session.store.state is StationState.STOPPED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import json
 import logging
 import os
@@ -19,6 +20,9 @@ from station.cell.process import DAEMON_NICENESS, go_before_others
 from station.cell.socket_folder import default_socket
 from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
 from station.devices.cell import Cell
+
+END_S = 4.7
+"""The arm stands and the recording is finished long before, unless the disk hangs."""
 
 
 def serve_command(
@@ -97,17 +101,26 @@ def _real_cell(config: Path, root: Path) -> Cell:
 
 
 async def serve_cell(cell: Cell, root: Path, socket: Path, end_with_stdin: bool) -> None:
+    """Ends the process, too: a thread in a driver or on a disk that hangs is not waited for."""
     from station.daemon import Daemon
 
     go_before_others(DAEMON_NICENESS)
     try:
-        daemon = Daemon(cell, root, socket)
+        daemon = Daemon(cell, root, socket, _end_in_time)
         if end_with_stdin:
             loop = asyncio.get_running_loop()
             loop.add_reader(sys.stdin.fileno(), lambda: None if os.read(0, 4096) else daemon.end())
         await daemon.run(lambda: print(json.dumps({"ready": True, "socket": str(socket)}), flush=True))
     finally:
         cell.ended()
+    logging.shutdown()
+    sys.stdout.flush()
+    os._exit(0)
+
+
+def _end_in_time() -> None:
+    """Whatever hangs, the process has ended END_S later, with 1; the log says what each thread was doing."""
+    faulthandler.dump_traceback_later(END_S, exit=True)
 
 
 class JournalFormatter(logging.Formatter):

@@ -318,12 +318,20 @@ class DeviceConnector:
         self._context.store.event("device-found", f"{device} {identity} found", device=device)
 
     async def close(self) -> None:
+        """The robot's side does not wait for a camera whose driver hangs."""
         cell = self._context.cell
-        for closing in (cell.camera.close(), cell.robot.close()):
-            with contextlib.suppress(RobotError, CameraError):
-                await closing
-        if cell.trigger is not None:
-            await cell.trigger.close()
+
+        async def close_robot() -> None:
+            with contextlib.suppress(RobotError):
+                await cell.robot.close()
+
+        async def close_camera() -> None:
+            with contextlib.suppress(CameraError):
+                await cell.camera.close()
+            if cell.trigger is not None:
+                await cell.trigger.close()
+
+        await asyncio.gather(close_robot(), close_camera())
         await asyncio.to_thread(cell.ended)
 
 

@@ -45,8 +45,12 @@ from station.session.stop_test import prepare_stop_test
 from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.session.supervisor import SessionSupervisor
 
+log = logging.getLogger(__name__)
+
 R = TypeVar("R")
 END_RUN_S = 10.0
+END_RUN_AT_CLOSE_S, CLOSE_DEVICES_S = 1.0, 1.8
+"""At the daemon's end, which waits no longer for what hangs."""
 STOP_WAIT_S = 1.0
 """The answer to STOP waits no longer for what still goes to the disk: the arm stands."""
 PLAN_TIMEOUT_S = 180.0
@@ -98,7 +102,7 @@ class Session:
         if self.store.state in RUNNING:
             await self._halt(StationState.STOPPED, "The station is ending.", "station-ending")
         with contextlib.suppress(RefusedError):
-            await self._run_ended()
+            await self._run_ended(END_RUN_AT_CLOSE_S)
         if context.recording is not None and context.recorder is not None:
             with contextlib.suppress(RecordingError):
                 path = await context.recording.seal(context.require_queue())
@@ -106,9 +110,13 @@ class Session:
         logging.getLogger("station").removeHandler(self._logbook)
         for task in self._tasks:
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
         context.workers.close()
-        await self.devices.close()
+        closing = asyncio.create_task(self.devices.close())
+        _, left = await asyncio.wait({*self._tasks, closing}, timeout=CLOSE_DEVICES_S)
+        if closing in left:
+            log.error("the devices did not close within %g s", CLOSE_DEVICES_S)
+        else:
+            closing.result()
 
     # -- stopping, by anyone and anything ----------------------------------------------------------------
 
@@ -247,10 +255,10 @@ class Session:
         if not closing.cancelled():
             closing.result()
 
-    async def _run_ended(self) -> None:
+    async def _run_ended(self, wait_s: float = END_RUN_S) -> None:
         """RefusedError when it does not: nothing new begins beside it."""
         if self._run is not None and not self._run.done():
-            await asyncio.wait({self._run}, timeout=END_RUN_S)
+            await asyncio.wait({self._run}, timeout=wait_s)
         self._require_run_ended()
 
     def _require_run_ended(self) -> None:

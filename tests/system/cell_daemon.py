@@ -3,6 +3,7 @@
 `station serve --simulate` owns its controller, which ends with it; here a test can look at the arm of a
 daemon that was killed. CELL_TOLD: another truth, that the configuration is made from. CELL_CONTROL: what
 drives the arm.
+CELL_HANGS: `camera` or `disk` hangs for ever, from the second image or the first view on.
 """
 
 from __future__ import annotations
@@ -10,16 +11,49 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
+import threading
 from pathlib import Path
 
 import msgspec
 
+from recordings.schema.messages import Image
+from station.cell.session_folder import SessionState
 from station.cli.serve import log_to_stderr, serve_cell
+from station.devices.base import DeviceThread
 from station.devices.cell import Cell
 from station.devices.ur import UrRobot
+from station.session import recording as session_recording
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import read_truth
 from station.simulation.scenes import cell_config
+
+
+class HangingCamera(RenderedCamera):
+    """Its driver takes one image and never returns from the next."""
+
+    _driver: DeviceThread | None = None
+
+    async def capture(self, timeout_s: float = 5.0) -> Image:
+        if self._driver is not None:
+            await self._driver.run(threading.Event().wait)
+        self._driver = DeviceThread("hanging driver")
+        return await super().capture(timeout_s)
+
+    async def close(self) -> None:
+        if self._driver is not None:
+            await self._driver.close(lambda: None)
+
+
+def let_the_disk_hang() -> None:
+    """No state of a session with a view is ever written."""
+    write = session_recording.write_state
+
+    def writes(folder: Path, state: SessionState) -> None:
+        if any(pose.state == "done" for pose in state.poses):
+            threading.Event().wait()
+        write(folder, state)
+
+    session_recording.write_state = writes
 
 
 def main() -> None:
@@ -30,11 +64,13 @@ def main() -> None:
     capture = msgspec.structs.replace(config.capture, free_space_bytes=1)
     robot = msgspec.structs.replace(config.robot, control=os.environ.get("CELL_CONTROL"))
     config = msgspec.structs.replace(config, capture=capture, robot=robot)
-    place = Path(root)
+    place, hangs = Path(root), os.environ.get("CELL_HANGS", "")
+    if hangs == "disk":
+        let_the_disk_hang()
     cell = Cell(
         config=config,
         robot=UrRobot(config.robot, place),
-        camera=RenderedCamera(truth, host, config.camera),
+        camera=(HangingCamera if hangs == "camera" else RenderedCamera)(truth, host, config.camera),
         source="simulated",
         attachments={"truth.json": Path(truth_file).read_bytes()},
     )

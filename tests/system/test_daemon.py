@@ -110,6 +110,27 @@ async def test_a_daemon_that_hangs_is_killed_or_told_to_end_stops_the_arm(
     assert not second.socket.exists()
 
 
+@pytest.mark.parametrize(("hangs", "exit_code"), [("camera", 0), ("disk", 1)])
+async def test_a_daemon_told_to_end_ends_whatever_hangs(
+    rig: SystemRig, short_plan: Plan, monkeypatch: pytest.MonkeyPatch, hangs: str, exit_code: int
+) -> None:
+    """The arm stands, what can be finished is finished, and no thread that hangs is waited for."""
+    monkeypatch.setenv("CELL_HANGS", hangs)
+    daemon = await rig.daemon()
+    stuck = S.CAPTURING if hangs == "camera" else S.WRITING
+    async with await daemon.client() as anna:
+        await go(anna, short_plan)
+        await status_when(anna, lambda s: s.state is stuck and s.session.captured == (hangs == "camera"))
+        daemon.process.terminate()
+        await asyncio.to_thread(daemon.process.wait, PATIENCE_S)
+    assert daemon.process.returncode == exit_code
+    await rig.stays_at_rest()
+    (folder,) = (rig.root / "sessions").iterdir()
+    if hangs == "camera":
+        assert not list(folder.glob("*.part"))
+        assert len(open_recording(folder).views()) == 1
+
+
 async def test_one_station_per_socket_and_per_robot(rig: SystemRig) -> None:
     daemon = await rig.daemon()
     command = [sys.executable, "-m", "tests.system.cell_daemon", rig.controller.host]

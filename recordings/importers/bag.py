@@ -1,4 +1,4 @@
-"""A ROS 2 bag, or any MCAP with images and poses → a recording like the station's own.
+"""A ROS bag, or any MCAP with images and poses → a recording like the station's own.
 
 A first pass reads frames, joints and the images' stamps, finds the stops of the arm and pairs each with
 its last image; a second one reads those images and the joints, and writes. One image is in memory at a
@@ -82,7 +82,7 @@ def import_bag(
     bag = open_bag(source, progress)
     try:
         chosen = select(bag, wanted)
-        images_ns = np.fromiter(bag.image_stamps(chosen.image.name), np.int64)
+        images_ns = np.fromiter((image.stamp_ns for image in bag.images(chosen.image.name)), np.int64)
         joints = chosen.joints
         speeds = (joints.stamps_ns, joints.fastest_rad_s) if joints and joints.has_speeds else None
         stops, passed = find_stops(chosen.track, images_ns, speeds, limits, pair_within_s)

@@ -1,10 +1,9 @@
-"""Bags on the disk: MCAP files of anyone by this package's own reader, ROS 2 sqlite3 bags by `rosbags`."""
+"""Bags on the disk: MCAP files of anyone, proven first; other ROS bags by `rosbags`."""
 
 from __future__ import annotations
 
 import os
-from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,14 +12,12 @@ from recordings.errors import ImportSourceError
 from recordings.files import open_file
 from recordings.importers.messages import (
     CDR,
-    STAMP_BYTES,
     ImageMessage,
     Kind,
     Progress,
     Value,
     decoded,
     kind_of,
-    ros_image_stamp_ns,
     ros_types,
 )
 from recordings.mcap.contents import Contents
@@ -52,11 +49,12 @@ class _Storage(Protocol):
     declared: list[tuple[str, str, str, int]]
     """Topic, encoding, schema and messages of each channel."""
 
-    def read(self, topic: str, places: list[int] | None, limit_bytes: int | None) -> _Messages:
-        """A topic's messages, or those at the ascending places, in file order.
+    def read(self, topic: str, places: list[int] | None) -> _Messages:
+        """A topic's messages, or those at the ascending places, in file order."""
+        ...
 
-        `limit_bytes`: only the beginning is needed.
-        """
+    def deserialize(self, data: bytes, schema: str) -> Any:
+        """A ROS message."""
         ...
 
     def close(self) -> None: ...
@@ -84,54 +82,36 @@ class Bag:
     def close(self) -> None:
         self._storage.close()
 
-    def _read(self, topic: str, places: list[int] | None = None, limit_bytes: int | None = None) -> _Messages:
-        """The first pass over a topic tells how far it is."""
-        for message in self._storage.read(topic, places, limit_bytes):
-            yield message
+    def values(self, topic: str, places: list[int] | None = None) -> Iterator[Value]:
+        """Yield the values, or those at the ascending places, in the order of the file.
+
+        The first pass over a topic tells how far it is. Raises ImportSourceError.
+        """
+        told = self._by_name[topic]
+        for time_ns, data in self._storage.read(topic, places):
+            yield decoded(told.encoding, told.schema, data, time_ns, self._storage.deserialize)
             self._done += 1
             if self._done <= self._total and self._done % _SHOWN_EVERY == 0:
                 self._progress(self._done, self._total, "reading the bag")
 
-    def values(self, topic: str) -> Iterator[Value]:
-        """Yield the values in the order of the file. Raises ImportSourceError."""
-        told = self._by_name[topic]
-        for time_ns, data in self._read(topic):
-            yield decoded(told.encoding, told.schema, data, time_ns)
-
-    def image_stamps(self, topic: str) -> Iterator[int]:
-        """Yield the stamp of every image, ns, without decoding pixels."""
-        if self._by_name[topic].encoding == CDR:
-            for time_ns, data in self._read(topic, limit_bytes=STAMP_BYTES):
-                yield ros_image_stamp_ns(data, time_ns)
-        else:
-            yield from (image.stamp_ns for image in self.values(topic) if isinstance(image, ImageMessage))
-
-    def images(self, topic: str, places: list[int]) -> Iterator[ImageMessage]:
-        """Those at these places (ascending) of the topic."""
-        told = self._by_name[topic]
-        for time_ns, data in self._read(topic, places):
-            image = decoded(told.encoding, told.schema, data, time_ns)
-            assert isinstance(image, ImageMessage)
-            yield image
+    def images(self, topic: str, places: list[int] | None = None) -> Iterator[ImageMessage]:
+        return (image for image in self.values(topic, places) if isinstance(image, ImageMessage))
 
 
 def open_bag(path: Path, progress: Progress = lambda done, total, text: None) -> Bag:
     """A bag's folder, or one file; MCAP is proven first. Raises ImportSourceError or RecordingError."""
-    if path.suffix == ".bag":
-        remedy = f"Convert it first: rosbags-convert --src {path} --dst BAG"
-        raise ImportSourceError(f"{path} is a ROS 1 bag", code="ros1-bag", remedy=remedy)
     if not path.exists():
         raise ImportSourceError(f"{path} does not exist", code="no-file")
-    mcap, sqlite = [path], path.suffix == ".db3"
     if path.is_dir():
-        mcap = sorted(path.glob("*.mcap"))
-        sqlite = not mcap and bool([*path.glob("*.db3"), *path.glob("*.zstd")])
-    if sqlite:
-        return Bag(_SqliteBag(path), progress)
-    if not mcap:
-        text = f"{path} holds neither dataset.yaml with poses.csv, nor a bag (*.mcap, *.db3)"
+        mcap, ros = sorted(path.glob("*.mcap")), sorted(path.glob("*.bag"))
+        if not ros and any(file.suffix in (".db3", ".zstd") for file in path.iterdir()):
+            ros = [path]
+    else:
+        mcap, ros = ([], [path]) if path.suffix in (".bag", ".db3") else ([path], [])
+    if not mcap and not ros:
+        text = f"{path} holds neither dataset.yaml with poses.csv, nor a bag (*.mcap, *.db3, *.bag)"
         raise ImportSourceError(text, code="no-bag", remedy="Name another folder.")
-    return Bag(_McapBag(mcap, progress), progress)
+    return Bag(_McapBag(mcap, progress) if mcap else _RosBag(ros), progress)
 
 
 class _McapBag:
@@ -171,45 +151,49 @@ class _McapBag:
         while self._descriptors:
             os.close(self._descriptors.pop())
 
-    def read(self, topic: str, places: list[int] | None, limit_bytes: int | None) -> _Messages:
-        first, wanted = 0, None if places is None else list(places)
-        for source, addresses in self._addresses(topic):
-            chosen: list[int] | array[int] = addresses
-            if wanted is not None:
-                chosen = [addresses[place - first] for place in wanted if place < first + len(addresses)]
-                wanted, first = wanted[len(chosen) :], first + len(addresses)
-            for address in chosen:
-                found = source.message(address, limit_bytes)
+    def deserialize(self, data: bytes, schema: str) -> Any:
+        return ros_types().deserialize_cdr(data, schema)
+
+    def read(self, topic: str, places: list[int] | None) -> _Messages:
+        wanted = None if places is None else set(places)
+        for place, (source, address) in enumerate(self._addresses(topic)):
+            if wanted is None or place in wanted:
+                found = source.message(address)
                 yield found.log_time, found.data
 
-    def _addresses(self, topic: str) -> Iterator[tuple[Source, array[int]]]:
+    def _addresses(self, topic: str) -> Iterator[tuple[Source, int]]:
         for contents, source in self._files:
             for number, channel in contents.channels.items():
                 if channel.topic == topic:
-                    yield source, contents.messages[number].addresses
+                    for address in contents.messages[number].addresses:
+                        yield source, address
 
 
-class _SqliteBag:
-    """A ROS 2 bag in sqlite3, whole or a single file."""
+class _RosBag:
+    """A ROS 2 bag in sqlite3, whole or a single file, or ROS 1 bags."""
 
-    def __init__(self, path: Path) -> None:
-        ros_types()
-        from rosbags.rosbag2 import Reader
+    def __init__(self, paths: Sequence[Path]) -> None:
+        types = ros_types()
+        from rosbags.highlevel import AnyReader
 
-        self._path = path
+        self._path = paths[0]
         try:
-            self._reader: Any = Reader(path)
+            self._reader: Any = AnyReader(paths, default_typestore=types)
             self._reader.open()
         except Exception as error:  # sqlite's, yaml's and the library's own
-            raise ImportSourceError(
-                f"{path} is no ROS 2 bag that can be read: {error}", code="no-bag"
-            ) from error
+            raise self._unreadable(error) from error
         self.declared = [(c.topic, CDR, c.msgtype, c.msgcount) for c in self._reader.connections]
+
+    def _unreadable(self, error: Exception) -> ImportSourceError:
+        return ImportSourceError(f"{self._path} is no ROS bag that can be read: {error}", code="no-bag")
 
     def close(self) -> None:
         self._reader.close()
 
-    def read(self, topic: str, places: list[int] | None, limit_bytes: int | None) -> _Messages:
+    def deserialize(self, data: bytes, schema: str) -> Any:
+        return self._reader.deserialize(data, schema)
+
+    def read(self, topic: str, places: list[int] | None) -> _Messages:
         chosen = [c for c in self._reader.connections if c.topic == topic]
         wanted = None if places is None else set(places)
         messages = enumerate(self._reader.messages(connections=chosen))
@@ -219,6 +203,6 @@ class _SqliteBag:
             except StopIteration:
                 return
             except Exception as error:
-                raise ImportSourceError(f"{self._path} cannot be read: {error}", code="no-bag") from error
+                raise self._unreadable(error) from error
             if wanted is None or place in wanted:
-                yield time_ns, bytes(data if limit_bytes is None else data[:limit_bytes])
+                yield time_ns, bytes(data)

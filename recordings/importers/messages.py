@@ -1,4 +1,4 @@
-"""Messages of bags that an import can use, decoded from ROS 2 (CDR) or foxglove (protobuf, JSON).
+"""Messages of bags that an import can use, decoded from ROS or foxglove (protobuf, JSON).
 
 One type per kind of message, times in ns. ROS messages need `rosbags` (the extra `ros`).
 """
@@ -6,7 +6,6 @@ One type per kind of message, times in ns. ROS messages need `rosbags` (the extr
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -99,9 +98,6 @@ _ROS = {
     "geometry_msgs/msg/PoseStamped": Kind.POSE,
 }
 _NS = 1_000_000_000
-_LITTLE_ENDIAN = 1
-STAMP_BYTES = 12
-"""Beginning of a ROS message with a header: encapsulation (4), seconds, nanoseconds."""
 
 
 def kind_of(encoding: str, schema: str) -> Kind | None:
@@ -111,8 +107,13 @@ def kind_of(encoding: str, schema: str) -> Kind | None:
     return _ROS.get(schema) if encoding == CDR else None
 
 
-def decoded(encoding: str, schema: str, data: bytes, time_ns: int) -> Value:
-    """`time_ns`: when it was recorded; stands in for a stamp that is missing. Raises ImportSourceError."""
+def decoded(
+    encoding: str, schema: str, data: bytes, time_ns: int, deserialize: Callable[[bytes, str], Any]
+) -> Value:
+    """`time_ns`: when it was recorded; stands in for a stamp that is missing. Raises ImportSourceError.
+
+    `deserialize`: makes a message of ROS's bytes.
+    """
     try:
         if encoding == PROTOBUF:
             return _from_foxglove(schema, _FOXGLOVE[schema][0].FromString(data), time_ns)
@@ -120,7 +121,7 @@ def decoded(encoding: str, schema: str, data: bytes, time_ns: int) -> Value:
             fields = json.loads(data, object_hook=_protobufs_time)
             message = ParseDict(fields, _FOXGLOVE[schema][0](), ignore_unknown_fields=True)
             return _from_foxglove(schema, message, time_ns)
-        message = ros_types().deserialize_cdr(data, schema)
+        message = deserialize(data, schema)
     except ImportSourceError:
         raise
     except Exception as error:  # whatever rosbags makes of bytes that are no message
@@ -148,15 +149,6 @@ def ros_types() -> Any:
         text, remedy = "ROS messages need the package rosbags", "pip install 'calibration-station[ros]'"
         raise ImportSourceError(text, code="missing-package", remedy=remedy) from error
     return get_typestore(Stores.ROS2_HUMBLE)
-
-
-def ros_image_stamp_ns(data: bytes, time_ns: int) -> int:
-    """The stamp of a message that begins with a header, without decoding the rest."""
-    if len(data) < STAMP_BYTES:
-        raise _undecodable("ROS 2 image", f"{len(data)} bytes")
-    order = "<" if data[1] == _LITTLE_ENDIAN else ">"
-    seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
-    return int(seconds * _NS + nanoseconds) or time_ns
 
 
 def _frame(stamp_ns: int, parent: str, child: str, at: Any, turn: Any) -> FrameMessage:
@@ -214,7 +206,8 @@ def _from_ros(schema: str, message: Any, time_ns: int) -> Value:
         return ImageMessage(stamp_ns, 0, 0, encoding, 0, message.data.tobytes())
     if schema == "sensor_msgs/msg/CameraInfo":
         size = (message.width, message.height)
-        return intrinsics(*size, message.k, message.d, message.distortion_model)
+        k, d = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)  # ROS 1, ROS 2
+        return intrinsics(*size, k, d, message.distortion_model)
     if schema == "sensor_msgs/msg/JointState":
         speeds = tuple(map(float, message.velocity))
         return Joints(stamp_ns, tuple(message.name), tuple(map(float, message.position)), speeds)

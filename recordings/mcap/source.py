@@ -58,13 +58,11 @@ class Source:
         at, block = self._around(address)
         return int(MESSAGE_HEAD.unpack_from(block, at + RECORD_HEAD.size)[1])
 
-    def message(self, address: int, limit_bytes: int | None = None) -> Message:
-        """The message record at this address, with at most the first `limit_bytes` of its data."""
+    def message(self, address: int) -> Message:
+        """The message record at this address."""
         at, block = self._around(address)
         length = RECORD_HEAD.unpack_from(block, at)[1] - MESSAGE_HEAD.size
         channel, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(block, at + RECORD_HEAD.size)
-        if limit_bytes is not None:
-            length = min(length, limit_bytes)
         data = block[at + _HEAD_BYTES : at + _HEAD_BYTES + length]
         if len(data) < length:
             data = self.read(address + _HEAD_BYTES, length)

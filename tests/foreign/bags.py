@@ -148,6 +148,37 @@ def write_rosbag2(path: Path, storage: str, compression: str = "none") -> Path:
     return path
 
 
+class Ros1Messages(RosMessages):
+    """As ROS 1 has them: a header that counts, a camera's numbers in capitals, and no tf2 among the usual."""
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        self.store = get_typestore(Stores.ROS1_NOETIC)
+        frames = "geometry_msgs/TransformStamped[] transforms"
+        self.store.register(get_types_from_msg(frames, "tf2_msgs/msg/TFMessage"))
+
+    def header(self, stamp_ns: int, frame: str) -> Any:
+        stamp = self.make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 10**9))
+        return self.make("std_msgs/msg/Header", 7, stamp, frame)
+
+
+def write_rosbag1(path: Path) -> Path:
+    """A ROS 1 bag, by `rosbags`."""
+    from rosbags.rosbag1 import Writer
+
+    ros = Ros1Messages()
+    with Writer(path) as writer:
+        connections: dict[str, Any] = {}
+        for stamp_ns, kind, time_s in moments():
+            topic, message = ros.message(stamp_ns, kind, time_s, "mono8")
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
+            data = ros.store.serialize_ros1(message, message.__msgtype__)
+            writer.write(connections[topic], stamp_ns + 3_000_000, data)
+    return path
+
+
 def write_ros_mcap(path: Path, poses: bool = False, encoding: str = "mono8", **options: Any) -> Path:
     """The same in one MCAP file, by the reference library's writer and its `options`.
 

@@ -31,12 +31,14 @@ from tests.foreign.bags import (
     write_foxglove_json,
     write_foxglove_mcap,
     write_ros_mcap,
+    write_rosbag1,
     write_rosbag2,
 )
 from tests.recordings.small_recording import refused
 
 DESCRIPTION = "mount: eye-in-hand\nboard: {kind: chessboard, columns: 7, rows: 6, square_m: 0.025}\n"
 SOURCES = {
+    "rosbag1": lambda folder: write_rosbag1(folder / "a.bag"),
     "rosbag2 sqlite3": lambda folder: write_rosbag2(folder / "bag", "sqlite3"),
     "rosbag2 sqlite3, messages packed": lambda folder: write_rosbag2(folder / "bag", "sqlite3", "message"),
     "rosbag2 sqlite3, files packed": lambda folder: write_rosbag2(folder / "bag", "sqlite3", "file"),
@@ -143,6 +145,11 @@ def test_a_dry_run_says_what_would_be_taken_and_writes_nothing(tmp_path: Path) -
     assert call(main, "import", source).returncode == 2, "neither an output nor a dry run"
 
 
+def cut(path: Path) -> Path:
+    path.write_bytes(path.read_bytes()[:-20_000])
+    return path
+
+
 REFUSED = {
     "no description": (lambda folder: write_rosbag2(folder / "bag", "mcap"), Wanted(), "no-dataset"),
     "frames that are not there": (
@@ -155,7 +162,7 @@ REFUSED = {
         Wanted(image_topic="/left"),
         "no-topic",
     ),
-    "a ROS 1 bag": (lambda folder: folder / "a.bag", Wanted(), "ros1-bag"),
+    "a ROS 1 bag that is cut": (lambda folder: cut(write_rosbag1(folder / "a.bag")), Wanted(), "no-bag"),
     "nothing": (lambda folder: folder / "none", Wanted(), "no-file"),
     "no bag at all": (lambda folder: Path(__file__), Wanted(), "damaged-recording"),
 }
@@ -175,8 +182,7 @@ def test_what_cannot_be_imported_is_named(tmp_path: Path, name: str) -> None:
 
 
 def test_a_cut_bag_is_named_as_such(tmp_path: Path, description: Path) -> None:
-    path = write_ros_mcap(tmp_path / "a.mcap")
-    path.write_bytes(path.read_bytes()[:-2000])
+    path = cut(write_ros_mcap(tmp_path / "a.mcap"))
     with refused("unfinished-recording"):
         import_bag(path, tmp_path / "out.mcap", description)
 
@@ -184,7 +190,7 @@ def test_a_cut_bag_is_named_as_such(tmp_path: Path, description: Path) -> None:
 def test_without_rosbags_the_way_out_is_named(tmp_path: Path, description: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     source = write_ros_mcap(tmp_path / "a.mcap")
     ros_types.cache_clear()
-    for module in ("rosbags.typesys", "rosbags.rosbag2"):
+    for module in ("rosbags.typesys", "rosbags.highlevel"):
         monkeypatch.setitem(sys.modules, module, None)
     with refused("missing-package"):
         import_bag(source, tmp_path / "out.mcap", description)

@@ -27,6 +27,7 @@ from recordings.schema.messages import RobotState
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
 from station.cell.process import DAEMON_NICENESS, go_before_others
+from station.devices.base import fresh
 from station.devices.ur import UrRobot
 from station.devices.ur_dashboard import STOP
 from station.simulation.launch import AdminClient, start_controller
@@ -52,7 +53,7 @@ class LatencyRig:
     async def cruise(self) -> asyncio.Task[None]:
         if not self.robot.control:
             await self.robot.start_control()
-        goal = list((await self.robot.fresh()).joints_rad)
+        goal = list((await fresh(self.robot)).joints_rad)
         goal[0] += 1.5 if self._forth else -1.5
         self._forth = not self._forth
         move = asyncio.create_task(self.robot.move(goal, CRUISE_RAD_S, 1.4))

@@ -18,14 +18,12 @@ from calibrate.kinematics import JOINT_NAMES, RobotModel, forward
 from recordings.schema.messages import RobotState, Stillness
 from recordings.schema.stillness import LEAST_SAMPLES, scatter
 from station.cell.config import StillnessConfig
-from station.cell.errors import StaleStateError, StationError
+from station.cell.errors import StationError
 
 JOGGED_RAD = 0.01
 
 _DEG = math.degrees(1.0)
 POLL_S = 0.02
-NEWS_POLL_S = 0.01
-REST_PATIENCE_S = 1.0
 FIND_SHAKE = "Find what shakes the arm or the camera, or retake the pose later."
 UNSEEN = "image motion unknown, no images"
 CHECK_CAMERA = "Check the camera's cable and power, or retake the pose later."
@@ -117,7 +115,7 @@ class StillnessMonitor:
         look: Callable[[int], float | None] = lambda since_ns: math.nan,
         now_s: Callable[[], float] = time.monotonic,
     ) -> Stillness:
-        """Returns as soon as everything is at rest. `alive` raises when the robot is lost; False: old news.
+        """Returns as soon as everything is at rest. `alive`: the robot's `check`; None: its news are late.
 
         `look`: motion (px) in images exposed since this host time, when the joints came to rest; NaN where it
         cannot be measured, None = not yet.
@@ -126,7 +124,7 @@ class StillnessMonitor:
         give_up_s = now_s() + self._limits.timeout_s
         resting_since_ns: int | None = None
         while True:
-            old = alive() is False
+            old = alive() is None
             found = self.measure() if not old else None
             unrest = self.unrest(found) if found is not None else "too few robot states"
             unrest, remedy = "no fresh news of the robot" if old else unrest, FIND_SHAKE
@@ -166,38 +164,3 @@ class StillnessMonitor:
                 speed_rad_s=float(speeds[joint]),
                 limit_rad_s=limit,
             )
-
-
-class RestingCheck:
-    """`check` (the robot's), forgiving stale news for up to `patience_s` at a stretch; all else at once.
-
-    Nothing is commanded to move while this waits. A moving arm has no such patience: `Robot.move` ends it.
-    """
-
-    def __init__(
-        self,
-        check: Callable[[], None],
-        patience_s: float = REST_PATIENCE_S,
-        now_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._check, self._patience_s, self._now_s = check, patience_s, now_s
-        self._stale_since_s: float | None = None
-
-    def __call__(self) -> bool:
-        """True when the news are fresh and good. Raises what `check` raises."""
-        try:
-            self._check()
-        except StaleStateError:
-            now_s = self._now_s()
-            if self._stale_since_s is None:
-                self._stale_since_s = now_s
-            if now_s - self._stale_since_s >= self._patience_s:
-                raise
-            return False
-        self._stale_since_s = None
-        return True
-
-    async def news(self) -> None:
-        """Returns with fresh and good news."""
-        while not self():
-            await asyncio.sleep(NEWS_POLL_S)

@@ -186,6 +186,7 @@ def asked_standing(cell: StationConfig, socket: Path) -> list[float] | None:
 
 async def _read_joints(cell: StationConfig) -> Vector6:
     """By the read-only half of the driver. Raises RobotError."""
+    from station.devices.base import fresh
     from station.devices.rtde import PORT
     from station.devices.ur_link import UrLink
     from station.devices.ur_probe import check_port
@@ -194,7 +195,7 @@ async def _read_joints(cell: StationConfig) -> Vector6:
     link = UrLink(cell.robot)
     try:
         await link.connect()
-        return link.latest().joints_rad
+        return (await fresh(link)).joints_rad
     finally:
         await link.close()
 

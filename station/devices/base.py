@@ -52,7 +52,25 @@ def _letting_go(job: Callable[[], T]) -> T:
         raise
 
 
-class Robot(Protocol):
+class ArmNews(Protocol):
+    """What an arm tells of itself; how late that may come: `devices.news`."""
+
+    guided: bool
+    """A person moves the arm by hand: its news may be late by no more than those of an arm in motion."""
+
+    def latest(self) -> RobotState:
+        """Newest state; StaleStateError when older than 100 ms. For who looks again anyway; who decides waits
+        for the news: `fresh`, `ready`."""
+
+    def news(self) -> RobotState | None:
+        """Newest state; None while it is late, but may still come. StaleStateError after 0.25 s in motion,
+        1 s at rest."""
+
+    def check(self) -> RobotState | None:
+        """`news`; raises RobotError for what speaks against capturing now: safety stop, TCP changed."""
+
+
+class Robot(ArmNews, Protocol):
     """An arm. Connecting is read-only; only `start_control` (by an approval) replaces the robot's program."""
 
     @property
@@ -84,17 +102,11 @@ class Robot(Protocol):
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
         """Every sample, in order, at the full rate, from the reader's thread: the callback must be quick."""
 
-    def latest(self) -> RobotState:
-        """Newest state; StaleStateError when older than 100 ms or its controller time stands still."""
-
     def at(self, host_monotonic_ns: int) -> RobotState:
         """State interpolated at a host time within the last 10 s; StaleStateError outside."""
 
     def clock(self) -> ClockFit | None:
         """The controller's clock against the host's; None while not known."""
-
-    def check(self) -> None:
-        """Raises RobotError for what speaks against capturing now: safety stop, stale state, TCP changed."""
 
     async def start_control(self) -> None:
         """Spawns the control child. Only in answer to a motion approval. RobotError when refused."""
@@ -119,6 +131,23 @@ class Robot(Protocol):
         """Stops the script and ends the child."""
 
     async def close(self) -> None: ...
+
+
+NEWS_POLL_S = 0.005
+
+
+async def fresh(robot: ArmNews) -> RobotState:
+    """Where the arm is now. News that are late are waited for. StaleStateError when they do not come."""
+    while (state := robot.news()) is None:
+        await asyncio.sleep(NEWS_POLL_S)
+    return state
+
+
+async def ready(robot: ArmNews) -> RobotState:
+    """`fresh`, and nothing speaks against capturing. Raises RobotError for what does."""
+    while (state := robot.check()) is None:
+        await asyncio.sleep(NEWS_POLL_S)
+    return state
 
 
 class Camera(Protocol):

@@ -133,6 +133,7 @@ class PlaybackRobot:
         self.identity, self.camera = self._recording.info.robot, self._recording.info.camera_identity
         self.control_path, self.notice, self.remote, self.kinematics = "", "", None, None
         self.payload: tuple[float, ...] = ()
+        self.guided = False
 
     def plan(self) -> Plan:
         """The recorded poses as a plan."""
@@ -195,7 +196,11 @@ class PlaybackRobot:
     def clock(self) -> ClockFit | None:
         return _HOST_CLOCK
 
-    def check(self) -> None: ...
+    def news(self) -> RobotState | None:
+        return self.latest()
+
+    def check(self) -> RobotState | None:
+        return self.latest()
 
     async def start_control(self) -> None:
         self.control = True

@@ -12,29 +12,33 @@ import logging
 import os
 import signal
 import time
-from collections import deque
 from collections.abc import Coroutine, Sequence
 from functools import cache
 from importlib.util import find_spec
-from itertools import pairwise
 from pathlib import Path
 
 from recordings.schema.messages import RobotState
 from station.cell.acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
+from station.devices.base import fresh, ready
+from station.devices.news import (
+    RESTING_S,
+    Evidence,
+    is_loopback,
+    largest_gap,
+    longest_silence_s,
+)
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import (
     APPROVE_AGAIN,
-    STALE_S,
     foreign_program,
     not_powered,
     program_ended,
     program_not_running,
     program_replaced,
     safety_stop,
-    watchdog_cause,
 )
 from station.devices.ur_control import LIBRARY_REMEDY
 from station.devices.ur_dashboard import STOP, Dashboard, came
@@ -50,8 +54,6 @@ TOOL_S = 0.04
 ONE_WAY_S = 1.0
 RESTING_RAD_S = 0.005
 STOP_WAIT_S = 0.05
-UNANSWERED_S = 0.1
-"""A heartbeat that the control process did not answer for so long kicked nothing any more."""
 OUTLIVED_S: dict[ControlPath, float] = {"ur_rtde": 0.3, "script": 0.6}
 """A program that still plays so long after a pause began did not stop for it. Our script plays until the arm
 rests: at its fastest it brakes for 0.26 s."""
@@ -63,12 +65,6 @@ PROGRAM_START_NS = 200_000_000
 LEFTOVER_WAIT_NS = 2_000_000_000
 NEWS_WAIT_NS = 250_000_000
 CLOSE_WAIT_S = 0.5
-KEPT = 64
-
-
-def longest_gap_s(moments_s: Sequence[float], since_s: float) -> float:
-    """Longest time between neighbours that began after `since_s`; 0 when there is none."""
-    return max((b - a for a, b in pairwise(moments_s) if a > since_s), default=0.0)
 
 
 def control_path(config: RobotConfig) -> ControlPath:
@@ -100,13 +96,16 @@ class UrRobot(UrLink):
         self._child: ControlChild | None = None
         self.control = False
         """The control program runs and obeys us."""
-        self._moving = False
+        self._moving = self._sent = False
         self._stop_reason = self._link_loss = ""
-        self._beats_s: deque[float] = deque(maxlen=KEPT)
+        self._ended_by: RobotError | None = None
+        """What ended control between two moves."""
         self._one_way_s: float | None = None
         """When a stop test gave its one way (host monotonic); until then, and afterwards, None."""
         self._played_s = 0.0
-        """When the control program was last seen playing, in a move."""
+        """When the control program was last seen playing (host monotonic)."""
+        self._tool_looked_s = 0.0
+        """When TCP and payload were last looked at in a move."""
         self._background: set[asyncio.Task[object]] = set()
 
     @property
@@ -117,6 +116,10 @@ class UrRobot(UrLink):
     def control_pid(self) -> int | None:
         return self._child.pid if self._child is not None else None
 
+    @property
+    def in_motion(self) -> bool:
+        return self._sent or super().in_motion
+
     async def start_control(self) -> None:
         """Spawns the control process, which loads its program; returns when that heard a first heartbeat.
 
@@ -124,10 +127,9 @@ class UrRobot(UrLink):
         """
         if self._child is not None:
             raise RobotError("control is already started", code="control-started")
-        self._stop_reason = ""
+        self._stop_reason, self._ended_by = "", None
         await self.idle()  # a child that is still ending holds the registers
-        await self.fresh()
-        self.check()
+        await ready(self)
         await self._may_start()
         if why := self._why_stopped():
             raise _stopped(f" before control started{why}")
@@ -151,17 +153,17 @@ class UrRobot(UrLink):
         try:
             await child.heard()
         except RobotError as error:
-            raise await self._look_again(self._program_trouble() or error) from None
+            raise await self._look_again(self._program_trouble(self.latest()) or error, child) from None
 
     async def _may_start(self) -> None:
         """Raises RobotError, with the remedy, while starting control would disturb somebody or must fail."""
         # A connection that was opened in local mode stays refused: e-Series want a new one.
-        fresh = await self.renew_dashboard()
-        self.remote = await fresh.remote()
-        state = await self.fresh()
+        dashboard = await self.renew_dashboard()
+        self.remote = await dashboard.remote()
+        state = await fresh(self)
         if self.remote is False:
             raise _local_control()
-        program = await fresh.ask("programState")
+        program = await dashboard.ask("programState")
         if self._primary is not None:
             self._primary.started = ""
         trouble = safety_stop(state) or not_powered(state) or foreign_program(state, program)
@@ -171,7 +173,6 @@ class UrRobot(UrLink):
 
     def heartbeat(self) -> None:
         """Called by the session loop at least every 50 ms while control lives; without it the arm stops."""
-        self._beats_s.append(time.monotonic())
         if self._child is not None:
             self._child.beat()
 
@@ -192,7 +193,7 @@ class UrRobot(UrLink):
         check_goal(joints_rad, speed_rad_s, acceleration_rad_s2, self.model.joint_limit_rad)
         child = self._child
         if child is None or not self.control:
-            raise RobotError(
+            raise self._ended_by or RobotError(
                 f"control is not started{self._why_stopped()}",
                 code="no-control",
                 remedy="Approve motion first.",
@@ -201,46 +202,65 @@ class UrRobot(UrLink):
             raise RobotError("a move is already under way", code="moving")
         self._moving, self._link_loss = True, ""
         try:
-            await self.fresh()
-            await child.heard()
-            self.check()
-            if self._child is not child:
-                raise _stopped()  # while we waited
+            await self._ready_to_move(child)
             sample = self.newest()
             self._played_s = time.monotonic()
             watch = MoveWatch(sample.state.joints_rad, joints_rad, sample.operation, self._played_s)
-            await child.move(joints_rad, speed_rad_s, acceleration_rad_s2)
-            await self._follow(watch, child)
+            self._sent = True
+            await self._follow(watch, child, child.move(joints_rad, speed_rad_s, acceleration_rad_s2))
         except BaseException as error:
             cause = self._explain(error, child)
             try:
                 await self._one_way_ends()
             finally:
                 await asyncio.shield(self.stop(str(cause) or type(cause).__name__))
-            raise await self._look_again(cause) from None
+            raise await self._look_again(cause, child) from None
         finally:
-            self._moving = False
+            self._moving = self._sent = False
             self.notice, self._one_way_s = "", None
 
-    async def _follow(self, watch: MoveWatch, child: ControlChild) -> None:
-        tool_s = 0.0
+    async def _ready_to_move(self, child: ControlChild) -> None:
+        """Returns with current news of an arm that may move and a heartbeat that was just heard."""
         while True:
-            if self._stop_reason:
-                raise _stopped(f": {self._stop_reason}")
-            sample = self.newest()
-            if sample.state.runtime_state == RuntimeState.PLAYING:
-                self._played_s = sample.state.stamps.host_monotonic_ns / 1e9
-            if watch.step(sample.state, sample.operation, self.age_s(), time.monotonic()):
+            await ready(self)
+            await child.heard()
+            if self._child is not child:
+                raise _stopped()  # while we waited
+            if self.check() is not None:
                 return
-            if time.monotonic() > tool_s + TOOL_S:
-                tool_s = time.monotonic()
-                self.check_tool(sample)
-            child.check()
-            self.notice = watch.notice
-            await asyncio.sleep(POLL_S)
+
+    async def _follow(
+        self, watch: MoveWatch, child: ControlChild, sending: Coroutine[object, object, None]
+    ) -> None:
+        """Sends the move and watches it until the arm arrived."""
+        sent = asyncio.ensure_future(sending)
+        try:
+            while not await self._step(watch, child, sent):
+                await asyncio.sleep(POLL_S)
+        finally:
+            sent.cancel()
+
+    async def _step(self, watch: MoveWatch, child: ControlChild, sent: asyncio.Future[None]) -> bool:
+        """True when the arm arrived."""
+        if self._stop_reason:
+            raise _stopped(f": {self._stop_reason}")
+        if sent.done():
+            sent.result()
+        self.news()
+        sample = self.newest()
+        if sample.state.runtime_state == RuntimeState.PLAYING:
+            self._played_s = sample.state.stamps.host_monotonic_ns / 1e9
+        if watch.step(sample.state, sample.operation, time.monotonic()) and sent.done():
+            return True
+        if (now_s := time.monotonic()) > self._tool_looked_s + TOOL_S:
+            self._tool_looked_s = now_s
+            self.check_tool(sample)
+        child.check()
+        self.notice = watch.notice
+        return False
 
     def _explain(self, error: BaseException, child: ControlChild) -> BaseException:
-        """The cause behind a symptom: STOP first, then safety, the link, our own heartbeat, the child."""
+        """The cause behind a symptom, as far as it is known at once: STOP first, then safety, the link."""
         if not isinstance(error, RobotError):
             return error
         if self._stop_reason:
@@ -252,50 +272,46 @@ class UrRobot(UrLink):
             return stop
         if self._link_loss:  # the link may be on its way back already
             return link_lost(self._link_loss)
-        if reader is None or state is None:
-            return error
-        if reader.ended is not None or isinstance(error, StaleStateError):
-            pause_s = self._pause_s(time.monotonic() - self.age_s() - OUTLIVED_S[self.control_path])
-            busy = watchdog_cause(pause_s, 0.0) if reader.ended is None else None
-            return busy or self.stale(self.age_s())
-        refused = child.kicks_refused and state.runtime_state == RuntimeState.PLAYING  # it tells no more yet
-        if state.runtime_state != RuntimeState.STOPPED and not refused:
-            return error
-        since_s = self._played_s - OUTLIVED_S[self.control_path]
-        arrivals_s = [s.stamps.host_monotonic_ns / 1e9 for s in reader.history.copy()]
-        cause = watchdog_cause(self._pause_s(since_s), longest_gap_s(arrivals_s, since_s))
-        if cause is not None:
-            return cause
-        if refused:
-            return program_ended(RuntimeState.STOPPED)
-        try:
-            child.check(patience_s=UNANSWERED_S)
-        except RobotError as trouble:
-            return trouble
+        child.read_waiting()  # its last words say when it kicked; after the stop there are no more
         return error
 
-    def _pause_s(self, since_s: float) -> float:
-        """Longest pause of the heartbeat that began after `since_s` (host monotonic), ended or not."""
-        return longest_gap_s([*self._beats_s, time.monotonic()], since_s)
-
-    async def _look_again(self, error: BaseException) -> BaseException:
-        """A program that just stopped was stopped by something that state and dashboard may tell only now:
-        a safety stop, the arm's power, the switch to local control."""
+    async def _look_again(self, error: BaseException, child: ControlChild) -> BaseException:
+        """What only news tell that come after the stop: a safety stop, the arm's power, the switch to local
+        control, and what was late when the watchdog or late news ended the program."""
         if not isinstance(error, RobotError) or isinstance(error, SafetyStopError):
             return error
-        now_ns = time.monotonic_ns()
-        unsure = error.code in ("program-ended", "watchdog")
-        if unsure and (state := await self._state_after(now_ns, NEWS_WAIT_NS)):
-            error = safety_stop(state) or not_powered(state) or error
+        now_ns, late = time.monotonic_ns(), error.code == StaleStateError.code
+        ended = error.code in ("program-ended", "watchdog")
+        if late or ended:
+            state = await self._state_after(now_ns, round(RESTING_S * 1e9) if late else NEWS_WAIT_NS)
+            if state is not None and (held := safety_stop(state) or not_powered(state)) is not None:
+                return held
+            if state is not None or not late:
+                error = self._evidence(child, late).error() or error
         if self.remote and self.dashboard is not None:
             with contextlib.suppress(RobotError, TimeoutError):
                 async with asyncio.timeout(0.3):
                     self.remote = await self.dashboard.remote()
         if self.remote is False:
             return _local_control()
-        wait_s = REPLACED_S if unsure else 0.0
+        wait_s = REPLACED_S if ended else 0.0
         other = await self._other_program(wait_s) if error.code in MAY_BE_REPLACED else None
-        return error if other is None else program_replaced(other)
+        if other is not None:
+            return program_replaced(other)
+        return program_ended(RuntimeState.STOPPED) if error.code == "watchdog" else error
+
+    def _evidence(self, child: ControlChild, late: bool) -> Evidence:
+        """What was late before the control program ended, or (`late`) since its last news."""
+        states = self.reader.history.copy() if self.reader is not None else ()
+        ended = (s for s in states if s.runtime_state != RuntimeState.PLAYING)
+        after_s = (s.stamps.host_monotonic_ns / 1e9 for s in ended)
+        now_s = time.monotonic()
+        until_s = now_s if late else next((t for t in after_s if t > self._played_s), now_s)
+        since_s = (self._played_s if late else until_s) - OUTLIVED_S[self.control_path]
+        silence_s = 0.0 if late else longest_silence_s(child.kicks_s, since_s, until_s)
+        period_s = 1 / self.reader.rate_hz if self.reader is not None and self.reader.rate_hz else 0.0
+        gaps = largest_gap(states, since_s, until_s, period_s)
+        return Evidence(silence_s, *gaps, is_loopback(self.config.host))
 
     async def _other_program(self, wait_s: float) -> str | None:
         """Name of another program that began to play since ours was last seen playing; '' if it has none.
@@ -425,17 +441,20 @@ class UrRobot(UrLink):
             return
         try:
             child.check()
-            if (trouble := self._program_trouble()) is not None:
+            state = self.news()
+            if state is not None and (trouble := self._program_trouble(state)) is not None:
                 raise trouble
         except RobotError as error:
-            await self.stop(str(error))
-            raise await self._look_again(error) from None
+            cause = self._explain(error, child)
+            await self.stop(str(cause))
+            cause = await self._look_again(cause, child)
+            assert isinstance(cause, RobotError)
+            self._ended_by = cause
+            raise cause from None
+        self._played_s = time.monotonic()
 
-    def _program_trouble(self) -> RobotError | None:
-        """Say what state and dashboard hold against the control program; StaleStateError without news."""
-        state = self.newest().state
-        if self.age_s() > STALE_S:
-            return self.stale(self.age_s())
+    def _program_trouble(self, state: RobotState) -> RobotError | None:
+        """Say what state and dashboard hold against the control program."""
         if self.remote is False:
             return _local_control()
         return safety_stop(state) or not_powered(state) or program_not_running(state)

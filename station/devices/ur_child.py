@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -36,6 +37,8 @@ REAP_S = 2.0
 LOG_LIMIT_BYTES = 1_000_000
 STOP_DECELERATION = 4.0
 """Of the joints, rad/s². From full speed the arm rests after 0.26 s, as with our own script."""
+KEPT = 64
+"""Kicks of the watchdog that are remembered: more than a second of them."""
 
 
 class _Answer(msgspec.Struct):
@@ -44,6 +47,7 @@ class _Answer(msgspec.Struct):
     tcp: tuple[float, ...] | None = None
     refused: ErrorData | None = None
     beat: int | None = None
+    ns: int = 0
     kicked: bool = False
     lost: bool = False
     id: int | None = None
@@ -73,6 +77,8 @@ class ControlChild:
         self._number = 0
         self._beat_ns = 0
         self._answered_ns = 0
+        self.kicks_s: deque[float] = deque(maxlen=KEPT)
+        """When the newest heartbeats kicked the watchdog (host monotonic)."""
         self.stop_acknowledged: asyncio.Future[None] = self._loop.create_future()
         self.kicks_refused = False
         """The child says that the control script does not take kicks any more."""
@@ -259,22 +265,29 @@ class ControlChild:
             return f" (signal {-code}, {signal.Signals(-code).name})"
         return f" (exit code {code})"
 
-    def _receive(self) -> None:
+    def read_waiting(self) -> None:
+        """Takes the messages that wait unread, because this computer was busy."""
+        while self._receive():
+            pass
+
+    def _receive(self) -> bool:
+        """Takes a message; False: there was none."""
         try:
             message = self._channel.recv(65536)
         except (BlockingIOError, ConnectionResetError):
-            return  # a reset tells of heartbeats it never read; its last words come with the next call
+            return False  # a reset tells of heartbeats it never read; its last words come with the next call
         except OSError:
             message = b""
         if not message:
             self._close()
-            return
+            return False
         answer = _ANSWER.decode(message)
         if answer.beat is not None:
             self._answered_ns = max(self._answered_ns, answer.beat)
             self.kicks_refused = answer.lost
             if answer.kicked:
                 self._kicked_ns = answer.beat
+                self.kicks_s.append(answer.ns / 1e9)
             self._news.set()
         elif answer.id is not None:
             waiter = self._moves.get(answer.id)
@@ -285,6 +298,7 @@ class ControlChild:
                 self.stop_acknowledged.set_result(None)
         elif not self._ready.done():
             self._ready.set_result(answer)
+        return True
 
     def _close(self) -> None:
         if self._channel.fileno() >= 0:

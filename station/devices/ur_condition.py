@@ -8,13 +8,6 @@ from recordings.schema.messages import RobotState
 from station.cell.errors import RobotError, SafetyStopError
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 
-STALE_S = 0.1
-"""An older robot state is none to begin with."""
-HICCUP_S = 0.25
-"""So long this computer may be busy: a move goes on, and what wants a state waits for it."""
-WATCHDOG_S = 0.15
-"""A silence that can have tripped the control program's watchdog (1/5 s, and ticks)."""
-WATCHDOG_LIMIT_MS = 200
 APPROVE_AGAIN = "then approve motion again"
 NOT_STARTED_REMEDY = (
     "Clear the pendant's messages, and look there why programs from the network are not started."
@@ -142,32 +135,6 @@ def not_powered(state: RobotState) -> RobotError | None:
 def program_not_running(state: RobotState) -> RobotError | None:
     """Finds our own control script not playing, as it must while control lives."""
     return None if state.runtime_state == RuntimeState.PLAYING else program_ended(state.runtime_state)
-
-
-def watchdog_cause(pause_s: float, gap_s: float) -> RobotError | None:
-    """Why the watchdog can have stopped the arm: `pause_s` without a heartbeat of ours, `gap_s` without news.
-
-    A computer that is busy holds up both, so its pause is named first. None: neither was long enough.
-    """
-    if pause_s > WATCHDOG_S:
-        return RobotError(
-            f"the session was busy for {pause_s * 1000:.0f} ms and the watchdog stopped the arm "
-            f"(limit {WATCHDOG_LIMIT_MS} ms)",
-            code="watchdog-computer",
-            remedy=f"Reduce the load of this computer, {APPROVE_AGAIN}.",
-            pause_ms=pause_s * 1000,
-            limit_ms=WATCHDOG_LIMIT_MS,
-        )
-    if gap_s > WATCHDOG_S:
-        return RobotError(
-            f"the network carried nothing from the robot for {gap_s * 1000:.0f} ms and the watchdog stopped "
-            f"the arm (limit {WATCHDOG_LIMIT_MS} ms)",
-            code="watchdog-network",
-            remedy=f"Check cable, switch and what else uses this network, {APPROVE_AGAIN}.",
-            gap_ms=gap_s * 1000,
-            limit_ms=WATCHDOG_LIMIT_MS,
-        )
-    return None
 
 
 def program_ended(runtime_state: int) -> RobotError:

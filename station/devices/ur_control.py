@@ -9,7 +9,8 @@ Requests: {"do": "beat", "ns": N}   N = host monotonic time of the session loop;
           {"do": "stop", "deceleration": …}
           {"do": "end"}
 Answers:  {"ready": true, "tcp": [6] | null} · {"refused": an `ErrorData`}
-          {"beat": N, "kicked": bool, "lost": bool}   kicked: the beat was fresh and the script took the kick
+          {"beat": N, "ns": N, "kicked": bool, "lost": bool}   kicked: at `ns`, for the beat was fresh and the
+                                                               script took it
           {"id": I, "ok": bool, "error": text} · {"stopped": true}
 """
 
@@ -96,7 +97,13 @@ class MotionServer:
             armed = self._armed or self._arm()
             kicked = bool(armed and self._control.kickWatchdog())
             self._script_lost = not kicked
-        self.answer({"beat": beat_ns, "kicked": kicked, "lost": self._script_lost})
+        told: dict[str, object] = {
+            "beat": beat_ns,
+            "ns": time.monotonic_ns(),
+            "kicked": kicked,
+            "lost": self._script_lost,
+        }
+        self.answer(told)
 
     def _arm(self) -> bool:
         """From now on the script lives only as long as it is kicked."""

@@ -18,7 +18,8 @@ from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.cell.process import waited_share
 from station.cell.scene import arm_model
-from station.devices.ur_condition import HICCUP_S, STALE_S, safety_stop
+from station.devices.news import CURRENT_S, MOVING_S, RESTING_S
+from station.devices.ur_condition import safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_probe import (
     SCRIPT_PORT,
@@ -51,6 +52,10 @@ class UrLink:
         """Remote control is on; None where there is no such switch (CB3)."""
         self.reader: StateReader | None = None
         """The state stream's counters; another object after a lost connection."""
+        self._before_ns = 0
+        """Arrival of the newest sample of the connection before."""
+        self.guided = False
+        """A person moves the arm by hand: it may move at any moment."""
         self.dashboard: Dashboard | None = None
         self.lost = 0
         """Connections that ended by themselves."""
@@ -169,6 +174,7 @@ class UrLink:
         await self._close_link()
         self._unlock()
         self._tool = self._payload = None
+        self._before_ns = 0
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -176,6 +182,7 @@ class UrLink:
             self._lock = None
 
     async def _close_link(self) -> None:
+        self._before_ns = self._newest_ns()
         reader, self.reader = self.reader, None
         if reader is not None:
             await asyncio.to_thread(reader.close)
@@ -211,53 +218,68 @@ class UrLink:
         """Whatever came last, however old. Raises StaleStateError when nothing ever came."""
         sample = self.reader.newest if self.reader is not None else None
         if sample is None:
-            raise StaleStateError(f"no connection to the robot at {self.config.host}", code="not-connected")
+            raise not_connected(self.config.host)
         return sample
 
+    @property
+    def in_motion(self) -> bool:
+        """News may be late by much less than at rest: see `devices.news`."""
+        return self.guided
+
     def age_s(self) -> float:
-        """Age of the newest sample; a controller time that stands still makes none."""
+        """Age of the newest sample; a controller time that stands still makes none.
+
+        What waits unread in the socket is read before: a busy computer makes no news old.
+        """
+        age_s = self._age_s()
+        if age_s > CURRENT_S and self.reader is not None:
+            self.reader.read_waiting()
+            age_s = self._age_s()
+        return age_s
+
+    def _age_s(self) -> float:
+        return (time.monotonic_ns() - self._newest_ns()) / 1e9 if self._newest_ns() else float("inf")
+
+    def _newest_ns(self) -> int:
+        """Arrival of the newest sample (host monotonic), of this connection or the one before; 0: none."""
         sample = self.reader.newest if self.reader is not None else None
-        if sample is None:
-            return float("inf")
-        return (time.monotonic_ns() - sample.state.stamps.host_monotonic_ns) / 1e9
+        return self._before_ns if sample is None else sample.state.stamps.host_monotonic_ns
 
     def latest(self) -> RobotState:
         """Newest state; StaleStateError when older than 100 ms or its controller time stands still."""
-        sample, age_s = self.newest(), self.age_s()
-        if age_s > STALE_S or not self.connected:
-            raise self.stale(age_s)
-        return sample.state
+        age_s = self.age_s()
+        if age_s > CURRENT_S or not self.connected:
+            raise self.stale(age_s, CURRENT_S)
+        return self.newest().state
 
-    async def fresh(self) -> RobotState:
-        """`latest`, but lets a hiccup of this computer pass. StaleStateError after 0.25 s."""
-        give_up_s = time.monotonic() + HICCUP_S
-        while True:
-            try:
-                return self.latest()
-            except StaleStateError:
-                if time.monotonic() > give_up_s or not self.connected:
-                    raise
-            await asyncio.sleep(0.005)
+    def news(self) -> RobotState | None:
+        """Newest state; None while it is late, but not later than the arm's rest or motion allows.
 
-    def stale(self, age_s: float) -> StaleStateError:
+        StaleStateError after that, and at once when the connection of an arm in motion ended.
+        """
+        age_s = self.age_s()
+        if age_s <= CURRENT_S and self.connected:
+            return self.newest().state
+        limit_s = MOVING_S if self.in_motion else RESTING_S
+        if age_s > limit_s or (self.in_motion and not self.connected):
+            raise self.stale(age_s, limit_s)
+        return None
+
+    def stale(self, age_s: float, limit_s: float) -> StaleStateError:
         """Why the newest state is too old."""
         reader = self.reader
-        assert reader is not None
+        if reader is None or (reader.ended is None and reader.newest is None):
+            return not_connected(self.config.host)
         if reader.ended is not None:
             return link_lost(reader.ended)
-        less_load = "Reduce the load of this computer"
+        text, remedy = f"no news from the robot for {age_s * 1000:.0f} ms", "Check cable and network."
         if reader.stands_still:
             text = f"the controller's clock stands still since {age_s * 1000:.0f} ms"
-            code, remedy = "", "Restart the controller."
-        elif reader.waits_unread():
-            text = f"this computer was too busy for {age_s * 1000:.0f} ms to read the robot's state"
-            code, remedy = "computer-busy", f"{less_load}."
-        else:
-            text, code = f"no news from the robot for {age_s * 1000:.0f} ms", ""
-            remedy = "Check cable and network."
-            if (waited := waited_share()) >= _BUSY_SHARE:
-                remedy = f"{less_load}: programs wait for it {waited:.0%} of the time. {remedy}"
-        return StaleStateError(text, code=code, remedy=remedy, age_s=age_s, limit_s=STALE_S)
+            remedy = "Restart the controller."
+        elif (waited := waited_share()) >= _BUSY_SHARE:
+            load = f"Reduce the load of this computer: programs wait for it {waited:.0%} of the time."
+            remedy = f"{load} {remedy}"
+        return StaleStateError(text, remedy=remedy, age_s=age_s, limit_s=limit_s)
 
     def at(self, host_monotonic_ns: int) -> RobotState:
         """State interpolated at a host time within the last 10 s; StaleStateError outside."""
@@ -269,15 +291,18 @@ class UrLink:
         """The controller's clock against the host's; None before there is enough to tell."""
         return self.reader.clock.fit() if self.reader is not None else None
 
-    def check(self) -> None:
-        """Raises what speaks against capturing here and now: safety stop, stale state, TCP changed …"""
-        state = self.latest()
+    def check(self) -> RobotState | None:
+        """`news`, or raises what speaks against capturing here and now: safety stop, TCP changed …"""
+        state = self.news()
+        if state is None:
+            return None
         stop = safety_stop(state)
         if stop is not None:
             raise stop
         self.check_tool(self.newest())
         if self._trouble is not None:
             raise self._trouble
+        return state
 
     def check_tool(self, sample: Sample) -> None:
         """Raises RobotError when TCP or payload are other ones than at connect; in motion, too."""
@@ -335,6 +360,10 @@ class UrLink:
         if self.remote is not None:
             with contextlib.suppress(DashboardError):
                 self.remote = await self.dashboard.remote()
+
+
+def not_connected(host: str) -> StaleStateError:
+    return StaleStateError(f"no connection to the robot at {host}", code="not-connected")
 
 
 def link_lost(why: str) -> StaleStateError:

@@ -18,6 +18,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from functools import partial
 from typing import NamedTuple
 
 import msgspec
@@ -41,6 +42,9 @@ SILENCE_S = 2.0
 SO_TIMESTAMPNS = 35
 """Linux, 64 bit: receive time by the kernel, wall clock; `socket` does not name it."""
 RECEIVE_BUFFER_BYTES = 1 << 20
+READ_BYTES = 1 << 16
+READING_WAIT_S = 0.02
+"""Longer than a full buffer takes to read."""
 WALL_STEP_NS = 1_000_000
 """Between two packets no wall clock is slewed by so much: it was set."""
 _TIMESPEC = struct.Struct("@qq")
@@ -71,7 +75,8 @@ class Sample(NamedTuple):
 
 
 class StateReader(threading.Thread):
-    """`on_state` is called for every sample from this thread and must be quick; `on_end` once, at the end."""
+    """`on_state` is called for every sample, in order, one at a time, and must be quick: from this thread, or
+    from one that asked to read what waits. `on_end` once, at the end."""
 
     def __init__(
         self, host: str, on_state: Callable[[RobotState], None], on_end: Callable[[str], None]
@@ -95,7 +100,10 @@ class StateReader(threading.Thread):
         """Why the connection is over; None while it lives."""
         self._on_state = on_state
         self._on_end = on_end
-        self._link: socket.socket | None = None
+        self._reading = threading.Lock()
+        self._read: Callable[[], None] = lambda: None
+        """Takes all that waits in the socket; nothing but while the connection lives. Under the lock."""
+        self._broken: OSError | RtdeError | None = None
         self._stop_read, self._stop_write = socket.socketpair()
         self._wall_ahead_ns = _wall_ahead_ns()
         self._wall_set_ns = 0
@@ -111,7 +119,6 @@ class StateReader(threading.Thread):
                 link.connect((self.host, PORT))
                 rtde = RtdeLink(link)
                 recipe = self._handshake(rtde)
-                self._link = link
                 self._follow(link, rtde, recipe)
         except TimeoutError:
             why = f"no answer from {self.host}:{PORT} within {HANDSHAKE_S:g} s"
@@ -135,13 +142,19 @@ class StateReader(threading.Thread):
             self._stop_write.close()
         self.join(HANDSHAKE_S + 1.0)
 
-    def waits_unread(self) -> bool:
-        """Data that came is not read yet: this computer is busy, and the network is not to blame."""
-        link = self._link
-        with contextlib.suppress(OSError, ValueError):
-            if link is not None and link.fileno() >= 0:
-                return bool(select.select([link], [], [], 0)[0])
-        return False
+    def read_waiting(self) -> None:
+        """Reads what came and waits unread, because this thread had no processor yet. From any thread.
+
+        What ends the connection is kept for the reader's own thread, which says so.
+        """
+        if not self._reading.acquire(timeout=READING_WAIT_S):
+            return
+        try:
+            self._read()
+        except (OSError, RtdeError) as error:
+            self._broken = error
+        finally:
+            self._reading.release()
 
     def _handshake(self, link: RtdeLink) -> Recipe:
         begun = time.perf_counter()
@@ -161,24 +174,38 @@ class StateReader(threading.Thread):
         link.setblocking(False)
         for kind, payload in rtde.pending:
             self._take(kind, payload, recipe, time.monotonic_ns(), time.time_ns())
+        self._read = partial(self._read_all, link, rtde, recipe)
         poller = select.poll()
         poller.register(link, select.POLLIN)
         poller.register(self._stop_read, select.POLLIN)
-        while True:
-            ready = poller.poll(SILENCE_S * 1000)
-            if not ready:
-                raise RtdeError(f"no data from the robot for {SILENCE_S:g} s")
-            if any(fd == self._stop_read.fileno() for fd, _ in ready):
-                return
+        try:
+            while True:
+                ready = poller.poll(SILENCE_S * 1000)
+                if not ready:
+                    raise RtdeError(f"no data from the robot for {SILENCE_S:g} s")
+                if any(fd == self._stop_read.fileno() for fd, _ in ready):
+                    return
+                with self._reading:
+                    if self._broken is not None:
+                        raise self._broken
+                    self._read()
+        finally:
+            with self._reading:
+                self._read = lambda: None
+
+    def _read_all(self, link: socket.socket, rtde: RtdeLink, recipe: Recipe) -> None:
+        for _ in range(RECEIVE_BUFFER_BYTES // READ_BYTES):
             try:
-                data, ancillary, _, _ = link.recvmsg(65536, _ANCILLARY_BYTES)
+                data, ancillary, _, _ = link.recvmsg(READ_BYTES, _ANCILLARY_BYTES)
             except BlockingIOError:
-                continue
+                return
             if not data:
                 raise RtdeError("the robot closed the connection")
             monotonic_ns, wall_ns = self._arrival(ancillary)
             for kind, payload in rtde.packets.feed(data):
                 self._take(kind, payload, recipe, monotonic_ns, wall_ns)
+            if len(data) < READ_BYTES:
+                return
 
     def _take(self, kind: int, payload: bytes, recipe: Recipe, monotonic_ns: int, wall_ns: int) -> None:
         if kind != PacketType.DATA:

@@ -111,7 +111,7 @@ class SessionDispatcher:
         return self._session.leases.lease
 
     async def _acknowledge(self, caller: Peer, args: verbs.Acknowledge) -> None:
-        self._session.acknowledge(caller.who)
+        await self._session.acknowledge(caller.who)
 
     async def _plan(self, caller: Peer, args: verbs.GetPlan) -> verbs.LoadedPlan:
         queue = self._session.context.queue
@@ -143,7 +143,7 @@ class SessionDispatcher:
         else:
             how = self._rule.approve(asks, args.plan_sha256, waiting.summary.plan_sha256 if waiting else "")
         approval = f"motion approved by {caller.who}, {how}"
-        self._session.go(caller.client_id, args.token, approval, again=args.headless)
+        await self._session.go(caller.client_id, args.token, approval, again=args.headless)
 
     async def _asks(self, caller: Peer) -> Peer:
         caller.user = await self._name(caller.uid)

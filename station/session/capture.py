@@ -20,12 +20,10 @@ from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.scene import flange_pose
 from station.cell.status import PoseState, StationState
-from station.cell.stillness import RestingCheck
+from station.devices.news import RESTING_S
 from station.session.context import SessionContext
 from station.session.recording import to_the_end
 
-STATE_WAIT_S = 1.0
-"""The robot state of mid-exposure may come later than the image, on a busy computer by this much."""
 SATURATED_LIMIT = 0.05
 GAPS_S = (0.0, 0.03)
 """Between glimpses. Uneven, so that a ringing whose period fits one gap does not fit the other."""
@@ -48,13 +46,12 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
     PoseFailedError and NotStillError when this pose gave nothing; RobotError and RecordingError end the run.
     """
     _phase(context, index, StationState.SETTLING, "settling")
-    resting = RestingCheck(context.cell.robot.check)
     async with ImageWatch(context, index) as watch:
-        still = await context.stillness.settle(resting, watch.look)
+        still = await context.stillness.settle(context.cell.robot.check, watch.look)
     _phase(context, index, StationState.CAPTURING, "capturing")
     image = context.require_recording().number(await take_image(context, index))
     show_frame(context, image)
-    state, bound_s = await at_exposure(context, resting, image)
+    state, bound_s = await at_exposure(context, image)
     stamps = Stamps(
         host_monotonic_ns=state.stamps.host_monotonic_ns,
         host_wall_ns=state.stamps.host_wall_ns,
@@ -115,16 +112,14 @@ def show_frame(context: SessionContext, image: Image) -> None:
     context.store.update(camera=shown)
 
 
-async def at_exposure(
-    context: SessionContext, resting: RestingCheck, image: Image
-) -> tuple[RobotState, float]:
+async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState, float]:
     """The arm, at rest, in the middle of an exposure, and the bound of that time, seconds.
 
     PoseFailedError and NotStillError when it is not known or the arm moved; RobotError.
     """
     if image.time is None:
         raise PoseFailedError("The camera's driver gave an image without a time.", code="no-time")
-    robot, deadline_s = context.cell.robot, time.monotonic() + STATE_WAIT_S
+    robot, deadline_s = context.cell.robot, time.monotonic() + RESTING_S
     while True:
         try:
             state = robot.at(image.time.host_monotonic_ns)
@@ -133,7 +128,7 @@ async def at_exposure(
             if time.monotonic() > deadline_s:
                 raise
             await asyncio.sleep(0.01)
-    await resting.news()
+    await context.arm()
     context.stillness.require_rest(state)
     clock = robot.clock()
     bound_s = image.time.bound_s + (clock.bound_s if clock else 0.0)

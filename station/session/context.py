@@ -24,7 +24,8 @@ from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.collision import CellGeometry
 from station.cell.errors import RefusedError
 from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
-from station.cell.stillness import RestingCheck, StillnessMonitor
+from station.cell.stillness import StillnessMonitor
+from station.devices.base import ready
 from station.devices.cell import Cell
 from station.protocol.states import check_transition
 from station.session.queue import PoseQueue
@@ -88,8 +89,7 @@ class SessionContext:
 
     async def arm(self) -> RobotState:
         """The arm's state, fresh and good; news that are late are waited for. Raises RobotError."""
-        await RestingCheck(self.cell.robot.check).news()
-        return self.cell.robot.latest()
+        return await ready(self.cell.robot)
 
     @property
     def recorder(self) -> Recorder | None:

@@ -13,7 +13,8 @@ from station.cell.errors import RefusedError, RobotError, StaleStateError, Stati
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState
 from station.cell.stillness import NotStillError
-from station.protocol.verbs import Record
+from station.devices.base import fresh
+from station.protocol.verbs import Freedrive, Record
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
 from station.session.queue import PoseQueue
@@ -35,6 +36,13 @@ class FreedriveCapture:
         self._taking = asyncio.Lock()
         self._watcher: asyncio.Task[None] | None = None
         self._last_place: Vector6 | None = None
+        context.store.watch(self._note_guiding)
+
+    def _note_guiding(self) -> None:
+        """Between the images of freedrive, and while one is taken, a person moves the arm."""
+        state = self._context.store.state
+        if state not in (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING):
+            self._context.cell.robot.guided = state is StationState.FREE_DRIVE
 
     async def begin(self, auto: bool) -> None:
         """Opens the recording if none is open. `auto`: an image whenever the arm rests anew."""
@@ -42,7 +50,9 @@ class FreedriveCapture:
             raise _taking()
         self._end_watch()
         context, store = self._context, self._context.store
-        context.cell.robot.check()
+        await context.arm()
+        if (refusal := Freedrive.refusal(store.state)) is not None:
+            raise refusal  # STOP came in between
         context.requests.halt = False
         # At once, and taking: while the disk works nobody is offered a motion, and no image is begun.
         store.enter(StationState.FREE_DRIVE, "The recording is being opened.")
@@ -105,7 +115,7 @@ class FreedriveCapture:
     async def _record(self) -> int:
         context = self._context
         queue, store = context.require_queue(), context.store
-        joints = context.cell.robot.latest().joints_rad
+        joints = (await fresh(context.cell.robot)).joints_rad
         index = queue.add(
             PlannedPose(f"hand-{queue.next_index + 1:02d}", joints, why="guided by hand", guided=True)
         )
@@ -113,7 +123,7 @@ class FreedriveCapture:
         self._last_place = joints
         try:
             await take_pose(context, index, attempt)
-        except (PoseFailedError, NotStillError) as error:
+        except (PoseFailedError, NotStillError, StaleStateError) as error:  # late news: nothing of ours moves
             queue.mark(index, "failed", error)
             store.problem(error, "warning", index)
         except RecordingError as error:

@@ -34,7 +34,7 @@ from station.cell.status import (
     StationState,
     TriggerStatus,
 )
-from station.cell.stillness import NotStillError, RestingCheck
+from station.cell.stillness import NotStillError
 from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Observation, Observe, PreviewImage
@@ -368,12 +368,11 @@ class Previewer:
         context, robot = self._context, self._context.cell.robot
         async with self._taking:  # one at a time: a session that begins waits for one image at most
             _require_between_sessions(context)
-            resting = RestingCheck(robot.check)
-            await resting.news()
+            await context.arm()
             if not context.stillness.at_rest:
                 raise NotStillError("The arm moves.", code="arm-moves", remedy="Ask again when it rests.")
             image = await context.cell.camera.capture(_OBSERVE_S)
-            state, _ = await at_exposure(context, resting, image)
+            state, _ = await at_exposure(context, image)
             _require_between_sessions(context)
             found = await context.workers.call(
                 detect, viewable(image.pixels, image.pixel_format), tag, False, False, timeout_s=_OBSERVE_S

@@ -22,6 +22,7 @@ from station.cell.limits import check_path, with_plan_speeds
 from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError
+from station.devices.base import fresh
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import RunRequests, SessionContext
 from station.session.lease import MotionApproval, require_start
@@ -93,7 +94,7 @@ class Run:
                 # Nothing moves by poses that a restart would not find again.
                 await context.recording.save_state(context.require_queue())
             await context.cell.robot.start_control()
-            here = context.cell.robot.latest().joints_rad  # starting control takes a second or two
+            here = (await fresh(context.cell.robot)).joints_rad  # starting control takes a second or two
             require_start(here, self._go.start_joints_rad, "while control was started")
             if self._go.beside is None:
                 await self._open_recording()

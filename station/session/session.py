@@ -27,6 +27,7 @@ from station.cell.scene import cell_geometry
 from station.cell.session_folder import interrupted_session
 from station.cell.status import LeaseStatus, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
+from station.devices.base import fresh
 from station.devices.cell import Cell
 from station.plan.choose import CRITERIA, Aim
 from station.plan.planner import make_plan
@@ -152,14 +153,15 @@ class Session:
             await asyncio.wait({run}, timeout=STOP_WAIT_S)
         unmark_busy(context)
 
-    def acknowledge(self, who: str) -> None:
+    async def acknowledge(self, who: str) -> None:
         """A person looked. What still holds the arm is told at the next approval."""
         self._require_state(verbs.Acknowledge)
         try:
-            self.context.cell.robot.latest()
+            await fresh(self.context.cell.robot)
             resting = self.context.resting
         except RobotError:
             resting = StationState.DISCONNECTED
+        self._require_state(verbs.Acknowledge)
         self.store.enter(resting)
         self.store.event("acknowledged", f"acknowledged by {who}", who=who)
 
@@ -203,17 +205,18 @@ class Session:
         # To every watcher, without the token that is for the one who asked.
         self.store.update(go=msgspec.structs.replace(asked.summary, token=""))
 
-    def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
+    async def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
         """A person approves exactly that summary. RefusedError when anything changed.
 
         `approval`: who gave it and how, for log and recording. `again`: see MotionApproval.
         """
         context = self.context
         self.permit(verbs.Go, client_id)
+        joints = (await fresh(context.cell.robot)).joints_rad
+        self.permit(verbs.Go, client_id)
         self._require_run_ended()
         if self.freedrive.taking:
             raise _still_ending("freedrive")
-        joints = context.cell.robot.latest().joints_rad
         plan_sha256 = context.queue.sha256 if context.queue else ""
         try:
             go = self.approvals.redeem(token, client_id, plan_sha256, joints, again)
@@ -288,7 +291,7 @@ class Session:
         self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
         try:
-            start = self.context.cell.robot.latest().joints_rad
+            start = (await fresh(self.context.cell.robot)).joints_rad
         except RobotError:
             start = None
         self.store.event("planning", f"planning {poses} poses", poses=poses)

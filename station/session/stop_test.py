@@ -68,7 +68,7 @@ async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) ->
         plan_sha256=plan_sha256(plan),
         poses=1,
         first_move=displacement(context, start, target),
-        warnings=tuple(await motion_warnings(context)),
+        warnings=tuple(await motion_warnings(context, state)),
     )
     offer = StopTestOffer(
         preview, context.cell.subject, request.joint, target[request.joint], move.joint_speed_rad_s

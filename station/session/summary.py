@@ -11,7 +11,7 @@ import msgspec
 
 from recordings.errors import RecordingError
 from recordings.files import require_free_space
-from recordings.schema.messages import Vector6
+from recordings.schema.messages import RobotState, Vector6
 from station.analysis.worker import check_run
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import PlanCheck
@@ -73,7 +73,8 @@ async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple
         await DISK.run(require_free_space, context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
         raise RefusedError(f"{full} Nothing moved.", code="disk-full") from None
-    start = (await context.arm()).joints_rad
+    arm = await context.arm()
+    start = arm.joints_rad
     queue, poses = offered.queue, offered.poses
     plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
     check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
@@ -88,7 +89,7 @@ async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple
         plan_sha256=queue.sha256,
         poses=len(poses),
         first_move=f"{displacement(context, start, first)} to pose {poses[0] + 1}",
-        warnings=(*notes, *await motion_warnings(context)),
+        warnings=(*notes, *await motion_warnings(context, arm)),
     )
 
 
@@ -148,9 +149,9 @@ def _purpose_words(context: SessionContext, purpose: Purpose, poses: tuple[int, 
     return f"continue session {context.recording.name}"
 
 
-async def motion_warnings(context: SessionContext) -> list[str]:
+async def motion_warnings(context: SessionContext, arm: RobotState) -> list[str]:
     warnings = []
-    slider = context.cell.robot.latest().target_speed_fraction
+    slider = arm.target_speed_fraction
     if slider < _SLOW_SLIDER:
         warnings.append(f"the speed slider stands at {100 * slider:.0f} %")
     if trouble := await DISK.run(context.cell.acceptance_trouble, context.root):

@@ -26,8 +26,6 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.02
 STATUS_TICKS = 5
-LOST_ROUNDS = 10
-"""A resting arm may be silent for this many status rounds (1 s); a moving one never."""
 RESTING_RAD_S = 0.01
 LAGS_KEPT = 3000
 
@@ -47,7 +45,8 @@ class SessionSupervisor:
         self._failure = ""
         self._rest: tuple[int, Vector6] | None = None
         """Which pause it is, of `store.entered`, and the joints at rest in it."""
-        self._stale_rounds = 0
+        self._silent = False
+        """The robot's news are later than its rest or motion allows."""
         self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
         """Delay of each round."""
 
@@ -91,18 +90,17 @@ class SessionSupervisor:
         """idle ⇄ disconnected; a running session notices a lost robot by itself."""
         store, robot = self._context.store, self._context.cell.robot
         try:
-            robot.latest()
+            if robot.news() is None:
+                return
         except StaleStateError as error:
-            self._stale_rounds += 1
-            if self._stale_rounds == LOST_ROUNDS:
+            if not self._silent:
                 self._lost()
-            if store.state is StationState.IDLE and self._stale_rounds >= LOST_ROUNDS:
+            self._silent = True
+            if store.state is StationState.IDLE:
                 store.enter(StationState.DISCONNECTED, error)
                 store.problem(error, said="robot lost: {}")
             return
-        except RobotError:
-            return
-        self._stale_rounds = 0
+        self._silent = False
         if store.state is StationState.DISCONNECTED:
             store.enter(self._context.resting)
             store.event("robot-connected", "robot connected")

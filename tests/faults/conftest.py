@@ -16,6 +16,7 @@ import pytest
 
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
+from station.devices.news import Delay
 from station.devices.ur import UrRobot
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import write_truth
@@ -208,7 +209,7 @@ def strike(cell: MakeCell, fault_times: Callable[[Outcome], None]) -> Strike:
                 if not left:
                     raise
             else:
-                overtaken = made.beating and outcome.error.code.startswith("watchdog")
+                overtaken = made.beating and outcome.error.code in set(Delay)
                 if not overtaken or not left:
                     fault_times(outcome)
                     return made, outcome

@@ -171,8 +171,8 @@ async def test_controller_restart(strike: Strike) -> None:
 
 @pytest.mark.parametrize(
     ("kill", "code"),
-    [(signal.SIGSEGV, "control-process"), (signal.SIGSTOP, "control-process")],
-    ids=["child segfault", "child hung"],
+    [(signal.SIGSEGV, "control-process"), (signal.SIGSTOP, "computer-late")],
+    ids=["child segfault", "child held up"],
 )
 async def test_control_process(strike: Strike, kill: signal.Signals, code: str) -> None:
     killed: list[int] = []
@@ -193,7 +193,7 @@ async def test_a_session_loop_that_stalls_stops_the_arm(strike: Strike) -> None:
         c.beating = False
 
     c, outcome = await strike(stall)
-    assert outcome.error.code == "watchdog-computer"
+    assert outcome.error.code == "computer-late"
     assert isinstance(outcome.error, RobotError)
     await c.stays_at_rest()
 

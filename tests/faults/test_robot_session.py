@@ -69,7 +69,7 @@ async def test_07_an_arm_jogged_while_paused_voids_the_go(cell: tuple[Rig, Admin
     await until(lambda: bool(rig.told("jogged")))
     uploads = asked(admin, "upload")
     with raises("approval-used"):
-        rig.session.go(1, summary.token)
+        await rig.session.go(1, summary.token)
     await until(lambda: np.abs(joints(admin) - state - 0.1).max() < 1e-3)
     await asyncio.sleep(0.3)
     assert asked(admin, "upload") == uploads and rig.state is S.PAUSED

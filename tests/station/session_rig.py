@@ -58,7 +58,9 @@ class ArmInMemory:
         self.arrive = asyncio.Event()
         self.trouble: RobotError | None = None
         self.refuse_control: RobotError | None = None
-        self.stale = False
+        self.guided = False
+        self.late = self.lost = False
+        """Its news are late; they do not come any more."""
         self.beats = 0
         self._callbacks: list[Callable[[RobotState], None]] = []
         self._controller_s = 100.0
@@ -99,7 +101,7 @@ class ArmInMemory:
         )
 
     def latest(self) -> RobotState:
-        if self.stale:
+        if self.late or self.lost:
             raise StaleStateError("no news from the robot")
         return self._state()
 
@@ -110,10 +112,13 @@ class ArmInMemory:
     def clock(self) -> None:
         return None
 
-    def check(self) -> None:
+    def news(self) -> RobotState | None:
+        return None if self.late else self.latest()
+
+    def check(self) -> RobotState | None:
         if self.trouble is not None:
             raise self.trouble
-        self.latest()
+        return self.news()
 
     async def start_control(self) -> None:
         self.log.append("start control")
@@ -299,7 +304,7 @@ class Rig:
 
     async def give_go(self, purpose: Purpose = Purpose.RUN) -> None:
         summary = await self.session.prepare(1, purpose)
-        self.session.go(1, summary.token)
+        await self.session.go(1, summary.token)
 
     async def go_until_it_moves(self) -> None:
         """The slow arm is on its way to the first pose."""

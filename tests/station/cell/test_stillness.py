@@ -140,11 +140,12 @@ async def test_settling_returns_as_soon_as_the_arm_rests() -> None:
     shake(m, 0.5, 0.01)
     polls = 0
 
-    def alive() -> None:
+    def alive() -> bool:
         nonlocal polls
         polls += 1
         for i in range(10):  # 80 ms of rest between two looks
             m.add(state(0.5 + polls * 0.08 + i * 0.008))
+        return True
 
     assert (await m.settle(alive)).max_joint_speed_rad_s == 0.0
     assert 3 <= polls <= 7
@@ -155,7 +156,7 @@ async def test_an_arm_that_never_rests_is_given_up_with_the_reason() -> None:
     shake(m, 0.5, 0.01)
     clock = iter([0.0, 1.0, 5.1])
     with raises("not-settled", NotStillError) as told:
-        await m.settle(lambda: None, now_s=lambda: next(clock))
+        await m.settle(lambda: True, now_s=lambda: next(clock))
     assert told.value.values["limit_s"] == 5.0 and "shoulder" in told.value.text
     assert float(told.value.values["max_joint_speed_rad_s"]) > 0.1  # type: ignore[arg-type]
 
@@ -164,7 +165,7 @@ async def test_waiting_for_rest_leaves_the_loop_to_heartbeat_and_stop() -> None:
     m = monitor(timeout_s=5.0)
     shake(m, 0.5, 0.01)
     clock = iter([0.0, 1.0, 5.1])
-    settling = asyncio.ensure_future(m.settle(lambda: None, now_s=lambda: next(clock)))
+    settling = asyncio.ensure_future(m.settle(lambda: True, now_s=lambda: next(clock)))
     await asyncio.sleep(0)
     assert not settling.done()
     settling.cancel()
@@ -173,15 +174,15 @@ async def test_waiting_for_rest_leaves_the_loop_to_heartbeat_and_stop() -> None:
 async def test_old_news_of_an_arm_at_rest_are_no_rest() -> None:
     m = monitor(timeout_s=5.0)
     shake(m, 0.5, 0.0)
-    news = iter([False, False, True])
-    asked: list[bool] = []
+    news = iter([None, None, True])
+    asked: list[bool | None] = []
 
-    def alive() -> bool:
+    def alive() -> bool | None:
         asked.append(next(news))
         return asked[-1]
 
     await m.settle(alive)
-    assert asked == [False, False, True]
+    assert asked == [None, None, True]
 
 
 async def test_news_that_stay_away_are_the_reason() -> None:
@@ -189,7 +190,7 @@ async def test_news_that_stay_away_are_the_reason() -> None:
     shake(m, 0.5, 0.0)
     clock = iter([0.0, 1.0, 5.1])
     with raises("no-news", NotStillError):
-        await m.settle(lambda: False, now_s=lambda: next(clock))
+        await m.settle(lambda: None, now_s=lambda: next(clock))
 
 
 async def test_a_camera_that_shows_nothing_is_not_called_a_shake() -> None:

@@ -7,35 +7,15 @@ import pytest
 
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 from station.devices.ur_condition import (
-    WATCHDOG_S,
     foreign_program,
     not_powered,
     program_not_running,
     safety_stop,
-    watchdog_cause,
 )
 from tests.station.devices.test_ur_moves import STATE
 
 MOVES = {SafetyMode.NORMAL, SafetyMode.REDUCED}
 HARMLESS = {SafetyStatus.NORMAL, SafetyStatus.REDUCED}
-
-
-@pytest.mark.parametrize(
-    ("pause_s", "gap_s", "blamed"),
-    [
-        (0.3, 0.0, "watchdog-computer"),
-        (0.0, 0.3, "watchdog-network"),
-        (0.3, 0.3, "watchdog-computer"),
-        (0.1, 0.1, None),
-    ],
-)
-def test_computer_and_network_are_told_apart_as_causes_of_a_watchdog_stop(
-    pause_s: float, gap_s: float, blamed: str | None
-) -> None:
-    assert 0.1 < WATCHDOG_S < 0.3
-    cause = watchdog_cause(pause_s, gap_s)
-    assert (cause and cause.code) == blamed
-    assert cause is None or 300.0 in cause.values.values()
 
 
 @pytest.mark.parametrize("mode", SafetyMode)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import random
-import socket
 import struct
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +18,6 @@ from station.cell.process import waited_share
 from station.devices.rtde import HEADER, PORT, PacketType, packet
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import ProbeResult, RobotLock
-from station.devices.ur_state import StateReader
 from tests.codes import raises
 
 CONFIG = RobotConfig(model="UR10", host="127.0.0.1", serial="2016")
@@ -110,22 +108,6 @@ async def test_a_controller_that_has_no_dashboard_server_is_told_from_one_that_d
     async with await asyncio.start_server(talk, host, PORT):
         with raises(code):
             await UrLink(RobotConfig(model="UR10e", host=host)).connect()
-
-
-def test_news_that_wait_unread_are_no_matter_of_the_cable(link: Any) -> None:
-    """The kernel has the robot's data; this program had no time to read them."""
-    ours, robots = socket.socketpair()
-    with ours, robots:
-        reader = StateReader("192.0.2.10", lambda state: None, lambda why: None)
-        reader._link = ours
-        link.reader = reader
-        assert link.stale(0.2).code == "stale-state"
-        robots.send(b"news")
-        assert link.stale(0.2).code == "computer-busy"
-        reader.stands_still = True  # what waits tells the same time again
-        assert link.stale(0.2).code == "stale-state"
-        reader._stop_write.close()
-        reader._stop_read.close()
 
 
 def test_the_share_of_time_that_programs_wait_is_the_kernels(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ async def test_the_sealed_session_stays_shown_until_the_go(rig: Rig) -> None:
     assert summary.poses == POSES
     assert rig.session.store.status.session == before  # the answer may be no
     rig.arm.slow = True
-    rig.session.go(1, summary.token)
+    await rig.session.go(1, summary.token)
     begun = rig.session.store.status.session
     assert (begun.captured, begun.elapsed_s, begun.recording) == (0, 0.0, "")
     assert set(rig.pose_states) == {"planned"}

@@ -67,7 +67,7 @@ async def test_what_drives_the_arm_is_said(
     ],
 )
 async def test_where_nothing_answers_the_remedy_is_one_sentence(rig: Rig, host: str, remedy: str) -> None:
-    rig.arm.stale = True
+    rig.arm.lost = True
     found = await robot_check(rig, host)
     assert (found.state, found.remedy) == ("failed", remedy)
 
@@ -98,7 +98,7 @@ async def test_what_the_network_says_is_said_in_words() -> None:
 async def test_a_robot_that_only_lacks_its_stream_is_told_by_name(
     rig: Rig, controller: Callable[..., SimulatedController]
 ) -> None:
-    rig.arm.stale = True
+    rig.arm.lost = True
     running = controller("UR10e")
     assert f"UR10e 20263000001 answers at {running.host}" in (await robot_check(rig, running.host)).remedy
 

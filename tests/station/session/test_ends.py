@@ -199,7 +199,7 @@ async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
     await rig.until(S.SEALING)
     for _ in range(2):
         await rig.session.stop("bert")
-        rig.session.acknowledge("anna")
+        await rig.session.acknowledge("anna")
         with raises("still-ending"):
             await rig.session.prepare(1, Purpose.RESUME)
         with raises("still-ending"):

@@ -106,7 +106,7 @@ async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate(
     assert elapsed_s > 0.5 * known.session.elapsed_s > 0, "the time before the crash is part of the session's"
     again.session.context.workers = WorkerThatLooksBack(half_way)  # type: ignore[assignment]
     again.session.take_lease(1, "anna")
-    again.session.acknowledge("anna")
+    await again.session.acknowledge("anna")
     await again.session.prepare(1, Purpose.RESUME)
     await until(lambda: again.session.store.status.estimate.views == BEFORE)
     assert again.session.store.status.estimate.translation_mm == known.estimate.translation_mm
@@ -125,7 +125,7 @@ async def test_nothing_moves_by_poses_that_the_disk_did_not_take(
     moves = half_way.arm.log.count("move")
     summary = await half_way.session.prepare(1, Purpose.RESUME)
     monkeypatch.setattr("station.session.recording.write_state", full)
-    half_way.session.go(1, summary.token)
+    await half_way.session.go(1, summary.token)
     await until(lambda: "No space left" in half_way.session.store.status.reason)
     assert half_way.state is S.PAUSED
     assert half_way.arm.log.count("move") == moves
@@ -135,5 +135,5 @@ async def test_it_is_void_when_the_poses_change_meanwhile(half_way: Rig) -> None
     summary = await half_way.session.prepare(1, Purpose.RESUME)
     await half_way.session.edit(Skip, 1, lambda queue: queue.skip(BEFORE + 1))
     with raises("approval-used"):
-        half_way.session.go(1, summary.token)
+        await half_way.session.go(1, summary.token)
     assert "p09" in [status.name for status in queue_of(half_way).statuses]

@@ -60,7 +60,7 @@ async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
     assert rig.cause == "safety-stop"
     await until(lambda: not rig.arm.control)
     assert set(rig.arm.log) <= {"start control", "move", "end control"}
-    rig.session.acknowledge("anna")
+    await rig.session.acknowledge("anna")
     with pytest.raises(SafetyStopError):
         await rig.session.prepare(1, Purpose.RESUME)
 
@@ -127,17 +127,17 @@ async def test_a_jogged_arm_is_named_and_its_go_is_void(rig: Rig) -> None:
     rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.3)
     await until(lambda: any("0 mm and 17°" in e.text for e in rig.told("jogged")))
     with raises("approval-used"):
-        rig.session.go(1, summary.token)
+        await rig.session.go(1, summary.token)
     again = await rig.session.prepare(1, Purpose.RESUME)
     assert any("was moved" in warning for warning in again.warnings)
 
 
 async def test_a_robot_that_is_lost_at_rest_comes_back(rig: Rig) -> None:
-    rig.arm.stale = True
+    rig.arm.lost = True
     await rig.until(S.DISCONNECTED)
     with raises("wrong-state"):
         await rig.session.prepare(1, Purpose.RUN)
-    rig.arm.stale = False
+    rig.arm.lost = False
     await rig.until(S.IDLE)
 
 
@@ -158,7 +158,7 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
     await asyncio.sleep(0.1)
     assert second.state is S.STOPPED
     second.session.take_lease(1, "anna")
-    second.session.acknowledge("anna")
+    await second.session.acknowledge("anna")
     assert second.state is S.PAUSED
     await second.give_go(Purpose.RESUME)
     await second.until(S.IDLE)

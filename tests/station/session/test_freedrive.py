@@ -76,10 +76,10 @@ async def test_auto_record_outlives_a_moment_without_news(bare_rig: Rig) -> None
     bare_rig.arm.rest()
     await bare_rig.session.switch_free_drive(1, True, auto=True)
     await until(lambda: bare_rig.session.store.status.session.captured == 1)
-    bare_rig.arm.stale = True
+    bare_rig.arm.lost = True
     bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
     await asyncio.sleep(0.25)  # two rounds of its watch
-    bare_rig.arm.stale = False
+    bare_rig.arm.lost = False
     bare_rig.arm.rest()
     await until(lambda: bare_rig.session.store.status.session.captured == 2)
 
@@ -175,7 +175,7 @@ async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
     beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
     await rig.until(S.FREE_DRIVE)
     await rig.session.stop("bert")
-    rig.session.acknowledge("anna")
+    await rig.session.acknowledge("anna")
     disk.set()
     with pytest.raises(RecordingError if fails else RefusedError):
         await beginning

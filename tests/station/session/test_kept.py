@@ -69,7 +69,7 @@ async def test_a_drift_check_is_still_one_after_a_crash(new_rig: NewRig) -> None
     crash(first)
     second = await new_rig(with_plan=False)
     assert second.session.store.status.session.check
-    second.session.acknowledge("anna")
+    await second.session.acknowledge("anna")
     second.session.take_lease(1, "anna")
     await second.session.finish(1)
     await second.give_go()
@@ -89,7 +89,7 @@ async def test_an_arm_that_stands_at_its_pose_is_not_moved(rig: Rig) -> None:
     await rig.go_until_it_moves()
     await rig.pause_after_this_pose("anna")
     summary = await rig.session.prepare(1, Purpose.RETAKE, 0)
-    rig.session.go(1, summary.token)
+    await rig.session.go(1, summary.token)
     poses = rig.session.store
     await until(lambda: rig.state is S.PAUSED and poses.status.session.poses[0].attempt == 2)
     assert rig.pose_states[0] == "done"

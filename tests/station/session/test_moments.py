@@ -139,7 +139,7 @@ async def test_a_run_that_cannot_be_made_leaves_the_station_at_rest(
 
     monkeypatch.setattr(run, "geometry_from", broken)
     with pytest.raises(ZeroDivisionError):
-        rig.session.go(1, summary.token)
+        await rig.session.go(1, summary.token)
     assert rig.state is S.IDLE and rig.session.store.status.go is None
 
 
@@ -150,7 +150,7 @@ async def test_nothing_new_begins_beside_a_run_that_does_not_end(
     await rig.give_go()
     await rig.until(S.WRITING)
     await rig.session.stop("bert")
-    rig.session.acknowledge("anna")
+    await rig.session.acknowledge("anna")
     assert rig.state is S.PAUSED
     for what in (
         lambda: rig.session.switch_free_drive(1, True, auto=False),

@@ -97,7 +97,7 @@ async def test_a_crowd_that_asks_delays_a_session_by_one_picture(
     crowd = [asyncio.create_task(rig.session.previews.observe(TAG)) for _ in range(20)]
     await asyncio.sleep(0)
     rig.arm.slow = True
-    rig.session.go(1, summary.token)
+    await rig.session.go(1, summary.token)
     await rig.until(S.MOVING)
     go_on.set()
     answers: list[Any] = await asyncio.gather(*crowd, return_exceptions=True)

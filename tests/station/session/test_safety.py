@@ -21,7 +21,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Reorder
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
-from station.session import monitor, supervisor
+from station.session import monitor
 from station.session.recording import SessionRecording
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
@@ -76,7 +76,7 @@ async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, chan
     await gate.entered.wait()
     if change == "stop":
         await rig.session.stop("bert")
-        rig.session.acknowledge("anna")
+        await rig.session.acknowledge("anna")
     elif change == "edit":
         await rig.session.edit(Reorder, 1, lambda queue: queue.reorder([1, 0, *range(2, POSES)]))
     elif change == "lease":
@@ -94,16 +94,15 @@ async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, chan
         assert rig.session.store.status.go is None
 
 
-async def test_a_robot_that_was_lost_voids_the_go(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "LOST_ROUNDS", 2)
+async def test_a_robot_that_was_lost_voids_the_go(rig: Rig) -> None:
     summary = await rig.session.prepare(1, Purpose.RUN)
-    rig.arm.stale = True
+    rig.arm.lost = True
     await rig.until(S.DISCONNECTED)
-    rig.arm.stale = False
+    rig.arm.lost = False
     await rig.until(S.IDLE)
     assert rig.session.store.status.go is None
     with raises("approval-used"):
-        rig.session.go(1, summary.token)
+        await rig.session.go(1, summary.token)
 
 
 async def test_an_arm_moved_while_control_started_is_not_driven(
@@ -135,7 +134,7 @@ async def test_stop_while_an_interrupted_session_is_closed_stays_latched(
     rig.session.context.recording = None  # as after a crash
     other = await new_rig(with_plan=False)
     other.session.take_lease(1, "anna")
-    other.session.acknowledge("anna")
+    await other.session.acknowledge("anna")
     await other.until(S.PAUSED)
     gate = Gate(other)
     finishing = asyncio.ensure_future(other.session.finish(1))
@@ -205,12 +204,12 @@ async def test_the_supervisor_outlives_an_error_in_what_it_shows(
 async def test_an_open_session_keeps_its_plan(rig: Rig, small_plan: Plan) -> None:
     await rig.go_until_it_moves()
     await rig.session.stop("bert")
-    rig.arm.stale = True
-    rig.session.acknowledge("anna")
+    rig.arm.lost = True
+    await rig.session.acknowledge("anna")
     assert rig.state is S.DISCONNECTED
     with raises("session-open"):
         await rig.session.make_plan(1, POSES, 4)
-    rig.arm.stale = False
+    rig.arm.lost = False
 
 
 async def test_a_session_of_a_simulated_cell_is_not_gone_on_with_by_a_real_arm(

@@ -117,7 +117,7 @@ async def test_stop_is_latched_and_the_go_is_gone(rig: Rig) -> None:
     for forbidden in (resume, run, rig.session.finish(1)):
         with raises("wrong-state"):
             await forbidden
-    rig.session.acknowledge("anna")
+    await rig.session.acknowledge("anna")
     assert rig.state is S.PAUSED
     moves = rig.arm.log.count("move")
     await asyncio.sleep(0.05)
@@ -131,9 +131,9 @@ async def test_stop_is_latched_and_the_go_is_gone(rig: Rig) -> None:
 async def test_stop_voids_a_go_that_waits(rig: Rig) -> None:
     summary = await rig.session.prepare(1, Purpose.RUN)
     await rig.session.stop("bert")
-    rig.session.acknowledge("anna")
+    await rig.session.acknowledge("anna")
     with raises("approval-used"):
-        rig.session.go(1, summary.token)
+        await rig.session.go(1, summary.token)
     assert rig.session.store.status.go is None
 
 
@@ -154,7 +154,7 @@ async def test_stop_in_every_phase_keeps_what_was_taken(rig: Rig, phase: S) -> N
     assert rig.state is S.STOPPED
     assert "stop" in rig.arm.log
     assert not {"moving", "settling", "capturing", "writing"} & set(rig.pose_states)
-    rig.session.acknowledge("anna")
+    await rig.session.acknowledge("anna")
     if phase is S.SEALING:
         assert rig.state is S.IDLE
     else:
@@ -176,7 +176,7 @@ async def test_a_lost_commander_stops_the_arm_at_once(rig: Rig) -> None:
     rig.session.take_lease(2, "bert")
     rig.arm.slow = False
     summary = await rig.session.prepare(2, Purpose.RESUME)
-    rig.session.go(2, summary.token)
+    await rig.session.go(2, summary.token)
     await rig.until(S.IDLE)
     assert len(sealed(rig).views()) == POSES
 
@@ -216,7 +216,7 @@ async def test_a_retake_supersedes(rig: Rig) -> None:
     summary = await rig.session.prepare(1, Purpose.RETAKE, 0)
     assert summary.purpose == "retake pose 1"
     assert summary.poses == 1
-    rig.session.go(1, summary.token)
+    await rig.session.go(1, summary.token)
     store = rig.session.store
     await until(lambda: rig.state is S.PAUSED and store.status.session.poses[0].attempt == 2)
     assert rig.pose_states.count("done") == done
@@ -229,7 +229,7 @@ async def test_plans_can_be_changed_and_a_waiting_go_is_void_then(rig: Rig, smal
     summary = await session.prepare(1, Purpose.RUN)
     await session.edit(Skip, 1, lambda queue: queue.skip(1))
     with raises("approval-used"):
-        session.go(1, summary.token)
+        await session.go(1, summary.token)
     await session.edit(Reorder, 1, lambda queue: queue.reorder([3, 2, 1, 0]))
     await session.edit(Drop, 1, lambda queue: queue.drop(0))
     extra = msgspec.structs.replace(small_plan.poses[0], name="again")

@@ -26,10 +26,10 @@ async def test_no_modelled_point_is_faster_than_asked_for(rig: Rig, joint: int, 
 async def test_a_move_needs_its_own_approval_and_records_nothing(rig: Rig) -> None:
     for _ in range(2):
         offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, 0.05))
-        rig.session.go(1, offer.go.token)
+        await rig.session.go(1, offer.go.token)
         await rig.until(S.IDLE)
         with pytest.raises(RefusedError) as refused:
-            rig.session.go(1, offer.go.token)
+            await rig.session.go(1, offer.go.token)
         assert refused.value.code == "approval-used"
     assert rig.arm.log.count("move") == 2 and rig.camera.taken == 0
     assert rig.session.context.recording is None and rig.cause == "stop-tested"
@@ -38,7 +38,7 @@ async def test_a_move_needs_its_own_approval_and_records_nothing(rig: Rig) -> No
 async def test_stop_of_a_person_stays_latched(rig: Rig) -> None:
     offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, 0.05))
     rig.arm.slow = True
-    rig.session.go(1, offer.go.token)
+    await rig.session.go(1, offer.go.token)
     await rig.until(S.MOVING)
     await rig.session.stop("ben")
     assert rig.state is S.STOPPED

@@ -28,7 +28,7 @@ async def test_a_lost_trigger_box_is_a_fault_of_the_session_until_the_next_go(ri
     await rig.until(S.FAULT)
     assert "trigger box lost" in rig.session.store.status.reason
     assert "done" not in rig.pose_states
-    rig.session.acknowledge(1)
+    await rig.session.acknowledge(1)
     await rig.give_go()
     await rig.until(S.IDLE)
     assert rig.pose_states == ["done"] * len(rig.pose_states)

@@ -38,7 +38,7 @@ def shaken(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 async def give_headless_go(rig: Rig) -> None:
     summary = await rig.session.prepare(1, Purpose.RUN)
-    rig.session.go(1, summary.token, again=True)
+    await rig.session.go(1, summary.token, again=True)
 
 
 async def test_headless_it_is_tried_once_more_at_the_end_by_the_same_go(rig: Rig, shaken: list[int]) -> None:

@@ -1,0 +1,119 @@
+"""How late news may be, and what is blamed for it."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+
+from recordings.schema.messages import RobotState, Stamps
+from station.cell.config import RobotConfig
+from station.cell.errors import StaleStateError
+from station.devices.base import fresh
+from station.devices.news import Delay, Evidence, is_loopback, largest_gap, longest_silence_s
+from station.devices.ur_link import UrLink
+from tests.codes import raises
+from tests.station.devices.test_ur_moves import STATE
+
+
+def arrived(host_s: float, controller_s: float = 0.0) -> RobotState:
+    return msgspec.structs.replace(STATE, stamps=Stamps(round(host_s * 1e9), 0, controller_s))
+
+
+class Reader:
+    """A connection whose newest state came so long ago; `unread`: what waits in the socket came just now."""
+
+    def __init__(self, age_s: float, *, unread: bool = False, ended: str | None = None) -> None:
+        self.ended, self.stands_still, self._unread = ended, False, unread
+        self._come(age_s)
+
+    def _come(self, age_s: float) -> None:
+        self.newest = SimpleNamespace(state=arrived(time.monotonic() - age_s))
+
+    def read_waiting(self) -> None:
+        if self._unread:
+            self._come(0.0)
+
+
+def link(age_s: float, *, moving: bool = False, **how: Any) -> UrLink:
+    made: Any = UrLink(RobotConfig(model="UR10", host="192.0.2.10"))
+    made.reader, made.guided = Reader(age_s, **how), moving
+    return made  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_news_of_a_moment_ago_are_taken(moving: bool) -> None:
+    assert link(0.05, moving=moving).news() is not None
+
+
+@pytest.mark.parametrize(("age_s", "moving"), [(0.12, True), (0.2, True), (0.12, False), (0.8, False)])
+def test_late_news_are_waited_for(age_s: float, moving: bool) -> None:
+    assert link(age_s, moving=moving).news() is None
+
+
+@pytest.mark.parametrize(("age_s", "moving"), [(0.3, True), (1.1, False)])
+def test_there_is_an_end_to_waiting(age_s: float, moving: bool) -> None:
+    with pytest.raises(StaleStateError) as told:
+        link(age_s, moving=moving).news()
+    told_age_s = told.value.values["age_s"]
+    assert isinstance(told_age_s, float) and age_s <= told_age_s < age_s + 0.2
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_what_waits_unread_is_read_before_anything_is_judged(moving: bool) -> None:
+    assert link(5.0, moving=moving, unread=True).news() is not None
+
+
+def test_a_connection_that_ended_is_waited_for_at_rest_only() -> None:
+    assert link(0.05, ended="reset").news() is None
+    with raises("link-lost"):
+        link(0.05, moving=True, ended="reset").news()
+
+
+async def test_the_news_that_come_are_the_ones_that_are_decided_on() -> None:
+    late = link(0.5)
+    answers = iter([None, None, arrived(7.0)])
+    late.news = lambda: next(answers)  # type: ignore[method-assign]
+    assert (await fresh(late)).stamps.host_monotonic_ns == 7_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("evidence", "blamed"),
+    [
+        (Evidence(0.3, 0.0, 0.0, loopback=False), Delay.COMPUTER),
+        (Evidence(0.3, 0.3, 0.3, loopback=True), Delay.COMPUTER),
+        (Evidence(0.05, 0.3, 0.0, loopback=False), Delay.NETWORK),
+        (Evidence(0.17, 0.4, 0.0, loopback=False), Delay.NETWORK),
+        (Evidence(0.05, 0.3, 0.29, loopback=False), Delay.CONTROLLER),
+        (Evidence(0.05, 0.3, 0.0, loopback=True), Delay.CONTROLLER),
+        (Evidence(0.1, 0.1, 0.1, loopback=False), None),
+    ],
+)
+def test_what_came_late_is_told_from_evidence(evidence: Evidence, blamed: Delay | None) -> None:
+    error = evidence.error()
+    assert (error and error.code) == blamed
+    assert error is None or (error.values["late_ms"] in (300.0, 400.0) and error.remedy)
+
+
+def test_the_largest_gap_is_between_arrivals_and_knows_what_the_controller_left_out() -> None:
+    states = [arrived(host_s, clock_s) for host_s, clock_s in ((1, 0), (1.5, 0.5), (2, 0.52), (2.3, 0.82))]
+    assert largest_gap(states, 1.2, 3.0, 0.02) == pytest.approx((0.5, 0.0))
+    assert largest_gap(states, 1.6, 3.0, 0.02) == pytest.approx((0.3, 0.28))
+    assert largest_gap(states, 1.6, 2.1, 0.02) == (0.0, 0.0)
+
+
+def test_a_silence_is_the_watchdogs_business_only_before_the_program_ended() -> None:
+    kicks_s = [0.0, 0.3, 0.35, 0.4, 0.9]
+    assert longest_silence_s(kicks_s, 0.1, 0.42) == pytest.approx(0.05)
+    assert longest_silence_s(kicks_s, 0.1, 0.65) == pytest.approx(0.25)
+    assert longest_silence_s([], 0.1, 0.65) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("host", "ours"), [("127.0.0.1", True), ("127.8.9.10", True), ("192.0.2.10", False), ("robot", False)]
+)
+def test_no_network_lies_before_an_address_of_this_computer(host: str, ours: bool) -> None:
+    assert is_loopback(host) is ours

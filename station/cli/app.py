@@ -90,6 +90,7 @@ STATION = LazyGroup(
         "bootstrap": "`station new` finds camera and board from views that you guide by hand.",
         "next-pose": "F3 on the screen adds views that you guide by hand.",
         "replan": "`station finish`, then `station plan` plans again.",
+        "trace": "The simulated controller's limits are in the docs: The simulator.",
     },
     help="A calibration station for a robot cell. Without a command: the operator screen.",
     epilog=examples(

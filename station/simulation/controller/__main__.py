@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import ipaddress
 import json
 import os
 import signal
@@ -39,6 +40,13 @@ What is verified and what a real controller may do differently: docs/contributor
 def main(arguments: list[str] | None = None) -> int:
     parent = os.getppid()  # now: it surely lives while it waits for the ready line
     options = _parser().parse_args(arguments)
+    if not (options.allow_other_computers or _is_loopback(options.host)):
+        print(
+            f"--host {options.host} lets other computers send programs, which run on this one. Choose "
+            "127.x.y.z, or add --allow-other-computers.",
+            file=sys.stderr,
+        )
+        return 2
     try:
         settings = _settings(options)
     except (OSError, msgspec.MsgspecError) as error:
@@ -57,6 +65,13 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
 def _parser() -> argparse.ArgumentParser:
     """What a field of `Settings` is named after sets it."""
     parser = argparse.ArgumentParser(
@@ -69,6 +84,8 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--model", choices=sorted(TABLES), help="default: UR10 (CB3, 125 Hz)")
     add("--host", default="127.0.0.1", help="loopback address to listen on")
+    text = "listen on an address that is not this computer's own: whoever reaches it can run programs here"
+    add("--allow-other-computers", action="store_true", help=text)
     add("--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors, drift")
     add(
         "--program", action="append", default=[], metavar="NAME[=SCRIPT]",

@@ -19,6 +19,12 @@ from station.simulation.controller.urscript import Pose, ScriptRun, ScriptRuntim
 from station.simulation.controller.urscript_parser import Builtin
 
 STEADY_RAD_S = 1e-3
+_INSTALLATION = (
+    "set_analog_inputrange", "set_input_actions_to_default", "set_runstate_outputs",
+    "set_safety_mode_transition_hardness", "set_standard_analog_input_domain", "set_tool_analog_input_domain",
+    "set_tool_communication", "set_tool_digital_output_mode", "set_tool_output_mode",
+)  # fmt: skip
+"""What a program that PolyScope exported sets first; without an effect here."""
 _QUIET = frozenset({"sync", "sleep", "textmsg", "force", "tool_contact"})
 
 
@@ -80,7 +86,7 @@ class InterpretedProgram:
             return lambda *_, **__: setattr(robot, name, on)
 
         def accepted(*_: object, **__: object) -> None:
-            """Without an effect here: there are no forces."""
+            """Without an effect here."""
 
         return {
             "sync": self._sync,
@@ -114,6 +120,7 @@ class InterpretedProgram:
             "set_gravity": lambda d: out.set("target_gravity", *map(float, d)),
             "get_tcp_force": vector("actual_TCP_force"),
             "force": lambda: out.get("tcp_force_scalar"),
+            **dict.fromkeys(_INSTALLATION, accepted),
             "zero_ftsensor": accepted,
             "ft_rtde_input_enable": accepted,
             "enable_external_ft_sensor": accepted,

@@ -5,6 +5,7 @@ Knows no socket, so that every rule here can be tested without one.
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable
 from math import inf
@@ -23,6 +24,8 @@ from station.simulation.controller.paths import UnreachableError
 from station.simulation.controller.programs import Upload
 from station.simulation.controller.state import DIGITAL_BANKS, ControllerState, Journal, Settings
 from station.simulation.controller.urscript_parser import ScriptError, ScriptSyntaxError
+
+log = logging.getLogger(__name__)
 
 PROGRAM_START_S = 0.05
 UNLOCK_AFTER_S = 5.0
@@ -200,7 +203,10 @@ class SimulatedRobot(ControllerState):
         except ScriptSyntaxError as error:
             self.journal.note("controller", "syntax error", name=name, error=str(error))
             self.tell("exception", text=error.text, line=error.line)
-            if not upload.secondary:
+            log.warning("%s: %s", name, error)
+            # A bare line that means nothing leaves the program alone, as on URSim 1.8 to 3.1
+            # (ros-industrial/universal_robot, pull request 165): many clients send `f()` behind a `def f()`.
+            if upload.name and not upload.secondary:
                 self.stop_program("replaced by a program that cannot start")
             return False
         if upload.secondary:

@@ -1,5 +1,7 @@
 """The text of a URScript program → Python's code: tokens, then recursive descent that writes Python.
 
+`$ 2 "Robot Program"`, a line in which PolyScope names the node of a program it exports, is a comment here.
+
 Variables of the script are items of a `Scope`, `_0` the global one, `_1` that of the program and so on; its
 functions are generators whose names begin with `f_`. What else is called here is told in `ScriptRun`.
 """
@@ -18,7 +20,7 @@ SCRIPT = "<URScript>"
 """What Python takes for the file of a script."""
 
 _TOKEN = re.compile(
-    r"""(?P<skip>[ \t\r]+|\#[^\n]*)
+    r"""(?P<skip>[ \t\r]+|[\#$][^\n]*)
     |(?P<line>[\n;])
     |(?P<float>\d+\.\d*(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)
     |(?P<int>0[xX][0-9a-fA-F]+|\d+)
@@ -27,6 +29,8 @@ _TOKEN = re.compile(
     |(?P<sign>==|!=|<=|>=|[-+*/%<>=()\[\],:])""",
     re.VERBOSE,
 )
+NOT_SUPPORTED = "not supported by this simulator"
+_STATEMENTS_MISSING = ("switch", "for")
 _WORDS = frozenset(
     ("and", "break", "continue", "def", "elif", "else", "end", "enter_critical", "exit_critical", "False",
      "global", "halt", "if", "join", "kill", "local", "not", "or", "pass", "return", "run", "sec", "thread",
@@ -75,7 +79,7 @@ def tokens(text: str) -> list[Token]:
     while place < len(text):
         match = _TOKEN.match(text, place)
         if match is None:
-            raise ScriptSyntaxError(f"{text[place]!r} begins nothing", line)
+            raise ScriptSyntaxError(f"{text[place]!r}: {NOT_SUPPORTED}", line)
         kind, word = str(match.lastgroup), match.group()
         depth += (word in ("(", "[")) - (word in (")", "]"))
         if kind == "name" and word in _WORDS:
@@ -113,7 +117,7 @@ class Call(NamedTuple):
         _, name, line = self.name
         found = next((f.inner[name].parameters for f in reversed(self.around) if name in f.inner), None)
         if found is None and name not in builtins:
-            raise ScriptSyntaxError(f"compile_error_name_not_found:{name}:", line)
+            raise ScriptSyntaxError(f"compile_error_name_not_found:{name}: {NOT_SUPPORTED}", line)
         if found is None and self.runs:
             raise ScriptSyntaxError(f"{name} is no thread", line)
         fits = True
@@ -281,6 +285,9 @@ class _Parser:
 
     def _assignment(self) -> str:
         """`a = …`, `a[i] = …`, or an expression for what it does."""
+        token = self._tokens[self._place]
+        if token.text in _STATEMENTS_MISSING and not self._next_is("name", "="):
+            raise ScriptSyntaxError(f"{token.text}: {NOT_SUPPORTED}", token.line)
         if self._next_is("name", "="):
             name = self._need(kind="name").text
             self._need("=")

@@ -146,6 +146,7 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
         (("plan", "--start", "1,2,3"), 2, "usage"),
         (("plan", "--check", "a", "--from-list", "b"), 2, "usage"),
         (("bootstrap", "--config", "absent.yaml"), 2, "gone"),
+        (("trace", "record", "192.0.2.1"), 2, "gone"),
     ],
 )
 def test_what_a_person_can_cause_has_a_code(args: tuple[str, ...], exit_code: int, code: str) -> None:

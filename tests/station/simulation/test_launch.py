@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from station.simulation.controller import __main__
 from station.simulation.launch import start_controller
 from tests.codes import raises
 from tests.patience import wait_until
@@ -121,3 +122,20 @@ def test_it_starts_without_the_numeric_libraries() -> None:
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "exit_code"),
+    [
+        (["--host", "192.0.2.1"], 2),
+        (["--host", "0.0.0.0"], 2),
+        (["--host", "::"], 2),
+        (["--host", "robot.example"], 2),
+        (["--host", "192.0.2.1", "--allow-other-computers"], 1),  # no address of this computer
+    ],
+)
+def test_other_computers_may_send_programs_only_where_a_person_says_so(
+    arguments: list[str], exit_code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert __main__.main(arguments) == exit_code
+    assert ("--allow-other-computers" in capsys.readouterr().err) is (exit_code == 2)

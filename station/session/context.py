@@ -30,6 +30,7 @@ from station.devices.cell import Cell
 from station.protocol.states import check_transition
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
+from station.session.threads import DISK
 
 log = logging.getLogger("station.events")
 
@@ -120,7 +121,9 @@ class SessionContext:
         image = await self.cell.camera.capture() if self.cell.config.camera.model is None else None
         if before is not None:
             await self.recover_segments(before)
-        recording = before or SessionRecording(self.root, self.cell, check=check)
+        recording = before
+        if recording is None:
+            recording = await DISK.run(SessionRecording, self.root, self.cell, check=check)
         # Before it is open, and so it stays when STOP cuts in: what is there then must be closed.
         self.recording = recording
         try:
@@ -133,10 +136,10 @@ class SessionContext:
         """Makes whole what a crash left open, before another segment follows. Raises RecordingError."""
         await recording.released()
         async with recording.recovering:
-            if recording.unfinished_segments:
+            if await DISK.run(recording.unfinished_segments):
                 for found in await self.workers.call(recover_recording, recording.folder):
                     self.store.event("recovered", f"recovered {found.text}")
-            recording.count_segments()
+            await DISK.run(recording.count_segments)
 
     async def look_at(self, image: Image, lens: CameraModel | None = None) -> BoardDetection:
         """The board in an image, by the configured lens where no other is given. Raises WorkerError."""

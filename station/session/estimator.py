@@ -16,6 +16,7 @@ from station.cell.status import EstimateStatus
 from station.plan.predict import next_best_text
 from station.session.context import SessionContext
 from station.session.recording import stamps_now
+from station.session.threads import DISK
 
 _LOOK_BACK_S, _ESTIMATE_S = 120.0, 20.0
 
@@ -87,7 +88,7 @@ async def look_back(context: SessionContext) -> None:
     try:
         await context.recover_segments(recording)
         found = await context.workers.call(
-            seen_before, recording.whole, context.cell.config.board, timeout_s=_LOOK_BACK_S
+            seen_before, await DISK.run(recording.whole), context.cell.config.board, timeout_s=_LOOK_BACK_S
         )
     except (RecordingError, WorkerError) as error:
         context.store.problem(error, said="the estimate restarts, without the images so far: {}")

@@ -124,7 +124,6 @@ class SessionRecording:
         """A run begins, or it has ended."""
         self._before_s, self._run_since_s = self.elapsed_s, time.monotonic() if running else 0.0
 
-    @property
     def unfinished_segments(self) -> bool:
         """Files that a crash left open."""
         return any(self.folder.glob(f"*.mcap{PART_SUFFIX}"))
@@ -135,7 +134,6 @@ class SessionRecording:
         manifest = read_manifest(self.folder)
         self.segment = 1 + max([files, *(manifest.parts if manifest else [])])
 
-    @property
     def whole(self) -> Path:
         """The one file, or the folder where there are several."""
         files = list(self.folder.glob("*.mcap"))
@@ -284,8 +282,9 @@ class SessionRecording:
         # Shielded: a cancelled waiter must not cancel what the writer's thread is doing.
         await asyncio.shield(asyncio.wrap_future(self.require_open().finish()))
         self.recorder = None
-        await self.save_state(queue, self.whole)
-        return self.whole
+        whole = await DISK.run(self.whole)
+        await self.save_state(queue, whole)
+        return whole
 
     def abandon(self) -> None:
         """After a write error: the `.part` file stays as it is, for `recordings recover`.

@@ -265,7 +265,7 @@ async def _seal(context: SessionContext) -> None:
     recording, queue = context.require_recording(), context.require_queue()
     if recording.recorder is None:  # nothing was added since the crash
         await context.recover_segments(recording)
-        await recording.save_state(queue, path := recording.whole)
+        await recording.save_state(queue, path := await DISK.run(recording.whole))
     else:
         path = await recording.seal(queue)
     context.recording = None

@@ -24,7 +24,7 @@ from station.cell.acceptance import StopTestOffer
 from station.cell.errors import RefusedError, RobotError
 from station.cell.plan import Plan
 from station.cell.scene import cell_geometry
-from station.cell.session_folder import interrupted_session
+from station.cell.session_folder import SessionState, interrupted_session
 from station.cell.status import LeaseStatus, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import fresh
@@ -45,6 +45,7 @@ from station.session.run import Run, close_or_seal, unmark_busy
 from station.session.stop_test import prepare_stop_test
 from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.session.supervisor import SessionSupervisor
+from station.session.threads import DISK
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +91,9 @@ class Session:
         """Connects, read-only, and keeps trying. Nothing moves. A session that a crash cut is found again."""
         self.context.root.mkdir(parents=True, exist_ok=True)
         logging.getLogger("station").addHandler(self._logbook)
-        find_interrupted(self.context)
+        found = await DISK.run(interrupted_session, self.context.root)
+        if found is not None:
+            show_interrupted(self.context, *found)
         if self.context.cell.plan is not None and self.context.queue is None:
             self._replace_plan(self.context.cell.plan)
         loops = (self.supervisor.run(), self.devices.run(), self._estimator.run())
@@ -375,12 +378,8 @@ def _still_ending(what: str) -> RefusedError:
     return RefusedError(f"{what} is still ending", code="still-ending", remedy="Try again in a moment.")
 
 
-def find_interrupted(context: SessionContext) -> None:
+def show_interrupted(context: SessionContext, folder: Path, state: SessionState) -> None:
     """Brings its poses back and stands in `stopped` until a person looked. Nothing moves."""
-    found = interrupted_session(context.root)
-    if found is None:
-        return
-    folder, state = found
     if state.source != context.cell.source:
         context.store.event(
             "interrupted-elsewhere",

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
-from collections.abc import Iterator
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
+import msgspec
 import pytest
 
+from station.cell.plan import Plan
 from station.daemon import Daemon
 from station.devices.cell import Cell
+from station.protocol.client import Client
 from tests.station.session_rig import ArmInMemory, CameraInMemory, WorkerInThisProcess, memory_config
 
 
@@ -35,3 +44,58 @@ async def test_what_was_loaded_is_not_searched_for_garbage_beside_a_moving_arm(
 
     await daemon.run(ready)
     assert left[0] < 5000
+
+
+_TOUCHED: list[str] = []
+_LOOPS: set[int] = set()
+"""Threads whose files are watched."""
+
+
+def _watch_files(event: str, arguments: tuple[object, ...]) -> None:
+    if threading.get_ident() not in _LOOPS or "'/proc/" in str(arguments[:1]):
+        return
+    if event == "open" or event.startswith(("os.", "shutil.", "glob.")):
+        frame: FrameType | None = sys._getframe()
+        while frame is not None and "/station/" not in frame.f_code.co_filename.replace(__file__, ""):
+            frame = frame.f_back
+        where = f"{frame.f_code.co_filename}:{frame.f_lineno}" if frame is not None else ""
+        _TOUCHED.append(f"{event} {arguments[:1]} {where}")
+
+
+async def test_the_loop_of_the_heartbeat_touches_no_file(
+    thawed: None, tmp_path: Path, small_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk or a file server may answer late or never: everything else goes on."""
+    sys.addaudithook(_watch_files)  # for ever, but it looks at watched threads only
+    for name in ("stat", "statvfs", "fsync", "fdatasync"):  # these are not told to hooks
+        real = getattr(os, name)
+
+        def told(*args: Any, name: str = name, real: Callable[..., Any] = real, **named: Any) -> Any:
+            _watch_files(f"os.{name}", args)
+            return real(*args, **named)
+
+        monkeypatch.setattr(os, name, told)
+    cell = Cell(memory_config(), ArmInMemory(), CameraInMemory(), "simulated")
+    daemon = Daemon(cell, tmp_path / "root", tmp_path / "s")
+    daemon.session.context.workers = WorkerInThisProcess()  # type: ignore[assignment]
+    ready = asyncio.Event()
+    running = asyncio.create_task(daemon.run(ready.set))
+    await ready.wait()
+    _LOOPS.add(threading.get_ident())
+    try:
+        async with await Client.connect(tmp_path / "s") as anna:
+            await anna.request("lease", action="take")
+            await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
+            await anna.request("doctor")
+            summary = await anna.request("prepare", purpose="run")
+            await anna.request("go", token=summary["token"])
+            async with asyncio.timeout(60):
+                async for status in anna.statuses():
+                    if status.session.recording:
+                        break
+            await anna.request("sessions")
+    finally:
+        _LOOPS.clear()
+    daemon.end()
+    await running
+    assert _TOUCHED == []

@@ -126,7 +126,7 @@ def estimate(
             scales = solved.scales
             state = state.moved(solved.step, linear.board_step(solved))
             weights = corner_weights(observed, state, scales.sigma_px)
-            converged = bool(np.sqrt(solved.step @ solved.precision @ solved.step) < _SETTLED)
+            converged = is_settled(solved.step, solved.precision)
             linear = Linear.at(observed, state, weights)
         solved = linear.solve(priors.linearise(state, scales.table), scales, "nothing")
         covariance = linear.covariance(solved)
@@ -150,6 +150,11 @@ def estimate(
         steps=steps,
         converged=converged,
     )
+
+
+def is_settled(step: Array, precision: Array) -> bool:
+    """Tell whether a step of all shared unknowns is short against their uncertainty."""
+    return bool(step @ precision @ step < _SETTLED**2)
 
 
 def corner_weights(observed: Observations, state: CellState, sigma_px: float) -> Array:
@@ -182,3 +187,5 @@ class CellFit:
     """Pairs of the views that count; after a move, of those after it."""
     certified: GlobalResult
     """Optimum of the quadratic objective over these pairs."""
+    arm_failure: str = ""
+    """Why systematic errors could not be fitted, where that failed."""

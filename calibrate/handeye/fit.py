@@ -13,8 +13,16 @@ from calibrate.handeye.arm import RELATIVE_SIGMA, arm_postures, by_parameters, f
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.cell_state import CellState, Layout
-from calibrate.handeye.estimate import CellFit, Estimate, MeanParts, corner_weights, estimate
-from calibrate.handeye.linear import Linear, LinearSolution
+from calibrate.handeye.estimate import (
+    MAX_STEPS,
+    CellFit,
+    Estimate,
+    MeanParts,
+    corner_weights,
+    estimate,
+    is_settled,
+)
+from calibrate.handeye.linear import Linear, LinearSolution, inverse_of
 from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.poses import BoardPoses, PoseViews, agreed_start, fit_poses
 from calibrate.handeye.priors import Priors
@@ -44,7 +52,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     state = CellState(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
-    log_bayes, arm, plain = None, arm_postures(views) if with_table else None, found
+    log_bayes, arm, plain, failure = None, arm_postures(views) if with_table else None, found, ""
     if with_table and len(views) >= FEWEST_FOR_TABLE:
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
         flex = flex_motion(views.mount, views.base_from_flange, held)
@@ -58,11 +66,11 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
                 replace(observed, table=motion), found, priors, errors_of_table
             )
             observed = replace(observed, table=motion)
-        except np.linalg.LinAlgError:
-            pass
+        except np.linalg.LinAlgError as problem:
+            failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used), seed)
     arm = None if log_bayes is None else arm
-    return CellFit(views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified)
+    return CellFit(views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified, failure)
 
 
 _SIZES = np.array([0.03, 0.06, 0.12, 0.25, 0.5, 1.0])
@@ -73,7 +81,7 @@ _BENDS_BEFOREHAND = np.array([3.0, 1.0, 1.0, 1.0]) / 6
 _NONE = 1e-6
 _ROUNDS = 3
 _WORTH_SOLVING = 1e-3
-"""Chance below which a size is left out of the second step."""
+"""Chance below which a size is left out after the first step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +120,10 @@ def allow_for_table(
     scales, weights = plain.scales, plain.corner_weights
     chances, log_bayes = sizes.beforehand, 0.0
     kept = np.arange(len(chances))
-    for last in (False, True):
+    converged, steps = False, 0
+    while steps < MAX_STEPS and not converged:
+        if steps == 1:
+            kept = kept[chances > _WORTH_SOLVING]
         linear = Linear.at(observed, state, weights)
         solutions: list[LinearSolution] = []
         for i in kept:  # neighbours have nearly the same noise
@@ -123,16 +134,17 @@ def allow_for_table(
         chances = sizes.beforehand[kept] * np.exp(log_evidence - log_all)
         step = chances @ np.array([s.step for s in solutions])
         by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
+        covariances = [linear.covariance(solution) for solution in solutions]
+        spread = np.array([
+            own + np.outer(solution.step - step, solution.step - step)
+            for own, solution in zip(covariances, solutions, strict=True)
+        ])  # fmt: skip
+        covariance = np.einsum("s,sij->ij", chances, spread)
         before, state = state, state.moved(step, by_view)
         weights = corner_weights(observed, state, scales.sigma_px)
-        if not last:
+        if steps == 0:
             log_bayes = float(log_all - log_evidence[0])
-            kept = kept[chances > _WORTH_SOLVING]
-    spread = np.array([
-        linear.covariance(solution) + np.outer(solution.step - step, solution.step - step)
-        for solution in solutions
-    ])  # fmt: skip
-    covariance = np.einsum("s,sij->ij", chances, spread)
+        converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
     best, at = solutions[int(chances.argmax())], Layout.of(state)
     by_table = slice(at.table.start, at.table.start + errors_of_table)
     with_table = replace(
@@ -145,7 +157,11 @@ def allow_for_table(
         robot_covariance=linear.predicted(best.scales, covariance),
         board_poses=linear.seen_boards(before.C),
         corner_weights=weights,
+        noise_parts=chances
+        @ [linear.noise_parts(s, own) for s, own in zip(solutions, covariances, strict=True)],
         log_evidence=float(log_all),
+        steps=steps,
+        converged=converged,
         mean_of=MeanParts(
             chances, _against(spread, covariance, at.X), _against(spread, covariance, by_table)
         ),

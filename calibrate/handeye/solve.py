@@ -280,6 +280,11 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
             "The arm's model is unknown: errors of its kinematic table are not in the stated error.",
         ),
         (arm is not None and arm.detected, "arm-systematics", systematic),
+        (
+            bool(fit.arm_failure),
+            "arm-not-fitted",
+            f"Errors of arm and bracket are left out: their fit failed ({fit.arm_failure}).",
+        ),
     )
     return tuple(Remark(code, text) for true, code, text in said if true)
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
+from calibrate.handeye import fit as fit_module
 from calibrate.handeye.arm import PARAMETERS, arm_postures, by_parameters
 from calibrate.handeye.estimate import MeanParts
 from calibrate.handeye.fit import fit_cell
@@ -86,6 +87,26 @@ def test_the_region_of_an_average_holds_95_percent_of_it():
     drawn = rng.choice(widths, n, p=chances) * 6 * rng.f(6, freedom, n)
     assert np.mean(drawn <= average.threshold) == pytest.approx(0.95, abs=0.002)
     assert average.threshold > 1.5 * average.table_threshold
+
+
+def test_noise_and_steps_are_those_of_the_fit_that_is_reported(monkeypatch):
+    views = worn_cell(np.random.default_rng(2), 1.0).views
+    found = fit_cell(views, Priors(LensPrior.given(views.camera)), 0)
+    reported, plain = (fit.noise_parts / fit.noise_parts.sum() for fit in (found.estimate, found.plain))
+    assert reported[1:].sum() < 0.8 * plain[1:].sum(), "the table explains what was taken for noise"
+    assert found.estimate.converged and found.estimate.steps > 2
+    monkeypatch.setattr(fit_module, "MAX_STEPS", 2, raising=False)
+    assert "not-converged" in {remark.code for remark in solve_views(views, WITH).warnings}
+
+
+def test_an_arm_that_cannot_be_fitted_is_said(monkeypatch):
+    def fails(*_):
+        raise np.linalg.LinAlgError("singular")
+
+    monkeypatch.setattr(fit_module, "allow_for_table", fails)
+    found = solve_views(worn_cell(np.random.default_rng(2), 0.4).views, WITH)
+    assert found.arm is None
+    assert "arm-not-fitted" in {remark.code for remark in found.warnings}
 
 
 def test_seven_views_are_too_few_for_eighteen_errors():

@@ -8,12 +8,11 @@ from typing import Any
 
 import msgspec
 
-from calibrate.batch.storage import BatchResult
+from calibrate.batch.run import BatchResult
 from calibrate.cli.contracts import (
     CompareJson,
     DiffJson,
     DriftCheckJson,
-    FleetJson,
     InstalledJson,
     ListedJson,
     SolveJson,
@@ -51,7 +50,6 @@ TYPES: dict[str, tuple[str, Any]] = {
     "diff": ("calibrate diff --json", DiffJson),
     "drift-check": ("calibrate drift-check --json", DriftCheckJson),
     "watch": ("A line of `calibrate watch --json`", WatchEventJson),
-    "fleet": ("calibrate fleet --json", FleetJson),
     "status": ("station status --json", StationStatus),
     "doctor": ("station doctor --json", DoctorJson),
     "demo": ("station demo --json", DemoJson),

@@ -18,7 +18,7 @@ sample = sys.argv[1]
 for main, *arguments in (
     (calibrate.cli.main, "solve", sample, "-o", "cell.yaml"),
     (calibrate.cli.main, "annotate", sample, "cell.yaml", "-o", "out.mcap"),
-    (calibrate.cli.main, "batch", sample, "-o", "fleet"),
+    (calibrate.cli.main, "batch", sample, "-o", "many"),
     (recordings.cli.main, "info", sample),
 ):
     sys.argv[1:] = arguments

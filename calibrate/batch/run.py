@@ -5,21 +5,21 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
 
-from calibrate.batch.storage import BatchResult, Results, facts, is_url, local_copy, whole
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.bounds import Limits, bounded
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import encode_calibration
+from calibrate.files.calibration import encode_calibration, write_output
+from calibrate.files.lines import append_line, read_lines
 from calibrate.files.proof import content_sha256
 from calibrate.job import JobOptions, SolvedRecording
 from calibrate.pipeline import solve_recording
@@ -28,12 +28,42 @@ from recordings.errors import RecordingError
 RESULTS = "results.jsonl"
 
 
+class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One recording of a batch: its camera pose and how good it is, or why it could not be solved."""
+
+    recording: str
+    key: str
+    """Key of recording and options: a finished one is not solved again."""
+    solved: bool
+    passed: bool = False
+    error: str = ""
+    session: str = ""
+    robot: str = ""
+    camera: str = ""
+    recorded_wall_ns: int = 0
+    mount: str = ""
+    translation_m: tuple[float, ...] = ()
+    rotation_xyzw: tuple[float, ...] = ()
+    covariance: tuple[tuple[float, ...], ...] = ()
+    sigma_mm: float | None = None
+    sigma_deg: float | None = None
+    e_t_mm: float | None = None
+    rms_px: float | None = None
+    views: int = 0
+    rejected: int = 0
+    failed_gates: tuple[str, ...] = ()
+    calibration: str = ""
+    """File name in the output folder."""
+    content_sha256: str = ""
+    """Hash of the calibration: equal for equal results, whoever computed them."""
+
+
 Progress = Callable[[int, int, BatchResult], None]
 
 
 def run_batch(
-    recordings: Sequence[Path | str],
-    output: Path | str,
+    recordings: Sequence[Path],
+    output: Path,
     options: JobOptions | None = None,
     workers: BatchWorkers | None = None,
     progress: Progress | None = None,
@@ -41,16 +71,15 @@ def run_batch(
 ) -> list[BatchResult]:
     """Solve what is not solved yet; return all results in the order of `recordings`.
 
-    Recordings and `output` are paths or fsspec's URLs. Each result is a calibration file and a line of
-    `results.jsonl` in `output`, written at once: a batch that was killed goes on where it stopped. `workers`:
-    a pool of processes, one per core, if none are given. Raises BatchError when `output` cannot be written.
+    Each result is a calibration file and a line of `results.jsonl` in `output`, written at once: a batch that
+    was killed goes on where it stopped. `workers`: a pool of processes, one per core, if none are given.
+    Raises BatchError when `output` cannot be written.
     """
     options = options or JobOptions()
-    store = Results(str(output))
     try:
-        store.prepare()
-        done = {result.key: result for result in store.read(RESULTS, BatchResult) if result.solved}
-        tasks = [(whole(place), batch_key(place, options)) for place in recordings]
+        output.mkdir(parents=True, exist_ok=True)
+        done = {result.key: result for result in read_lines(output / RESULTS, BatchResult) if result.solved}
+        tasks = [(os.path.realpath(path), batch_key(path, options)) for path in recordings]
         todo = [task for task in dict.fromkeys(tasks) if task[1] not in done]
         work = partial(solve_one, options=options, limits=limits or Limits())
         with closing((workers or pool())(work, todo)) as answers:
@@ -59,27 +88,24 @@ def run_batch(
                     answer = BatchResult(recording, key, False, error=answer.reason), b""
                 result, content = answer
                 if content:
-                    store.write(result.calibration, content)
+                    write_output(output / result.calibration, content)
                 done[key] = result
-                store.add(RESULTS, key, result)
+                append_line(output / RESULTS, result)
                 if progress:
                     progress(count, len(todo), result)
         results = [done[key] for _, key in tasks]
-        store.write("results.csv", _csv(results))
+        write_output(output / "results.csv", _csv(results))
     except OSError as problem:
         raise BatchError(f"{output}: {problem.strerror or problem}.", code="batch-folder") from None
     return results
 
 
-def batch_key(place: Path | str, options: JobOptions) -> str:
+def batch_key(recording: Path, options: JobOptions) -> str:
     """Key that changes with the recording's place, size and date, and with every option of the result."""
-    found: list[Any] = [whole(place), 0, 0]
-    if is_url(str(place)):
-        found = [str(place), *facts(str(place))]
-    else:
-        with suppress(OSError):
-            stat = Path(place).stat()
-            found = [whole(place), stat.st_size, stat.st_mtime_ns]
+    found: list[str | int] = [os.path.realpath(recording), 0, 0]
+    with suppress(OSError):
+        stat = recording.stat()
+        found[1:] = [stat.st_size, stat.st_mtime_ns]
     chosen = {name: msgspec.to_builtins(value) for name, value in vars(options).items() if name != "threads"}
     return hashlib.sha256(msgspec.json.encode([found, chosen], order="deterministic")).hexdigest()[:24]
 
@@ -92,15 +118,15 @@ def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> tup
     recording, key = task
     cv2.setNumThreads(1)
     try:
-        with local_copy(recording) as path, bounded(limits.time_s, limits.memory_mib):
-            job = solve_recording(path, replace(options, threads=1))
+        with bounded(limits.time_s, limits.memory_mib):
+            job = solve_recording(Path(recording), replace(options, threads=1))
         content = encode_calibration(job.calibration)
     except (CalibrationError, RecordingError) as problem:
         return BatchResult(recording, key, False, error=str(problem)), b""
     except Exception as problem:  # a defect in one recording must not stop the other 199
         error = f"internal error: {type(problem).__name__}: {problem}"
         return BatchResult(recording, key, False, error=error), b""
-    return _result(recording, key, job, f"{path.stem}-{key[:8]}.calibration.yaml"), content
+    return _result(recording, key, job, f"{Path(recording).stem}-{key[:8]}.calibration.yaml"), content
 
 
 def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchResult:

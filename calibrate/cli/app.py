@@ -76,14 +76,6 @@ COMMANDS = {
         (
             "calibrate batch monday.mcap tuesday.mcap -o results",
             "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",
-            "calibrate batch 's3://robots/sessions/*.mcap' -o s3://robots/results",
-        ),
-    ),
-    "fleet": LazyCommand(
-        "calibrate.cli.batch:fleet",
-        (
-            "calibrate fleet cells/* -o fleet  # copies of the cells' state folders",
-            "calibrate fleet 's3://robots/cells/*' -o s3://robots/fleet",
         ),
     ),
     "sweep": LazyCommand(
@@ -99,4 +91,5 @@ CALIBRATE = LazyGroup(
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 done with loss, 4 a gate or a "
     "drift check failed.",
     aliases={"check": "drift-check"},
+    gone={"fleet": "Run `calibrate metrics` on each cell."},
 )

@@ -1,13 +1,12 @@
-"""`calibrate batch | fleet`: solve many recordings again; collect the state of many cells."""
+"""`calibrate batch`: solve many recordings again."""
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -15,23 +14,20 @@ import msgspec
 import typer
 
 from calibrate.batch.cluster import Cluster, cluster_workers
-from calibrate.batch.fleet import UNREADABLE, collect_fleet, fleet_table
-from calibrate.batch.run import run_batch
-from calibrate.batch.storage import BatchResult, Results, expand
-from calibrate.batch.trends import CellHistory, cells, trends_text
+from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import BatchWorkers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
-from calibrate.cli.contracts import FleetCameraJson, FleetJson
 from calibrate.cli.job import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit, takes
-from calibrate.cli.output import AsJson, err, out, print_json
+from calibrate.cli.output import AsJson, err, out
 from calibrate.errors import UsageError
 from calibrate.job import JobOptions
 from calibrate.load import Progress as LoadProgress
 from calibrate.quality.gates import GateLimits, read_limits
 from recordings.cli.console import progress_bar
+from recordings.cli.lazy import GoneError
 
 DONE_WITH_LOSS = 3
-OutputFolder = Annotated[str, typer.Option("-o", "--output", help="Folder of the results, or a URL")]
+OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder of the results")]
 
 
 def chosen_workers(
@@ -68,9 +64,9 @@ def chosen_workers(
 
 @takes(chosen_workers, "workers")
 def batch(
-    recordings: Annotated[list[str], typer.Argument(help="Recordings or session folders; URLs may have *")],
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings or session folders")],
     workers: BatchWorkers,
-    output: OutputFolder = "batch",
+    output: OutputFolder = Path("batch"),
     profile: ProfileName = "robust",
     seed: Seed = 0,
     gates: GatesFile = None,
@@ -80,88 +76,39 @@ def batch(
 ) -> None:
     """Solve many recordings; resumable.
 
-    OUTPUT then holds a calibration each, results.jsonl, results.csv, and what moved: trends.html, trends.txt.
+    OUTPUT then holds a calibration each, results.jsonl and results.csv.
     The limits are those of one solve in a process here; on a cluster the workers' own hold.
     Exit codes: 0 all solved, 3 some recordings could not be solved.
     """
-    from calibrate.batch.page import trends_page  # matplotlib is slow to load
-
-    store = _results(output)
+    if output.is_file():
+        raise UsageError(f"{output} is a file; the results need a folder.", code="target-exists")
+    for place in map(str, (*recordings, output)):
+        if re.match("[a-z0-9+]+:/", place):
+            raise GoneError(f"{place}: URLs are gone.", remedy="Copy the files here, or mount their store.")
     gate_limits = GateLimits() if gates is None else read_limits(gates)
     options = JobOptions(profile=profile, seed=seed, limits=gate_limits)
     limits = Limits(time_limit_s, memory_limit_mib)
-    places = [place for word in recordings for place in expand(word)]
     with _stoppable("solving") as bar:
         told = None if bar is None else lambda done, total, result: bar(done, total, result.session)
-        results = run_batch(places, output, options, workers, told, limits)
-    found = cells(results)
-    store.write("trends.txt", trends_text(found).encode())
-    store.write("trends.html", trends_page(results, found).encode())
+        results = run_batch(recordings, output, options, workers, told, limits)
     if as_json:
         for result in results:
             typer.echo(msgspec.json.encode(result).decode())
     else:
-        _tell(results, found, output)
+        _tell(results, output)
     if not all(result.solved for result in results):
         raise typer.Exit(DONE_WITH_LOSS)
 
 
-@takes(chosen_workers, "workers")
-def fleet(
-    roots: Annotated[list[str], typer.Argument(help="State folders of the cells; URLs may have *")],
-    workers: BatchWorkers,
-    output: OutputFolder = "fleet",
-    as_json: AsJson = False,
-) -> None:
-    """Collect validity and drift of many cells into one table and one page.
-
-    Reads `calibrations` below each ROOT, all cameras, and writes fleet.sqlite (tables cameras, checks) and
-    fleet.html: which cameras are in doubt, since when, and their drift over time.
-    Exit codes: 0 all cells read, 3 some could not be read.
-    """
-    from calibrate.batch.page import fleet_page  # matplotlib is slow to load
-
-    store, now = _results(output), datetime.now(UTC)
-    places = [place for word in roots for place in expand(word)]
-    with _stoppable("reading") as bar:
-        records = collect_fleet(places, now, workers, bar)
-    store.prepare()
-    store.write("fleet.sqlite", fleet_table(records))
-    store.write("fleet.html", fleet_page(records, now).encode())
-    found = [record for record in records if record.to_look_at]
-    lost = sum(record.state == UNREADABLE for record in records)
-    if as_json:
-        look = [
-            FleetCameraJson(r.cell, r.camera, r.state, r.since, r.reason, r.trend is not None) for r in found
-        ]
-        print_json(FleetJson(len(records), dict(Counter(record.state for record in records)), look))
-    else:
-        for record in found:
-            since = f" since {record.since}" if record.since else ""
-            out.print(f"{record.cell} {record.camera}: {record.state}{since}. {record.why}", soft_wrap=True)
-        out.print(f"{len(records)} cameras, {len(found)} to look at. {output}/fleet.html, fleet.sqlite")
-    if lost:
-        raise typer.Exit(DONE_WITH_LOSS)
-
-
-def _tell(results: list[BatchResult], found: tuple[CellHistory, ...], output: str) -> None:
+def _tell(results: list[BatchResult], output: Path) -> None:
     good = sum(result.passed for result in results)
     failed = [result for result in results if not result.solved]
     out.print(
         f"{len(results)} recordings: {good} PASS, {len(results) - good - len(failed)} FAIL, "
-        f"{len(failed)} not solved. {output}/results.csv, results.jsonl, trends.html, trends.txt"
+        f"{len(failed)} not solved. {output}/results.csv, results.jsonl"
     )
-    for cell in found:
-        for finding in cell.findings:
-            out.print(f"{cell.name}: {finding.text}", soft_wrap=True)
     for result in failed:
         err.print(f"{Path(result.recording).name}: {result.error}", soft_wrap=True)
-
-
-def _results(output: str) -> Results:
-    if Path(output).is_file():
-        raise UsageError(f"{output} is a file; the results need a folder.", code="target-exists")
-    return Results(output)
 
 
 @contextmanager

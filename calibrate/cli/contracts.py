@@ -157,25 +157,6 @@ class DriftCheckJson(msgspec.Struct, frozen=True):
     validity: Validity | None
 
 
-class FleetCameraJson(msgspec.Struct, frozen=True):
-    """One camera to look at."""
-
-    cell: str
-    camera: str
-    state: str
-    since: str
-    reason: str
-    drifting: bool
-
-
-class FleetJson(msgspec.Struct, frozen=True):
-    """`calibrate fleet --json`"""
-
-    cameras: int
-    states: dict[str, int]
-    to_look_at: list[FleetCameraJson]
-
-
 class WatchEventJson(msgspec.Struct, frozen=True):
     """A line of `calibrate watch --json`; the last one is the summary."""
 

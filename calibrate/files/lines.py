@@ -40,12 +40,8 @@ def share(path: Path) -> None:
 
 def read_lines(path: Path, kind: type[S]) -> list[S]:
     """Oldest first; empty when there is no file. Lines that are no `kind` are left out."""
-    return parse_lines(read_file(path, LOG_LIMIT_BYTES), kind) if path.exists() else []
-
-
-def parse_lines(content: bytes, kind: type[S]) -> list[S]:
     found = []
-    for line in content.splitlines():
+    for line in (read_file(path, LOG_LIMIT_BYTES) if path.exists() else b"").splitlines():
         try:
             found.append(msgspec.json.decode(line, type=kind))
         except (msgspec.DecodeError, UnicodeDecodeError):

@@ -22,7 +22,6 @@ from recordings.plain_text import plain_text, printed
 _HELP_KEYS = {"help_option_names": ["-h", "--help"]}
 _EXTRAS = {
     "distributed": "cluster",
-    "fsspec": "cluster",
     "matplotlib": "report",
     "rosbags": "ros",
     "rtde_control": "station",

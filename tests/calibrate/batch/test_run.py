@@ -1,4 +1,4 @@
-"""A fleet's recordings, solved again: none stops the rest, nothing is lost, the same bits whoever solves."""
+"""Many recordings, solved again: none stops the rest, nothing is lost, the same bits whoever solves."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.batch.run import RESULTS, batch_key, run_batch
-from calibrate.batch.storage import BatchResult, Results
+from calibrate.batch.run import RESULTS, BatchResult, batch_key, run_batch
 from calibrate.batch.workers import Lost, R, T, pool
 from calibrate.bounds import Limits
+from calibrate.files.lines import read_lines
 from calibrate.job import JobOptions
 from tests.patience import PATIENCE_S, wait_until
 
@@ -38,7 +38,7 @@ def in_this_process(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tup
 
 
 def read_results(folder: Path) -> list[BatchResult]:
-    return Results(str(folder)).read(RESULTS, BatchResult)
+    return read_lines(folder / RESULTS, BatchResult)
 
 
 class Counted:

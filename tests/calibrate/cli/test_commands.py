@@ -228,7 +228,8 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(session_file: Path, tmp_
     again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)
     assert again.returncode == 0
     assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
-    assert all((tmp_path / "out" / name).stat().st_size for name in ("trends.txt", "trends.html"))
+    refused(run("batch", "s3://robots/a.mcap", cwd=tmp_path), 2, "gone")
+    refused(run("fleet", "cells", cwd=tmp_path), 2, "gone", "calibrate metrics")
     alone = run("solve", recordings[0], "-o", "alone.yaml", cwd=tmp_path)
     assert alone.returncode in (0, 4)
     pooled = read_calibration(tmp_path / "out" / rows[0]["calibration"])

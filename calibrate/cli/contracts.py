@@ -19,7 +19,6 @@ from calibrate.files.calibration import (
     ViewWeight,
 )
 from calibrate.files.gate import Gate
-from calibrate.files.hooks import HookRun
 from calibrate.files.validity import Validity
 from calibrate.results import BoardShape, HoldoutScore, RejectedView
 from recordings.schema.messages import Matrix4, Mount, TimeSource
@@ -122,7 +121,6 @@ class InstalledJson(msgspec.Struct, frozen=True):
     path: str
     current: str
     validity: Validity | None
-    hooks: tuple[HookRun, ...]
 
 
 class DiffJson(msgspec.Struct, frozen=True):

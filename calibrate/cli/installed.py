@@ -193,7 +193,7 @@ def install(
         camera_serial=facts.camera_serial,
         max_age_days=facts.max_age_days if max_age_days is None else max_age_days,
     )
-    _switched(made, as_json)
+    _switched(made, root, as_json)
     if not as_json:
         camera = camera or facts.camera or read_calibration(made.path).camera_name
         out.print(f"To undo: {installing.undo_line(root, camera)}", soft_wrap=True)
@@ -211,7 +211,7 @@ def rollback(
 
     The one before, or a version of `calibrate list`. It is unverified then, until a drift check passes.
     """
-    _switched(installing.rollback(root, to, reason, camera=camera), as_json)
+    _switched(installing.rollback(root, to, reason, camera=camera), root, as_json)
 
 
 def withdraw(
@@ -232,12 +232,12 @@ def withdraw(
         out.print(f"Camera {camera}, version {validity.version}: {validity_text(validity)}")
 
 
-def _switched(version: InstalledVersion, as_json: bool) -> None:
+def _switched(version: InstalledVersion, root: Path | None, as_json: bool) -> None:
     folder = version.path.parents[1]
     stable = folder / "current"
     if as_json:
         place = str(version.path), str(stable)
-        print_json(InstalledJson(version.number, *place, version.validity, version.hooks))
+        print_json(InstalledJson(version.number, *place, version.validity))
         return
     log = read_lines(folder / LOG, LogEntry)
     out.print(f"Installed: version {version.number}, {stable}", soft_wrap=True)
@@ -245,11 +245,11 @@ def _switched(version: InstalledVersion, as_json: bool) -> None:
         out.print(f"Change: {log[-1].change}")
     if version.validity is not None:
         out.print(f"Validity: {validity_text(version.validity)}")
-    for run in version.hooks:
-        if run.failed:
-            why = run.problem or f"exit code {run.exit_code}"
-            out_path = folder / "hooks.jsonl"
-            err.print(f"Hook {run.program}: {why} Output: {out_path}", style="yellow", soft_wrap=True)
+    hooks = state_root(root) / "hooks"
+    if hooks.is_dir():
+        err.print(
+            f"Programs in {hooks} are no longer run. Use: calibrate follow", style="yellow", soft_wrap=True
+        )
 
 
 def list_installed(

@@ -114,7 +114,7 @@ def watch(
     are taken anyway, while the arm stands. No motion and no session is added. The first 60 pictures with it
     are learned from. A posture that comes again is compared with its own earlier pictures: that notices most.
 
-    When something moved, the installed calibration is put in doubt and its hooks run. 30 pictures later it is
+    When something moved, the installed calibration is put in doubt. 30 pictures later it is
     said what moved, or that the pictures cannot tell, and the shortest way back. All pictures are kept in
     watch.jsonl beside the calibrations: start it again, with the same SOURCE or the next, and it goes on.
 

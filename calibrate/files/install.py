@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +22,6 @@ from calibrate.files.folders import (
     readable_folder,
 )
 from calibrate.files.gate import Gate
-from calibrate.files.hooks import HookEvent, announce
 from calibrate.files.lines import append_line
 from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
@@ -59,7 +57,6 @@ _CELL_OF: dict[Source, Cell] = {
 }
 _ARTICLE: dict[Cell, str] = {"real": "a", "imported": "an", "simulated": "a"}
 
-_LOG = logging.getLogger(__name__)
 WORSE_TIMES = 1.5
 """More than the estimates of two good sessions differ by chance."""
 REASON_LETTERS = 5
@@ -86,7 +83,7 @@ def install(
     camera_serial: str = "",
     max_age_days: float | None = None,
 ) -> InstalledVersion:
-    """Make the calibration file `path` the current one of its camera, and run the hooks.
+    """Make the calibration file `path` the current one of its camera.
 
     `cell`: what kind of cell this root belongs to; a real one takes nothing simulated, played back or
     imported, and no override changes that. `camera`: its name in the cell; empty: as in the file.
@@ -125,8 +122,7 @@ def install(
             calibration = msgspec.structs.replace(calibration, override=taken)
         change = change_text(before, calibration)
         validity = _first_validity(calibration, _max_age_days(folder, max_age_days))
-        made = add_version(folder, calibration, "install", validity, change, override.strip())
-    return _announced(root, camera, "install", made)
+        return add_version(folder, calibration, "install", validity, change, override.strip())
 
 
 def _first_validity(calibration: Calibration, max_age_days: float | None) -> Validity:
@@ -151,14 +147,6 @@ def _max_age_days(folder: Path, asked: float | None) -> float | None:
     recorded = read_validity(folder)
     newest = list(recorded.values())[-1:]
     return newest[0].max_age_days if newest else None
-
-
-def _announced(
-    root: Path | None, camera: str, event: HookEvent, version: InstalledVersion
-) -> InstalledVersion:
-    """The version with what the hooks said of it."""
-    assert version.validity is not None
-    return replace(version, hooks=announce(root, camera, event, version.validity))
 
 
 def rollback(
@@ -192,8 +180,7 @@ def rollback(
         before = None if current is None else current.calibration
         change = change_text(before, target.calibration)
         validity = _validity_again(target, _max_age_days(folder, None))
-        made = make_current(folder, target, "rollback", validity, change, reason)
-    return _announced(root, camera, "rollback", made)
+        return make_current(folder, target, "rollback", validity, change, reason)
 
 
 def _nothing_older(root: Path | None, camera: str, validity: Validity) -> InstallError:
@@ -252,7 +239,7 @@ def set_validity(
 ) -> Validity:
     """Say that the installed calibration of `camera` is valid, unverified, in doubt or withdrawn, and why.
 
-    The record grows by a line and the hooks run. `version`: the one that was judged; InstallError
+    The record grows by a line. `version`: the one that was judged; InstallError
     (`other-version`) where another is installed by now, and `nothing-installed` where nothing is. VALID makes
     now the time of the last proof.
     """
@@ -299,17 +286,11 @@ def _change_validity(
                 version=number,
                 judged=version,
             )
-        shown = current_validity(folder)
-        before = read_validity(folder).get(number, shown)
+        before = read_validity(folder).get(number, current_validity(folder))
         after = change(before)
         if after != before:
             append_line(folder / VALIDITY_FILE, after)
-    told = after.at(datetime.now(UTC))
-    if told.state is not shown.state:
-        for run in announce(root, camera, told.state.value, told):
-            if run.failed:
-                _LOG.warning("Hook %s: %s", run.program, run.problem or f"exit code {run.exit_code}")
-    return told
+    return after.at(datetime.now(UTC))
 
 
 def reason_problem(reason: str) -> str:

@@ -34,7 +34,6 @@ from calibrate.files.calibration import (
     write_calibration,
 )
 from calibrate.files.folders import VERSION_NAME, calibrations_folder, read_validity, readable_folder
-from calibrate.files.hooks import HookRun, announce
 from calibrate.files.lines import append_line, read_lines, share
 from calibrate.files.proof import read_bounded
 from calibrate.files.touch import LIMIT_SIGMAS, Touch, agrees, touch_sigmas, touch_text
@@ -62,8 +61,6 @@ class InstalledVersion:
     problem: str = ""
     validity: Validity | None = None
     """Whether it holds now; of one that is not current: as when it was replaced."""
-    hooks: tuple[HookRun, ...] = ()
-    """Programs that were run for this change."""
 
 
 class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -248,7 +245,7 @@ def note_installed(
 ) -> InstalledVersion:
     """Add them to the installed calibration: a new version, for versions never change.
 
-    A corner that is missed puts it in doubt, and hooks are told when that changes. Raises InstallError where
+    A corner that is missed puts it in doubt. Raises InstallError where
     no whole calibration is installed, or the folder or the disk does not allow it.
     """
     folder = calibrations_folder(root, camera)
@@ -272,10 +269,7 @@ def note_installed(
         now = datetime.now(UTC)
         passed = all(map(agrees, touches))
         validity = before.after_check("touch-test", passed, False, now, reason, who())
-        made = add_version(folder, calibration, "verify", validity, found)
-    if validity.state is not before.state:
-        made = replace(made, hooks=announce(root, camera, validity.state.value, made.validity or validity))
-    return made
+        return add_version(folder, calibration, "verify", validity, found)
 
 
 def _with_touches(calibration: Calibration, touches: Sequence[Touch]) -> Calibration:

@@ -85,18 +85,18 @@ async def install_result(desk: Desk, result: Result, calibration: Calibration) -
     put = partial(install, Path(result.path), state_root(result.path), cell=cell, max_age_days=oldest)
     try:
         try:
-            made = await asyncio.to_thread(put)
+            await asyncio.to_thread(put)
         except CalibrationError as refusal:
             if refusal.code not in OVERRIDABLE:
                 raise
             if not (reason := await desk.question(Reason("Not installed", refusal.text, OVERRIDES))):
                 desk.app.notify("Nothing was installed.")
                 return
-            made = await asyncio.to_thread(put, override=reason)
+            await asyncio.to_thread(put, override=reason)
     except CalibrationError as refusal:
         desk.app.notify(str(refusal), title="Not installed", severity="error", timeout=20, markup=False)
         return
-    _say_installed(desk, f"Installed. {undo}", made)
+    desk.app.notify(f"Installed. {undo}")
 
 
 def before_next(known: list[InstalledVersion], coming: Calibration) -> InstalledVersion | None:
@@ -122,7 +122,7 @@ async def undo_install(desk: Desk, result: Result, calibration: Calibration) -> 
         made = await desk.attempt(asyncio.to_thread(rollback, root, camera=camera))
         if made is not None:
             said = "The calibration before is installed again; a drift check proves it (7, k)."
-            _say_installed(desk, said, made)
+            desk.app.notify(said)
 
 
 async def _withdraw(desk: Desk, root: Path, camera: str, current: InstalledVersion) -> None:
@@ -138,14 +138,6 @@ async def _withdraw(desk: Desk, root: Path, camera: str, current: InstalledVersi
         return
     if await desk.attempt(asyncio.to_thread(withdraw, root, reason, camera=camera)) is not None:
         desk.app.notify("Out of use: programs are refused it. i installs a calibration.")
-
-
-def _say_installed(desk: Desk, said: str, version: InstalledVersion) -> None:
-    desk.app.notify(said)
-    for run in version.hooks:
-        if run.failed:
-            why = run.problem or f"exit code {run.exit_code}"
-            desk.app.notify(f"{run.program}: {why}", title="A hook failed", severity="warning", markup=False)
 
 
 async def export_result(desk: Desk, result: Result, calibration: Calibration) -> None:

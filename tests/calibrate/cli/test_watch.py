@@ -1,4 +1,4 @@
-"""`calibrate watch`: a folder that grows, an alarm, doubt, hooks, and going on after a restart."""
+"""`calibrate watch`: a folder that grows, an alarm, doubt, and going on after a restart."""
 
 from __future__ import annotations
 
@@ -101,10 +101,6 @@ def watch(root: Path, *arguments: object) -> tuple[int, list[dict[str, Any]]]:
 def test_a_camera_that_moves_between_two_runs_is_noticed_named_and_put_in_doubt(
     root: Path, tmp_path: Path
 ) -> None:
-    hook = root / "hooks" / "tell"
-    hook.parent.mkdir()
-    hook.write_text(f"#!/bin/sh\necho $1 $CALIBRATION_REASON >> {tmp_path}/told\n")
-    hook.chmod(0o700)
     production = Production(tmp_path / "pictures", root)
     production.take(75)
     code, lines = watch(root, production.folder)
@@ -119,7 +115,6 @@ def test_a_camera_that_moves_between_two_runs_is_noticed_named_and_put_in_doubt(
     assert lines[0]["validity"]["state"] == "in-doubt" and lines[0]["pictures"] <= 75 + 10
     doubted = load_installed(root, require_valid=False).validity
     assert (doubted.state, doubted.reason.code) == (ValidityState.IN_DOUBT, "watch")
-    assert (tmp_path / "told").read_text() == "in-doubt watch\n"
 
     production.take(25)
     code, lines = watch(root, production.folder)

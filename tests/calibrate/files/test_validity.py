@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import socket
 import subprocess
 import sys
 import threading
@@ -19,11 +17,8 @@ from hypothesis import strategies as st
 
 from calibrate import load_installed, watch
 from calibrate.errors import CalibrationFileError, InstallError, UsageError
-from calibrate.files import hooks
 from calibrate.files.folders import cameras
-from calibrate.files.hooks import HookRun
 from calibrate.files.install import install, installed_calibration, note_check, rollback, set_validity
-from calibrate.files.lines import read_lines
 from calibrate.files.proof import canonical_json
 from calibrate.files.touch import Touch
 from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState
@@ -267,92 +262,3 @@ def test_whoever_watches_hears_of_install_doubt_and_rollback(root: Path, make_fi
     ]
     assert heard[3].installed is not None and heard[3].installed.validity.state is U
     assert heard[4].problem is not None and heard[4].problem.code == "nothing-installed"
-
-
-# --- hooks ---
-def hook(root: Path, name: str, text: str, mode: int = 0o755) -> Path:
-    folder = root / "hooks"
-    folder.mkdir(mode=0o755, exist_ok=True)
-    path = folder / name
-    path.write_text(f"#!/bin/sh\n{text}\n")
-    path.chmod(mode)
-    return path
-
-
-def test_hooks_run_in_order_with_what_happened_and_their_output_is_kept(
-    root: Path, make_file: MakeFile, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(root.parent)
-    root = root.relative_to(root.parent)  # as a person types it
-    hook(root, "10-tell", 'echo "$1 $CALIBRATION_CAMERA $CALIBRATION_VERSION $CALIBRATION_STATE"')
-    hook(root, "20-fail", "echo no; exit 3")
-    made = install(make_file(0.001), root)
-    assert [(run.program, run.exit_code, run.output) for run in made.hooks] == [
-        ("10-tell", 0, "install main 2 valid\n"),
-        ("20-fail", 3, "no\n"),
-    ]
-    check(root, passed=False)
-    check(root, passed=False)  # no change, nobody is told
-    rollback(root)
-    kept = read_lines(root / "calibrations/hooks.jsonl", HookRun)
-    assert [(run.event, run.program) for run in kept[::2]] == [
-        ("install", "10-tell"),
-        ("in-doubt", "10-tell"),
-        ("rollback", "10-tell"),
-    ]
-
-
-def test_the_journal_gets_the_fields_of_every_change(
-    root: Path, make_file: MakeFile, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Read as systemd.io/JOURNAL_NATIVE_PROTOCOL says: NAME=VALUE, one a line."""
-    monkeypatch.chdir(tmp_path)  # a socket's path is short
-    monkeypatch.setattr(hooks, "JOURNAL", Path("journal"))
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as journal:
-        journal.bind("journal")
-        journal.settimeout(1.0)
-        install(make_file(0.001), root)
-        set_validity(root, W, ValidityReason("withdrawn", "A pallet\nPRIORITY=0 hit it."))
-        told = [dict(line.split("=", 1) for line in journal.recv(65536).decode().splitlines()) for _ in "12"]
-    assert [(entry["CALIBRATION_EVENT"], entry["PRIORITY"]) for entry in told] == [
-        ("install", "5"),
-        ("withdrawn", "4"),
-    ]
-    assert told[1]["CALIBRATION_STATE"] == "withdrawn" and told[1]["CALIBRATION_REASON"] == "withdrawn"
-    assert told[1]["CALIBRATION_CAMERA"] == "main" and told[1]["CALIBRATION_VERSION"] == "2"
-    assert {entry["SYSLOG_IDENTIFIER"] for entry in told} == {"calibrate"}
-    assert Path(told[0]["CALIBRATION_PATH"]) == (root / "calibrations/current").absolute()
-
-
-def test_a_hook_that_hangs_is_ended_with_its_children(
-    root: Path, make_file: MakeFile, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(hooks, "TIME_LIMIT_S", 0.3)
-    hook(root, "hangs", "sleep 60 & echo $!; wait")
-    (run,) = install(make_file(0.001), root).hooks
-    assert run.exit_code is None and run.problem
-    child = Path(f"/proc/{int(run.output)}/stat")
-    assert not child.exists() or child.read_text().rpartition(")")[2].split()[0] == "Z"
-
-
-@pytest.mark.parametrize("open_to", ["folder", "program", "link", "owner"])
-def test_what_others_could_have_put_there_is_not_run(
-    root: Path, make_file: MakeFile, tmp_path: Path, open_to: str
-) -> None:
-    path = hook(root, "10-tell", f"touch {tmp_path}/ran")
-    if open_to == "folder":
-        path.parent.chmod(0o775)
-    elif open_to == "program":
-        path.chmod(0o757)
-    elif open_to == "link":
-        path.rename(tmp_path / "elsewhere")
-        path.symlink_to(tmp_path / "elsewhere")
-    else:
-        try:
-            os.chown(path, 65534, 65534)
-        except PermissionError:
-            pytest.skip("only root can give a file away")
-    (run,) = install(make_file(0.001), root).hooks
-    assert run.exit_code is None and run.problem
-    assert not (tmp_path / "ran").exists()
-    assert load_installed(root).version == 2, "the calibration is installed all the same"

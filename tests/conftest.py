@@ -92,9 +92,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     place: Path | None = config.getoption("--only-of")
     if place is not None:
         named = set(place.read_text().splitlines())  # a module that was skipped as a whole by its path
-        others = [item for item in items if not {item.nodeid, item.nodeid.partition("::")[0]} & named]
-        items[:] = [item for item in items if item not in others]
-        config.hook.pytest_deselected(items=others)
+        items[:] = [item for item in items if {item.nodeid, item.nodeid.partition("::")[0]} & named]
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -240,31 +240,34 @@ def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment
 
 
 def _orphans(found: Salvage) -> set[int]:
-    """Places of messages that lost their partner, an image its facts or a view its image: told as losses."""
+    """Numbers of the messages that lost their partner, an image its facts or a view its image.
+
+    They are told as losses. Messages are counted as `found.messages` yields them.
+    """
     topics = {number: channel.topic for number, channel in found.contents.channels.items()}
     facts: dict[int, int] = {}
     images: dict[int, int] = {}
     views: list[tuple[int, bytes]] = []
-    for place, message in found.messages():
+    for number, message in enumerate(found.messages()):
         match topics.get(message.channel_id):
             case Topic.PICTURE_FACTS:
-                facts[message.sequence] = place
+                facts[message.sequence] = number
             case Topic.RAW_IMAGE | Topic.COMPRESSED_IMAGE:
-                images[message.sequence] = place
+                images[message.sequence] = number
             case Topic.VIEW:
-                views.append((place, message.data))
+                views.append((number, message.data))
     halves = facts.keys() ^ images.keys()
     dropped = {table[sequence] for table in (facts, images) for sequence in halves & table.keys()}
     found.losses += [f"image {sequence} is incomplete" for sequence in sorted(halves)]
-    for place, data in views:
+    for number, data in views:
         try:
             view = decode(View, data)
         except SchemaError:
-            dropped.add(place)
-            found.losses.append(f"a view at byte {place} cannot be read")
+            dropped.add(number)
+            found.losses.append(f"message {number}, a view, cannot be read")
             continue
         if view.picture_sequence not in facts.keys() & images.keys():
-            dropped.add(place)
+            dropped.add(number)
             found.losses.append(f"pose {view.index + 1} (attempt {view.attempt}) lost its image")
     return dropped
 
@@ -282,15 +285,15 @@ def _write(writer: Writer, found: Salvage, session: dict[str, str], dropped: set
     for kept in contents.attachments.values():
         writer.add_attachment(kept.create_time, kept.log_time, kept.name, kept.media_type, kept.data)
     numbers: dict[int, int] = {}
-    for place, message in found.messages():
+    for number, message in enumerate(found.messages()):
         channel = contents.channels.get(message.channel_id)
-        if channel is None or place in dropped:
+        if channel is None or number in dropped:
             continue
         if channel.id not in numbers:
             schema = contents.schema_of(channel)
-            number = writer.register_schema(schema.name, schema.encoding, schema.data)
+            declared = writer.register_schema(schema.name, schema.encoding, schema.data)
             numbers[channel.id] = writer.register_channel(
-                channel.topic, channel.message_encoding, number, channel.metadata
+                channel.topic, channel.message_encoding, declared, channel.metadata
             )
         writer.add_message(
             numbers[channel.id], message.log_time, message.data, message.publish_time, message.sequence

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import struct
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -33,13 +32,20 @@ from recordings.mcap.records import (
 )
 from recordings.mcap.scan import SUMMARY_LIMIT_BYTES
 
-_LIKE_A_RECORD = re.compile(rb"[\x06\x09\x0c].{4}\x00{4}", re.DOTALL)
-"""Opcode of a chunk, attachment or metadata record, and a length below 4 GiB."""
+_LIKE_A_RECORD = re.compile(
+    rb"\x06.{4}\0{4}.{16}(?:(.{4}\0{4}).{4}\0{4}\1|.{12}(?:\x03\0{3}lz4|\x04\0{3}zstd))"
+    rb"|\x09.{4}\0{4}.{16}[\x01-\x3c]\0{3}"
+    rb"|\x0c.{4}\0{4}[\x01-\x3c]\0{3}",
+    re.DOTALL,
+)
+"""Beginning of a chunk whose two sizes agree or that is compressed, an attachment, a metadata record.
+
+Dark images are full of what looks like an opcode and a length.
+"""
+_PATTERN_BYTES = 49
+"""Length of the longest beginning."""
 _BLOCK_BYTES = 1024 * 1024
 _DATA_END_BYTES = 4
-_CHUNK_HEAD = struct.Struct("<16xQ4xIQ")
-"""A chunk's content: uncompressed size, length of the compression's name, stored size where that is empty."""
-_NAME_LIMIT = 60
 _SAMPLES = 20
 _SAMPLES_LIMIT_BYTES = 64 * 1024 * 1024
 
@@ -63,15 +69,15 @@ class Salvage:
         self.lost_bytes += size_bytes
         self.losses.append(sentence)
 
-    def messages(self) -> Iterator[tuple[int, Message]]:
-        """(byte of the file, message) in file order; of channels that nobody declared, too."""
+    def messages(self) -> Iterator[Message]:
+        """Yield every message in file order; of channels that nobody declared, too."""
         for place, length in self.chunks:
             records = parse_chunk(os.pread(self.descriptor, length, place))[1]
-            for offset, opcode, start, end in split(records):
+            for _, opcode, start, end in split(records):
                 if opcode == Opcode.MESSAGE:
                     channel, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(records, start)
                     data = records[start + MESSAGE_HEAD.size : end]
-                    yield place + offset, Message(channel, log_time, data, publish_time, sequence)
+                    yield Message(channel, log_time, data, publish_time, sequence)
 
 
 def salvage(descriptor: int, identify: Identify) -> Salvage:
@@ -90,7 +96,7 @@ def _identify_channels(found: Salvage, identify: Identify) -> None:
     samples: dict[int, list[bytes]] = {}
     sizes: dict[int, int] = {}
     sampled_bytes = 0
-    for _, message in found.messages():
+    for message in found.messages():
         number = message.channel_id
         if number not in contents.channels:
             kept = samples.setdefault(number, [])
@@ -165,33 +171,14 @@ class _Walk:
 
     def _next_good(self, position: int) -> int:
         """The next place where a whole chunk, attachment or metadata record starts, or the file's end."""
-        for candidate in self._candidates(position):
-            with suppress(BadRecordError):
-                _proven(*self._content(candidate))
-                return candidate
-        return self._size
-
-    def _candidates(self, position: int) -> Iterator[int]:
         for start in range(position, self._size, _BLOCK_BYTES):
-            block = self._read(start, _BLOCK_BYTES + RECORD_HEAD.size - 1)
-            at = -1
+            block, at = self._read(start, _BLOCK_BYTES + _PATTERN_BYTES - 1), -1
             while (match := _LIKE_A_RECORD.search(block, at + 1)) is not None:
                 at = match.start()
-                if self._plausible(start + at):
-                    yield start + at
-
-    def _plausible(self, position: int) -> bool:
-        """Tell whether the first bytes fit the kind: dark images are full of what looks like records."""
-        head = self._read(position, RECORD_HEAD.size + _CHUNK_HEAD.size)
-        if len(head) < RECORD_HEAD.size + _CHUNK_HEAD.size:
-            return False
-        opcode, length = RECORD_HEAD.unpack_from(head)
-        if opcode == Opcode.CHUNK:
-            size, name_length, stored = _CHUNK_HEAD.unpack_from(head, RECORD_HEAD.size)
-            packed = name_length in (len("lz4"), len("zstd")) and size <= RECORD_LIMIT_BYTES
-            return bool(packed or size == stored == length - _CHUNK_HEAD.size)
-        name_at = RECORD_HEAD.size + (16 if opcode == Opcode.ATTACHMENT else 0)
-        return bool(0 < struct.unpack_from("<I", head, name_at)[0] <= _NAME_LIMIT)
+                with suppress(BadRecordError):
+                    _proven(*self._content(start + at))
+                    return start + at
+        return self._size
 
     def _declarations_from_summary(self) -> None:
         """A finished file repeats its channels at the end: they help when the chunk that had them is lost."""

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
+from itertools import islice
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -25,6 +26,9 @@ if TYPE_CHECKING:  # `load_plain` does without, and so do programs that only use
 
 LIMIT_BYTES = 256 * 1024
 _NEST_LIMIT = 20
+_NODE_LIMIT, _PLAIN_EVENT_LIMIT = 30_000, 150_000
+"""A second's work, or less; a plan of 200 poses has 8000 nodes."""
+_PROBLEMS_TOLD = 100
 T = TypeVar("T")
 
 
@@ -59,7 +63,7 @@ def _loader() -> Any:
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
         yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
-        depth = 0
+        depth = nodes = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             mark = self.peek_event().start_mark
@@ -71,6 +75,9 @@ def _loader() -> Any:
                 raise yaml.MarkedYAMLError(problem="tags (!) are refused", problem_mark=mark)
             _refuse_orders(self.peek_event())
             self.depth += 1
+            self.nodes += 1
+            if self.nodes > _NODE_LIMIT:
+                raise yaml.MarkedYAMLError(problem=f"more than {_NODE_LIMIT} values", problem_mark=mark)
             if self.depth > _NEST_LIMIT:
                 raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=mark)
             node = super().compose_node(parent, index)
@@ -101,7 +108,10 @@ def load_plain(content: bytes) -> Any:
     """
     depth = 0
     try:
-        for event in yaml.parse(content, yaml.CSafeLoader):
+        for count, event in enumerate(yaml.parse(content, yaml.CSafeLoader)):
+            if count > _PLAIN_EVENT_LIMIT:
+                text = f"more than {_PLAIN_EVENT_LIMIT} values"
+                raise yaml.MarkedYAMLError(problem=text, problem_mark=event.start_mark)
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > _NEST_LIMIT:
                 raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=event.start_mark)
@@ -184,7 +194,11 @@ def load(content: bytes, kind: type[T], under: str = "") -> T:
     try:
         loader = _loader()(content)
         node, where = _below(loader.get_single_node(), under)
-        problems = list(_problems(node, kind, where)) if node else [YamlProblem(0, "", "the file is empty")]
+        problems = (
+            list(islice(_problems(node, kind, where), _PROBLEMS_TOLD))
+            if node
+            else [YamlProblem(0, "", "the file is empty")]
+        )
         if wrong := [problem for problem in problems if not problem.harmless]:
             raise StrictYamlError(wrong)
         plain = loader.construct_document(node)

@@ -21,6 +21,7 @@ from calibrate.files.versions import installed_versions, read_log
 from calibrate.quality.checks import read_checks
 from recordings.cli import main as recordings
 from recordings.errors import CodedError
+from recordings.importers.bags import open_bag
 from station.cell.acceptance import read_acceptance
 from station.cell.session_folder import interrupted_session, list_sessions
 from station.cli import main as station
@@ -64,6 +65,11 @@ def _command(main: Callable[[], None], *arguments: str | Path) -> Callable[[Path
 
 def _nothing(found: object) -> None:
     assert not found
+
+
+def _bag(folder: Path) -> None:
+    (folder / "bag.db3").touch()
+    open_bag(folder).close()
 
 
 def _of_session(root: Path) -> None:
@@ -124,6 +130,7 @@ PLACES: dict[str, Place] = {
     ),
     "bag": ("bag.mcap", _command(recordings, "import", "FILE", "-o", "NEW.mcap")),
     "bag of ROS 2": ("bag.db3", _command(recordings, "import", "FILE", "-o", "NEW.mcap")),
+    "metadata of a bag": ("metadata.yaml", lambda path: _bag(path.parent)),
     "dataset.yaml": ("dataset.yaml", _command(recordings, "import", "ROOT", "-o", "NEW.mcap")),
 }
 
@@ -174,3 +181,25 @@ def test_nothing_in_place_of_a_file_is_waited_for(
                 "log of checks",
                 "validity",
             )  # the commands name the file, too
+
+
+ENDLESS: dict[str, bytes] = {
+    "a million poses": b"poses:\n" + b"- {name: a}\n" * 1_000_000,
+    "numbers": b"poses: [" + b"1," * 130_000 + b"1]",
+    "empty": b"poses: [" + b"{}," * 87_000 + b"{}]",
+    "keys": b"".join(b"k%d: 1\n" % number for number in range(25_000)),
+    "calibration": b"format: handeye-calibration/1\nviews: [" + b"1," * 2_000_000 + b"1]",
+}
+
+
+@pytest.mark.parametrize("content", ENDLESS)
+@pytest.mark.parametrize("place", ["plan", "list of poses", "configuration, doctor", "calibration", "board"])
+def test_no_text_is_read_for_long(
+    place: str, content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the daemon's process the arm's heartbeat would wait for it."""
+    monkeypatch.chdir(tmp_path)
+    name, read = PLACES[place]
+    (tmp_path / name).write_bytes(ENDLESS[content])
+    with at_once():
+        read(tmp_path / name)

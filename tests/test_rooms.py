@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import shutil
 import subprocess
@@ -95,3 +96,43 @@ def test_imports_make_no_circle_and_no_long_chain() -> None:
         chains[module] = [module, *max((chains[other] for other in imported[module]), key=len, default=[])]
     longest = max(chains.values(), key=len)
     assert len(longest) <= LONGEST_CHAIN, " > ".join(longest)
+
+
+READ_DIRECTLY = {
+    "recordings/files.py",  # the one function
+    "recordings/cli/lazy.py",  # our own source
+    "station/protocol/stop_client.py",  # the page, by a program that loads little
+    # the kernel's files
+    "station/cell/process.py", "station/server/approval.py", "station/devices/discovery.py",
+    "station/devices/aravis_device.py",
+    "station/cli/control.py", "station/simulation/controller/kinematics.py",  # files of the package
+    "station/simulation/controller/__main__.py",  # stands alone
+    "station/simulation/launch_cell.py",  # what it has just written
+}  # fmt: skip
+_READERS = {"read_text", "read_bytes", "imread", "memmap", "loadtxt", "genfromtxt", "fromfile"}
+
+
+def test_files_of_people_are_opened_by_one_function() -> None:
+    """`recordings.files.open_regular` opens at once, or not at all; anything else may wait for ever."""
+    found = set()
+    for room in ("recordings", "calibrate", "station"):
+        for path in (ROOT / room).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_bytes())):
+                if not isinstance(node, ast.Call):
+                    continue
+                match node.func:
+                    case ast.Name("open") | ast.Attribute(ast.Name("np"), "load"):
+                        found.add(path)
+                    case ast.Attribute(_, name) if name in _READERS:
+                        found.add(path)
+                    case ast.Attribute(_, "open") if _is_mode(node.args[:1]):
+                        found.add(path)
+    assert {path.relative_to(ROOT).as_posix() for path in found} <= READ_DIRECTLY
+
+
+def _is_mode(arguments: list[ast.expr]) -> bool:
+    """`Path.open` for reading or appending; writers make a new file first."""
+    match arguments:
+        case [ast.Constant(str(mode))]:
+            return set(mode) <= set("rab+t")
+    return False

@@ -177,6 +177,10 @@ class _RosBag:
         from rosbags.highlevel import AnyReader
 
         self._path = paths[0]
+        for path in paths:  # the library opens a pipe and waits
+            for file in filter(Path.exists, path.iterdir() if path.is_dir() else [path]):
+                if not file.is_dir():
+                    os.close(open_file(file))
         try:
             self._reader: Any = AnyReader(paths, default_typestore=types)
             self._reader.open()

@@ -31,6 +31,14 @@ COMMANDS = {
             "calibrate export --to ros-launch-follow -o camera.launch.py  # follows what is installed",
             "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
         ),
+        gone={
+            "json": "Use `calibrate show --json`.",
+            "ros-static-transform": "Use ros-launch, which sends it.",
+            **dict.fromkeys(("xacro", "mjcf"), "Use urdf."),
+            **dict.fromkeys(
+                ("kalibr", "nerfstudio", "matlab"), "Use opencv: it holds transform and intrinsics."
+            ),
+        },
     ),
     "install": LazyCommand(
         f"{_FILES}:install",

@@ -144,8 +144,6 @@ def export(
     if validity is not None and validity.state is not ValidityState.VALID:
         err.print(f"Warning: the calibration is {validity_text(validity)}", style="yellow")
     if output is None:
-        if b"\0" in content:
-            raise UsageError(f"{to.value} is no text.", remedy="Name a file with -o.")
         typer.echo(content.decode(), nl=False)
         return
     check_target(output, "export")

@@ -11,7 +11,6 @@ from __future__ import annotations
 import ast
 import json
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -52,39 +51,6 @@ def urdf(path, points, parent):
     return {"camera": into_camera(points, found[:3, :3], found[:3, 3])}
 
 
-def xacro(path, points, parent):
-    import xacro
-
-    cell = path.with_name("cell.xacro")
-    cell.write_text(
-        f'<robot name="cell" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="{parent}"/>'
-        f'<xacro:include filename="{path}"/><xacro:calibrated_camera/></robot>'
-    )
-    made = path.with_name("cell.urdf")
-    made.write_text(xacro.process_file(str(cell)).toxml())
-    return urdf(made, points, parent)
-
-
-def mjcf(path, points, parent):
-    """Through the frustum that MuJoCo's renderer takes; the middle of the first pixel is (0.5, 0.5) there."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    assert model.body(model.camera("camera_optical_frame").bodyid[0]).name == parent
-    placed, scene = mujoco.MjvCamera(), mujoco.MjvScene(model, 10)
-    placed.type, placed.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
-    every = mujoco.mjtCatBit.mjCAT_ALL
-    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, placed, every, scene)
-    seen, size = scene.camera[0], model.cam_resolution[0]
-    right, up, ahead = (into_camera(points, data.cam_xmat[0].reshape(3, 3), data.cam_xpos[0]) * [1, 1, -1]).T
-    left, wide = seen.frustum_center - seen.frustum_width, 2 * seen.frustum_width
-    x = (right / ahead * seen.frustum_near - left) / wide
-    y = (seen.frustum_top - up / ahead * seen.frustum_near) / (seen.frustum_top - seen.frustum_bottom)
-    return {"pixels": np.column_stack([x, y]) * size - 0.5}
-
-
 def opencv(path, points, parent):
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     frame = {"tool0": "flange"}.get(parent, parent)
@@ -111,10 +77,6 @@ def static_transform(words, points, parent):
     assert (said["frame-id"], said["child-frame-id"]) == (parent, "camera_optical_frame")
     R = Rotation.from_quat([float(said[f"q{axis}"]) for axis in "xyzw"]).as_matrix()
     return {"camera": into_camera(points, R, [float(said[axis]) for axis in "xyz"])}
-
-
-def ros_static_transform(path, points, parent):
-    return static_transform(shlex.split(path.read_text().splitlines()[-1])[4:], points, parent)
 
 
 def ros_launch(path, points, parent):
@@ -146,53 +108,6 @@ def zivid(path, points, parent):
     return {"camera": into_camera(points, matrix[:3, :3], matrix[:3, 3] / 1000)}
 
 
-def kalibr(path, points, parent):
-    camera = yaml.safe_load(path.read_text())["cam0"]
-    assert (camera["camera_model"], camera["distortion_model"]) == ("pinhole", "radtan")
-    fu, fv, pu, pv = camera["intrinsics"]
-    T = np.array(camera["T_cam_" + {"tool0": "flange"}.get(parent, parent)])
-    K = [[fu, 0, pu], [0, fv, pv], [0, 0, 1]]
-    return {"pixels": shown(points @ T[:3, :3].T + T[:3, 3], K, camera["distortion_coeffs"])}
-
-
-def nerfstudio(path, points, parent):
-    from nerfbaselines import cameras
-    from nerfbaselines.datasets import nerfstudio
-
-    folder = path.parent / "nerfstudio"
-    folder.mkdir(exist_ok=True)
-    (folder / "transforms.json").write_bytes(path.read_bytes())
-    read = nerfstudio.load_nerfstudio_dataset(folder, "train", downscale_factor=1)["cameras"]
-    # It states the middle of the first pixel as (0.5, 0.5), and computes with the precision of the points.
-    exact = read.replace(
-        **{
-            name: getattr(read, name).astype(float)
-            for name in ("poses", "intrinsics", "distortion_parameters")
-        }
-    )
-    return {"pixels": np.array([cameras.project(exact, p[None])[0] for p in points]) - 0.5}
-
-
-def matlab(path, points, parent):
-    """rigidtform3d premultiplies; the middle of the first pixel is (1, 1)."""
-    import mat4py
-
-    read = mat4py.loadmat(str(path))["calibration"]
-    assert (read["parent_frame"], read["child_frame"]) == (parent, "camera_optical_frame")
-    A = np.array(read["A"])
-    (fx, fy), (cx, cy) = read["FocalLength"], np.array(read["PrincipalPoint"]) - 1
-    (k1, k2, k3), (p1, p2) = read["RadialDistortion"], read["TangentialDistortion"]
-    camera = into_camera(points, A[:3, :3], A[:3, 3])
-    return {"pixels": shown(camera, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], [k1, k2, p1, p2, k3])}
-
-
-def plain_json(path, points, parent):
-    read = json.loads(path.read_text())
-    X = np.array(read["result"]["matrix"])
-    camera = into_camera(points, X[:3, :3], X[:3, 3])
-    return {"pixels": shown(camera, read["intrinsics"]["matrix"], read["intrinsics"]["distortion"])}
-
-
 def ur_tool(path, points, parent):
     """URScript: p[x, y, z, rx, ry, rz], metres and a rotation vector."""
     pose = np.array(re.search(r"p\[([^\]]+)\]", path.read_text())[1].split(","), float)
@@ -201,19 +116,12 @@ def ur_tool(path, points, parent):
 
 READERS = {
     "ros-camera-info": ros_camera_info,
-    "ros-static-transform": ros_static_transform,
     "ros-launch": ros_launch,
     "easy-handeye2": easy_handeye2,
     "urdf": urdf,
-    "xacro": xacro,
-    "mjcf": mjcf,
     "opencv": opencv,
     "halcon": halcon,
     "zivid": zivid,
-    "kalibr": kalibr,
-    "nerfstudio": nerfstudio,
-    "matlab": matlab,
-    "json": plain_json,
     "ur-tool": ur_tool,
 }
 

@@ -18,31 +18,22 @@ from calibrate.files.validity import require_usable
 class Format(NamedTuple):
     suffix: str
     says: str
-    make: Callable[[Calibration, FrameNames], str | bytes]
+    make: Callable[[Calibration, FrameNames], str]
     of_table: bool = False
     """It may hold the camera pose that belongs to the arm's corrected table."""
 
 
 FORMATS: dict[str, Format] = {
     "ros-camera-info": Format(".yaml", "ROS camera_info YAML: the intrinsics", ros.ros_camera_info),
-    "ros-static-transform": Format(
-        ".sh", "command line of ROS 2 static_transform_publisher", ros.ros_static_transform, True
-    ),
     "ros-launch": Format(".launch.py", "ROS 2 launch file with the static transform", ros.ros_launch, True),
     "ros-launch-follow": Format(
         ".launch.py", "ROS 2 launch file that follows what is installed", ros.ros_launch_follow
     ),
     "easy-handeye2": Format(".calib", "easy_handeye2 calibration", ros.easy_handeye2, True),
     "urdf": Format(".urdf", "URDF: camera body and optical frame", models.urdf, True),
-    "xacro": Format(".xacro", "the same as a macro for a robot's xacro", models.xacro, True),
-    "mjcf": Format(".xml", "MuJoCo model with the camera", models.mjcf),
     "opencv": Format(".yml", "OpenCV FileStorage: transform and intrinsics", vision.opencv),
     "halcon": Format(".dat", "HALCON pose: tool_in_cam_pose or base_in_cam_pose", vision.halcon),
     "zivid": Format(".yaml", "Zivid Matrix4x4: the transform, mm", vision.zivid),
-    "kalibr": Format(".yaml", "Kalibr camchain: intrinsics and transform", vision.kalibr),
-    "nerfstudio": Format(".json", "nerfstudio transforms.json", vision.nerfstudio),
-    "matlab": Format(".mat", "MATLAB: rigidtform3d and cameraIntrinsics", vision.matlab),
-    "json": Format(".json", "everything, as JSON", vision.plain_json),
     "ur-tool": Format(".txt", "camera as tool (TCP) or feature on the UR pendant", vision.ur_tool),
     "ur-kinematics": Format(".yaml", "the corrected arm for ROS 2's ur_description", models.ur_kinematics),
     "arm-urdf": Format(".urdf", "URDF of the corrected arm and its camera", models.arm_urdf),
@@ -65,8 +56,7 @@ def export(calibration: Calibration, name: str, frames: FrameNames | None = None
         require_usable(frames.validity, "The installed calibration", anyway)
     if frames.with_table:
         calibration = _of_table(calibration, name)
-    made = FORMATS[name].make(calibration, frames)
-    return made.encode() if isinstance(made, str) else made
+    return FORMATS[name].make(calibration, frames).encode()
 
 
 def _of_table(calibration: Calibration, name: str) -> Calibration:

@@ -19,8 +19,6 @@ from recordings.files import MAIN_CAMERA, state_root
 
 BODY_FROM_OPTICAL: Array = pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """REP-103: a body frame looks along x with z up, an optical frame along z with y down."""
-OPTICAL_FROM_OPENGL: Array = np.diag([1.0, -1.0, -1.0, 1.0])
-"""A camera of OpenGL looks along -z with y up."""
 
 
 class ExportError(CalibrationError):
@@ -59,7 +57,7 @@ class FrameNames:
 
     @property
     def node(self) -> str:
-        """The camera's name as ROS and xacro allow it: letters, digits and underscores."""
+        """The camera's name as ROS allows it: letters, digits and underscores."""
         name = re.sub(r"\W", "_", self.body.removesuffix("_link"), flags=re.ASCII)
         return name if name[:1].isalpha() else f"camera{name}"
 

@@ -1,4 +1,4 @@
-"""Exports that place the camera in a model of the robot: URDF, xacro, MuJoCo, and the corrected arm."""
+"""Exports that place the camera in a model of the robot: URDF, and the corrected arm."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ from numpy.typing import ArrayLike
 from calibrate.files.calibration import Calibration, CorrectedArm, DhTable
 from calibrate.files.exports.frames import (
     BODY_FROM_OPTICAL,
-    OPTICAL_FROM_OPENGL,
     ExportError,
     FrameNames,
     comment,
     roll_pitch_yaw,
 )
 from calibrate.files.proof import content_sha256
-from calibrate.geometry import Array, Transform, inverse, pose, rotation_exp
+from calibrate.geometry import Array, inverse, pose, rotation_exp
 from calibrate.kinematics import MODELS, RobotModel, link_frames
-from calibrate.projection import camera_matrix
 
 
 def urdf(calibration: Calibration, frames: FrameNames) -> str:
@@ -37,49 +35,9 @@ def urdf(calibration: Calibration, frames: FrameNames) -> str:
     )
 
 
-def xacro(calibration: Calibration, frames: FrameNames) -> str:
-    """A macro for a robot's own xacro: body and optical frame below the link `parent`."""
-    parent = frames.parent(calibration)
-    plain = FrameNames(camera=_verbatim(frames.camera), body=_verbatim(frames.body))
-    return (
-        f'{_commented(comment(calibration, frames))}<robot xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
-        f'<xacro:macro name="calibrated_{frames.node}" params={quoteattr(f"parent:={_verbatim(parent)}")}>\n'
-        f"{_camera(calibration.transform.matrix, '${parent}', plain)}</xacro:macro>\n</robot>\n"
-    )
-
-
-def mjcf(calibration: Calibration, frames: FrameNames) -> str:
-    """A whole MuJoCo model (3.6 and newer): a body where the robot's frame is, and the camera in it.
-
-    MuJoCo measures the principal point from the image's middle, away from the axis, and draws no distortion.
-    """
-    camera, matrix = calibration.intrinsics.model, calibration.transform.matrix @ OPTICAL_FROM_OPENGL
-    K, size = camera_matrix(camera), np.array([camera.width, camera.height])
-    x, y, z, w = Transform("", "", matrix).quaternion_xyzw
-    values: dict[str, ArrayLike] = {
-        "pos": matrix[:3, 3],
-        "quat": (w, x, y, z),
-        "focalpixel": (K[0, 0], K[1, 1]),
-        "principalpixel": size / 2 - (K[:2, 2] + 0.5),
-        "sensorsize": 1e-6 * size,  # any size: the focal length is in pixels
-    }
-    said = " ".join(f'{name}="{_numbers(value)}"' for name, value in values.items())
-    return (
-        f"{_commented(comment(calibration, frames))}<mujoco model={quoteattr(frames.node)}>\n<worldbody>\n"
-        f"<body name={quoteattr(frames.parent(calibration))}>\n"
-        f'<camera name={quoteattr(frames.camera)} resolution="{camera.width} {camera.height}" {said}/>\n'
-        "</body>\n</worldbody>\n</mujoco>\n"
-    )
-
-
 def _commented(note: str) -> str:
     safe = re.sub("-(?=-)", "- ", note)  # no -- inside a comment of XML
     return f"<!-- {safe} -->\n"
-
-
-def _verbatim(name: str) -> str:
-    """A name that xacro does not evaluate."""
-    return re.sub(r"\$(?=[{(])", "$$", name)
 
 
 def _camera(parent_from_optical: Array, parent: str, frames: FrameNames) -> str:

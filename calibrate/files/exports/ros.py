@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-
 import numpy as np
 
 from calibrate.files.calibration import Calibration
@@ -63,11 +61,6 @@ def _publisher_arguments(calibration: Calibration, frames: FrameNames) -> list[s
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     found = [part for name, value in zip(names, values, strict=True) for part in (name, repr(float(value)))]
     return [*found, "--frame-id", frames.parent(calibration), "--child-frame-id", frames.camera]
-
-
-def ros_static_transform(calibration: Calibration, frames: FrameNames) -> str:
-    arguments = shlex.join(_publisher_arguments(calibration, frames))
-    return f"# {comment(calibration, frames)}\nros2 run tf2_ros static_transform_publisher {arguments}\n"
 
 
 def ros_launch(calibration: Calibration, frames: FrameNames) -> str:

@@ -206,12 +206,12 @@ def test_what_an_arm_or_a_solve_was_needed_for_is_never_written_over(
     refused(same, 2, "target-exists", "new.yaml")
     for name in ("s.mcap", "c.yaml"):
         refused(
-            run("export", calibration, "--to", "json", "-o", name, cwd=tmp_path), 2, "target-exists", name
+            run("export", calibration, "--to", "opencv", "-o", name, cwd=tmp_path), 2, "target-exists", name
         )
     for _ in range(2):
-        assert run("export", calibration, "--to", "json", "-o", "c.json", cwd=tmp_path).returncode == 0
+        assert run("export", calibration, "--to", "opencv", "-o", "c.yml", cwd=tmp_path).returncode == 0
     os.mkfifo(tmp_path / "pipe")
-    for command in (("report", recording), ("export", calibration, "--to", "json"), ("solve", recording)):
+    for command in (("report", recording), ("export", calibration, "--to", "opencv"), ("solve", recording)):
         refused(run(*command, "-o", "pipe", cwd=tmp_path), 2, "output", "pipe")
     assert recording.read_bytes() == session_file.read_bytes()
     assert calibration.read_bytes() == real_file.read_bytes()

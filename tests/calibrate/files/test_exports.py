@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import re
-import shlex
 import sys
 import types
 import xml.etree.ElementTree as ElementTree
@@ -18,7 +16,6 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-import scipy.io
 import yaml
 from scipy.spatial.transform import Rotation
 
@@ -49,8 +46,8 @@ FOLLOWED = FrameNames(follow=("calibrate", "follow"))
 
 
 def export(calibration: Calibration, name: str, frames: FrameNames = FOLLOWED) -> str:
-    """The content as text; of a binary format its characters."""
-    return exports.export(calibration, name, frames).decode("utf-8" if name != "matlab" else "latin-1")
+    """The content as text."""
+    return exports.export(calibration, name, frames).decode()
 
 
 @pytest.fixture(params=["eye-in-hand", "eye-to-hand"])
@@ -201,15 +198,6 @@ def static_transform(arguments: list[str]) -> tuple[str, str, Array]:
     return got.frame_id, got.child_frame_id, pose(R, [got.x, got.y, got.z])
 
 
-def test_static_transform_publisher(calibration: Calibration) -> None:
-    line = export(calibration, "ros-static-transform").splitlines()[-1]
-    words = shlex.split(line)
-    assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
-    parent, child, X = static_transform(words[4:])
-    assert (parent, child) == (parent_of(calibration), "camera_optical_frame")
-    same(X, calibration)
-
-
 def launched(text: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """The one node that a launch file makes, as `ros2 launch` would be told of it."""
     made: list[dict[str, Any]] = []
@@ -243,13 +231,11 @@ def test_launch_file_runs_and_publishes_the_same(
 def test_frame_names_of_any_kind_stay_names(
     calibration: Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In Python and in a shell; a node's name may hold letters, digits and underscores only."""
+    """In Python; a node's name may hold letters, digits and underscores only."""
     odd = FrameNames(camera='cell 1/cam\'s "eye"')
     node = launched(export(calibration, "ros-launch", odd), monkeypatch)
     assert static_transform(node["arguments"])[1] == odd.camera
     assert re.fullmatch(r"[A-Za-z]\w*", node["name"], re.ASCII)
-    line = export(calibration, "ros-static-transform", odd).splitlines()[-1]
-    assert static_transform(shlex.split(line)[4:])[1] == odd.camera
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -364,36 +350,6 @@ def test_camera_info_of_other_lenses(
     assert found["data"] == [*lens.distortion, *[0.0] * (count - given)]
 
 
-@pytest.mark.parametrize(
-    ("model", "given", "refused"),
-    [
-        ("plumb_bob", (-0.09, 0.07, 4e-4, -3e-4, 0.1), set()),
-        ("plumb_bob", (-0.3, 2.0, 0.0, 0.0, -40.0), {"kalibr"}),  # k3 bends too much for k1 and k2
-        ("rational_polynomial", (-0.09, 0.07, 4e-4, -3e-4, 0.1, 0.01, 0.0, 0.0), {"nerfstudio"}),
-        ("equidistant", (0.01, -0.02, 0.003, -0.001), set()),
-    ],
-)
-def test_a_lens_that_a_format_cannot_say_is_refused_there(
-    calibration: Calibration, model: str, given: tuple[float, ...], refused: set[str]
-) -> None:
-    lens = msgspec.structs.replace(calibration.intrinsics, distortion_model=model, distortion=given)
-    bent = msgspec.structs.replace(calibration, intrinsics=lens)
-    for name in ("kalibr", "nerfstudio", "matlab"):
-        if name in refused:
-            with pytest.raises(ExportError) as caught:
-                export(bent, name)
-            assert caught.value.code == "lens-model"
-        else:
-            export(bent, name)
-    if model == "equidistant":
-        read = yaml.safe_load(export(bent, "kalibr"))["cam0"]
-        assert (read["distortion_model"], read["distortion_coeffs"]) == ("equidistant", list(given))
-        told = json.loads(export(bent, "nerfstudio"))
-        assert [told[key] for key in ("camera_model", "k1", "k2", "k3", "k4")] == ["OPENCV_FISHEYE", *given]
-    held = scipy.io.loadmat(io.BytesIO(exports.export(bent, "matlab")))["calibration"].dtype.names
-    assert ("RadialDistortion" in held) == (model == "plumb_bob")
-
-
 def test_only_what_is_installed_can_be_followed(calibration: Calibration) -> None:
     with pytest.raises(ExportError) as caught:
         exports.export(calibration, "ros-launch-follow")
@@ -442,12 +398,6 @@ def test_opencv_file_storage(calibration: Calibration, tmp_path: Path) -> None:
     assert calibration.provenance.session in path.read_text()
 
 
-def test_json(calibration: Calibration) -> None:
-    plain = json.loads(export(calibration, "json"))
-    same(np.array(plain["result"]["matrix"]), calibration)
-    assert msgspec.convert(plain, Calibration) == calibration
-
-
 def test_ur_tool_by_the_pendants_rule(calibration: Calibration) -> None:
     """Typed: mm and a rotation vector. In URScript: metres."""
     text = export(calibration, "ur-tool")
@@ -470,11 +420,9 @@ def test_simulated_is_stamped_in_every_format(calibration: Calibration, name: st
 
 
 def test_other_frame_names_and_unknown_formats(calibration: Calibration) -> None:
-    text = export(
-        calibration, "ros-static-transform", FrameNames(base="cell_base", flange="flange_b", camera="cam")
-    )
+    text = export(calibration, "ros-launch", FrameNames(base="cell_base", flange="flange_b", camera="cam"))
     parent = "flange_b" if calibration.mount == "eye-in-hand" else "cell_base"
-    assert f"--frame-id {parent} --child-frame-id cam" in text
+    assert f"'{parent}'" in text and "'cam'" in text
     with pytest.raises(ExportError):
         export(calibration, "nix")
 

@@ -188,6 +188,8 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Path of the sealed recording, once there is one."""
     calibration: str = ""
     """Path of the calibration file that was made of it, once there is one."""
+    approved_again: int = 0
+    """How often a simulated cell approved the rest of the session by itself, after news that came late."""
     check: bool = False
     """A drift check: to be compared with what is installed, not to be solved."""
     source: Source = "real"

@@ -73,6 +73,8 @@ class DemoJson(msgspec.Struct, frozen=True):
     report: str
     holdout: HoldoutScore | None
     gates_passed: bool
+    approved_again: int
+    """How often the cell approved the rest by itself, after news that came late."""
     arm: DemoArmJson
 
 
@@ -139,6 +141,8 @@ def _show_demo(result: DemoJson, duration_s: float) -> None:
     verdict = "all gates passed" if result.gates_passed else ("a gate FAILED", "red")
     taken = f"{result.poses.captured} of {result.poses.planned} poses, "
     out.print(Text.assemble(taken, verdict, f", {duration_s:.0f} s in all"))
+    if again := result.approved_again:
+        out.print(f"approved again by itself {again} time{'s' * (again > 1)}: this computer was busy")
     for name in ("recording", "calibration", "report"):
         out.print(f"{name:<12} {getattr(result, name)}")
     for sentence in result.arm.sentences:
@@ -175,6 +179,7 @@ def _run(
         report=str(report),
         holdout=solved.holdout,
         gates_passed=all(gate.passed for gate in solved.gates),
+        approved_again=outcome.session.approved_again,
         arm=DemoArmJson(
             offered=arm is not None and arm.offered,
             with_table_mm=None if arm is None else arm.with_table_mm,

@@ -11,6 +11,7 @@ from typing import Protocol, TypeVar
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
 from station.cell.acceptance import StopWay
+from station.cell.errors import StaleStateError
 from station.devices.frames import CameraCounts, FrameTiming, TriggerPulse
 
 T = TypeVar("T")
@@ -65,6 +66,12 @@ class ArmNews(Protocol):
     def news(self) -> RobotState | None:
         """Newest state; None while it is late, but may still come. StaleStateError after 0.25 s in motion,
         1 s at rest."""
+
+    def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
+        """What made news late since then (host monotonic), by `devices.news`; None: nothing did.
+
+        `pause_s`: how long this computer was busy.
+        """
 
     def check(self) -> RobotState | None:
         """`news`; raises RobotError for what speaks against capturing now: safety stop, TCP changed."""

@@ -21,6 +21,8 @@ CURRENT_S = 0.1
 """News that are not older tell where the arm is now."""
 MOVING_S = 0.25
 RESTING_S = 1.0
+TOLD_S = 0.3
+"""News of a resting arm that were later than this are told of, with what made them late."""
 SILENCE_S = 0.15
 """A silence that can have tripped the control program's watchdog (1/5 s, and ticks)."""
 
@@ -61,27 +63,27 @@ class Evidence(NamedTuple):
             return Delay.CONTROLLER
         return Delay.NETWORK
 
-    def error(self) -> StaleStateError | None:
+    def error(self, effect: str = ": the arm was stopped") -> StaleStateError | None:
         """What a person is told; None without a delay."""
         pause_ms, gap_ms = 1000 * self.pause_s, 1000 * self.gap_s
         match self.delay:
             case Delay.COMPUTER:
                 return StaleStateError(
-                    f"this computer was busy for {pause_ms:.0f} ms: the arm was stopped",
+                    f"this computer was busy for {pause_ms:.0f} ms{effect}",
                     code=Delay.COMPUTER,
                     remedy=f"End other programs on it, {APPROVE_AGAIN}.",
                     late_ms=pause_ms,
                 )
             case Delay.CONTROLLER:
                 return StaleStateError(
-                    f"the robot's controller sent nothing for {gap_ms:.0f} ms: the arm was stopped",
+                    f"the robot's controller sent nothing for {gap_ms:.0f} ms{effect}",
                     code=Delay.CONTROLLER,
                     remedy=f"Look at the pendant, {APPROVE_AGAIN}.",
                     late_ms=gap_ms,
                 )
             case Delay.NETWORK:
                 return StaleStateError(
-                    f"the network carried nothing from the robot for {gap_ms:.0f} ms: the arm was stopped",
+                    f"the network carried nothing from the robot for {gap_ms:.0f} ms{effect}",
                     code=Delay.NETWORK,
                     remedy=f"Check cable, switch and what else uses this network, {APPROVE_AGAIN}.",
                     late_ms=gap_ms,

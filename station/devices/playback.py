@@ -196,6 +196,9 @@ class PlaybackRobot:
     def clock(self) -> ClockFit | None:
         return _HOST_CLOCK
 
+    def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
+        return None
+
     def news(self) -> RobotState | None:
         return self.latest()
 

@@ -26,7 +26,6 @@ from station.devices.news import (
     RESTING_S,
     Evidence,
     is_loopback,
-    largest_gap,
     longest_silence_s,
 )
 from station.devices.rtde import RuntimeState
@@ -309,9 +308,7 @@ class UrRobot(UrLink):
         until_s = now_s if late else next((t for t in after_s if t > self._played_s), now_s)
         since_s = (self._played_s if late else until_s) - OUTLIVED_S[self.control_path]
         silence_s = 0.0 if late else longest_silence_s(child.kicks_s, since_s, until_s)
-        period_s = 1 / self.reader.rate_hz if self.reader is not None and self.reader.rate_hz else 0.0
-        gaps = largest_gap(states, since_s, until_s, period_s)
-        return Evidence(silence_s, *gaps, is_loopback(self.config.host))
+        return Evidence(silence_s, *self.largest_gap(since_s, until_s), is_loopback(self.config.host))
 
     async def _other_program(self, wait_s: float) -> str | None:
         """Name of another program that began to play since ours was last seen playing; '' if it has none.

@@ -18,7 +18,7 @@ from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.cell.process import waited_share
 from station.cell.scene import arm_model
-from station.devices.news import CURRENT_S, MOVING_S, RESTING_S
+from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_loopback, largest_gap
 from station.devices.ur_condition import safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_probe import (
@@ -264,6 +264,18 @@ class UrLink:
         if age_s > limit_s or (self.in_motion and not self.connected):
             raise self.stale(age_s, limit_s)
         return None
+
+    def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
+        """What made a resting arm's news late since then (host monotonic); None: nothing did."""
+        found = Evidence(pause_s, *self.largest_gap(since_s, time.monotonic()), is_loopback(self.config.host))
+        return found.error(effect="")
+
+    def largest_gap(self, since_s: float, until_s: float) -> tuple[float, float]:
+        """See `news.largest_gap`."""
+        reader = self.reader
+        if reader is None or not reader.rate_hz:
+            return 0.0, 0.0
+        return largest_gap(reader.history.copy(), since_s, until_s, 1 / reader.rate_hz)
 
     def stale(self, age_s: float, limit_s: float) -> StaleStateError:
         """Why the newest state is too old."""

@@ -157,6 +157,7 @@ class SessionContext:
             folder="",
             recording="",
             calibration="",
+            approved_again=0,
             check=check,
             elapsed_s=0.0,
             remaining_s=None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,11 +24,14 @@ from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError
 from station.devices.base import fresh
+from station.devices.news import Delay
+from station.protocol.verbs import Purpose
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import RunRequests, SessionContext
 from station.session.lease import MotionApproval, require_start
-from station.session.queue import BUSY
+from station.session.queue import BUSY, OfferedPoses
 from station.session.recording import to_the_end
+from station.session.summary import summarise
 from station.session.threads import DISK, MOTION
 
 log = logging.getLogger(__name__)
@@ -35,6 +39,8 @@ log = logging.getLogger(__name__)
 ARRIVED_RAD = 1e-4
 """Nearer to its target than this the arm need not move."""
 FAILURES_IN_A_ROW = 3
+APPROVED_AGAIN = 3
+"""So often a simulated cell goes on by itself under one approval of a person."""
 
 
 class Run:
@@ -46,17 +52,26 @@ class Run:
         """`geometry`: what a motion beside the plan was checked in; None: the cell, from where it stands."""
         self._context = context
         self._go = go
-        if geometry is None:
-            geometry = geometry_from(context.cell.config, go.start_joints_rad)
-            geometry = with_plan_speeds(geometry, context.require_queue().plan)
-        self._geometry = geometry
+        self._geometry = geometry or self._cell_geometry()
+        self._approved_again = 0
         self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
         """Poses where something still moved."""
         self._tried_again = False
 
+    def _cell_geometry(self) -> CellGeometry:
+        geometry = geometry_from(self._context.cell.config, self._go.start_joints_rad)
+        return with_plan_speeds(geometry, self._context.require_queue().plan)
+
     async def drive(self) -> None:
         """Drive from checking to paused, stopped, fault or idle; raises only when cancelled."""
+        while (late := await self._drive_once()) is not None:
+            if not await self._approve_again(late):
+                self._halt(StationState.FAULT, late)
+                return
+
+    async def _drive_once(self) -> StationError | None:
+        """What came late, where nothing real moves and the rest of the poses may be approved again."""
         try:
             if await self._begin():
                 await self._poses()
@@ -64,6 +79,8 @@ class Run:
             self._halt(StationState.STOPPED, error)  # the controller itself holds the arm
         except (RobotError, TriggerError) as error:
             await self._context.cell.robot.stop(str(error))
+            if self._may_go_on(error):
+                return error
             self._halt(StationState.FAULT, error)
         except RecordingError as error:
             await self._context.cell.robot.stop("the disk failed")
@@ -76,11 +93,46 @@ class Run:
             self._halt(StationState.FAULT, defect)
         finally:
             await self._context.cell.robot.end_control()
+        return None
+
+    def _may_go_on(self, error: StationError | RecordingError) -> bool:
+        """Only after lateness whose cause is known, in a cell whose simulator this program started, and not
+        where a person or the controller wants the arm to stand."""
+        late = error.code in set(Delay) and self._approved_again < APPROVED_AGAIN
+        return late and self._context.cell.simulated and self._go.beside is None and not self._halted
+
+    @property
+    def _halted(self) -> bool:
+        return self._context.requests.halt
+
+    async def _approve_again(self, late: StationError) -> bool:
+        """An approval of this simulated cell's own for the poses that are left; False: there can be none."""
+        context, queue = self._context, self._context.require_queue()
+        store, count = context.store, context.store.status.session.approved_again + 1
+        unmark_busy(context)
+        store.enter(StationState.CHECKING, late)
+        store.problem(late, "warning", store.status.session.current)
+        left = tuple(index for index in self._go.poses if index in queue.open)
+        if not left:
+            return False
+        try:
+            offered = OfferedPoses(Purpose.RESUME, queue, left, queue.sha256)
+            summary = await summarise(context, offered, ())
+        except StationError as trouble:
+            store.problem(trouble)
+            return False
+        self._approved_again += 1
+        said = f"approved by this simulated cell itself, {self._approved_again} of at most {APPROVED_AGAIN}"
+        self._go = replace(self._go, summary=summary, begins=None, poses=left, approval=said)
+        self._geometry = self._cell_geometry()
+        store.update_session(approved_again=count)
+        store.event("approved-again", self._go.said, "warning", None, count=count)
+        return True
 
     def _halt(self, state: StationState, error: StationError) -> None:
         """The run's own end for a reason; nothing when STOP or lost control already ended it."""
         context = self._context
-        if context.requests.halt:
+        if self._halted:
             return
         context.store.enter(state, error)
         context.store.problem(error, "error", context.store.status.session.current)
@@ -101,7 +153,9 @@ class Run:
         except SafetyStopError:
             raise
         except (StationError, RecordingError) as error:
-            if not context.requests.halt:
+            if self._may_go_on(error):
+                raise
+            if not self._halted:
                 context.store.enter(resting, error)
                 context.store.problem(error, "error", said="not started: {}")
             return False
@@ -273,6 +327,8 @@ async def _seal(context: SessionContext) -> None:
     # What matters first: a narrow screen cuts the end.
     poses = len(queue.statuses)
     text = f"finished with {queue.done} of {poses} poses: {path}"
+    if again := context.store.status.session.approved_again:
+        text += f" (approved again by itself {again} time{'s' * (again > 1)}: news came late)"
     context.store.event("finished", text, captured=queue.done, poses=poses, path=str(path))
     if context.store.state in (StationState.SEALING, StationState.PAUSED):
         context.store.enter(StationState.IDLE)

@@ -18,6 +18,7 @@ from recordings.schema.messages import Vector6
 from station.cell.errors import RobotError, StaleStateError
 from station.cell.status import StationState
 from station.cell.stillness import JOGGED_RAD
+from station.devices.news import CURRENT_S, TOLD_S, Delay
 from station.protocol.states import RUNNING
 from station.session.context import SessionContext, displacement
 from station.session.monitor import Monitor
@@ -47,6 +48,8 @@ class SessionSupervisor:
         """Which pause it is, of `store.entered`, and the joints at rest in it."""
         self._silent = False
         """The robot's news are later than its rest or motion allows."""
+        self._late_since_s = 0.0
+        """Since when they are late (host monotonic); 0: they are not."""
         self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
         """Delay of each round."""
 
@@ -91,6 +94,7 @@ class SessionSupervisor:
         store, robot = self._context.store, self._context.cell.robot
         try:
             if robot.news() is None:
+                self._late_since_s = self._late_since_s or time.monotonic()
                 return
         except StaleStateError as error:
             if not self._silent:
@@ -101,9 +105,21 @@ class SessionSupervisor:
                 store.problem(error, said="robot lost: {}")
             return
         self._silent = False
+        if self._late_since_s:
+            self._tell_delay(self._late_since_s)
+            self._late_since_s = 0.0
         if store.state is StationState.DISCONNECTED:
             store.enter(self._context.resting)
             store.event("robot-connected", "robot connected")
+
+    def _tell_delay(self, since_s: float) -> None:
+        """Names what made news late that were waited for; what stopped an arm was told then."""
+        store, now_s = self._context.store, time.monotonic()
+        late = self._context.cell.robot.delay(self.lag_ms() / 1000, since_s - TOLD_S)
+        began_ns = time.time_ns() - round(1e9 * (now_s - since_s))
+        told = any(event.code in set(Delay) and event.wall_ns > began_ns for event in store.status.events)
+        if late is not None and now_s - since_s > TOLD_S - CURRENT_S and not told:
+            store.problem(late)
 
     def _watch_rest(self) -> None:
         """Tells when somebody moves the arm while the session rests; any approval is void then."""

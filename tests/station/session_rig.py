@@ -32,6 +32,7 @@ from station.cell.status import DetectionStatus, Event, StationState
 from station.devices.base import Robot
 from station.devices.cell import Cell
 from station.devices.frames import CameraCounts, FrameTiming
+from station.devices.news import Evidence
 from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.scenes import cell_config, make_cell
@@ -59,6 +60,7 @@ class ArmInMemory:
         self.trouble: RobotError | None = None
         self.refuse_control: RobotError | None = None
         self.guided = False
+        self.gap_s = 0.0
         self.late = self.lost = False
         """Its news are late; they do not come any more."""
         self.beats = 0
@@ -111,6 +113,9 @@ class ArmInMemory:
 
     def clock(self) -> None:
         return None
+
+    def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
+        return Evidence(pause_s, self.gap_s, 0.0, loopback=True).error("")
 
     def news(self) -> RobotState | None:
         return None if self.late else self.latest()

@@ -9,7 +9,9 @@ _APPROVED = {"--go": "--approve"}
 STATION = LazyGroup(
     {
         "tui": LazyCommand(
-            "station.cli.daemon:tui_command", ("station tui", "station tui --replay session.mcap")
+            "station.cli.daemon:tui_command",
+            ("station tui",),
+            gone={"--replay": "Foxglove and `calibrate solve --report` show a recording."},
         ),
         "demo": LazyCommand(
             "station.cli.demo:demo_command",

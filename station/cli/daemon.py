@@ -13,9 +13,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from socket import AF_UNIX
 from socket import socket as connection
-from typing import Annotated
-
-import typer
 
 from recordings.files import LOG_LIMIT_BYTES, open_regular, read_file, state_root
 from station.cell.errors import StationError
@@ -129,10 +126,7 @@ def answers(socket: Path) -> bool:
     return True
 
 
-def tui_command(
-    socket: Socket = None,
-    replay: Annotated[Path | None, typer.Option(help="Play this recording on the live screen")] = None,
-) -> None:
+def tui_command(socket: Socket = None) -> None:
     """Open the operator screen; start a daemon if none runs.
 
     The daemon gets a simulated cell where there is no configuration. With --socket none is started: the
@@ -144,11 +138,8 @@ def tui_command(
             code="no-terminal",
             remedy="Without one use `station capture` or `station demo`.",
         )
-    from station.tui.app import run, run_replay
+    from station.tui.app import run
 
-    if replay is not None:
-        run_replay(replay)
-        return
     # A socket that is named belongs to somebody: on a cell's console a second daemon would be a wrong one.
     served = socket or ensure_daemon(default_socket())
     run(served)

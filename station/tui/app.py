@@ -37,9 +37,8 @@ from station.tui.desk import Connect, Desk, KnowingApp, ScreenLink, StatusChange
 from station.tui.dialogs import Confirm, ConfirmMotion, Help
 from station.tui.frame import SESSION
 from station.tui.installed import LOOK_S, Marks, Result, marks, read_past, read_result, state_root
-from station.tui.live import PLAYER_KEYS, WATCHABLE, LiveScreen, LogScreen, ReplayScreen
+from station.tui.live import LiveScreen, LogScreen
 from station.tui.plan import PlanScreen
-from station.tui.replay import ReplayLink
 from station.tui.result import InstallScreen, SolveScreen, VerifyScreen
 from station.tui.results import (
     check_drift,
@@ -188,9 +187,6 @@ class StationApp(KnowingApp):
         self.set_interval(ASK_S, self._look_for_terminal)
         self.set_interval(LOOK_S, self._look)
 
-    def playing(self) -> bool:
-        return any(isinstance(screen, ReplayScreen) for screen in self.screen_stack)
-
     # --- the person: an ssh that dies silently leaves this screen alive, and with it control of the arm ---
 
     def on_cursor_position(self, event: events.CursorPosition) -> None:
@@ -221,27 +217,11 @@ class StationApp(KnowingApp):
         """Only for a screen that shows them, and only as large as it can show."""
         while True:
             await asyncio.sleep(PREVIEW_PERIOD_S)
-            if (link := self.shown_link) is None:
+            if (link := self.desk.link) is None:
                 continue
             for preview in self.screen.query(PreviewPane):
                 with contextlib.suppress(OSError, StationError):
                     await preview.fetch(link)
-
-    @property
-    def shown_link(self) -> ScreenLink | None:
-        """What the screen shows: the daemon, or a recording."""
-        return self.screen.player if isinstance(self.screen, ReplayScreen) else self.desk.link
-
-    def action_play(self, what: str, by: float = 0.0) -> None:
-        """Steer the playback that is shown."""
-        if isinstance(player := self.shown_link, ReplayLink):
-            match what:
-                case "toggle":
-                    player.toggle()
-                case "step":
-                    player.step(int(by))
-                case "seek":
-                    player.seek(by)
 
     def on_status_changed(self, message: StatusChanged) -> None:
         before, status = self.known.live, message.status
@@ -345,15 +325,6 @@ class StationApp(KnowingApp):
                 await check_session(desk, session.recording, session.folder)
             case "recover":
                 await recover_session(desk, session.folder)
-            case "play":
-                live = self.known.live
-                if live is not None and live.state not in WATCHABLE:
-                    state = live.state.value
-                    self.notify(f"The cell is {state}: finish that first, then look at old recordings.")
-                    return
-                player = await desk.attempt(asyncio.to_thread(ReplayLink, Path(session.folder)))
-                if player is not None:
-                    await self.push_screen(ReplayScreen(player))
 
     async def _solve(self, recording: str, folder: str) -> None:
         if path := await solve_session(self.desk, recording, folder):
@@ -460,11 +431,7 @@ class StationApp(KnowingApp):
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_leave(self) -> None:
         state = None if self.known.live is None else self.known.live.state
-        if not self.known.shown.playback and state not in (
-            None,
-            StationState.IDLE,
-            StationState.DISCONNECTED,
-        ):
+        if state not in (None, StationState.IDLE, StationState.DISCONNECTED):
             held = state in RUNNING and self.desk.has_control()
             text = (
                 f"The arm works, commanded from here. {DECELERATES}"
@@ -507,12 +474,6 @@ class StationApp(KnowingApp):
                 )
 
 
-class ReplayApp(StationApp):
-    """The same screens over a recording alone: no station stands behind them."""
-
-    BINDINGS: ClassVar[list[BindingType]] = [*PLAYER_KEYS, *StationApp.BINDINGS]
-
-
 def run(socket: Path, who: str = "") -> None:
     """Opens the screen on the daemon that serves `socket` and returns when it is closed."""
 
@@ -522,16 +483,4 @@ def run(socket: Path, who: str = "") -> None:
     app = StationApp(connect)
     PreviewPane.graphics = detect()
     app.desk.stop_unconnected = partial(send_stop, socket)
-    app.run()
-
-
-def run_replay(recording: Path) -> None:
-    """The live screen over a recording; no daemon is asked. StationError when it cannot be read."""
-    link = ReplayLink(recording)
-
-    async def connect() -> ScreenLink:
-        return link
-
-    app = ReplayApp(connect)
-    PreviewPane.graphics = detect()
     app.run()

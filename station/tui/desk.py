@@ -44,7 +44,7 @@ REMEDIES = {
 
 
 class ScreenLink(motion.Link, Protocol):
-    """A connection: `station.protocol.client.Client`, a recording, or a test's own."""
+    """A connection: `station.protocol.client.Client`, or a test's own."""
 
     max_age_days: float | None
     """Oldest proof of a calibration by the cell's rule; None: none."""
@@ -67,10 +67,6 @@ class KnowingApp(ThemedApp[None]):
     """An app whose screens watch what is known."""
 
     known: reactive[Known] = reactive(Known(), repaint=False)
-
-    def playing(self) -> bool:
-        """A recording is shown in place of the cell."""
-        return False
 
 
 class Desk:
@@ -160,13 +156,7 @@ class Desk:
     # --- the screen → the daemon ---
 
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
-        """The verb's result. Raises StationError, also where nothing is sent: in a playback, while silent."""
-        if self.app.playing():
-            raise RefusedError(
-                "This is the PLAYBACK of a recording.",
-                code="playback",
-                remedy="Escape leaves it; F12 still stops the arm.",
-            )
+        """The verb's result. Raises StationError, also while the daemon is silent, when nothing is sent."""
         if self.link is None:
             raise StationError("No connection to the daemon: nothing was sent.", code="no-daemon")
         if self.known.silent_s is not None:

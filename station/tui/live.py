@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import ClassVar
 
 import numpy as np
 from rich.text import Text
-from textual import work
 from textual.app import ComposeResult
-from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.widgets import ProgressBar, RichLog, Static
@@ -20,7 +17,6 @@ from station.cell.scene import Scene
 from station.cell.status import Event, PoseStatus, SessionStatus, StationState, StationStatus
 from station.protocol.states import LATCHED, RUNNING
 from station.tui.frame import Line
-from station.tui.replay import ReplayLink
 from station.tui.screen import Box, Panel, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
@@ -168,8 +164,6 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     estimate, poses = status.estimate, status.session.poses
     goal = estimate.goal_mm
     now = estimate.sigma_translation_mm
-    if status.playback and estimate.advice:
-        return dim(estimate.advice)
     head = facts(("", f"± {now:.2f}" if now is not None else f"± {UNKNOWN}", "mm"))
     if goal:
         head += Content.assemble(("   goal ", "$dim"), (f"± {goal:.2f}", "$warn"))
@@ -404,63 +398,6 @@ class LiveScreen(StationScreen):
         self.query_one("#live").set_class(status.state in LATCHED, "-dimmed")
 
 
-WATCHABLE = (StationState.IDLE, StationState.DISCONNECTED)
-"""A cell at rest: nobody looks at an old recording while the arm works or waits for an answer."""
-JUMP_S = 10.0
-PLAYER_KEYS: list[BindingType] = [
-    Binding("space", "app.play('toggle')", "Play/Pause", tooltip="Stop the playback here, or go on"),
-    Binding("left", "app.play('step', -1)", "Image back", tooltip="To the image before this one"),
-    Binding("right", "app.play('step', 1)", "Image on", tooltip="To the next image"),
-    Binding("pageup", f"app.play('seek', {-JUMP_S})", "10 s back", show=False, tooltip="Ten seconds back"),
-    Binding("pagedown", f"app.play('seek', {JUMP_S})", "10 s on", show=False, tooltip="Ten seconds on"),
-    Binding("home", "app.play('seek', -1e9)", "Start", show=False, tooltip="To the start of the recording"),
-]
-"""For a playback beside a cell, and for an app over a recording alone."""
-
-
-class ReplayScreen(LiveScreen):
-    """Shows `link`'s statuses in place of the daemon's. STOP still goes to the daemon."""
-
-    NAME = "Playback"
-    HELP = (
-        "PLAYBACK of a recording. Nothing can be commanded; F12 still stops this cell's arm. Escape leaves."
-    )
-    BINDINGS: ClassVar[list[BindingType]] = [
-        *PLAYER_KEYS,
-        Binding("escape", "close", "Back", tooltip="Leave the playback"),
-    ]
-
-    def __init__(self, link: ReplayLink) -> None:
-        super().__init__()
-        self.player = link
-        self._played: StationStatus | None = None
-
-    def on_mount(self) -> None:
-        self.follow()
-
-    def show(self, known: Known) -> None:
-        """The cell's own status shows nothing here, but its work ends the playback."""
-        status = known.live
-        if status is not None and status.state not in WATCHABLE:
-            self.notify(f"The playback was closed: the cell is {status.state.value}.", severity="warning")
-            self.action_close()
-            return
-        super().show(Known(self._played))
-
-    @work(exclusive=True, exit_on_error=False)
-    async def follow(self) -> None:
-        async for status in self.player.statuses():
-            self._played = status
-            super().show(Known(status))
-
-    async def on_unmount(self) -> None:
-        await self.player.close()
-
-    def action_close(self) -> None:
-        if self.is_attached:
-            self.dismiss()
-
-
 class LogScreen(StationScreen):
     """All events, newest last, to scroll through."""
 
@@ -480,8 +417,6 @@ class LogScreen(StationScreen):
         events = () if status is None else status.events
         start = events.index(self._last) + 1 if self._last in events else 0
         log = self.query_one("#log", RichLog)
-        if status is not None and status.playback and start == 0:  # it went back
-            log.clear()
         for event in events[start:]:
             log.write(Text(event_text(event).plain, style=_RICH[event.level]))
             self._last = event

@@ -25,7 +25,7 @@ NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its pa
 COLUMNS = ("session", "what became of it", "verdict", "predicted", "held-out", "views")
 
 
-SessionWork = Literal["solve", "show", "play", "check", "recover"]
+SessionWork = Literal["solve", "show", "check", "recover"]
 
 
 class SessionWish(Message):
@@ -48,7 +48,6 @@ class SessionsScreen(StationScreen):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f9", "act('solve')", "Solve", tooltip="Solve this recording again, outside the daemon"),
         Binding("v", "act('show')", "Result", tooltip="Show this session's calibration; so does Enter"),
-        Binding("w", "act('play')", "Watch", tooltip="Play this recording in the live screen"),
         Binding("k", "act('check')", "Check", tooltip="Drift check on the views of this recording"),
         Binding("d", "app.drift_check", "Drift", tooltip=DRIFT),
         Binding("c", "act('recover')", "Recover", tooltip="Rebuild an unfinished recording"),
@@ -109,7 +108,7 @@ class SessionsScreen(StationScreen):
                     f"{figures(found)['gates'].value} gates passed",
                 ),
             ]
-        keys = "Enter result  " * bool(session.calibration) + "F9 solve  w play  k drift check on it"
+        keys = "Enter result  " * bool(session.calibration) + "F9 solve  k drift check on it"
         return lines(*rows, Content(""), Content.styled(keys, "$accent"))
 
     def action_act(self, what: SessionWork) -> None:

@@ -132,8 +132,6 @@ def _connect(known: Known, status: StationStatus) -> Step:
     devices += [True] if status.trigger.present else []
     if known.missing is not None:
         return Step("connect", "look", f"{known.missing.name} missing")
-    if status.playback:
-        return Step("connect", "todo", "a recording")
     ready = sum(devices)
     text = f"{many(ready, 'device')} ready" if all(devices) else f"{ready} of {len(devices)} devices"
     return Step("connect", "done" if all(devices) else "look", text)
@@ -187,8 +185,9 @@ def _results(known: Known) -> tuple[Step, Step, Step]:
         bad = end.way is Way.LOOK_FOR and not failed
         verified = Step("verify", "look" if bad else "done", many(len(touches), "corner") + " touched")
     if result.installed:
-        kind: Mark = "look" if result.state.withdrawn else "done"
-        return solved, verified, Step("install", kind, result.state.held.lower())
+        if result.state.withdrawn:
+            return solved, verified, Step("install", "look", "withdrawn")
+        return solved, verified, Step("install", "done", result.state.held.lower())
     return solved, verified, Step("install", "todo", "not installed")
 
 
@@ -200,8 +199,6 @@ def next_action(known: Known) -> Action:
         return Action("", "EMERGENCY STOP if it moves", why, look=True)
     if status is None:
         return _without_daemon(known)
-    if status.playback:
-        return Action("Space", "Pause or play", status.reason)
     latched = status.state in LATCHED or status.state is StationState.DISCONNECTED
     if known.busy and not latched:
         why = " ".join(words for words in (known.busy, status.reason) if words)
@@ -276,7 +273,7 @@ def _with_result(result: Result, status: StationStatus) -> Action:
         return Action("7", "Choose a session", result.problem, look=True)
     end = after_solve(calibration, () if result.installed else result.objections)
     if result.state.withdrawn and result.installed:
-        why = "This calibration was taken out of use; programs are refused it. i on 6 installs it again."
+        why = "Withdrawn: programs are refused this one. i on 6 installs it again."
         return Action("n", "Plan 25 poses", why, at="plan", look=True)
     if result.installed:
         return Action("d", "Drift check", "Installed. Check in some days that it still holds.", at="sessions")

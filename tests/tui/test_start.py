@@ -82,7 +82,7 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
         ("4", "i", "There is no result"),
         ("4", "e", "There is no result"),
         ("7", "v", "No session is recorded yet"),
-        ("7", "w", "No session is recorded yet"),
+        ("7", "c", "No session is recorded yet"),
     ]
     link._statuses.get_nowait()
     fresh = idle()

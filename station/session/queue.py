@@ -147,7 +147,13 @@ class PoseQueue:
         if sorted(order) != sorted(self._poses):
             text = f"An order names each of the {len(self._poses)} poses exactly once."
             raise RefusedError(text, code="wrong-order")
+        before = self.statuses
         self._poses = {i: self._poses[i] for i in order}
+        for place, (index, was) in enumerate(zip(order, before, strict=True)):
+            # An error is expected after all poses so far: it holds where these are the same as before.
+            same = {old.index for old in before[: place + 1]} == set(order[: place + 1])
+            sigma_mm = was.predicted_sigma_mm if same else None
+            self._status[index] = msgspec.structs.replace(self._status[index], predicted_sigma_mm=sigma_mm)
         self._changed()
 
     def add(self, pose: PlannedPose) -> int:

@@ -382,7 +382,9 @@ class StationApp(KnowingApp):
         """`run` goes on with a session that is paused."""
         paused = self.known.live is not None and self.known.live.state is StationState.PAUSED
         wanted = Purpose.RESUME if purpose == Purpose.RUN and paused else Purpose(purpose)
-        await self.desk.start(prepared_motion(self.desk, wanted, self.approves, plans_here=self.plans_here))
+        begun = prepared_motion(self.desk, wanted, self.approves, plans_here=self.plans_here)
+        if await self.desk.start(begun):
+            await self.switch_mode("capture")
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_ask(self, verb: str) -> None:

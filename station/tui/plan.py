@@ -22,7 +22,7 @@ from station.tui.task import Known
 from station.tui.widgets.scene import LEGEND, cell_scene, draw, view_of
 from station.tui.words import MARKS, UNKNOWN, Mark, degrees, dim, facts, limit_bar, lines, many, mark, mm
 
-COLUMNS = ("#", "error after", "", "distance", "tilt", "reason", "state")
+COLUMNS = ("#", "error after", "", "distance", "tilt", "state", "reason")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
@@ -60,8 +60,8 @@ def row_of(pose: PoseStatus, goal_mm: float, scene: Scene | None) -> tuple[Conte
         ),
         Content.styled(mm(view[0], 0) if view else UNKNOWN, "$foreground"),
         Content.styled(f"{degrees(view[1], 0):>4}" if view else UNKNOWN, "$foreground"),
-        Content.styled(_SEEN.sub("", pose.why) if view else pose.why or pose.name, "$foreground"),
         Content.styled("to be captured again" if pose.kept else state, MARKS[kind][1]),
+        Content.styled(_SEEN.sub("", pose.why) if view else pose.why or pose.name, "$foreground"),
     )
 
 

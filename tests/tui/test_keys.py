@@ -17,7 +17,7 @@ from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, opened, text_of,
 
 async def test_run_asks_first_and_go_carries_the_token(link: FakeLink) -> None:
     async with opened(link) as pilot:
-        await pilot.press("f5")
+        await pilot.press("2", "f5")
         await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         assert "go" not in link.verbs
         body = str(pilot.app.screen.query_one("#confirm-body", Static).render())
@@ -25,6 +25,7 @@ async def test_run_asks_first_and_go_carries_the_token(link: FakeLink) -> None:
         assert "0.22 m/s" in body
         await pilot.click("#yes")
         await until(pilot, lambda: verbs.Go("t-1", SUMMARY.plan_sha256) in link.asked)
+        await until(pilot, lambda: pilot.app.current_mode == "capture")  # where the work is watched
 
 
 @pytest.mark.parametrize("answer", ["escape", "enter"])

@@ -101,6 +101,6 @@ async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> No
         link.show(msgspec.structs.replace(status, session=session))
         table = pilot.app.screen.query_one(DataTable)
         await until(
-            pilot, lambda: table.row_count == 25 and str(table.get_row_at(7)[-1]) == "failed: too dark"
+            pilot, lambda: table.row_count == 25 and str(table.get_row_at(7)[-2]) == "failed: too dark"
         )
         assert [str(table.get_row_at(row)[0])[-1] for row in (6, 7)] == ["○", "✗"]  # never cut away

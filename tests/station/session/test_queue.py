@@ -36,6 +36,15 @@ def test_a_plan_that_a_person_changed_is_no_longer_the_planners(change: Callable
     assert queue.plan.criterion is None
 
 
+def test_an_error_stays_expected_after_the_same_poses_in_another_order() -> None:
+    plan = queue_of().plan
+    poses = [msgspec.structs.replace(p, predicted_sigma_m=1 / (i + 1)) for i, p in enumerate(plan.poses)]
+    queue = PoseQueue(msgspec.structs.replace(plan, poses=tuple(poses)))
+    before = [status.predicted_sigma_mm for status in queue.statuses]
+    queue.reorder((2, 0, 1, 3))
+    assert [s.predicted_sigma_mm for s in queue.statuses] == [None, None, before[2], before[3]]
+
+
 @pytest.mark.parametrize("state", sorted(BUSY))
 def test_a_pose_that_is_being_taken_is_left_alone(state: PoseState) -> None:
     queue = queue_of()

@@ -32,6 +32,7 @@ STATION = LazyGroup(
                 "station plan --config station.yaml -o plan.yaml  # from where the arm stands",
                 "station plan --config station.yaml --check plan.yaml --picture plan.png",
             ),
+            gone={"--foxglove": "`--picture plan.png` draws the plan; Plan (2) on the screen turns it."},
         ),
         "capture": LazyCommand(
             "station.cli.session:capture_command",

@@ -32,7 +32,7 @@ from station.plan.choose import CRITERIA, WITH_TABLE, Aim
 from station.plan.files import import_list, load_plan, save_plan, taught_plan
 from station.plan.planner import make_plan
 from station.plan.predict import ArmForecast, forecast_arm, with_forecast
-from station.plan.preview import save_picture, save_scene, sketch
+from station.plan.preview import save_picture
 
 SceneName = Literal["paper", "blog", "paper-binned"]
 """Of `station.simulation.cell`, which is loaded only where it is wanted."""
@@ -67,7 +67,6 @@ def plan_command(
         bool, typer.Option("--d-optimal", help="Minimize the error ellipsoid instead of the error")
     ] = False,
     picture: Annotated[Path | None, typer.Option(help="Save a picture of the plan (png, svg, pdf)")] = None,
-    foxglove: Annotated[Path | None, typer.Option(help="Save a scene for Foxglove (mcap)")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a pose plan, or check one. Nothing moves.
@@ -91,7 +90,7 @@ def plan_command(
             )
     geometry = cell_geometry(cell) if standing is None else geometry_from(cell, standing)
     outcome = check_plan(plan, standing, geometry)
-    shown = _scene(cell, needed=picture is not None or foxglove is not None)
+    shown = _scene(cell, needed=picture is not None)
     told, cut = (plan, ()) if shown is None else with_forecast(shown, plan)
     if check is None:
         plan = told
@@ -102,13 +101,10 @@ def plan_command(
         arm = forecast_arm(shown, plan)
     if shown is not None and picture is not None:
         save_picture(shown, plan, picture)
-    if shown is not None and foxglove is not None:
-        save_scene(shown, plan, foxglove)
     if as_json:
         print_json(_summary(plan, told, outcome, arm))
     else:
-        drawn = sketch(shown, told) if shown is not None else ""
-        _show(told, outcome, drawn, cut, output if check is None else None, cell.capture.goal_m)
+        _show(told, outcome, cut, output if check is None else None, cell.capture.goal_m)
         if arm is not None:
             _show_arm(arm)
     if outcome.problems:
@@ -315,9 +311,7 @@ def _goal_text(plan: Plan, goal_m: float) -> str:
     return f"not enough for the {goal}: about {more} poses would be (--poses), or a better camera or arm"
 
 
-def _show(
-    plan: Plan, outcome: PlanCheck, picture: str, cut: tuple[str, ...], output: Path | None, goal_m: float
-) -> None:
+def _show(plan: Plan, outcome: PlanCheck, cut: tuple[str, ...], output: Path | None, goal_m: float) -> None:
     table = Table(box=None, pad_edge=False)
     for heading in ("pose", "move s", "turn °", "margin mm", "σ mm"):
         table.add_column(heading, justify="left" if heading == "pose" else "right", no_wrap=True)
@@ -334,8 +328,6 @@ def _show(
             pose.why,
         )
     out.print(table)
-    if picture:
-        out.print(picture)
     out.print(
         f"{len(plan.poses)} poses, {outcome.duration_s:.0f} s of motion over {outcome.path_m:.1f} m, "
         f"at most {outcome.top_speed_m_s:.2f} m/s and {np.rad2deg(outcome.largest_step_rad):.0f}° in one move"

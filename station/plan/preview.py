@@ -1,4 +1,4 @@
-"""A plan to look at: a picture file, a scene that other viewers play, a sketch in the terminal."""
+"""A picture file of a plan: cameras and board in space, board points in the image, the expected error."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ import numpy as np
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
 from calibrate.projection import project
-from recordings.scene import Colour, Entity, Polyline, write_scene
 from station.cell.collision import body_segments
 from station.cell.errors import ConfigError
-from station.cell.limits import check_plan
 from station.cell.plan import Plan
 from station.cell.scene import Scene, flange_poses, frustum, printed_corners
-from station.plan.visibility import count_in_parts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,14 +21,6 @@ if TYPE_CHECKING:
 
 _FRUSTUM_M = 0.06
 _SHOWN_ARMS = 3
-_SHADES = " ░▒▓█"
-_BARS = "▁▂▃▄▅▆▇█"
-_WIDTH, _ROWS = 78, 11
-_ARM: Colour = (0.6, 0.6, 0.65, 0.8)
-_CAMERA: Colour = (0.1, 0.4, 0.9, 1.0)
-_BOARD: Colour = (0.1, 0.1, 0.1, 1.0)
-_PATH: Colour = (1.0, 0.5, 0.0, 1.0)
-_STEPS_PER_MOVE = 10
 
 
 def save_picture(scene: Scene, plan: Plan, path: Path) -> None:
@@ -124,100 +113,3 @@ def expected_pixels(scene: Scene, plan: Plan) -> Array:
     pixels = project(scene.camera, np.maximum(seen.reshape(-1, 3), [-np.inf, -np.inf, 1e-3])).pixels
     pixels[seen.reshape(-1, 3)[:, 2] <= 1e-3] = np.nan
     return pixels.reshape(len(seen), len(points), 2)
-
-
-def coverage_grid(scene: Scene, plan: Plan, columns: int, rows: int) -> Array:
-    """Counts the board points in each cell of the image, (rows, columns)."""
-    pixels = expected_pixels(scene, plan).reshape(-1, 2)
-    return count_in_parts(scene.camera, pixels[np.isfinite(pixels).all(axis=1)], rows, columns)
-
-
-def board_from_cameras(scene: Scene, plan: Plan) -> Array:
-    """Camera centres in `board`, (n, 3) metres; the viewer's side is z < 0."""
-    seen = scene.camera_from_board(flange_poses(scene, plan))
-    return np.asarray(-np.einsum("nji,nj->ni", seen[:, :3, :3], seen[:, :3, 3]))
-
-
-def sketch(scene: Scene, plan: Plan) -> str:
-    """Three small panels as lines of text, at most 78 wide."""
-    left, right = _picture_panel(scene, plan), _camera_panel(scene, plan)
-    lines = [f"{a:<40}{b}"[:_WIDTH] for a, b in zip(left, right, strict=True)]
-    sigmas = [pose.predicted_sigma_m for pose in plan.poses]
-    known = [s for s in sigmas if s is not None]
-    if known:
-        bars = "".join(_bar(s, known) for s in known)
-        lines.append(
-            f"expected camera pose error  {bars}  {1000 * known[-1]:.2f} mm after {len(plan.poses)} poses"[
-                :_WIDTH
-            ]
-        )
-    return "\n".join(lines)
-
-
-def _picture_panel(scene: Scene, plan: Plan) -> list[str]:
-    counts = coverage_grid(scene, plan, 34, _ROWS)
-    shade = np.ceil((len(_SHADES) - 1) * counts / max(float(counts.max()), 1.0)).astype(int)
-    empty = int((coverage_grid(scene, plan, 4, 4) == 0).sum())
-    title = f"board points in the image, {16 - empty}/16 filled"
-    return _framed(title, ["".join(_SHADES[s] for s in row) for row in shade])
-
-
-def _camera_panel(scene: Scene, plan: Plan) -> list[str]:
-    """Camera centres over the board plane, numbered in order of visit."""
-    columns, rows = 33, _ROWS
-    centres = board_from_cameras(scene, plan)
-    offset = centres[:, :2] - board_points(scene.board).mean(axis=0)[:2]
-    reach = max(float(np.abs(offset).max()), 0.05)
-    cells = [[" "] * columns for _ in range(rows)]
-    cells[rows // 2][columns // 2] = "#"
-    for number, (x, y) in enumerate(offset):
-        row = round((y / reach + 1) / 2 * (rows - 1))
-        column = round((x / reach + 1) / 2 * (columns - 2))
-        for k, letter in enumerate(f"{number + 1}"):
-            cells[row][min(column + k, columns - 1)] = letter
-    return _framed(f"camera over the board (#), ±{1000 * reach:.0f} mm", ["".join(row) for row in cells])
-
-
-def _framed(title: str, rows: list[str]) -> list[str]:
-    line = "─" * len(rows[0])
-    return [title, f"┌{line}┐", *(f"│{row}│" for row in rows), f"└{line}┘"]
-
-
-def _bar(value: float, values: list[float]) -> str:
-    low, high = np.log(min(values)), np.log(max(values))
-    share = (np.log(value) - low) / max(high - low, 1e-9)
-    return _BARS[round(float(share) * (len(_BARS) - 1))]
-
-
-def save_scene(scene: Scene, plan: Plan, path: Path) -> None:
-    """Writes an MCAP in which the planned motion plays at its planned pace. RecordingError when it cannot."""
-    steps: list[tuple[float, list[Entity]]] = [(0.0, _fixed(scene, plan))]
-    seconds = 0.0
-    moves = check_plan(plan, None, scene.geometry).moves
-    for number, pose in enumerate(plan.poses):
-        before = plan.poses[max(number - 1, 0)].joints_rad
-        for share in np.linspace(0, 1, _STEPS_PER_MOVE + 1)[1:]:
-            joints = np.array(before) + share * (np.array(pose.joints_rad) - before)
-            now = seconds + share * moves[number].duration_s
-            steps.append((now, _moving(scene, joints, f"{number + 1} {pose.why}")))
-        seconds += moves[number].duration_s + 0.5
-    write_scene(path, steps)
-
-
-def _fixed(scene: Scene, plan: Plan) -> list[Entity]:
-    cameras, boards, path = _placed(scene, plan)
-    frusta = tuple(
-        Polyline(edge, _CAMERA, 0.001) for camera in cameras for edge in camera_frustum(scene, camera)
-    )
-    outlines = tuple(Polyline(printed_outline(scene, board), _BOARD, 0.002) for board in boards)
-    return [Entity("plan", "base", (*frusta, *outlines, Polyline(path, _PATH, 0.002)))]
-
-
-def _moving(scene: Scene, joints: Array, text: str) -> list[Entity]:
-    starts, ends, radii = body_segments(scene.geometry, joints[None])
-    arm = tuple(
-        Polyline(np.stack([a, b]), _ARM, float(2 * r))
-        for a, b, r in zip(starts[0], ends[0], radii, strict=True)
-    )
-    x, y, z = (float(v) for v in ends[0, 6] + [0.0, 0.0, 0.15])
-    return [Entity("arm", "base", arm, text, (x, y, z))]

@@ -8,13 +8,11 @@ from functools import partial
 import msgspec
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from station.cli import main
 from station.plan.files import load_plan, save_plan
 from station.simulation.scenes import cell_config, make_cell
 from tests.command_line import call
-from tests.recordings.small_recording import write_small
 
 run = partial(call, main, "plan")
 
@@ -22,14 +20,9 @@ run = partial(call, main, "plan")
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plan")
-    files = {name: folder / name for name in ("plan.yaml", "plan.png", "plan.mcap")}
-    options = ["-o", files["plan.yaml"], "--picture", files["plan.png"], "--foxglove", files["plan.mcap"]]
+    files = {name: folder / name for name in ("plan.yaml", "plan.png")}
+    options = ["-o", files["plan.yaml"], "--picture", files["plan.png"]]
     return run("--poses", 12, *options), files
-
-
-@pytest.fixture
-def small_recording(tmp_path):
-    return write_small(tmp_path / "session.mcap")
 
 
 def test_a_plan_is_made_shown_and_saved(made):
@@ -45,16 +38,6 @@ def test_the_other_criterion_makes_another_plan(made, tmp_path):
     assert result.returncode == 0, result.stderr
     mine, other = load_plan(made[1]["plan.yaml"]), load_plan(tmp_path / "d.yaml")
     assert other.poses != mine.poses and (mine.criterion, other.criterion) == ("A", "D")
-
-
-def test_the_scene_file_opens_and_shows_the_arm_moving(made):
-    with made[1]["plan.mcap"].open("rb") as stream:
-        reader = make_reader(stream)
-        messages = list(reader.iter_messages())
-    assert {schema.name for schema, _, _ in messages} == {"foxglove.SceneUpdate"}
-    times = [message.log_time for _, _, message in messages]
-    assert times == sorted(times)
-    assert 10e9 < times[-1] < 60e9
 
 
 def test_json_is_one_object_and_nothing_else(made):
@@ -117,20 +100,14 @@ def test_checking_needs_no_lens_but_a_picture_does(made, tmp_path):
     assert refused.returncode == 2
 
 
-def test_only_plans_and_scenes_are_written_over(made, tmp_path, small_recording):
-    """A slip of the name must not cost a configuration or a recording."""
+def test_only_plans_are_written_over(tmp_path):
+    """A slip of the name must not cost a configuration."""
     truth = make_cell("paper", 0, "low", "eye-in-hand")
     config = tmp_path / "cell.yaml"
     config.write_bytes(msgspec.yaml.encode(cell_config(truth, "127.0.0.1")))
-    before = config.read_bytes(), small_recording.read_bytes()
+    before = config.read_bytes()
     refused = run("--config", config, "-o", config)
-    assert refused.returncode == 2
-    files = made[1]
-    check = ["--config", config, "--check", files["plan.yaml"], "--foxglove"]
-    refused = run(*check, small_recording)
-    assert refused.returncode == 1
-    assert (config.read_bytes(), small_recording.read_bytes()) == before
-    assert run(*check, files["plan.mcap"]).returncode == 0
+    assert refused.returncode == 2 and config.read_bytes() == before
 
 
 def test_an_aim_that_is_none_is_refused():

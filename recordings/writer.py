@@ -76,14 +76,14 @@ class RecordingWriter:
         self._shown_ns = 0
         """Time of the newest state that viewers get."""
         self._attachments: set[str] = set()
+        self._session = with_crc({"format": FORMATS[-1], "session": msgspec.json.encode(info).decode()})
+        """Emptied once its copy is in the file."""
         self._file = OutputFile(self.part_path)
         self._mcap = self._file.writer()
         self._background = BackgroundSync(self._file.descriptor)
         try:
             self._mcap.start(library="calibration-station")
-            content = with_crc({"format": FORMATS[-1], "session": msgspec.json.encode(info).decode()})
-            for name in SESSION_RECORDS:
-                self._mcap.add_metadata(name, content)
+            self._mcap.add_metadata(SESSION_RECORDS[0], self._session)
             sync_folder(path.parent)
         except OSError as error:
             self._file.close()
@@ -159,6 +159,14 @@ class RecordingWriter:
             T = view.base_from_flange
             self._show(Topic.TRANSFORM, viewing.frame_transform("base", "flange", T, time_ns), time_ns)
         self.flush()
+        with self._disk():
+            self._copy_session()
+
+    def _copy_session(self) -> None:
+        """Behind the first view: a lost page at the file's beginning does not reach it."""
+        if self._session:
+            self._mcap.add_metadata(SESSION_RECORDS[1], self._session)
+            self._session = {}
 
     def marks(self, sequence: int, marks: Sequence[viewing.Marks], text: str = "") -> None:
         """Write marks that viewers draw over an image: corners, residuals. Nothing for an unknown image."""
@@ -238,6 +246,7 @@ class RecordingWriter:
     def finish(self) -> Path:
         """Finishes the file, renames it, and returns its final path."""
         with self._disk():
+            self._copy_session()
             self._mcap.finish()
             self._background.wait()
             os.fsync(self._file.descriptor)

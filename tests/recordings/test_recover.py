@@ -235,6 +235,15 @@ def test_the_first_picture_takes_nothing_with_it_that_the_end_of_the_file_repeat
     assert [view.index for view in open_recording(path).views()] == [1, 2]
 
 
+@pytest.mark.parametrize("unfinished", [True, False], ids=["unfinished", "finished"])
+def test_a_lost_first_page_of_the_disk_leaves_the_other_poses(tmp_path: Path, unfinished: bool) -> None:
+    make = write_unfinished if unfinished else write_small
+    path = make(tmp_path / "a.mcap", poses=9)
+    path.write_bytes(bytes(4096) + path.read_bytes()[4096:])
+    (result,) = recover_recording(path, tmp_path / "saved.mcap")
+    assert result.poses >= 8
+
+
 def test_a_folder_with_parts_of_two_sessions_is_recovered_but_nothing_is_given_up(tmp_path: Path) -> None:
     for name, part in (("one", 1), ("two", 3)):
         with RecordingWriter(tmp_path / f"{name}.mcap", make_info(name=name, part=part)) as writer:

@@ -16,6 +16,7 @@ from pathlib import Path
 from recordings.schema.messages import Source
 from station.cell.config import REAL_DRIVERS, StationConfig
 from station.cell.errors import ConfigError, RobotError
+from station.cell.process import RealTimeThreads
 from station.cell.status import StationState
 from station.devices.base import Camera, Trigger
 from station.devices.cell import Cell
@@ -60,7 +61,12 @@ def watchdog_period_s() -> float | None:
 
 class Daemon:
     def __init__(
-        self, cell: Cell, root: Path, control: Path, told_to_end: Callable[[], None] = lambda: None
+        self,
+        cell: Cell,
+        root: Path,
+        control: Path,
+        told_to_end: Callable[[], None] = lambda: None,
+        real_time: RealTimeThreads | None = None,
     ) -> None:
         """`told_to_end` is called when SIGTERM, SIGINT or `end` begins the end."""
         self.session = Session(cell, root)
@@ -74,6 +80,7 @@ class Daemon:
         self._ending, self._told_to_end = asyncio.Event(), told_to_end
         self._served_s = time.monotonic()
         self._said = ""
+        self._real_time = real_time
 
     async def run(self, ready: Callable[[], None] = lambda: None) -> None:
         """Until SIGTERM or SIGINT. `ready` is called once the socket listens. Raises StationError."""
@@ -127,6 +134,8 @@ class Daemon:
 
     def _ping(self) -> None:
         """Pings systemd from the working loop, and only while the loop and the recorder do their work."""
+        if self._real_time is not None:
+            self._real_time.sweep()
         now_s = time.monotonic()
         if self._watchdog_s is None or now_s - self._pinged_s < min(self._watchdog_s, 1.0):
             return

@@ -16,7 +16,7 @@ import typer
 
 from recordings.files import state_root
 from station.cell.errors import ConfigError
-from station.cell.process import DAEMON_NICENESS, go_before_others
+from station.cell.process import DAEMON_NICENESS, RealTimeThreads, go_before_others
 from station.cell.socket_folder import default_socket
 from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
 from station.devices.cell import Cell
@@ -68,6 +68,8 @@ def serve_command(
             "--rehearse needs the cell to rehearse.", code="usage", remedy="Give --config FILE too."
         )
     log_to_stderr()
+    go_before_others(DAEMON_NICENESS)
+    real_time = RealTimeThreads()  # before a simulated controller is started, which is given the same
     place = state_root(root)
     # What only one kind of cell needs is loaded only for it.
     if config is not None and rehearse:
@@ -89,7 +91,7 @@ def serve_command(
             scene, seed, noise, mount, time_scale, gige, hardware_trigger, control, robot
         )
         cell = simulated_cell(options, place / "simulation")
-    asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))
+    asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin, real_time))
 
 
 def _real_cell(config: Path, root: Path) -> Cell:
@@ -100,13 +102,14 @@ def _real_cell(config: Path, root: Path) -> Cell:
     return replace(configured_cell(loaded, text, root), config_path=str(config.absolute()))
 
 
-async def serve_cell(cell: Cell, root: Path, socket: Path, end_with_stdin: bool) -> None:
+async def serve_cell(
+    cell: Cell, root: Path, socket: Path, end_with_stdin: bool, real_time: RealTimeThreads
+) -> None:
     """Ends the process, too: a thread in a driver or on a disk that hangs is not waited for."""
     from station.daemon import Daemon
 
-    go_before_others(DAEMON_NICENESS)
     try:
-        daemon = Daemon(cell, root, socket, _end_in_time)
+        daemon = Daemon(cell, root, socket, _end_in_time, real_time)
         if end_with_stdin:
             loop = asyncio.get_running_loop()
             loop.add_reader(sys.stdin.fileno(), lambda: None if os.read(0, 4096) else daemon.end())

@@ -27,7 +27,12 @@ from dataclasses import asdict
 from typing import Any, NoReturn
 
 from station.cell.errors import RobotError
-from station.cell.process import DAEMON_NICENESS, die_with_parent, go_before_others
+from station.cell.process import (
+    DAEMON_NICENESS,
+    control_in_real_time,
+    die_with_parent,
+    go_before_others,
+)
 from station.devices.ur_condition import NOT_STARTED_REMEDY
 
 BEAT_FRESH_NS = 100_000_000
@@ -152,6 +157,7 @@ def main(path: str, host: str, descriptor: int, parent_pid: int) -> NoReturn:
     """`descriptor`: the inherited socket. Leaves by os._exit: the library's destructors can hang or abort."""
     die_with_parent(parent_pid)
     go_before_others(DAEMON_NICENESS)
+    control_in_real_time()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = socket.socket(fileno=descriptor)
     try:

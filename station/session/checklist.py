@@ -11,6 +11,7 @@ from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState, validity_text
 from recordings.files import bytes_text
 from station.cell.errors import CameraError, RobotError
+from station.cell.process import GRANT_REAL_TIME, in_real_time
 from station.cell.status import StationState
 from station.devices.discovery import USB3_MBIT_S, FoundCamera, UsbCamera, discover, discover_usb
 from station.devices.ur import control_trouble
@@ -31,6 +32,7 @@ async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[C
         await _camera_check(context, troubles),
         *await _wire_checks(context),
         _trigger_check(context, troubles),
+        _computer_check(context),
         Check("board", "ok", describe_board(context.cell.config.board)),
         await ASKED.run(_calibration_check, context),
         await ASKED.run(_disk_check, context),
@@ -69,6 +71,18 @@ def _control_check(context: SessionContext) -> Check:
     if trouble := context.cell.acceptance_trouble(context.root):
         return Check("control", "warning", f"{path}, {trouble}", NOT_ACCEPTED_REMEDY)
     return Check("control", "ok", path) if path else Check("control", "skipped", "no arm moves")
+
+
+def _computer_check(context: SessionContext) -> Check:
+    """Other programs hold up the heartbeat of an arm in motion, unless this program goes before them."""
+    if in_real_time():
+        return Check("computer", "ok", "real-time scheduling: other programs do not hold up the arm")
+    text = "no real-time scheduling: another program can hold up the heartbeat, and the arm stops"
+    if context.cell.source != "real":
+        return Check("computer", "skipped", text)
+    return Check(
+        "computer", "warning", text, f"run it as the service station, or grant it: {GRANT_REAL_TIME}"
+    )
 
 
 async def _from_outside(host: str) -> str:

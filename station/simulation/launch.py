@@ -15,6 +15,7 @@ from typing import Any, Self
 
 from recordings.files import open_regular
 from station.cell.errors import CameraError, RobotError
+from station.cell.process import give_own_priority
 from station.simulation.netns import is_isolated
 
 Json = dict[str, Any]
@@ -130,6 +131,7 @@ def start_controller(
         address = host or f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
         child, problem = _start([*command, "--host", address], timeout_s, log)
         if not problem:
+            give_own_priority(child.pid)
             return SimulatedController(address, child)
         if host is not None or child.returncode != ADDRESS_TAKEN or attempt == 1:
             break

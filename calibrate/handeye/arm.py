@@ -1,8 +1,9 @@
-"""Errors of the arm's Denavit-Hartenberg table and of a bracket that bends, whose size nobody knows.
+"""Errors of the arm's Denavit-Hartenberg table and of a bracket that bends, to be estimated.
 
-Of the 24 errors of a table, eight change nothing that X and the board's pose would not take: six of the first
-and the last joint, and two of the three shifts along the parallel axes of joints 2, 3 and 4. They are held.
-Two turns of those axes about y (S. Hayati, 1983) are added, which the table cannot say.
+Of the 24 errors of a table, eight look exactly like a change of X or of the board's pose: six of the first
+and the last joint, and two of the three shifts along the parallel axes of joints 2, 3 and 4. These eight
+stay at their nominal values. Two rotations of those axes about y (S. Hayati, 1983), which the table cannot
+express, are added.
 """
 
 from __future__ import annotations
@@ -34,21 +35,21 @@ HELD = {
 FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")
 """Names of a bracket's compliance, radians: turn about `row` for gravity along `column` of the flange."""
 RELATIVE_SIGMA = np.array([3**0.5 if name == "d4" else 1.0 for name in PARAMETERS])
-"""1σ of each against the common one: d4 stands for d2 + d3 + d4."""
+"""1σ of each error as a multiple of the common one; larger for d4, which stands for d2 + d3 + d4."""
 _SAME_M, _SAME_RAD = 0.02, float(np.radians(2.0))
 """Recorded joints and flange belong together when the nominal table agrees within this."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArmPostures:
-    """The arm in every view."""
+    """Joint angles of the arm in every view, and the kinematic table that they belong to."""
 
     model: RobotModel
     """The nominal table, that the recorded flanges follow."""
     joints_rad: Array
     """(n, 6)"""
     recorded: bool
-    """False: by inverse kinematics in one branch, which serves X, but need not be the arm's own."""
+    """True: measured. False: by inverse kinematics in one branch, which need not be the arm's real one."""
 
 
 def arm_postures(views: ViewSet) -> ArmPostures | None:
@@ -80,9 +81,9 @@ def corrected_model(nominal: RobotModel, errors: Array) -> RobotModel:
 def flex_motion(mount: Mount, flange: Array, held: Array) -> Array:
     """Compute the motion (n, 6, 9) of the flange, in base, by each entry of a bracket's compliance (3, 3).
 
-    What the flange carries at `held` (4, 4), the camera (eye-in-hand) or the board, turns by
-    compliance times the direction of gravity in it, less its mean over the views: X and Y are those of
-    the mean. Base's z is taken to be up.
+    The bracket carries the camera (eye-in-hand) or the board at `held` (4, 4) in the flange. It bends by the
+    compliance times the direction of gravity in the flange. The mean bend over the views is subtracted: it
+    belongs to X or Y. Base's z is taken to point up.
     """
     R = flange[:, :3, :3]
     gravity = -R[:, 2, :]
@@ -103,7 +104,10 @@ def _recorded_joints(views: ViewSet, model: RobotModel) -> Array | None:
 
 
 def _joints_of_one_branch(model: RobotModel, flanges: Array) -> Array | None:
-    """(n, 6): any branch serves X as well as the true one, if it is the same in all views."""
+    """Find joints (n, 6) in one branch of inverse kinematics that reaches all flanges, else None.
+
+    X comes out the same in any branch, as long as all views use the same one.
+    """
     owner, joints, branch = inverse_many(model, flanges)
     for one in range(8):
         if np.array_equal(owner[branch == one], np.arange(len(flanges))):
@@ -114,9 +118,9 @@ def _joints_of_one_branch(model: RobotModel, flanges: Array) -> Array | None:
 def by_parameters(model: RobotModel, joints_rad: Array) -> Array:
     """Compute the motion [δt, δφ] (n, 6, 18) of the flange, in base, by each of `PARAMETERS`.
 
-    model: a table whose axes are near (`kinematics.with_near_axes`); joints_rad: (n, 6). Standard convention:
-    theta and d act about and along z of the frame before the joint; alpha and a about and along x, beta about
-    y, of the frame after it.
+    model: a table made by `kinematics.with_near_axes`; joints_rad: (n, 6). Standard convention: theta and d
+    act about and along z of the frame before the joint; alpha and a about and along x, beta about y, of the
+    frame after it.
     """
     frames = link_frames(model, joints_rad)
     z, before = frames[:, :6, :3, 2], frames[:, :6, :3, 3]

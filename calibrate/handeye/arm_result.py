@@ -1,4 +1,4 @@
-"""The table of an arm as a result: what may be installed, how good it is, what another recording says."""
+"""The arm's fitted kinematic table as a result: whether it is offered, its accuracy, its verification."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from calibrate.results import SHAPE
 from calibrate.views import BoardView, ViewSet, observe_views
 
 _NOMINAL_M = 1e-4
-"""Recorded flanges farther than this from the nominal table, rms, are another table's."""
+"""Above this rms distance (m) the recorded flanges were not computed with the nominal table."""
 
 
 def table_result(
     fit: CellFit, arm: ArmPostures, detected: bool, distance_m: float, missed: Array | None
 ) -> TableResult:
-    """Derive from a fit with errors of the arm's table what may be installed, and how good each way is.
+    """Derive the corrected table from a fit, decide whether it is offered, state the error with and without.
 
-    missed: (2, n) of `TableResult.held_out_m`.
+    missed: (2, n), as `TableResult.held_out_m`.
     """
     found, state = fit.estimate, fit.estimate.state
     places = Layout.of(state).table.start + np.arange(len(PARAMETERS))
@@ -62,15 +62,16 @@ def table_result(
 
 
 _ELSEWHERE_RAD = 0.1
-"""A view from where a joint differs by this from every view of the fit is one elsewhere."""
+"""A view counts as taken elsewhere when some joint differs by this much from every view of the fit."""
 _FEWEST_ELSEWHERE = 5
 
 
 def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") -> Verification:
-    """Judge X and table by views of the same board, lying anywhere, that were not used to find them.
+    """Verify X and the arm's table with views of the same board that took no part in the fit.
 
-    The board is in one place: its middle is seen there by each view, in base or in the flange. Views that
-    stand where the fit's do are left out. Raises BadViewsError where too few are left or have joints.
+    The board may lie anywhere but must not move: every view should place its middle at one point of base (or
+    of the flange). Views from the postures of the fit are left out. Raises BadViewsError where too few are
+    left or have joints.
     """
     arm = None if solution.arm is None else solution.arm.result
     if arm is None:
@@ -114,7 +115,7 @@ def _stands_elsewhere(view: BoardView, fitted: Sequence[Array]) -> bool:
 
 
 def _of_X_and_table(covariance: Array, places: NDArray[np.intp]) -> Array:
-    """(24, 24) of [X, table's errors (metres, radians)] out of that of all unknowns."""
+    """Extract the covariance (24, 24) of [X, table's errors (metres, radians)] from that of all unknowns."""
     scale = np.concatenate([np.ones(6), RELATIVE_SIGMA])
     picked = np.concatenate([np.arange(6), places])
     return np.asarray(covariance[np.ix_(picked, picked)] * scale * scale[:, None])
@@ -136,7 +137,7 @@ def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | Non
 
 
 def _if_measured(fit: CellFit, room: Workspace, places: NDArray[np.intp]) -> dict[str, float]:
-    """`TableResult.if_measured_m`: the covariance with the information of a good measurement added."""
+    """Compute `TableResult.if_measured_m`: the error if board or intrinsics were measured to `MEASURED`."""
     at, found = Layout.of(fit.estimate.state), fit.estimate
     focal = intrinsics_vector(found.state.camera)[:2]
     known = {

@@ -1,8 +1,8 @@
-"""The two halves of the one likelihood, what was observed and what is unknown, and the flange between them.
+"""The unknowns of a cell, and the residual of the flange that they imply against the recorded one.
 
 Unknown: the camera's pose X, the board's pose Y, the lens, the board's shape, errors of the arm's kinematic
 table, and every camera_from_board C_i. Observed: the corners and the recorded flange poses F_i. The true
-flange is Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand): the robot's noise sits where it arises, in base.
+flange is Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand). The robot's noise is modelled in base.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class CellState:
     table: Array
     """(q,) errors of the kinematic table, empty where they are not modelled."""
     second: Array | None = None
-    """(4, 4) X or Y of the later views, where something was moved."""
+    """(4, 4) X or Y of the views marked `later`, where camera or board was moved."""
 
     def poses(self, observed: Observations) -> tuple[Array, Array]:
         """Return X and Y of every view, (n, 4, 4) each or one (4, 4) for all."""
@@ -47,11 +47,11 @@ class CellState:
         return self.X, np.where(later, self.second, self.Y)
 
     def with_boards(self, C: Array) -> CellState:
-        """Replace the board poses by others (m, 4, 4)."""
+        """Return a copy with the board poses (m, 4, 4) in place of its own."""
         return replace(self, C=C)
 
     def moved(self, step: Array, by_view: Array) -> CellState:
-        """Take a step (G,) in the order of `Layout`, and (n, 6) for C."""
+        """Return the state after a step: (G,) for the shared unknowns, in `Layout`'s order, (n, 6) for C."""
         at = Layout.of(self)
         camera = with_intrinsics_vector(self.camera, intrinsics_vector(self.camera) + step[at.lens])
         return replace(
@@ -68,7 +68,7 @@ class CellState:
 
 @dataclass(frozen=True)
 class Layout:
-    """Places of the unknowns that all views share."""
+    """Positions, in a step or covariance, of the unknowns that all views share."""
 
     X: slice
     Y: slice
@@ -97,7 +97,7 @@ def flange_residuals(observed: Observations, state: CellState) -> Array:
 
 
 def flange_derivatives(mount: Mount, X: Array, Y: Array, C: Array, miss: Array) -> tuple[Array, Array, Array]:
-    """Compute ∂residual/∂X, ∂Y, ∂C (n, 6, 6) of `perturb`'s deltas.
+    """Compute ∂residual/∂X, ∂Y, ∂C (n, 6, 6) for deltas of `geometry.perturb`.
 
     X and Y: (4, 4), or (n, 4, 4) where they differ from view to view; C (n, 4, 4); miss: (n, 6), the residual
     without errors of the kinematic table.
@@ -134,7 +134,7 @@ def _blocks(tt: Array, tr: Array, rt: Array, rr: Array) -> Array:
 
 
 def _inverse_left_jacobian(v: Array) -> Any:
-    """∂Log(Exp(δ) Exp(v))/∂δ at 0, (n, 3) → (n, 3, 3)."""
+    """Compute ∂Log(Exp(δ) Exp(v))/∂δ at 0, (n, 3) → (n, 3, 3)."""
     angle = np.linalg.norm(v, axis=1)
     half = np.maximum(angle / 2, 1e-6)
     c = np.where(angle < 1e-4, 1 / 12, (1 - half / np.tan(half)) / (4 * half * half))
@@ -153,5 +153,5 @@ class Quadratic:
     log: float = 0.0
 
     def gain(self, step: Array) -> float:
-        """Compute the log density at a step (G,) against that at the state."""
+        """Compute how much the log density rises by a step (G,)."""
         return float(self.right @ step - 0.5 * step @ self.N @ step)

@@ -1,4 +1,4 @@
-"""Corners against the model: residuals, and their least squares with one small block for each view."""
+"""Corner residuals (observed minus modelled pixels) and their normal equations, one block for each view."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calibrate.views import Observations
 from recordings.schema.messages import CameraModel
 
 _CHUNK_POINTS = 40_000
-"""Corners linearised at once: bounds memory for thousands of views."""
+"""Most corners linearised at once, so that thousands of views fit into memory."""
 _STEPS, _LIMIT_SIGMA = 10, 4.0
 
 
@@ -53,7 +53,7 @@ def _unit_square(observed: Observations) -> tuple[Array, Array]:
 
 
 def _in_camera(observed: Observations, points: Array, C: Array) -> tuple[Array, Array]:
-    """Points turned, and placed, in `camera` (n, k, 3); padding stands in front of it."""
+    """Rotate, and transform, points (n, k, 3) into `camera`; padding is put in front of it."""
     turned = points @ np.swapaxes(C[:, :3, :3], 1, 2)
     placed = turned + C[:, None, :3, 3]
     return turned, np.where(observed.present[..., None] > 0, placed, [0.0, 0.0, 1.0])
@@ -127,7 +127,7 @@ def linearise_corners(
 
 
 def boards_by_corners(observed: Observations, camera: CameraModel, C: Array, shape: Array) -> Array:
-    """Fit board poses (n, 4, 4) to each view's own corners from C, far corners weighed down."""
+    """Fit board poses (n, 4, 4) to each view's own corners, starting at C, outliers down-weighted."""
     if not observed.has_pixels:
         return C
     for _ in range(_STEPS):
@@ -147,7 +147,7 @@ def boards_by_corners(observed: Observations, camera: CameraModel, C: Array, sha
 
 
 def _by_shape(observed: Observations) -> Array:
-    """(n, k, 3, 5) motion of each corner, in the board's frame, by each number of its shape."""
+    """Compute the motion (n, k, 3, 5) of each corner, in the board's frame, by each number of its shape."""
     x, y = observed.points[..., 0], observed.points[..., 1]
     u, v = _unit_square(observed)
     D = np.zeros((*x.shape, 3, len(SHAPE)))

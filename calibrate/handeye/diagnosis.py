@@ -1,4 +1,4 @@
-"""An estimate against what was stated and recorded: lens and board, single views, views left out of folds."""
+"""Diagnosis of an estimate: given lens and board, error sources, rejected views, cross-validation."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from calibrate.results import RejectedView
 from calibrate.views import Places, implied_flange
 
 _LOOSER = 0.01
-"""A statement is taken back by giving its information this factor, not none: without it X may be open."""
+"""Factor on the information of a stated value to test what X is without it; 0 could leave X undetermined."""
 
 
 def judge_lens(fit: CellFit, distance_m: float) -> Finding:
-    """Judge a given lens by its images and the robot's motion."""
+    """Compare the given lens with what the images and the robot's motion tell."""
     state, prior = fit.estimate.state, fit.priors.lens
     places = np.arange(Layout.of(state).lens.start, Layout.of(state).lens.stop)
     return _judge(fit, places, intrinsics_vector(state.camera) - prior.mean, prior.sigma, distance_m)
 
 
 def judge_board(fit: CellFit, distance_m: float) -> Finding:
-    """Judge the stated board (size, equal print, flatness) by the views."""
+    """Compare the stated board (size, equal scale in x and y, flatness) with what the views tell."""
     state = fit.estimate.state
     places = np.arange(Layout.of(state).shape.start, Layout.of(state).shape.stop)
     return _judge(fit, places, state.shape, fit.priors.board_sigma, distance_m)
@@ -37,7 +37,8 @@ def judge_board(fit: CellFit, distance_m: float) -> Finding:
 
 def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: float) -> Finding:
     covariance = fit.estimate.covariance
-    # Where both agree, the difference of the estimates has the difference of their covariances.
+    # If statement and views agree, the covariance of the difference of the estimates with and without the
+    # statement is the difference of their covariances.
     root = 1.0 / sigma
     left = np.eye(len(places)) - covariance[np.ix_(places, places)] * root * root[:, None]
     values, vectors = np.linalg.eigh((left + left.T) / 2)
@@ -65,7 +66,8 @@ def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: f
 def error_shares(fit: CellFit) -> dict[str, float]:
     """Split X's variance by source into shares, mean over directions, summing to 1.
 
-    Of lens, board shape and arm: what knowing them would take away; the rest by whose noise it is.
+    The share of lens, board shape or arm is the variance that would vanish if it were known exactly; the
+    rest is split between the noise of corners, robot translation and robot rotation.
     """
     state, covariance = fit.estimate.state, fit.estimate.covariance
     at = Layout.of(state)
@@ -90,11 +92,11 @@ def error_shares(fit: CellFit) -> dict[str, float]:
 
 _COMPONENTS = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
 _CHANCE = 1e-6
-"""Below this a residual is not explained by noise."""
+"""Probability of a residual this large by noise alone, below which noise is no explanation."""
 
 
 def explain_views(fit: CellFit, places: Places) -> tuple[RejectedView, ...]:
-    """Tell how the views at these places, none of which counts, contradict the others, and why."""
+    """Explain why each of the rejected views at `places` contradicts the others."""
     X, Y = fit.estimate.state.poses(fit.observed)
     implied = implied_flange(fit.observed.mount, X, Y, fit.estimate.board_poses)
     return tuple(_explain(fit, implied[place], int(place), places) for place in places)
@@ -136,9 +138,9 @@ def _chance(residual: Array, covariance: Array) -> float:
 FOLDS = 5
 FEWEST_VIEWS = 6
 _STEPS = 3
-"""Linearisations of each fold: it starts from the estimate of all views."""
+"""Linearisations for each fold; few suffice, as it starts from the estimate of all views."""
 _CALLED_TOO_SMALL = 1e-4
-"""Chance that sound claims are called too small."""
+"""Probability that a correct predicted error is reported as too small."""
 
 
 def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
@@ -171,10 +173,10 @@ def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
 
 
 def held_out_elsewhere(fit: CellFit, joints_rad: Array) -> Array | None:
-    """Predict views from those taken elsewhere: by how much the middle of the board is missed, metres.
+    """Predict each view from views taken elsewhere: error (2, n) of the board's middle, metres.
 
-    (2, n): without and with the errors of the arm's table; NaN for views that do not count fully. The arm's
-    postures (n, 6) are cut in FOLDS along their longest axis. None where a fold determines nothing.
+    First row without, second with the errors of the arm's table; NaN for views that do not count fully.
+    joints_rad: (n, 6), split into FOLDS along their principal axis. None where a fold determines nothing.
     """
     full = np.flatnonzero(fit.estimate.chances[:, 0] > FULL)
     if len(full) < 2 * FOLDS:
@@ -200,7 +202,7 @@ def held_out_elsewhere(fit: CellFit, joints_rad: Array) -> Array | None:
 
 
 def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:
-    """Residuals (m, 6) of the views left out, and the covariance (m, 6, 6) that the other views give them."""
+    """Compute residuals (m, 6) of the views left out, and their covariance (m, 6, 6) by the other views."""
     others = np.setdiff1d(np.arange(len(fit.views)), left_out)
     whole = fit.estimate
     start = whole.state.with_boards(whole.state.C[others])
@@ -211,7 +213,7 @@ def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:
 
 
 def _at_board(fit: CellFit) -> Array:
-    """(n, 6, 6) from [δt, δφ] of the flange to that of the middle of the board, in base."""
+    """Make matrices (n, 6, 6) from [δt, δφ] of the flange to that of the board's middle, in base."""
     state, observed = fit.estimate.state, fit.observed
     middle = np.array([*observed.extent[0], 0.0])
     _, Y = state.poses(observed)

@@ -1,4 +1,4 @@
-"""The one estimate: every unknown of a cell together, each view with the weight that its residual earns.
+"""The joint estimate of all unknowns of a cell, with robust weights for the views.
 
 Gauss-Newton on one posterior (`linear`), noise scales by restricted maximum likelihood between the steps; at
 most MAX_STEPS linearisations.
@@ -25,21 +25,24 @@ from calibrate.views import Observations, ViewSet
 
 MAX_STEPS = 15
 REJECTED = 0.05
-"""A view of less weight than this counts for nothing."""
+"""Weight at or below which a view is rejected."""
 FULL = 0.35
-"""A view whose chance to be an ordinary one is larger than this counts fully."""
+"""Probability of the class of ordinary noise above which a view counts fully."""
 _SETTLED = 0.01
-"""Length of a step, in sigmas of all unknowns together."""
+"""Step length, in sigmas of all unknowns together, below which the iteration has converged."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeanParts:
-    """Estimates that one is the mean of: tails of a mean of normal distributions are heavier than one's."""
+    """Components of the mixture of normal distributions that an estimate averages over.
+
+    A mixture has heavier tails than one normal distribution, so its 95 % region is wider.
+    """
 
     chances: Array = field(default_factory=lambda: np.ones(1))
-    """(s,)"""
+    """(s,) weights of the components, sum 1."""
     camera_ratio: Array = field(default_factory=lambda: np.ones(1))
-    """(s,) variance of X over the mean's."""
+    """(s,) variance of X in each component over that of the mixture."""
     table_ratio: Array = field(default_factory=lambda: np.ones(1))
     """(s,) the same for the errors of the arm's table."""
 
@@ -49,17 +52,17 @@ class Estimate:
     state: CellState
     scales: Scales
     chances: Array
-    """(n, K) of the classes, per view."""
+    """(n, K) probability of each noise class, per view."""
     covariance: Array
     """(G, G) posterior of the shared unknowns, in the order of `Layout`."""
     robot: Array
     """(n, 6) residuals at the optimum: implied minus recorded flange, the board seen by its corners alone."""
     robot_covariance: Array
-    """(n, 6, 6) of `robot` for an ordinary view that took no part."""
+    """(n, 6, 6) covariance of `robot` for an ordinary view that took no part in the fit."""
     board_poses: Array
     """(n, 4, 4) camera_from_board by each view's corners alone, with the final lens and shape."""
     corner_weights: Array
-    """(n, k)"""
+    """(n, k) in 0 … 1"""
     noise_parts: Array
     """(3,) variance of X, whitened, from corners, robot translation and robot rotation."""
     log_evidence: float
@@ -69,22 +72,22 @@ class Estimate:
 
     @property
     def weight(self) -> Array:
-        """(n,) what each view counts for: 1 fully, 0 not at all."""
+        """Weight (n,) of each view: 1 counts fully, 0 not at all."""
         return np.asarray(self.chances[:, :3] @ GAIN**-2.0)
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """(n,) the views that count for something."""
+        """Mask (n,) of the views that are not rejected."""
         return np.asarray(self.weight > REJECTED)
 
     @property
     def threshold(self) -> float:
-        """95 % region δᵀ C⁻¹ δ of X: 6·F(6, ν), ν = 3n - 6 of the n views that count."""
+        """Limit of δᵀ C⁻¹ δ that holds the true X with 95 %: 6·F(6, ν), ν = 3n - 6 of n views that count."""
         return self._region(self.mean_of.camera_ratio)
 
     @property
     def table_threshold(self) -> float:
-        """The same for the six errors of a flange, by those of the arm's table."""
+        """The same limit for the error (6,) of a flange that is computed with the arm's table."""
         return self._region(self.mean_of.table_ratio)
 
     def _region(self, ratio: Array) -> float:
@@ -111,7 +114,8 @@ def estimate(
 ) -> Estimate:
     """Find the maximum of the posterior from `start`.
 
-    scales: where to start, or what to keep (`fit_scales` False); None: `wide` times what residuals show.
+    scales: the noise to start from, or to keep (`fit_scales` False); None: from the residuals at `start`, the
+    robot's times `wide`.
     Raises BadViewsError where views and priors together do not determine the unknowns.
     """
     state, weights = start, observed.present
@@ -158,7 +162,7 @@ def is_settled(step: Array, precision: Array) -> bool:
 
 
 def corner_weights(observed: Observations, state: CellState, sigma_px: float) -> Array:
-    """Weigh corners (n, k) by Student's t about the model; 0 for padding."""
+    """Compute weights (n, k) of corners from Student's t distribution of their residuals; 0 for padding."""
     if not observed.has_pixels:
         return observed.present
     distance = corner_distance(corner_residuals(observed, state.camera, state.C, state.shape))
@@ -168,12 +172,12 @@ def corner_weights(observed: Observations, state: CellState, sigma_px: float) ->
 
 @dataclass(frozen=True, eq=False)
 class CellFit:
-    """Everything about a cell that its views tell."""
+    """Result of `fit_cell`: the estimate and what is needed to judge it."""
 
     views: ViewSet
-    """The input, boards turned where that was needed."""
+    """The input, with boards rotated onto themselves where their corner order disagreed."""
     turned: tuple[int, ...]
-    """Places of the views whose board was turned."""
+    """Indices of the views whose board was rotated."""
     observed: Observations
     priors: Priors
     estimate: Estimate
@@ -182,7 +186,7 @@ class CellFit:
     arm: ArmPostures | None
     """None where errors of the arm's kinematic table are not among them."""
     plain: Estimate
-    """The estimate without them."""
+    """The estimate without systematic errors of arm and bracket."""
     pairs: Pairs
     """Pairs of the views that count; after a move, of those after it."""
     certified: GlobalResult

@@ -1,4 +1,4 @@
-"""The way from views to the estimate: a certain start, boards set right, every unknown together."""
+"""From views to the estimate: a global start, corner orders corrected, then all unknowns together."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from calibrate.results import SHAPE
 from calibrate.views import BoardView, Moved, Observations, Places, ViewSet, observe_views
 
 FEWEST_FOR_TABLE = 8
-"""Fewer views cannot tell 18 errors of a table from noise."""
+"""Fewest views from which 18 errors of a table can be told from noise."""
 FEWEST_USED = 3
-"""Views that must count for something: fewer have no two motions."""
+"""Fewest views that must not be rejected: two motions need three views."""
 _NARROW = 0.5
 _CLEARLY = 5.0
-"""Log evidence."""
+"""Log evidence by which the estimate from the narrow start must beat the one from the wide start."""
 MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
-"""Noise beyond this per axis is none: no X is returned."""
+"""Above this robot noise (1σ per axis, metres and radians) the poses are refused."""
 
 
 def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True) -> CellFit:
-    """Fit everything. Raises BadViewsError or DegenerateMotionError where the views determine no X."""
+    """Estimate all unknowns of a cell. Raises BadViewsError or DegenerateMotionError: X is not determined."""
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = all_pairs(H, C)
     require_motion(pairs)
@@ -76,22 +76,22 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
 _SIZES = np.array([0.03, 0.06, 0.12, 0.25, 0.5, 1.0])
 """1σ of the errors of an arm's table, mm and mrad: no arm is exactly its table."""
 _BENDS = np.array([1e-6, 0.1, 0.4, 1.6])
-"""1σ of a bracket's compliance, mrad; the first stands for a rigid one, half of all."""
+"""1σ of a bracket's compliance, mrad; the first stands for a rigid bracket, which has probability ½."""
 _BENDS_BEFOREHAND = np.array([3.0, 1.0, 1.0, 1.0]) / 6
 _NONE = 1e-6
 _ROUNDS = 3
 _WORTH_SOLVING = 1e-3
-"""Chance below which a size is left out after the first step."""
+"""Probability below which a pair of sizes is dropped after the first step."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Sizes:
-    """Sizes that are averaged over."""
+    """Pairs of assumed sizes, of the table's errors and of the bracket's, that the estimate averages over."""
 
     sigma: Array
     """(s, q) 1σ of each error, mm and mrad."""
     beforehand: Array
-    """(s,) chances; the first is that of no errors, 0."""
+    """(s,) prior probabilities; the first pair, no errors at all, has 0 and is for comparison only."""
 
     @classmethod
     def of(cls, table: int, bracket: int) -> _Sizes:
@@ -105,11 +105,11 @@ class _Sizes:
 def allow_for_table(
     observed: Observations, plain: Estimate, priors: Priors, errors_of_table: int
 ) -> tuple[Estimate, float]:
-    """Estimate anew with the `table` of the observations, from the estimate without it.
+    """Estimate again with systematic errors of arm and bracket, starting from the estimate without them.
 
     The first `errors_of_table` errors are those of the arm's table, the others a bracket's. How large each of
     the two is, is not fitted but averaged over: one solution for each pair of sizes, weighed by its evidence.
-    So the price for an arm without errors is small, and the stated uncertainty of one with errors is not.
+    So the uncertainty grows little for an arm without errors, and enough for one with errors.
 
     The second value is the log evidence of errors of any size against none; above 3 they are worth saying.
     Raises LinAlgError where it fails.
@@ -170,7 +170,7 @@ def allow_for_table(
 
 
 def _against(spread: Array, mean: Array, part: slice) -> Array:
-    """Compare covariances (s, q, q) with their mean (q, q): the ratio (s,) of variances within `part`."""
+    """Compute the ratios (s,) of covariances (s, q, q) to their mean (q, q), within `part`."""
     if part.start == part.stop:
         return np.ones(len(spread))
     inverse_mean = np.linalg.inv(mean[part, part])
@@ -178,7 +178,10 @@ def _against(spread: Array, mean: Array, part: slice) -> Array:
 
 
 def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Estimate:
-    """Try two starts of the noise; the narrow one, which finds bad views, must be clearly likelier."""
+    """Estimate from a wide and a narrow initial robot noise; take the narrow one only if clearly likelier.
+
+    A narrow start rejects more views at once.
+    """
     found = estimate(observed, start, priors)
     narrow = estimate(observed, start, priors, wide=_NARROW)
     return narrow if narrow.log_evidence > found.log_evidence + _CLEARLY else found
@@ -192,7 +195,7 @@ def _certify(views: ViewSet, found: Estimate, places: Places, seed: int) -> tupl
 
 
 def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: Moved, seed: int) -> CellFit:
-    """Fit a cell whose camera or board was moved before the view at place `at`: both halves count.
+    """Fit a cell whose camera or board was moved before the view at index `at`, from the views of both parts.
 
     X and the board's pose are those after the move. Raises BadViewsError where a half determines nothing.
     """
@@ -205,7 +208,7 @@ def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: 
             code="pose-open",
             remedy="Record again.",
         ) from None
-    # The later value is the one that holds now: `second` is that of the views before.
+    # The state's own X and Y must be those after the move, so `second` is for the views before it.
     observed = replace(observe_views(views), later=~later, moved=moved)
     state = CellState(
         start.X[-1],
@@ -223,7 +226,7 @@ def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: 
 
 
 def require_plausible_noise(found: Estimate) -> None:
-    """Raise PosesDisagreeError where robot and images have nothing to do with each other."""
+    """Raise PosesDisagreeError where the robot noise is above its limit, or nearly every view is rejected."""
     robot_m, robot_rad = found.scales.robot
     if found.used.sum() < FEWEST_USED:
         raise PosesDisagreeError("Robot poses and images disagree in nearly every view.", remedy=_MEND)
@@ -238,11 +241,11 @@ def require_plausible_noise(found: Estimate) -> None:
 _MEND = "Check the mounting, units and order of poses, and that each belongs to its image."
 _LEVER_M = 0.5
 _NEARER = 0.2
-"""A turned board is believed when it brings the view this much nearer (the factor) to where the board is."""
+"""A rotated board is accepted when its distance to the board's pose falls below this share of before."""
 
 
 def set_boards_right(views: ViewSet, X: Array, Y: Array) -> tuple[ViewSet, tuple[int, ...]]:
-    """Turn boards where that brings them to the board's pose Y; the views, and the places turned."""
+    """Rotate boards onto themselves where that fits Y (4, 4); return the views, and the indices rotated."""
     H = mount_poses(views.base_from_flange, views.mount)
     kept, turned = list(views.views), []
     for place, view in enumerate(views):
@@ -262,7 +265,7 @@ def _distance(found: Array, expected: Array) -> float:
 
 
 def _turns(view: BoardView) -> list[Array]:
-    """Rigid maps of the board onto itself: half a turn, and quarter turns where it is square."""
+    """List the rotations of the board onto itself: by 180°, and by ±90° where it is square."""
     if not len(view.board_points):
         return []
     low, high = view.board_points.min(axis=0), view.board_points.max(axis=0)

@@ -1,7 +1,7 @@
-"""Information of a set of views on X, board pose, lens and board shape, from geometry alone.
+"""Fisher information of views about X, board pose, lens and board shape, from geometry alone.
 
-The model is the estimate's own (`handeye.linear`): corner noise, and on every robot pose an independent error
-that is a nuisance of its own view. Parameter order: δX (6), δY (6), the lens (`projection.intrinsics_names`),
+The model is that of the estimate (`handeye.linear`): corner noise, and an independent error of every robot
+pose. Parameter order: δX (6), δY (6), the lens (`projection.intrinsics_names`),
 the board's shape (`results.SHAPE`), and the errors of the arm's table (`handeye.arm.PARAMETERS`,
 over `RELATIVE_SIGMA`) where their motion is given. Deltas are those of `geometry.perturb`.
 X = flange_from_camera, Y = base_from_board (eye-in-hand), or X = base_from_camera, Y = flange_from_board
@@ -26,14 +26,14 @@ from calibrate.views import Observations, array_of, board_in_camera, extent_of, 
 from recordings.schema.messages import CameraModel, Mount
 
 _FOCAL_SHARE = 0.05
-"""The lens is known beforehand to about this share of its focal length: few views are not hopeless."""
+"""Prior 1σ of an unknown focal length, relative: keeps the prediction finite with few views."""
 _POSE_PRECISION = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
-"""A metre and three radians: no knowledge, only so that the first few views have a finite sigma."""
+"""Prior of a pose, 1 m and about 3 rad: practically none, but the first few views get a finite sigma."""
 
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """Standard deviations per axis."""
+    """Standard deviations of corner and robot noise, per axis."""
 
     pixel_px: float = 0.15
     robot_m: float = 0.0001
@@ -93,10 +93,10 @@ def prior_information(
     table_mm: float = 0.0,
     lens: LensPrior | None = None,
 ) -> Array:
-    """Compute the information (p, p) before any view: lens (`LensPrior`) and board's tolerance.
+    """Compute the prior information (p, p), before any view, of lens and board tolerance.
 
     `table_mm`: 1σ, mm and mrad, of errors of the arm's table; 0: none are modelled. `lens`: what is known of
-    it, instead of the usual.
+    the lens; None: the defaults for a known or an unknown one.
     """
     errors = np.zeros(len(PARAMETERS) if table_mm else 0)
     state = CellState(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), errors)
@@ -121,6 +121,6 @@ def covariance_of(information: Array, prior: Array | None = None) -> Array:
 
 
 def sigma_of(information: Array, prior: Array) -> tuple[float, float]:
-    """1σ of X from a sum of informations: translation (m, root of the summed variances), rotation (rad)."""
+    """Compute 1σ of X from information (p, p) and prior: root of the summed variances, metres, radians."""
     diagonal = np.diag(covariance_of(information, prior))
     return float(np.sqrt(diagonal[:3].sum())), float(np.sqrt(diagonal[3:6].sum()))

@@ -22,13 +22,13 @@ from calibrate.views import Observations
 
 ROUNDS = 8
 GAIN = np.array([1.0, 3.0, 10.0])
-"""Robot noise of a view, in multiples of the usual one."""
+"""Robot noise of the first three classes of views, as multiples of the ordinary one."""
 GARBAGE_M, GARBAGE_RAD = 0.3, 1.0
-"""A view of the last class tells nothing: its pose may be anywhere in the cell."""
+"""1σ of the last class, metres and radians: so wide that such a view tells nothing."""
 _COUNTS = np.array([5.0, 0.5 / 3, 0.5 / 3, 0.5 / 3])
-"""Dirichlet prior of the classes."""
+"""Dirichlet prior of the classes' shares, in counts of views."""
 Fit = Literal["all", "robot", "nothing"]
-"""Noise scales to be fitted."""
+"""Which noise scales are fitted."""
 STUDENT = 8.0
 """Degrees of freedom of Student's t of a corner: a wrong detection loses its weight."""
 _INFORMATION = (STUDENT + 2) / (STUDENT + 4)
@@ -38,12 +38,12 @@ _ROBOT_PRIOR_M, _ROBOT_PRIOR_RAD = 1e-4, float(np.radians(0.02))
 WIDE = 3.0
 _ROUNDING = 1e-14
 _MODE_COUNT = 4.0
-"""Weight, in residuals, of the rule that no mode of the corners is quieter than those below it."""
+"""Weight, in residuals, of the prior that τ is about λ or larger."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """Noise, 1σ."""
+    """Scales (1σ) of the noise of robot and corners, and the shares of the noise classes."""
 
     robot: Array
     """(2,) metres and radians per axis, of a view of the first class."""
@@ -51,20 +51,23 @@ class Scales:
     lambda_px: float
     sigma_px: float
     shares: Array
-    """(K,) prior chance of each class."""
+    """(K,) prior probability of each class."""
     table: Array = field(default_factory=lambda: np.zeros(0))
-    """(q,) of each systematic error beforehand, mm and mrad."""
+    """(q,) prior 1σ of each systematic error, mm and mrad."""
 
     @property
     def classes(self) -> Array:
-        """(K, 6) variances of the robot's noise."""
+        """Variances (K, 6) of the robot's noise in each class."""
         robot = np.repeat(self.robot, 3) ** 2
         garbage = np.repeat([GARBAGE_M**2, GARBAGE_RAD**2], 3)
         return np.concatenate([GAIN[:, None] ** 2 * robot, garbage[None]])
 
 
 def first_scales(linear: Linear, wide: float = WIDE) -> Scales:
-    """Take medians of the residuals, the robot's times `wide`: a view must be found wrong, not start so."""
+    """Take initial noise scales from the medians of the residuals, the robot's times `wide`.
+
+    Above 1, `wide` starts with a wide noise, so that no view begins as an outlier.
+    """
     robot = [wide * 1.48 * float(np.median(np.abs(part))) for part in (linear.m[:, :3], linear.m[:, 3:])]
     pixel = 1.0 if linear.modes is None else linear.modes.typical_px
     robot_m, robot_rad = (max(value, 1e-5) for value in robot)
@@ -78,10 +81,10 @@ class LinearSolution:
     step: Array
     """(G,) in the order of `Layout`."""
     precision: Array
-    """(G, G) for the classes' chances as they are."""
+    """(G, G) information at the present class probabilities, which it takes as certain."""
     scales: Scales
     chances: Array
-    """(n, K)"""
+    """(n, K) probability of each noise class, per view."""
     residual: Array
     """(n, 6) m at the step's end."""
     z: Array
@@ -92,24 +95,24 @@ class LinearSolution:
 
 @dataclass(frozen=True, eq=False)
 class CornerModes:
-    """Information of the corners on lens and board shape, board poses eliminated."""
+    """Information of the corners about lens and board shape, with each view's board pose eliminated."""
 
     to_optimum: Array
     """(n, 6) step of each board pose to its own corners' optimum."""
     by_shared: Array
-    """(n, 6, g) by which that optimum moves with lens and shape, negative."""
+    """(n, 6, g) negative derivative of that optimum by lens and shape."""
     information: Array
     """(n, g, g)"""
     right: Array
     """(n, g)"""
     whole: Array
-    """(n, g, g) information with the board poses held: it tells the size of a column."""
+    """(n, g, g) information if the board poses were known: the scale by which columns are compared."""
     left: Array
     """(n,) weighted squares (px²) at each board pose's optimum."""
     rows: Array
     """(n,) twice the weighted number of corners."""
     shared: slice
-    """Places of lens and shape among the unknowns."""
+    """Positions of lens and shape among the shared unknowns."""
 
     @classmethod
     def of(cls, blocks: CornerBlocks, H: Array, shared: slice) -> CornerModes:
@@ -128,13 +131,13 @@ class CornerModes:
         )
 
     def gain(self, step: Array) -> float:
-        """Compute half the squares (px²) that a step (G,) takes away."""
+        """Compute half the decrease of the sum of squares (px²) by a step (G,)."""
         x = step[self.shared]
         return float(self.right.sum(axis=0) @ x - 0.5 * x @ self.information.sum(axis=0) @ x)
 
     @cached_property
     def _whitening(self) -> tuple[Array, float]:
-        """W (n, g, g) with |W·r|² = rᵀ·information⁻¹·r where the information is not empty, and its rank."""
+        """Compute W (n, g, g) with |W·r|² = rᵀ·information⁻¹·r (pseudo-inverse), and the summed rank."""
         scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->ni", self.whole), 1e-300))
         values, vectors = np.linalg.eigh(self.information * scale[:, :, None] * scale[:, None, :])
         kept = values > 1e-6
@@ -142,18 +145,18 @@ class CornerModes:
         return root[:, :, None] * np.swapaxes(vectors, 1, 2) * scale[:, None, :], float(kept.sum())
 
     def _inside(self, right: Array) -> float:
-        """Squares (px²) that lens and shape of each view alone could take from `right` (n, g)."""
+        """Compute the decrease of squares (px²) if each view had its own lens and shape; `right`: (n, g)."""
         return float(((self._whitening[0] @ right[..., None]) ** 2).sum())
 
     @cached_property
     def _plain(self) -> float:
-        """σ² of plain corner noise, px²."""
+        """Estimate σ², px²: corner noise that no board pose, lens or shape explains."""
         rest = max(float(self.left.sum()) - self._inside(self.right), 0.0)
         free = float(self.rows.sum()) - 6 * len(self.rows) - self._whitening[1]
         return max(rest / max(free, 1.0), 1e-8)
 
     def variances(self, lambda_px: float, covariance: Array, step: Array) -> tuple[float, float]:
-        """Fit σ² of plain corner noise and λ² of that in the modes of lens and shape, px², after a step."""
+        """Estimate σ² and λ² (px², see the module's text) after a step (G,) with this covariance (G, G)."""
         after = self.right - self.information @ step[self.shared]
         part = covariance[self.shared, self.shared]
         used = float(np.einsum("ij,ji", part, self.information.sum(axis=0))) / lambda_px**2
@@ -172,19 +175,19 @@ class Linear:
     """The posterior around one state."""
 
     H: Array
-    """(n, 6, 6) covariance of each board pose by its own corners, for corners of 1 px."""
+    """(n, 6, 6) covariance of each board pose by its own corners, for corner noise of 1 px."""
     A: Array
     """(n, 6, 6) ∂m/∂C"""
     m: Array
     """(n, 6) robot residual with each board pose at its own corners' optimum."""
     J: Array
-    """(n, 6, G)"""
+    """(n, 6, G) ∂m/∂(shared unknowns)"""
     modes: CornerModes | None = None
-    """None where board poses were given, not seen."""
+    """None where the input holds board poses without corners."""
 
     @cached_property
     def B(self) -> Array:
-        """(n, 6, 6) covariance of m from corners of 1 px."""
+        """Covariance (n, 6, 6) of m by corner noise of 1 px."""
         B = self.A @ self.H @ np.swapaxes(self.A, 1, 2)
         return np.asarray((B + np.swapaxes(B, 1, 2)) / 2)
 
@@ -192,7 +195,10 @@ class Linear:
     def at(
         cls, observed: Observations, state: CellState, weights: Array, information: float = _INFORMATION
     ) -> Linear:
-        """Linearise at `state`; weights (n, k), and information of a corner over a normal one's."""
+        """Linearise at `state` for corner weights (n, k).
+
+        information: that of a corner over one with normal noise of the same scale.
+        """
         at, n = Layout.of(state), len(observed)
         m = flange_residuals(observed, state)
         bare = m if observed.table is None or not len(state.table) else m + observed.table @ state.table
@@ -244,7 +250,7 @@ class Linear:
         return LinearSolution(step, N, scales, chances, residual, z, evidence)
 
     def _noise(self, scales: Scales) -> tuple[Array, Array]:
-        """Covariances (n, K, 6, 6) of m by class, and their inverses."""
+        """Compute the covariances (n, K, 6, 6) of m for each class, and their inverses."""
         S = scales.tau_px**2 * self.B[:, None] + scales.classes[:, :, None] * np.eye(6)
         return S, np.asarray(np.linalg.inv(S), dtype=float)
 
@@ -282,7 +288,7 @@ class Linear:
         return replace(updated, tau_px=tau, lambda_px=lambda_, sigma_px=sigma)
 
     def predicted(self, scales: Scales, covariance: Array) -> Array:
-        """Predict the covariance (n, 6, 6) of m for an ordinary view, unknown to `covariance` (G, G)."""
+        """Predict the covariance (n, 6, 6) of m for ordinary views outside the fit of `covariance` (G, G)."""
         noise = scales.tau_px**2 * self.B + np.diag(scales.classes[0])
         return np.asarray(noise + self.J @ covariance @ np.swapaxes(self.J, 1, 2))
 
@@ -300,13 +306,13 @@ class Linear:
         return C if self.modes is None else perturb(C, self.modes.to_optimum)
 
     def lost(self, solved: LinearSolution) -> Array:
-        """Compute the information (G, G) that not knowing the views' classes costs (Louis 1982)."""
+        """Compute the information (G, G) lost because the views' classes are unknown (Louis 1982)."""
         mean = np.einsum("nk,nki->ni", solved.chances, solved.z)
         spread = np.einsum("nk,nki,nkj->nij", solved.chances, solved.z, solved.z)
         spread -= mean[:, :, None] * mean[:, None, :]
         _, S_inverse = self._noise(solved.scales)
         W = np.einsum("nk,nkij->nij", solved.chances, S_inverse)
-        # A view cannot cost more than it tells.
+        # A view cannot lose more information than it gives.
         root = np.linalg.cholesky(W)
         inner = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, spread), 1, 2))
         values, vectors = np.linalg.eigh((inner + np.swapaxes(inner, 1, 2)) / 2)
@@ -331,12 +337,12 @@ class Linear:
         return np.array(parts)
 
     def covariance(self, solved: LinearSolution) -> Array:
-        """Compute the posterior covariance (G, G), doubts about the views' classes included."""
+        """Compute the posterior covariance (G, G), with the uncertainty of the views' classes."""
         return inverse_of(solved.precision - self.lost(solved))
 
 
 def _chances(residual: Array, S: Array, S_inverse: Array, shares: Array) -> tuple[Array, Array]:
-    """Chances (n, K) of the classes and the log density (n,) of each view's residual (n, 6)."""
+    """Compute the probabilities (n, K) of the classes and the log density (n,) of residuals (n, 6)."""
     square = np.einsum("ni,nkij,nj->nk", residual, S_inverse, residual)
     log = np.log(shares) - 0.5 * (square + np.linalg.slogdet(S)[1] + 6 * np.log(2 * np.pi))
     top = log.max(axis=1, keepdims=True)
@@ -346,21 +352,21 @@ def _chances(residual: Array, S: Array, S_inverse: Array, shares: Array) -> tupl
 
 
 def _summed(J: Array, WJ: Array) -> Array:
-    """Sum of the views' Jᵀ·WJ (a, b), for J (n, 6, a) and WJ (n, 6, b)."""
+    """Sum Jᵀ·WJ (a, b) over the views, for J (n, 6, a) and WJ (n, 6, b)."""
     return np.asarray(J.reshape(-1, J.shape[-1]).T @ WJ.reshape(-1, WJ.shape[-1]))
 
 
 def inverse_of(N: Array) -> Array:
     """Invert a symmetric positive matrix, scaled to ones first. LinAlgError where it is not.
 
-    What rounding cannot tell from open (two terms of a rational lens, say) gets a huge variance, not an
-    infinite one.
+    A direction that is undetermined up to rounding (two terms of a rational lens, say) gets a huge variance,
+    not an infinite one.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     scaled = (N + N.T) / 2 * np.outer(scale, scale)
     try:
         values, vectors = np.linalg.eigh(scaled)
-    except np.linalg.LinAlgError:  # LAPACK's divide and conquer gives up on a matrix in some thousand
+    except np.linalg.LinAlgError:  # LAPACK's divide and conquer fails for about one matrix in a thousand
         values, vectors = linalg.eigh(scaled, driver="ev")
     if not values[0] > -_ROUNDING:
         raise np.linalg.LinAlgError("some unknowns are left open")

@@ -1,4 +1,4 @@
-"""Quality of an X: held-out errors of the paper, board spread, what the motions can and cannot show."""
+"""Quality of an X: the paper's held-out errors, board spread, observability; and checks of the input."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from calibrate.results import HoldoutScore
 from calibrate.views import BoardView, ViewSet, require_no_copies
 
 _MIN_SECOND_AXIS_RAD = np.radians(0.3)
-"""Root mean square rotation about the second axis below which no X is worth the name."""
+"""Rms rotation about the second axis below which X is not determined."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """Weakest direction of X and the motions behind it."""
+    """The direction in which X is known worst, and the rotations that the views hold."""
 
     weakest_direction: Array
     """(6,) unit [δt, δφ] in X's parent frame, rotation weighed at the working distance."""
     weakest_text: str
     weakest_sigma_m: float
-    """1σ along it, as metres at the working distance."""
+    """1σ along `weakest_direction`, as metres at the working distance."""
     largest_angle_rad: float
     """Largest rotation between any two views."""
     axis_spread: float
@@ -43,7 +43,7 @@ def motion_errors(X: Array, pairs: Pairs) -> tuple[Array, Array]:
 def score_holdout(
     X: Array, pairs: Pairs, indices: list[int], fitted_views: int, note: str = ""
 ) -> HoldoutScore:
-    """Score held-out `pairs`; `indices` are the pose numbers of the view places that pairs speak of."""
+    """Score an X (4, 4) by held-out `pairs`; `indices`: pose number of each view that pairs refer to."""
     e_t, e_R = motion_errors(X, pairs)
     named = [
         (indices[i], indices[j]) for i, j in zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
@@ -109,11 +109,11 @@ FEWEST_CORNERS = 4
 
 
 MAX_VIEWS = 20_000
-"""Beyond this the last stage would need more than a minute and a gigabyte."""
+"""Most views: more would need over a minute and a gigabyte."""
 
 
 def require_solvable(views: ViewSet) -> None:
-    """Raise TooFewViewsError or BadViewsError, naming view and remedy."""
+    """Check number and content of views. Raises TooFewViewsError or BadViewsError, naming view and remedy."""
     if len(views) < MIN_VIEWS:
         raise TooFewViewsError(
             f"{len(views)} usable views (minimum {MIN_VIEWS}).",
@@ -165,7 +165,7 @@ def _require_view(view: BoardView, fewest_corners: int) -> None:
 
 
 def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> Observability:
-    """Find the direction of X that is known worst, rotations weighed as metres at `distance_m`.
+    """Find the direction in which X is known worst, rotations converted to metres at `distance_m`.
 
     covariance: (6, 6) of X; parent: the name of X's parent frame, for the sentence.
     """

@@ -51,7 +51,7 @@ Method = Callable[[ViewSet], Array]
 PAPER = "DE, paper"
 _MAX_PAIRS = 2000
 _EXACT = 1e-6
-"""1σ of robot poses, lens and board that are as good as exact: metres and radians, or relative."""
+"""1σ of robot poses, lens and board that are taken as exact: metres and radians, or relative."""
 
 
 def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[PeerResult]:
@@ -118,7 +118,7 @@ def _paper(views: ViewSet, seed: int) -> Array:
 
 
 def _reprojection_only(views: ViewSet) -> Array:
-    """Pixels alone, robot poses taken as exact, intrinsics held; from Park and Martin's X."""
+    """Minimise the reprojection error from Park and Martin's X, robot poses and intrinsics taken as exact."""
     observed = observe_views(views)
     if not observed.has_pixels:
         raise CalibrationError(
@@ -136,7 +136,7 @@ def _reprojection_only(views: ViewSet) -> Array:
 
 
 def _pose_arrays(views: ViewSet) -> tuple[Array, Array]:
-    """H (n, 4, 4) as in `pairs` and camera_from_board (n, 4, 4)."""
+    """Return H (n, 4, 4) as in `pairs`, and camera_from_board (n, 4, 4)."""
     return mount_poses(views.base_from_flange, views.mount), views.camera_from_board
 
 

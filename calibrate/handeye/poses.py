@@ -1,6 +1,7 @@
-"""X and the board's pose from poses alone: a start that most views agree on, then the same likelihood.
+"""Quick fit of X and the board's pose from poses alone, without corners.
 
-It takes milliseconds, so that many readings of one recording can be compared by their evidence.
+It starts where most views agree and maximises the likelihood of `linear`. It takes milliseconds, so that many
+interpretations of one recording (`readings`) can be compared by their evidence.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from recordings.schema.messages import Mount
 
 _SUBSETS, _OF = 120, 4
 _VOTERS = 60
-"""Most views that judge, evenly spread."""
+"""Most views, evenly spread, that candidates are compared by."""
 _SHARE = 0.55
-"""Share of the views that have to agree."""
+"""Share of the views that have to agree with a start."""
 _OPEN = 0.1
 _LEVER_M = 0.5
-"""Turns a rotation into a length."""
+"""Lever by which rotations are converted to lengths."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPoses:
-    """camera_from_board of every view, and factors of the camera or the board that move them."""
+    """camera_from_board of every view, and unknown factors (board size, focal length) that change it."""
 
     C: Array
     """(n, 4, 4) with every factor 1."""
@@ -54,7 +55,7 @@ class BoardPoses:
 
     @property
     def open(self) -> Places:
-        """Factors of which so little is known that a start must find them."""
+        """Indices of the factors that are too uncertain to start at 1."""
         return np.flatnonzero(self.sigma > _OPEN)
 
 
@@ -63,7 +64,7 @@ class Start:
     X: Array
     """(4, 4)"""
     Y: Array
-    """(4, 4) pose of the board"""
+    """(4, 4) pose of the board: base_from_board or flange_from_board"""
     factors: Array
     """(p,)"""
 
@@ -72,8 +73,8 @@ def agreed_start(H: Array, boards: BoardPoses, seed: int, candidate: Array | Non
     """Find the X, board pose and factors on which the largest part of the views agrees best.
 
     H as in `pairs`, (n, 4, 4). Park and Martin's method (1994) on subsets of four views; the one with the
-    least 55 % quantile of the distance from the most central board pose wins. `candidate`: an X (4, 4) that
-    takes part.
+    least 55 % quantile of the distance from the most central board pose wins. `candidate`: a further X (4, 4)
+    to compare.
     """
     n = len(H)
     rng = np.random.default_rng(seed)
@@ -90,7 +91,7 @@ def agreed_start(H: Array, boards: BoardPoses, seed: int, candidate: Array | Non
 
 
 def _of_subsets(H: Array, boards: BoardPoses, subsets: Places) -> tuple[Array, Array]:
-    """X (s, 4, 4) and factors (s, p) by each subset (s, 4) of the views that tells them."""
+    """Compute X (s, 4, 4) and factors (s, p) from each subset (s, 4) of views that determines them."""
     first, second = np.array(list(combinations(range(subsets.shape[1]), 2))).T
     i, j = subsets[:, first], subsets[:, second]
     A = inverse(H[j]) @ H[i]
@@ -103,7 +104,7 @@ def _of_subsets(H: Array, boards: BoardPoses, subsets: Places) -> tuple[Array, A
     R = (U @ D @ Vt)[:, None]
 
     def shift(t: Array) -> Array:
-        """Translation of B for translations t (n, 3) of the board poses, seen through X."""
+        """Compute B's translation for translations t (n, 3) of the board poses, transformed by X."""
         return np.asarray((R @ (t[j] - (R_B @ t[i][..., None])[..., 0])[..., None])[..., 0])
 
     free = boards.motion[boards.open, :, :3]
@@ -126,7 +127,7 @@ def _of_subsets(H: Array, boards: BoardPoses, subsets: Places) -> tuple[Array, A
 
 
 def central_pose(places: Array) -> Array:
-    """Average those of `places` (n, 4, 4) that are nearest to the most central one, (4, 4)."""
+    """Average the poses nearest to the most central one of `places` (n, 4, 4) → (4, 4)."""
     some = places[:: 1 + len(places) // (4 * _VOTERS)]
     middle = some[int(_reach(some).argmin())]
     near = np.argsort(_distance(places, middle[None])[:, 0], kind="stable")[: _quorum(len(places)) + 1]
@@ -138,13 +139,13 @@ def _quorum(count: int) -> int:
 
 
 def _reach(places: Array) -> Array:
-    """(..., n) distance within which each place has its share of the others."""
+    """Compute the distance (..., n) within which each place has `_SHARE` of the others."""
     quorum = _quorum(places.shape[-3])
     return np.asarray(np.partition(_distance(places, places), quorum, axis=-1)[..., quorum])
 
 
 def _distance(first: Array, second: Array) -> Array:
-    """(..., n, m) between poses: metres, and radians at half a metre."""
+    """Compute distances (..., n, m) between poses: metres, and radians times `_LEVER_M`."""
     shift = np.linalg.norm(first[..., :, None, :3, 3] - second[..., None, :, :3, 3], axis=-1)
     R, Q = (places[..., :3, :3].reshape(*places.shape[:-2], 9) for places in (first, second))
     cosine = (R @ np.swapaxes(Q, -1, -2) - 1) / 2
@@ -153,7 +154,7 @@ def _distance(first: Array, second: Array) -> Array:
 
 _STEPS = 8
 _SETTLED = 0.3
-"""Length of a step, in sigmas: evidence is not asked to be exact."""
+"""Step length, in sigmas, below which the fit has converged: the evidence need not be exact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +168,7 @@ class PoseViews:
     covariance: Array
     """(n, 6, 6) of the board poses."""
     later: NDArray[np.bool_] | None = None
-    """(n,) views after something was moved; None where nothing was."""
+    """(n,) mask of the views after camera or board was moved; None where nothing was."""
     moved: Moved = "board"
 
     def __len__(self) -> int:
@@ -221,7 +222,7 @@ class PoseFit:
 
     @property
     def full(self) -> Array:
-        """(n,) chance that a view is an ordinary one."""
+        """Probability (n,) that a view is an ordinary one."""
         return self.solved.chances[:, 0]
 
 
@@ -264,7 +265,7 @@ def _start(views: PoseViews, seed: int) -> tuple[Array, Array, Array]:
 
 
 def _prior(boards: BoardPoses, poses: int, factors: Array) -> Quadratic:
-    """Make the prior of poses, known to 1 m and 1 rad, and factors: open ones may be of any size."""
+    """Make the prior of X and Y (1 m, 1 rad) and of the factors; `BoardPoses.open` ones have none."""
     precision = np.concatenate([np.full(6 * poses, 1e-6), boards.sigma**-2.0])
     precision[6 * poses + boards.open] = 1e-9
     miss = np.concatenate([np.zeros(6 * poses), factors - 1.0])

@@ -1,4 +1,4 @@
-"""Priors on lens, board and arm: knowledge from before the images are looked at."""
+"""Priors on lens, board and arm: what is known before any image."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from calibrate.results import SHAPE
 from recordings.schema.messages import BoardSpec, CameraModel
 
 ASPECT_SIGMA = 0.001
-"""1σ of log(fy/fx): a sensor's pixels are square. It tells an unequal print from the lens."""
+"""1σ of log(fy/fx). Pixels are square, so a print that is longer in y than in x is not put on the lens."""
 _NOT_SQUARE = 0.02
-"""A lens farther from square pixels than this belongs to a sensor that has none: it keeps its ratio."""
+"""Deviation of fy/fx from 1 above which the pixels are taken as not square: the given ratio is kept."""
 _KNOWN = {"k1": 0.01, "k2": 0.02, "k3": 0.02, "k4": 0.02, "k5": 0.02, "k6": 0.02, "p1": 5e-4, "p2": 5e-4}
-"""1σ of a given lens whose uncertainty nobody states, beside 0.2 % of the focal length and of the width."""
+"""Default 1σ of a given lens's distortion; focal length and centre have `_KNOWN_SHARE`."""
 _KNOWN_SHARE = 0.002
 _UNKNOWN = {"k1": 1.0, "k2": 3.0, "k3": 10.0, "k4": 1.0, "k5": 3.0, "k6": 10.0, "p1": 0.02, "p2": 0.02}
-"""1σ of a lens of which nothing is known, about no distortion; the centre is the middle ± 20 %."""
+"""1σ of an unknown lens's distortion, about 0; its centre is the middle of the image ± `_UNKNOWN_CENTRE`."""
 _UNKNOWN_CENTRE = 0.2
 TABLE_UNIT = 1e-3
-"""Errors of the arm's table are counted in mm and mrad: equal harm at an arm's length of 1 m."""
+"""Errors of the arm's table are in mm and mrad: at a reach of 1 m both move the flange alike."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class BoardTolerance:
     """1σ of the board's shape against its drawing."""
 
     square: float = 0.003
-    """Relative, of the size of its squares, and of x against y of the print."""
+    """Relative, of the size of the squares, and of their size in x against that in y."""
     flatness_m: float = 0.001
 
     @classmethod
     def of(cls, board: BoardSpec) -> BoardTolerance:
-        """Take what the board's description states, else the usual one."""
+        """Take what the board's description states, else the defaults."""
         usual = cls()
         return cls(
             usual.square if board.square_tolerance is None else board.square_tolerance,
@@ -54,7 +54,7 @@ class LensPrior:
 
     @classmethod
     def given(cls, camera: CameraModel, sigma: Array | None = None) -> LensPrior:
-        """Describe a calibrated lens, with the uncertainty (p,) stated for it or the usual one."""
+        """Make the prior of a calibrated lens; sigma: (p,) its stated uncertainty, None: the default."""
         mean = intrinsics_vector(camera)
         if sigma is None:
             names = intrinsics_names(camera)
@@ -65,7 +65,7 @@ class LensPrior:
 
     @classmethod
     def unknown(cls, camera: CameraModel) -> LensPrior:
-        """Describe a lens of which only the model is known: it is found from the same images."""
+        """Make the prior of a lens of which only the model is known: it is estimated from the same images."""
         start = intrinsics_vector(camera)
         names = intrinsics_names(camera)
         mean = np.zeros(len(names))
@@ -87,7 +87,7 @@ class Priors:
     board: BoardTolerance = field(default_factory=BoardTolerance)
 
     def linearise(self, state: CellState, table: Array | float) -> Quadratic:
-        """Linearise around `state`, for systematic errors of 1σ `table`, (q,) or all the same (mm, mrad)."""
+        """Linearise around `state`. table: 1σ of the systematic errors, (q,) or one for all, mm and mrad."""
         at = Layout.of(state)
         N, right = np.zeros((at.size, at.size)), np.zeros(at.size)
         vector = intrinsics_vector(state.camera)
@@ -102,13 +102,13 @@ class Priors:
         miss = (np.log(vector[1] / vector[0]) - self.lens.log_aspect) / ASPECT_SIGMA
         N[fx : fy + 1, fx : fy + 1] += np.outer(slope, slope)
         right[fx : fy + 1] -= slope * miss
-        # Only what differs between sizes of the table's errors.
+        # Constants are left out, except what differs between sizes of the table's errors.
         log = -0.5 * float(((state.table / table_sigma) ** 2).sum()) - float(np.log(table_sigma).sum())
         return Quadratic(N, right, log)
 
     @property
     def board_sigma(self) -> Array:
-        """(5,) in the order of `SHAPE`."""
+        """1σ (5,) of the board's shape, in the order of `SHAPE`."""
         square, bend = self.board.square, self.board.flatness_m
         sigma = np.array([square, square, bend, bend, bend])
         assert len(sigma) == len(SHAPE)

@@ -1,8 +1,8 @@
-"""Other readings of a whole recording: what explains all views at once, before any single one is blamed.
+"""Alternative interpretations ("readings") of a recording in which robot poses and images disagree.
 
 Poses in another convention, images that belong to their neighbours' poses, squares of another size,
-something moved half-way: each is a reading of the same views, fitted like the recording as it stands
-(`poses`) and compared with it by evidence.
+something moved half-way: each is fitted like the recording as it stands (`poses`), and the evidence tells
+which one explains all views. This comes before any single view is called wrong.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from calibrate.handeye.solution import Explanation, Reading
 from calibrate.views import Moved, ViewSet
 
 _CLEAR = 10.0
-"""Log evidence beyond chance by which another reading has to win."""
+"""Log evidence, besides the logarithm of the number of views, by which another reading has to win."""
 _MOST_VIEWS = 60
-"""Most views that are read, evenly spread (neighbours for shifted images)."""
+"""Most views that are fitted: evenly spread ones (consecutive ones for shifted images)."""
 _LARGEST_SHIFT = 3
 _FEWEST_PER_PART = 4
 _LOST_VIEW = 15.0
-"""Log evidence charged for each view that a reading leaves without a partner."""
+"""Log evidence subtracted for each view for which a shifted reading has no pose."""
 _SIZE, _FOCAL = 0, 1
-"""Places of the factors of `pose_views`."""
+"""Indices of the factors of `pose_views`."""
 _NEAR = 0.1
-"""Relative, of a factor to a thousand."""
+"""Relative distance of a factor from 1000 within which millimetres were given for metres."""
 _LEAST = 0.01
-"""A factor nearer to 1 than this (relative) is a tolerance, no other reading."""
+"""Relative distance of a factor from 1 below which it is a tolerance, not another reading."""
 _FREE = 1.0
-"""1σ of a factor that a reading lets free."""
+"""1σ of a factor that a reading leaves open."""
 
 
 _FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL, Reading.REFOCUSED: -1}
 
 
 def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
-    """Find the best reading; AS_RECORDED unless another one's evidence is clear beyond chance."""
+    """Find the reading with the most evidence; AS_RECORDED unless another one is clearly better."""
     as_recorded = _fit(views, seed)
     base = -np.inf if as_recorded is None else as_recorded.log_evidence
     best = Explanation(Reading.AS_RECORDED, 0.0)
@@ -79,7 +79,7 @@ def _fit(views: PoseViews, seed: int) -> PoseFit | None:
 def _readings(
     views: PoseViews, as_recorded: PoseFit | None
 ) -> Iterator[tuple[Reading, PoseViews, int, float]]:
-    """Reading, the views in it, `Explanation.at`, and the evidence that it is charged beforehand."""
+    """Yield each reading, its views, `Explanation.at`, and the log evidence to subtract for it."""
     for reading, change in _CONVENTIONS.items():
         yield reading, replace(views, flange=change(views.flange)), 0, 0.0
     yield Reading.MIRRORED, replace(views, boards=_mirrored(views.boards)), 0, 0.0
@@ -99,7 +99,7 @@ def _readings(
 
 
 def _changes(views: PoseViews, as_recorded: PoseFit | None) -> list[int]:
-    """Places where something may have been moved: where the views' weights part best, and the middle."""
+    """List indices at which something may have moved: where view weights change most, and the middle."""
     n = len(views)
     places = np.arange(_FEWEST_PER_PART, n - _FEWEST_PER_PART + 1)
     if not len(places):
@@ -121,7 +121,7 @@ def _let_free(boards: BoardPoses, factor: int) -> BoardPoses:
 
 
 def _refocused(boards: BoardPoses, later: NDArray[np.bool_]) -> BoardPoses:
-    """One focal length before, another one after; the last factor is that of the later part."""
+    """Give views before and after a change a focal length each; the last factor is that of the later ones."""
     focal = boards.motion[_FOCAL]
     parts = np.stack([focal * ~later[:, None], focal * later[:, None]])
     return replace(
@@ -132,21 +132,21 @@ def _refocused(boards: BoardPoses, later: NDArray[np.bool_]) -> BoardPoses:
 
 
 def _mirrored(boards: BoardPoses) -> BoardPoses:
-    """Board poses of mirrored images: x of the camera and of the board change their sign."""
+    """Convert to board poses of mirrored images: x of camera and board change their sign."""
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
     motion = boards.motion * [-1.0, 1.0, 1.0, 1.0, -1.0, -1.0]
     return replace(boards, C=mirror @ boards.C @ mirror, motion=motion)
 
 
 def _shifted(views: PoseViews, shift: int) -> PoseViews:
-    """Image i with pose i + shift."""
+    """Pair image i with pose i + shift."""
     n = len(views)
     images = np.arange(max(0, -shift), n - max(0, shift))
     return replace(views.part(images), flange=views.flange[images + shift])
 
 
 def _rotations(change: Callable[[Array], Array]) -> Callable[[Array], Array]:
-    """A change of rotations (n, 3, 3), for poses (n, 4, 4)."""
+    """Make a function of poses (n, 4, 4) from a change of their rotations (n, 3, 3)."""
 
     def changed(poses: Array) -> Array:
         result = poses.copy()

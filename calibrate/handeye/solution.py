@@ -43,9 +43,9 @@ class SolveOptions:
     profile: Profile = "robust"
     seed: int = 0
     intrinsics_from_same_pictures: bool = False
-    """The camera model was fitted to these very images: nothing is known of the lens beforehand."""
+    """The camera model was fitted to these same images, so it is no prior knowledge of the lens."""
     lens_sigma: tuple[float, ...] | None = None
-    """1σ of a given lens in the order of `projection.intrinsics_names`; None: the usual 0.2 %."""
+    """1σ of a given lens in the order of `projection.intrinsics_names`; None: the default 0.2 %."""
     board: BoardTolerance = field(default_factory=BoardTolerance)
     model_arm: bool = True
     """Allow for errors of the arm's kinematic table where its model is known."""
@@ -63,50 +63,50 @@ class SolveOptions:
 
 @dataclass(frozen=True)
 class Remark:
-    """Something that is doubtful, as a code for programs and a sentence for people."""
+    """Warning about a solution: a code for programs and a sentence for people."""
 
     code: str
     text: str
 
 
 _EXPLAINED = 4.0
-"""Sigmas of a statement's own tolerance within which views may differ from it."""
+"""Sigmas of its own tolerance by which a stated value may differ from the views."""
 
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """One statement (the lens, the board) against the views."""
+    """Comparison of a stated value (the lens, the board) with the views."""
 
     sigmas: float
-    """Contradiction of views and statement, as sigmas of one normal number."""
+    """Significance of the contradiction, as sigmas of one normal variable."""
     pull_m: float
-    """Shift of X at the working distance by believing the statement."""
+    """Shift of X at the working distance caused by using the stated value, metres."""
 
     @property
     def unexplained_m(self) -> float:
-        """The part of `pull_m` that the statement's tolerance does not explain."""
+        """The part of `pull_m` that the stated value's tolerance does not explain."""
         return float(self.pull_m * np.maximum(0.0, 1.0 - _EXPLAINED / np.maximum(self.sigmas, 1e-9)))
 
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Errors of views predicted without them, at the middle of the board; of views that count fully."""
+    """Errors at the middle of the board of views predicted from the others; only views that count fully."""
 
     rms_m: float
     rms_rad: float
     claimed_m: float
-    """`rms_m` as the estimates predict it."""
+    """Value of `rms_m` that the stated uncertainties predict."""
     limit: float
-    """Limit of `rms_m` over `claimed_m`; beyond it the claim is too small."""
+    """Limit of `rms_m` over `claimed_m`; above it the stated uncertainties are too small."""
     folds: int
 
 
 @dataclass(frozen=True)
 class NoiseScales:
-    """Standard deviations that the residuals show (restricted maximum likelihood)."""
+    """Noise estimated from the residuals (restricted maximum likelihood), 1σ."""
 
     corner_px: float
-    """The part that moves a board's pose: corner errors are smooth over a board."""
+    """Of a corner per axis: only the smooth part of the corner errors, which moves the board's pose."""
     robot_m: float
     robot_rad: float
 
@@ -118,12 +118,12 @@ class TableResult:
     nominal: RobotModel
     """The table that the recorded flanges follow."""
     factory: bool
-    """It is the maker's calibration of this arm, not the published table."""
+    """`nominal` is the maker's calibration of this arm, not the published table."""
     corrected: RobotModel
     covariance: Array
     """(24, 24) of X, as in `Solution.parent_from_child`, and of the errors in the order of `PARAMETERS`."""
     flange_threshold: float
-    """As `Solution.confidence_threshold`, of the six errors of a corrected flange by `covariance`."""
+    """As `Solution.confidence_threshold`, for the error (6,) of a flange computed with the table."""
     for_uncorrected: Array
     """(4, 4) the X that serves the uncorrected arm best, over the workspace and where the views are."""
     uncorrected_covariance: Array
@@ -135,7 +135,7 @@ class TableResult:
     if_measured_m: dict[str, float]
     """`with_table_m` if this (board, intrinsics) were known to `MEASURED`."""
     held_out_m: Array | None
-    """(2, n) distance by which the views were missed by those taken elsewhere: without, with the table."""
+    """(2, n) error of views predicted from those taken elsewhere: without, with the table."""
     refused: TableRefusal | None
     """Reason why the table is not offered; None where it is."""
 
@@ -168,7 +168,7 @@ TableRefusal = Literal["no-evidence", "no-joints", "not-nominal", "not-better"]
 """No clear evidence; joints by inverse kinematics; recorded flanges do not follow the nominal table; the
 table does not help on poses elsewhere."""
 MEASURED = 2e-4
-"""Relative 1σ of what was measured with care."""
+"""Relative 1σ of a careful measurement."""
 
 
 @dataclass(frozen=True)
@@ -176,9 +176,9 @@ class ArmTable:
     """Systematic errors of the robot: of the arm's kinematic table, and of a bracket that bends."""
 
     log_bayes: float
-    """Log evidence for any errors against none."""
+    """Log evidence for systematic errors of any size against none."""
     size_mm: float
-    """Their 1σ, mm and mrad."""
+    """1σ of the errors, mm and mrad."""
     errors: dict[str, tuple[float, float]]
     """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
     arm_known: bool = True
@@ -192,7 +192,7 @@ class ArmTable:
 
 
 class Reading(Enum):
-    """Ways in which a recording may have to be read; the value is the code in files."""
+    """Interpretations of a recording, such as inverted poses; the value is the code in files."""
 
     AS_RECORDED = "as-recorded"
     INVERSE_POSES = "inverse-poses"
@@ -216,16 +216,16 @@ class Explanation:
 
     reading: Reading
     log_evidence_gain: float
-    """Over the recording as it stands."""
+    """Gain over the recording as it stands."""
     at: int = 0
-    """Place of the first view after a change; images by which they are shifted."""
+    """Index of the first view after a change; for shifted images, by how many poses."""
     factor: float = 1.0
     """True over configured size of the squares, or focal length, of the later part where it changed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """X and everything that says how good it is."""
+    """X with its uncertainty, quality figures and warnings."""
 
     mount: Mount
     profile: Profile
@@ -234,7 +234,7 @@ class Solution:
     covariance: Array
     """(6, 6)"""
     confidence_threshold: float
-    """δᵀ C⁻¹ δ below this holds the truth in 95 % of cases: 6·F(6, ν), ν = 3N - 6."""
+    """Limit of δᵀ C⁻¹ δ that holds the true X in 95 % of cases: 6·F(6, ν), ν = 3N - 6."""
     board_place: Transform
     """base_from_board or flange_from_board."""
     camera: CameraModel
@@ -252,9 +252,9 @@ class Solution:
     turned: tuple[int, ...] = ()
     """Views whose corner order was turned by 180° to agree with the others, and kept."""
     weights: dict[int, float] = field(default_factory=dict)
-    """Pose number → what the view counts for, 1 fully … 0."""
+    """Pose number → weight of the view, 0 (rejected) … 1."""
     suspects: dict[int, float] = field(default_factory=dict)
-    """Used views that count in part, by pose number: the chance that they are wrong."""
+    """Pose number of a down-weighted view → probability that it is an outlier."""
     session: Explanation = field(default_factory=lambda: Explanation(Reading.AS_RECORDED, 0.0))
     """Reading of the recording as a whole."""
     move_accepted: bool = False

@@ -1,4 +1,4 @@
-"""ViewSet in, Solution out: one estimate of all that a cell does not know, and what may be said of it."""
+"""The solver: views in, a `Solution` with uncertainty, checks and warnings out."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ from calibrate.views import Moved, ViewSet, array_of
 __all__ = ["Solution", "SolveOptions", "solve_views"]
 
 _ENOUGH = 0.9
-"""Share of views with full weight above which a recording is taken as it stands."""
+"""Share of views with full weight above which no other reading of the recording is tried."""
 _NOISY_M, _NOISY_RAD = 0.002, float(np.radians(0.3))
-"""Noise of the robot that is more than an arm's."""
+"""Robot noise, 1σ, that is larger than a sound arm's."""
 _FREE_FOCAL = 0.02
-"""1σ of the focal length of a lens that was found from the same images, relative, for other readings."""
+"""Relative 1σ, for other readings, of a focal length that was estimated from the same images."""
 
 
 def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution:
@@ -82,7 +82,7 @@ def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution
 
 
 def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
-    """Estimate from all views. PosesDisagreeError names the reading that would explain the recording."""
+    """Run the robust profile on all views. PosesDisagreeError names the reading that explains them."""
     priors = _priors(views, options)
     focal_sigma = float(min(priors.lens.sigma[0] / priors.lens.mean[0], _FREE_FOCAL))
     poses = pose_views(views, focal_sigma, priors.board.square)
@@ -93,7 +93,7 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         disagree = problem
 
     def ask() -> tuple[Explanation, CellFit | None]:
-        """Find how the recording has to be read, and fit a move that is accepted."""
+        """Find the reading that explains the recording; fit the move if it is one and moves are accepted."""
         found = explain_recording(poses, options.seed)
         moved = _MOVED.get(found.reading)
         if not options.accept_move or moved is None:
@@ -131,7 +131,7 @@ def _priors(views: ViewSet, options: SolveOptions) -> Priors:
 
 
 def _doubtful(solution: Solution) -> bool:
-    """Tell whether something is left that another reading of the whole recording might explain."""
+    """Tell whether another reading of the recording might explain what this solution leaves."""
     folds, noise = solution.cross_validation, solution.noise
     findings = (solution.lens_finding, solution.board_finding)
     return bool(
@@ -200,7 +200,10 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
 
 
 def _corner_rms(fit: CellFit) -> tuple[float | None, Array]:
-    """Over all corners of the used views, and for each view (n,), at the board poses that fit its corners."""
+    """Compute the rms reprojection error (px) over all used views, and of each view (n,).
+
+    Each view has the board pose that fits its own corners.
+    """
     found = fit.estimate
     if not fit.observed.has_pixels:
         return None, np.zeros(len(fit.views))
@@ -234,8 +237,7 @@ def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: flo
 def _holdout(fit: CellFit) -> HoldoutScore | None:
     """Fit on all but the last 6 used views, lens included; score all pairs inside those 6.
 
-    That fit starts at the estimate of all views: a start decides how long the way to its own optimum is, not
-    where the optimum lies.
+    The fit starts at the estimate of all views. That saves steps and does not change the optimum.
     """
     used = np.flatnonzero(fit.estimate.used)
     first, last = used[:-HELD_OUT], used[-HELD_OUT:]
@@ -333,9 +335,9 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
 
 
 def _of_returned(objective: QuadraticObjective, X: Array, pairs: int) -> Certificate:
-    """The bound of the relaxation against the value at the X that is returned, translation included.
+    """Compare the relaxation's lower bound with the value at the returned X, translation included.
 
-    `certify` itself judges the rotation, with the best translation for it.
+    `certify` itself compares it with the best translation for the rotation.
     """
     problem = (
         f"logarithmic objective of eq. 16 (lambda 1) over the {pairs} consecutive pairs that were fitted"

@@ -1,8 +1,8 @@
-"""Error of points in the robot's base over its workspace: with the arm's table, and of one X without it.
+"""Errors of points in base over the arm's workspace, with the arm's corrected table and without it.
 
 A point on the camera's axis or near it (eye-in-hand), or one that the flange carries (eye-to-hand), is placed
-by X and the flange. Rigid motions of all points together (of base, or of what the flange carries) count as no
-error: nothing that was recorded tells them from the place of the board.
+by X and the flange. A rigid motion of all points together (of base, or of what the flange carries) counts as
+no error: nothing in a recording tells it from another place of the board.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SHELL = (0.35, 0.9)
 """Reach of the sampled flange positions, as shares of upper arm and forearm together."""
 MIDDLE = np.zeros((1, 2))
 SPREAD = 0.25 * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
-"""An X needs points beside the axis (radians) too: one point says nothing of a roll about it."""
+"""Directions of points beside the camera's axis, radians: on the axis alone a roll of X has no effect."""
 
 
 def sample_workspace(model: RobotModel, like_rad: Array, count: int = POSES, seed: int = 0) -> Array:
@@ -48,7 +48,7 @@ def sample_workspace(model: RobotModel, like_rad: Array, count: int = POSES, see
 
 
 def _branch(model: RobotModel, joints_rad: Array) -> int:
-    """The arm branch, of `inverse_many`, of most of the joints (n, 6)."""
+    """Return the branch of `inverse_many` that most of the joints (n, 6) are in."""
     owner, solutions, branch = inverse_many(model, forward(model, joints_rad))
     off = np.abs(np.angle(np.exp(1j * (solutions - joints_rad[owner])))).max(axis=1)
     same = branch[off < 0.1]
@@ -57,10 +57,10 @@ def _branch(model: RobotModel, joints_rad: Array) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """Linear dependence of points in base on X and on the errors of the table."""
+    """Derivatives of points in base by X and by the errors of the table."""
 
     by_camera: Array
-    """(m, 6)"""
+    """(m, 6) by X"""
     by_table: Array
     """(m, 18) in the order of `PARAMETERS`."""
     by_rigid: Array
@@ -105,7 +105,7 @@ class Workspace:
         return cls(by_camera.reshape(rows), T.reshape(rows), by_rigid.reshape(rows))
 
     def __add__(self, other: Workspace) -> Workspace:
-        """Put both together, each with the same weight as a whole."""
+        """Combine the points of both; each workspace as a whole has the same weight."""
         ratio = np.sqrt(len(self.by_camera) / len(other.by_camera))
         return Workspace(
             *(
@@ -115,28 +115,28 @@ class Workspace:
         )
 
     def for_uncorrected(self) -> Array:
-        """(6, 18): X by it times the table's errors serves the uncorrected arm best, over these poses."""
+        """Matrix (6, 18): times the table's errors, the change of X that is best for the uncorrected arm."""
         J = np.concatenate([self.by_camera, self.by_rigid], axis=1)
         return np.asarray(np.linalg.lstsq(J, self.by_table, rcond=None)[0][:6])
 
     def quadratic(self) -> Array:
-        """(24, 24) K: a point's mean squared error (m²) is trace(K C) for a covariance C of [X, errors]."""
+        """Matrix K (24, 24): a point's mean squared error is trace(K C), C the covariance of [X, errors]."""
         J = self._beside_rigid(np.concatenate([self.by_camera, self.by_table], axis=1))
         return np.asarray(3 * J.T @ J / len(J))
 
     def among(self, size: int) -> Array:
-        """(size, size) `quadratic` among the unknowns of `handeye.information`: X first, the table last."""
+        """Embed `quadratic` into (size, size), in `handeye.information`'s order: X first, the table last."""
         K, unit = np.zeros((size, size)), np.concatenate([np.ones(6), RELATIVE_SIGMA])
         places = np.concatenate([np.arange(6), np.arange(size - len(PARAMETERS), size)])
         K[np.ix_(places, places)] = self.quadratic() * unit * unit[:, None]
         return K
 
     def rms_m(self, covariance: Array) -> float:
-        """Root mean square error of a point for a covariance (24, 24) of [X, table's errors]."""
+        """Compute a point's rms error, metres, from a covariance (24, 24) of [X, table's errors]."""
         return float(np.sqrt(np.trace(self.quadratic() @ covariance)))
 
     def error_m(self, shift: Array, errors: Array) -> float:
-        """Root mean square error of a point for an X that is off by `shift` (6,), errors (18,) left out."""
+        """Compute a point's rms error, metres, for X wrong by `shift` (6,) and table errors (18,) ignored."""
         off = self._beside_rigid(self.by_camera @ shift - self.by_table @ errors)
         return float(np.sqrt(3 * (off**2).mean()))
 

@@ -31,8 +31,8 @@ FLOOR = 1e-8
 class Certificate:
     """Proof that the quadratic objective has no better X: a lower bound from the dual of the SDP relaxation.
 
-    It speaks of `problem` on the inlier pairs, not of the final maximum-likelihood X; `distance_sigma`
-    is how far the two are apart.
+    It proves the optimum of `problem` on the inlier pairs, not the final maximum-likelihood X;
+    `distance_sigma` tells how far the two are apart.
     """
 
     certified: bool
@@ -43,7 +43,7 @@ class Certificate:
     floor: float
     """Absolute floor of the denominator, 1e-8 times the trace of the form."""
     distance_sigma: float | None = None
-    """Largest number of sigmas, over all directions, between the certified X and the final X."""
+    """Distance between the certified X and the final X in sigmas, in the direction where it is largest."""
     problem: str = ""
     restarts: int = 0
 
@@ -85,14 +85,14 @@ def _in_candidate_frame(objective: QuadraticObjective) -> Array:
 
 
 def _bound(S: Array, y: Array, gamma: float) -> float:
-    """Lower bound by multipliers y."""
+    """Compute the lower bound that the multipliers y (20,) prove."""
     M = S - np.tensordot(y, _constraints(), axes=1)
     M[9, 9] -= gamma
     return gamma + 4.0 * min(0.0, float(np.linalg.eigvalsh(M)[0]))
 
 
 def _stationary(S: Array, y: Array, candidate: Array, f: float) -> Array:
-    """The multipliers nearest to y under which the candidate is a null vector of the dual matrix."""
+    """Find the multipliers nearest to y under which the candidate is a null vector of the dual matrix."""
     right = S @ candidate
     right[9] -= f
     B = (_constraints() @ candidate).T
@@ -100,7 +100,7 @@ def _stationary(S: Array, y: Array, candidate: Array, f: float) -> Array:
 
 
 def _solve_dual(S: Array) -> tuple[Array, Array]:
-    """max γ with S - Σ y_i C_i - γ E positive semidefinite → y (20,), moment matrix (10, 10)."""
+    """Maximise γ with S - Σ y_i C_i - γ E positive semidefinite; return y (20,), moment matrix (10, 10)."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_iter = 100
@@ -132,7 +132,7 @@ _ROOT2 = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
 
 
 def _pack(M: Array) -> Array:
-    """Clarabel's scaled upper triangle, column by column."""
+    """Pack a symmetric matrix as Clarabel wants it: scaled upper triangle, column by column."""
     return np.asarray(M[_UPPER] * _ROOT2)
 
 
@@ -143,12 +143,12 @@ def _unpack(packed: Array) -> Array:
 
 
 _ENTRIES = np.arange(9).reshape(3, 3)
-"""Place of a rotation's entry in vec."""
+"""Index of entry (row, column) of a rotation in its vec."""
 
 
 @cache
 def _constraints() -> Array:
-    """(20, 10, 10) symmetric, orthonormal: zᵀ C z = 0 for every rotation."""
+    """Build the matrices C (20, 10, 10), symmetric and orthonormal, with zᵀ C z = 0 for every rotation."""
     found = []
     for index in (_ENTRIES, _ENTRIES.T):
         for a in range(3):

@@ -1,7 +1,7 @@
-"""Differential evolution (Storn and Price 1997) as the paper runs it, over a whole generation at a time.
+"""Differential evolution (Storn and Price 1997) as in the paper, a whole generation at a time.
 
 Synchronous generations: every mutant is made from the old population (eqs. 18-20). All random numbers are
-drawn before the first generation, so a run is a function of its seed alone, whatever is evaluated.
+drawn before the first generation, so they depend on the seed alone, not on the values of the objective.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class EvolutionSettings:
     factor: float = 0.5
     """F"""
     crossover: float = 0.9
-    """CR, per component; no component is forced to cross."""
+    """CR, per component; a trial may equal its parent, as no component is forced to cross."""
     generations: int = 100
 
 
@@ -69,7 +69,10 @@ def evolve(
 
 
 def _partners(rng: np.random.Generator, generations: int, population: int) -> NDArray[np.intp]:
-    """p1 ≠ p2 ≠ p3 ≠ i, uniform, (generations, 3, population): draws that step over what is taken."""
+    """Draw p1 ≠ p2 ≠ p3 ≠ i uniformly, (generations, 3, population).
+
+    Each is drawn from as many numbers as are free, then raised past those already taken.
+    """
     shape = (generations, population)
     own = np.broadcast_to(np.arange(population), shape)
     p1 = rng.integers(0, population - 1, size=shape)

@@ -105,7 +105,7 @@ def build_objective(
 
 
 def _add_chordal(G: Array, R_A: Array, R_B: Array, R0: Array) -> None:
-    """½‖R_A R - R R_B‖² in the recentred variables: M = R_A ⊗ I - I ⊗ R_Bᵀ on vec R."""
+    """Add ½‖R_A R - R R_B‖² in the recentred variables: M = R_A ⊗ I - I ⊗ R_Bᵀ on vec R."""
     products = R_A.reshape(-1, 9).T @ R_B.reshape(-1, 9)
     cross = products.reshape(3, 3, 3, 3).transpose(0, 2, 1, 3).reshape(9, 9)
     G[:9, :9] = len(R_A) * np.eye(9) - (cross + cross.T) / 2
@@ -121,7 +121,7 @@ def closed_form_rotation(pairs: Pairs) -> Array:
 
 
 def _closed_form_translation(D: Array, right: Array) -> Array:
-    """Least squares b of D b + right = 0; D (n, 3, 3), right (n, 3)."""
+    """Solve D b + right = 0 for b (3,) by least squares; D (n, 3, 3), right (n, 3)."""
     flat = D.reshape(-1, 3)
     return np.asarray(
         -np.linalg.pinv(flat.T @ flat, rcond=1e-10, hermitian=True) @ flat.T @ right.reshape(-1)
@@ -129,7 +129,7 @@ def _closed_form_translation(D: Array, right: Array) -> Array:
 
 
 _FEWEST_VIEWS = 10
-"""Fewer views' scores do not span six directions: pairs count as independent, variance times n/2."""
+"""With fewer views their scores do not span six directions: pairs then count as independent."""
 
 
 def pair_covariance(objective: QuadraticObjective, pairs: Pairs, X: Array) -> Array:
@@ -152,7 +152,7 @@ def pair_covariance(objective: QuadraticObjective, pairs: Pairs, X: Array) -> Ar
 
 
 def _gradients(pairs: Pairs, X: Array) -> Array:
-    """Half the gradient of each pair's term, (n, 6)."""
+    """Compute half the gradient of each pair's term, (n, 6)."""
     R, b = X[:3, :3], X[:3, 3]
     R_A, R_B, b_B = pairs.A[:, :3, :3], pairs.B[:, :3, :3], pairs.B[:, :3, 3] @ R.T
     residual = R_A @ R - R @ R_B

@@ -19,7 +19,7 @@ from recordings.schema.messages import Mount
 Places = NDArray[np.intp]
 
 MAX_PAIRS = 20_000
-"""More pairs than this are thinned evenly: bounded memory and time with thousands of views."""
+"""Most pairs made; beyond it they are thinned evenly, so that memory and time stay bounded."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,11 @@ from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pairs import Pairs
 
 BOX = np.array([np.pi / 2] * 3 + [1.0] * 3)
-"""Upper bound of x = [γ; b], the lower is its negative (eq. 22): rad, m."""
+"""Upper bound of x = [γ; b] in rad and m; the lower bound is its negative (eq. 22)."""
 SETTINGS = EvolutionSettings()
 LAMBDA = 1.0
 _ON_BOX = 1e-4
-"""Relative: 0.1 mm or 0.01°; the evolution ends near a bound, not always on it."""
+"""Relative distance from a bound that counts as on it: the evolution ends near a bound, not always on it."""
 NAMES = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z")
 
 
@@ -29,11 +29,11 @@ class PaperResult:
     """(6,) [γ; b] (eq. 15)"""
     objective: QuadraticObjective
     on_box: tuple[str, ...]
-    """Components on the box: the true camera is probably outside it."""
+    """Components of x on a bound: the true camera probably lies outside the box."""
 
 
 def solve_paper(pairs: Pairs, seed: int) -> PaperResult:
-    """Run the evolution once, seeded, on the pairs that take part (the caller holds out the rest)."""
+    """Run the evolution once, seeded, on all of `pairs`; the caller has taken out those held out."""
     objective = build_objective(pairs, "log", LAMBDA)
     evolved = evolve(paper_evaluate(objective), -BOX, BOX, np.random.default_rng(seed), SETTINGS)
     x = evolved.best

@@ -1,7 +1,7 @@
-"""The certain solver: any mount on SO(3), restarted until its certificate holds.
+"""Global minimum of the chordal objective over pairs, restarted until its certificate holds.
 
-Differential evolution over the unit quaternion with the translation eliminated, then Newton's method on
-every member of the last generation. With one well to find, evolution only has to reach its basin.
+Differential evolution over unit quaternions with the translation eliminated, then Newton's method from every
+member of the last generation: evolution only has to reach the basin of the minimum, Newton does the rest.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from calibrate.handeye.axxb.pairs import Pairs
 
 SETTINGS = EvolutionSettings(population=30, generations=40)
 MAX_RESTARTS = 6
-"""After these the result is returned uncertified, and says so: bounded time (about 20 ms each)."""
+"""Runs (about 20 ms each) after which the result is returned uncertified, and marked so."""
 _POLISH_STEPS = 40
 _GENERATORS = skew(np.eye(3))
 """(3, 3, 3) d Exp(δ) / dδ_k at 0."""
@@ -60,7 +60,7 @@ def solve_global(pairs: Pairs, seed: int, problem: str = "") -> GlobalResult:
 
 
 def _evolve_rotations(objective: QuadraticObjective, rng: np.random.Generator) -> Array:
-    """Last generation over quaternions (M, 3, 3)."""
+    """Run the evolution over quaternions; return its last generation as rotations (M, 3, 3)."""
     S, centre = objective.reduced(), objective.R0.reshape(9)
 
     def evaluate(q: Array) -> Array:
@@ -73,7 +73,7 @@ def _evolve_rotations(objective: QuadraticObjective, rng: np.random.Generator) -
 
 
 def _rotations(quaternions: Array) -> Array:
-    """(m, 3, 3) of quaternions (m, 4) of any length; a mutant of none at all is no turn."""
+    """Convert quaternions (m, 4) of any length to rotations (m, 3, 3); a zero one gives the identity."""
     nothing = np.linalg.norm(quaternions, axis=1, keepdims=True) < 1e-150
     return np.asarray(Rotation.from_quat(np.where(nothing, [0.0, 0.0, 0.0, 1.0], quaternions)).as_matrix())
 

@@ -29,7 +29,7 @@ _SINGLE, _CHANGES = (0.1, 0.2, 0.4), (0.2, 0.35, 0.5)
 MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 HEADER = ("what is wrong", "views", "mount", "pass %", "refused, a reading named %", "ours rms mm",
           "oracle rms mm", "ours / oracle", "rotation ours / oracle", "coverage %", "named truly %",
-          "named falsely %", "move accepted: / oracle")  # fmt: skip
+          "named falsely %")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,6 @@ class OutlierTrial:
     ours: tuple[float, float] | None = None
     """None where nothing was solved."""
     covered: bool = False
-    accepted: tuple[float, float] | None = None
-    """Error with the move accepted."""
 
 
 Spoil = Callable[[ImperfectCell, Places, np.random.Generator], Spoilt]
@@ -87,8 +85,7 @@ def run() -> str:
         "cell, the first ones): board by 10 … 50 mm and 1 … 5°, TCP by 20 … 120 mm, focal length by "
         "2 … 6 %. Oracle: the same estimate of the right views, or of the longer part. Ours and ratios: over "
         "the cells in which no other reading of the recording was named. Truly: the reading, or the cause of "
-        "every bad view and of no other. Falsely: another reading, a good view rejected, or a wrong cause. "
-        "Move accepted: `--accept-move`, where a move was named."
+        "every bad view and of no other. Falsely: another reading, a good view rejected, or a wrong cause."
     )
     return text + "\n\n" + table(HEADER, rows)
 
@@ -109,16 +106,13 @@ def measure(task: tuple[str, float, Mount, int]) -> OutlierTrial:
             truly = named == spoilt.reading.value
             return OutlierTrial(False, named, oracle, truly, bool(problem.hypothesis) and not truly)
         reading = solution.session.reading
-        accepted = None
-        if reading in (Reading.BOARD_MOVED, Reading.CAMERA_MOVED):
-            accepted = _accepted(spoilt)
     delta = difference(solution.matrix, spoilt.X)
     square = float(delta @ np.linalg.solve(solution.covariance, delta))
     passed = all(gate.passed for gate in judge(solution, GateInputs()))
     truly, falsely = _named(solution, spoilt, set(bad.tolist()))
     covered = square <= solution.confidence_threshold
     ours = _error(solution.matrix, spoilt.X)
-    return OutlierTrial(passed, reading.value, oracle, truly, falsely, ours, covered, accepted)
+    return OutlierTrial(passed, reading.value, oracle, truly, falsely, ours, covered)
 
 
 def _bad_views(name: str, share: float, seed: int, rng: np.random.Generator) -> Places:
@@ -126,14 +120,6 @@ def _bad_views(name: str, share: float, seed: int, rng: np.random.Generator) -> 
     if name in _CHANGED:
         return np.arange(_VIEWS)[-count:] if seed % 2 else np.arange(count)
     return np.asarray(rng.choice(_VIEWS, count - count % 2 if name == "swapped" else count, replace=False))
-
-
-def _accepted(spoilt: Spoilt) -> tuple[float, float] | None:
-    try:
-        solution = solve_views(spoilt.views, replace(_ORACLE, accept_move=True))
-    except CalibrationError:
-        return None
-    return _error(solution.matrix, spoilt.X) if solution.move_accepted else None
 
 
 def _named(solution: Solution, spoilt: Spoilt, bad: set[int]) -> tuple[bool, bool]:
@@ -156,7 +142,6 @@ def _error(X: Array, truth: Array) -> tuple[float, float]:
 def line(name: str, share: float, mount: Mount, found: Sequence[OutlierTrial]) -> list[str]:
     plain = Reading.AS_RECORDED.value
     taken = [t for t in found if t.ours is not None and t.reading == plain]
-    accepted = [t for t in found if t.accepted is not None]
 
     def percent(count: int, of: Sequence[OutlierTrial]) -> str:
         return f"{100 * count / len(of):.0f}" if of else "-"
@@ -167,13 +152,6 @@ def line(name: str, share: float, mount: Mount, found: Sequence[OutlierTrial]) -
     if taken:
         a, b = ([rms(e[:, i]) for i in (0, 1)] for e in (ours, oracle))
         numbers = [f"{1e3 * a[0]:.3f}", f"{1e3 * b[0]:.3f}", *(f"{a[i] / b[i]:.3f}" for i in (0, 1))]
-    both = "-"
-    if accepted:
-        a, b = (
-            [rms(np.array([getattr(t, who)[i] for t in accepted])) for i in (0, 1)]
-            for who in ("accepted", "oracle")
-        )
-        both = f"{a[0] / b[0]:.2f}, {a[1] / b[1]:.2f}"
     return [
         name,
         f"{100 * share:.0f} %",
@@ -184,7 +162,6 @@ def line(name: str, share: float, mount: Mount, found: Sequence[OutlierTrial]) -
         percent(sum(t.covered for t in taken), taken),
         percent(sum(t.truly for t in found), found),
         percent(sum(t.falsely for t in found), found),
-        both,
     ]
 
 

@@ -38,8 +38,6 @@ class JobOptions:
     find_intrinsics: bool = False
     """Find them from these pictures even where some are recorded."""
     limits: GateLimits = field(default_factory=GateLimits)
-    accept_move: bool = False
-    """Use both parts of a session in which camera or board was moved half-way."""
     working_distance_m: float | None = None
     without: tuple[int, ...] = ()
     """Numbers, from 1, of the poses that a person leaves out."""

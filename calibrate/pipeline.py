@@ -103,7 +103,6 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
         intrinsics_from_same_pictures=prepared.intrinsics is not None,
         lens_sigma=_lens_sigma(options, prepared.views.camera),
         board=BoardTolerance.of(prepared.loaded.board),
-        accept_move=options.accept_move,
         working_distance_m=options.working_distance_m,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -141,7 +141,6 @@ def require_no_copies(views: ViewSet) -> None:
 
 
 Places = NDArray[np.intp]
-Moved = Literal["camera", "board"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +160,6 @@ class Observations:
     """(n, 6, q) motion of the flange, in base, by each error of the kinematic table; None without joints."""
     extent: Array = field(default_factory=lambda: np.array([[0.0, 0.0], [1.0, 1.0]]))
     """(2, 2) middle and half size of all corners seen, metres: what the board's bends refer to."""
-    later: NDArray[np.bool_] | None = None
-    """(n,) the views after something was moved (`CellState.second`); None where nothing was."""
-    moved: Moved = "board"
-    """Camera (X has a second value) or board (Y has)."""
 
     def __len__(self) -> int:
         return len(self.flange)
@@ -182,7 +177,6 @@ class Observations:
             pixels=self.pixels[places],
             present=self.present[places],
             table=None if self.table is None else self.table[places],
-            later=None if self.later is None else self.later[places],
         )
 
 

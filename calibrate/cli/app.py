@@ -5,6 +5,7 @@ from __future__ import annotations
 from recordings.cli.lazy import LazyCommand, LazyGroup
 
 _SOLVE, _FILES = "calibrate.cli.solve", "calibrate.cli.installed"
+_GONE_FROM_SOLVE = {"--accept-move": "The message names what moved and when. Record again."}
 COMMANDS = {
     "solve": LazyCommand(
         f"{_SOLVE}:solve",
@@ -12,12 +13,15 @@ COMMANDS = {
             "calibrate solve session.mcap -o cell.yaml --report cell.html",
             "calibrate solve session.mcap -o cell.yaml --without 3,7",
         ),
+        gone=_GONE_FROM_SOLVE,
     ),
     "compare": LazyCommand(
         f"{_SOLVE}:compare",
         ("calibrate compare session.mcap", "calibrate compare session.mcap --camera cell.yaml"),
     ),
-    "report": LazyCommand(f"{_SOLVE}:report", ("calibrate report session.mcap -o cell.html",)),
+    "report": LazyCommand(
+        f"{_SOLVE}:report", ("calibrate report session.mcap -o cell.html",), gone=_GONE_FROM_SOLVE
+    ),
     "show": LazyCommand(
         f"{_FILES}:show", ("calibrate show  # the installed one", "calibrate show cell.yaml")
     ),

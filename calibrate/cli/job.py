@@ -37,10 +37,6 @@ Find = Annotated[
         help="Estimate the intrinsics even where some are recorded",
     ),
 ]
-AcceptMove = Annotated[
-    bool,
-    typer.Option("--accept-move", help="Use both halves of a session in which camera or board moved"),
-]
 LensKind = Annotated[LensModel, typer.Option("--lens", help="Lens model of estimated intrinsics")]
 GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other gate limits")]
 Without = Annotated[str | None, typer.Option(help="Poses to exclude, e.g. 3,7")]
@@ -127,7 +123,6 @@ def job_options(
     options: JobOptions,
     profile: ProfileName = "robust",
     gates: GatesFile = None,
-    accept_move: AcceptMove = False,
     working_distance_mm: Distance = None,
 ) -> JobOptions:
     """Add how they are solved and judged."""
@@ -135,6 +130,5 @@ def job_options(
         options,
         profile=profile,
         limits=GateLimits() if gates is None else read_limits(gates),
-        accept_move=accept_move,
         working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
     )

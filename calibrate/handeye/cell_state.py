@@ -34,17 +34,6 @@ class CellState:
     """(5,) as in `SHAPE`."""
     table: Array
     """(q,) errors of the kinematic table, empty where they are not modelled."""
-    second: Array | None = None
-    """(4, 4) X or Y of the views marked `later`, where camera or board was moved."""
-
-    def poses(self, observed: Observations) -> tuple[Array, Array]:
-        """Return X and Y of every view, (n, 4, 4) each or one (4, 4) for all."""
-        if self.second is None or observed.later is None:
-            return self.X, self.Y
-        later = observed.later[:, None, None]
-        if observed.moved == "camera":
-            return np.where(later, self.second, self.X), self.Y
-        return self.X, np.where(later, self.second, self.Y)
 
     def with_boards(self, C: Array) -> CellState:
         """Return a copy with the board poses (m, 4, 4) in place of its own."""
@@ -62,7 +51,6 @@ class CellState:
             camera=camera,
             shape=self.shape + step[at.shape],
             table=self.table + step[at.table],
-            second=None if self.second is None else perturb(self.second, step[at.second]),
         )
 
 
@@ -75,24 +63,21 @@ class Layout:
     lens: slice
     shape: slice
     table: slice
-    second: slice
     size: int
 
     @classmethod
     def of(cls, state: CellState) -> Layout:
         """Lay out the unknowns of `state` one after the other."""
-        lens, second = len(intrinsics_names(state.camera)), 6 * (state.second is not None)
-        sizes = (6, 6, lens, len(SHAPE), len(state.table), second)
+        sizes = (6, 6, len(intrinsics_names(state.camera)), len(SHAPE), len(state.table))
         ends = np.cumsum(sizes).tolist()
         slices = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
-        X, Y, at_lens, shape, table, at_second = slices
-        return cls(X, Y, at_lens, shape, table, at_second, ends[-1])
+        X, Y, lens, shape, table = slices
+        return cls(X, Y, lens, shape, table, ends[-1])
 
 
 def flange_residuals(observed: Observations, state: CellState) -> Array:
     """Compute [δt, δφ] (n, 6) in base, implied minus recorded flange, without errors of the arm's table."""
-    X, Y = state.poses(observed)
-    miss = difference(implied_flange(observed.mount, X, Y, state.C), observed.flange)
+    miss = difference(implied_flange(observed.mount, state.X, state.Y, state.C), observed.flange)
     return miss if observed.table is None or not len(state.table) else miss - observed.table @ state.table
 
 

@@ -97,8 +97,8 @@ _CHANCE = 1e-6
 
 def explain_views(fit: CellFit, places: Places) -> tuple[RejectedView, ...]:
     """Explain why each of the rejected views at `places` contradicts the others."""
-    X, Y = fit.estimate.state.poses(fit.observed)
-    implied = implied_flange(fit.observed.mount, X, Y, fit.estimate.board_poses)
+    state = fit.estimate.state
+    implied = implied_flange(fit.observed.mount, state.X, state.Y, fit.estimate.board_poses)
     return tuple(_explain(fit, implied[place], int(place), places) for place in places)
 
 
@@ -216,8 +216,7 @@ def _at_board(fit: CellFit) -> Array:
     """Make matrices (n, 6, 6) from [δt, δφ] of the flange to that of the board's middle, in base."""
     state, observed = fit.estimate.state, fit.observed
     middle = np.array([*observed.extent[0], 0.0])
-    _, Y = state.poses(observed)
-    board = Y if observed.mount == "eye-in-hand" else observed.flange @ Y
+    board = state.Y if observed.mount == "eye-in-hand" else observed.flange @ state.Y
     point = np.broadcast_to(board[..., :3, :3] @ middle + board[..., :3, 3], (len(observed), 3))
     T = np.tile(np.eye(6), (len(observed), 1, 1))
     T[:, :3, 3:] = -skew(point - observed.flange[:, :3, 3])

@@ -188,7 +188,7 @@ class CellFit:
     plain: Estimate
     """The estimate without systematic errors of arm and bracket."""
     pairs: Pairs
-    """Pairs of the views that count; after a move, of those after it."""
+    """Pairs of the views that count."""
     certified: GlobalResult
     """Optimum of the quadratic objective over these pairs."""
     arm_failure: str = ""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from calibrate.errors import BadViewsError, PosesDisagreeError
+from calibrate.errors import PosesDisagreeError
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.arm import RELATIVE_SIGMA, arm_postures, by_parameters, flex_motion
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
@@ -24,10 +24,10 @@ from calibrate.handeye.estimate import (
 )
 from calibrate.handeye.linear import Linear, LinearSolution, inverse_of
 from calibrate.handeye.metrics import require_motion
-from calibrate.handeye.poses import BoardPoses, PoseViews, agreed_start, fit_poses
+from calibrate.handeye.poses import BoardPoses, agreed_start
 from calibrate.handeye.priors import Priors
 from calibrate.results import SHAPE
-from calibrate.views import BoardView, Moved, Observations, Places, ViewSet, observe_views
+from calibrate.views import BoardView, Observations, Places, ViewSet, observe_views
 
 FEWEST_FOR_TABLE = 8
 """Fewest views from which 18 errors of a table can be told from noise."""
@@ -192,37 +192,6 @@ def _certify(views: ViewSet, found: Estimate, places: Places, seed: int) -> tupl
     pairs = all_pairs(H, found.board_poses[places])
     problem = f"the quadratic objective over the pairs of the {len(places)} used views"
     return pairs, solve_global(pairs, seed, problem)
-
-
-def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: Moved, seed: int) -> CellFit:
-    """Fit a cell whose camera or board was moved before the view at index `at`, from the views of both parts.
-
-    X and the board's pose are those after the move. Raises BadViewsError where a half determines nothing.
-    """
-    later = np.arange(len(views)) >= at
-    try:
-        start = fit_poses(replace(poses, later=later, moved=moved), seed)
-    except np.linalg.LinAlgError as problem:
-        raise BadViewsError(
-            f"The views before or after the move determine no pose ({problem}).",
-            code="pose-open",
-            remedy="Record again.",
-        ) from None
-    # The state's own X and Y must be those after the move, so `second` is for the views before it.
-    observed = replace(observe_views(views), later=~later, moved=moved)
-    state = CellState(
-        start.X[-1],
-        start.Y[-1],
-        views.camera_from_board,
-        views.camera,
-        np.zeros(len(SHAPE)),
-        np.zeros(0),
-        start.X[0] if moved == "camera" else start.Y[0],
-    )
-    found = estimate(observed, state, priors)
-    require_plausible_noise(found)
-    pairs, certified = _certify(views, found, np.flatnonzero(found.used & later), seed)
-    return CellFit(views, (), observed, priors, found, None, None, found, pairs, certified)
 
 
 def require_plausible_noise(found: Estimate) -> None:

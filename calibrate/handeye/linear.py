@@ -202,16 +202,11 @@ class Linear:
         at, n = Layout.of(state), len(observed)
         m = flange_residuals(observed, state)
         bare = m if observed.table is None or not len(state.table) else m + observed.table @ state.table
-        by_X, by_Y, A = flange_derivatives(observed.mount, *state.poses(observed), state.C, bare)
+        by_X, by_Y, A = flange_derivatives(observed.mount, state.X, state.Y, state.C, bare)
         J = np.zeros((n, 6, at.size))
         J[..., at.X], J[..., at.Y] = by_X, by_Y
         if observed.table is not None and len(state.table):
             J[..., at.table] = -observed.table
-        if state.second is not None and observed.later is not None:
-            first = at.X if observed.moved == "camera" else at.Y
-            later = observed.later[:, None, None]
-            J[..., at.second] = np.where(later, J[..., first], 0.0)
-            J[..., first] = np.where(later, 0.0, J[..., first])
         if not observed.has_pixels:
             return cls(np.zeros((n, 6, 6)), A, m, J)
         blocks = linearise_corners(observed, state.camera, state.C, information * weights, True, state.shape)

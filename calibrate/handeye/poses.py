@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from calibrate.handeye.cell_state import Quadratic, flange_derivatives
 from calibrate.handeye.corners import linearise_corners
 from calibrate.handeye.linear import CornerModes, Linear, LinearSolution, Scales, first_scales
 from calibrate.projection import intrinsics_vector
-from calibrate.views import Moved, Places, ViewSet, implied_flange, observe_views
+from calibrate.views import Places, ViewSet, implied_flange, observe_views
 from recordings.schema.messages import Mount
 
 _SUBSETS, _OF = 120, 4
@@ -29,6 +30,8 @@ _SHARE = 0.55
 _OPEN = 0.1
 _LEVER_M = 0.5
 """Lever by which rotations are converted to lengths."""
+
+Moved = Literal["camera", "board"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +173,7 @@ class PoseViews:
     later: NDArray[np.bool_] | None = None
     """(n,) mask of the views after camera or board was moved; None where nothing was."""
     moved: Moved = "board"
+    """Camera (X has a second value) or board (Y has)."""
 
     def __len__(self) -> int:
         return len(self.flange)

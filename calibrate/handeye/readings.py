@@ -22,9 +22,9 @@ from calibrate.geometry import (
     rotation_exp,
     rotation_log,
 )
-from calibrate.handeye.poses import BoardPoses, PoseFit, PoseViews, fit_poses
+from calibrate.handeye.poses import BoardPoses, Moved, PoseFit, PoseViews, fit_poses
 from calibrate.handeye.solution import Explanation, Reading
-from calibrate.views import Moved, ViewSet
+from calibrate.views import ViewSet
 
 _CLEAR = 10.0
 """Log evidence, besides the logarithm of the number of views, by which another reading has to win."""
@@ -181,7 +181,7 @@ _CONVENTIONS: dict[Reading, Callable[[Array], Array]] = {
 
 
 _INPUT = " Correct poses.csv or dataset.yaml and import again."
-_MOVED = "{moved} {where}. Record again, or use both parts with --accept-move (result: after the move)."
+_MOVED = "{moved} {where}. Record again."
 _TEXTS = {
     Reading.AS_RECORDED: "No other reading explains the recording. "
     "Check the mounting, and that the robot poses belong to these images.",

@@ -49,8 +49,6 @@ class SolveOptions:
     board: BoardTolerance = field(default_factory=BoardTolerance)
     model_arm: bool = True
     """Allow for errors of the arm's kinematic table where its model is known."""
-    accept_move: bool = False
-    """Model a move of camera or board half-way instead of refusing the recording."""
     working_distance_m: float | None = None
     """Distance along the camera's axis for the predicted error; None: median board distance."""
     holdout: bool = True
@@ -257,8 +255,6 @@ class Solution:
     """Pose number of a down-weighted view → probability that it is an outlier."""
     session: Explanation = field(default_factory=lambda: Explanation(Reading.AS_RECORDED, 0.0))
     """Reading of the recording as a whole."""
-    move_accepted: bool = False
-    """The move that `session` names is modelled: X is that after it."""
     cross_validation: CrossValidation | None = None
     lens_finding: Finding | None = None
     """None where no lens was given."""

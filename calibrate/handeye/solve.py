@@ -26,7 +26,7 @@ from calibrate.handeye.diagnosis import (
     judge_lens,
 )
 from calibrate.handeye.estimate import FULL, CellFit, estimate
-from calibrate.handeye.fit import fit_cell, fit_moved
+from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.metrics import (
     HELD_OUT,
     board_spread,
@@ -56,7 +56,7 @@ from calibrate.handeye.solution import (
 )
 from calibrate.projection import intrinsics_names
 from calibrate.results import BoardShape, HoldoutScore
-from calibrate.views import Moved, ViewSet, array_of
+from calibrate.views import ViewSet, array_of
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
 
@@ -86,40 +86,16 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     priors = _priors(views, options)
     focal_sigma = float(min(priors.lens.sigma[0] / priors.lens.mean[0], _FREE_FOCAL))
     poses = pose_views(views, focal_sigma, priors.board.square)
-    session, fit, disagree = Explanation(Reading.AS_RECORDED, 0.0), None, None
     try:
         fit = fit_cell(views, priors, options.seed, options.model_arm)
     except PosesDisagreeError as problem:
-        disagree = problem
-
-    def ask() -> tuple[Explanation, CellFit | None]:
-        """Find the reading that explains the recording; fit the move if it is one and moves are accepted."""
-        found = explain_recording(poses, options.seed)
-        moved = _MOVED.get(found.reading)
-        if not options.accept_move or moved is None:
-            return found, None
-        return found, fit_moved(views, priors, poses, found.at, moved, options.seed)
-
-    if fit is None or float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH:
-        session, after_move = ask()
-        fit = after_move or fit
-    if fit is None:
+        session = explain_recording(poses, options.seed)
         remedy = explain_text(session, views)
-        raise PosesDisagreeError(str(disagree), session.reading.value, remedy=remedy) from None
-    solution = _describe(fit, options)
-    if session.reading is Reading.AS_RECORDED and _doubtful(solution):
-        session, after_move = ask()
-        if after_move is not None:
-            fit, solution = after_move, _describe(after_move, options)
-    return replace(
-        solution,
-        session=session,
-        move_accepted=fit.estimate.state.second is not None,
-        warnings=_remarks(fit, solution, session),
-    )
-
-
-_MOVED: dict[Reading, Moved] = {Reading.BOARD_MOVED: "board", Reading.CAMERA_MOVED: "camera"}
+        raise PosesDisagreeError(str(problem), session.reading.value, remedy=remedy) from None
+    solution, session = _describe(fit, options), Explanation(Reading.AS_RECORDED, 0.0)
+    if float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH or _doubtful(solution):
+        session = explain_recording(poses, options.seed)
+    return replace(solution, session=session, warnings=_remarks(fit, solution, session))
 
 
 def _priors(views: ViewSet, options: SolveOptions) -> Priors:
@@ -156,8 +132,8 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
     seen = fit.observed.has_pixels
     lens_finding = judge_lens(fit, distance) if given and seen else None
     board_finding = judge_board(fit, distance) if seen else None
-    folds = cross_validate(fit, options.seed) if options.folds and state.second is None else None
-    holdout = _holdout(fit) if options.holdout and state.second is None else None
+    folds = cross_validate(fit, options.seed) if options.folds else None
+    holdout = _holdout(fit) if options.holdout else None
     weight = found.weight
     rms_px, view_rms_px = _corner_rms(fit)
     return Solution(

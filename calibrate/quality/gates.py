@@ -167,7 +167,7 @@ def _measured(solution: Solution, inputs: GateInputs) -> Iterator[tuple[str, flo
 
 def _session_gate(solution: Solution) -> Gate:
     session = solution.session
-    passed = session.reading is Reading.AS_RECORDED or solution.move_accepted
+    passed = session.reading is Reading.AS_RECORDED
     told = next((remark.text for remark in solution.warnings if remark.code == session.reading.value), "")
     remedy = "" if passed else told
     text = f"Session: {session.reading.value} {'PASS' if passed else 'FAIL. ' + told}".rstrip()

@@ -232,6 +232,8 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(session_file: Path, tmp_
     assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
     refused(run("batch", "s3://robots/a.mcap", cwd=tmp_path), 2, "gone")
     refused(run("fleet", "cells", cwd=tmp_path), 2, "gone", "calibrate metrics")
+    for command in ("solve", "report"):
+        refused(run(command, recordings[0], "--accept-move", cwd=tmp_path), 2, "gone", "Record again")
     refused(run("export", "--to", "json", cwd=tmp_path), 2, "gone", "calibrate show --json")
     alone = run("solve", recordings[0], "-o", "alone.yaml", cwd=tmp_path)
     assert alone.returncode in (0, 4)

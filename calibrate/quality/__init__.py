@@ -1,1 +1,1 @@
-"""Gates, drift check, touch test and sweep. Nothing here writes a calibration."""
+"""Quality of calibrations: gates, drift check, touch test, movement. Nothing here writes a calibration."""

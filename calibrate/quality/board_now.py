@@ -1,4 +1,4 @@
-"""Board pose by a calibration and one image, and the uncertainty of a tip sent to one of its corners.
+"""Board pose from a calibration and one image, and the uncertainty of a tip sent to one of its corners.
 
 Eye-in-hand: base_from_board = base_from_flange · X · camera_from_board; eye-to-hand: X · camera_from_board,
 the board lying free in the fixed camera's view.
@@ -22,9 +22,9 @@ from calibrate.views import BoardView, ViewSet, observe_views
 from recordings.schema.messages import BoardSpec
 
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.01, 0.03
-"""Nearer than this the board was not moved since it was calibrated."""
+"""Distance within which the board counts as not moved since the calibration."""
 _SAME_TILT_RAD = 0.01
-"""Two starts of the pose estimate may end in one pose; further apart they are two readings of a picture."""
+"""Difference in tilt above which two results of the pose estimate are two solutions, not one found twice."""
 _STEP = 1e-6
 
 
@@ -36,7 +36,10 @@ class BoardNow:
 
 
 def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) -> BoardNow:
-    """BadViewsError where the picture leaves it open, or shows the board on the flange (eye-to-hand)."""
+    """Locate the board in base from one image.
+
+    Raises BadViewsError where the tilt is ambiguous, or where the board is still on the flange (eye-to-hand).
+    """
     camera, X, E = calibration.intrinsics.model, calibration.transform.matrix, view.base_from_flange
     in_hand = calibration.mount == "eye-in-hand"
     place = np.array(calibration.board_place.matrix)
@@ -63,14 +66,14 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
 
 
 def _shaped(reading: Candidate, view: BoardView, calibration: Calibration) -> Candidate:
-    """Reading with the board's shape that the calibration found."""
+    """Return the candidate pose refined with the board shape that the calibration estimated."""
     placed = replace(view, camera_from_board=reading.camera_from_board)
     views = ViewSet(calibration.mount, (placed,), calibration.intrinsics.model)
     return replace(reading, camera_from_board=with_found_shape(views, calibration).camera_from_board[0])
 
 
 def found_points(calibration: Calibration, board: BoardSpec) -> Array:
-    """(k, 3) of the board, in its own frame: as the calibration found them where it is the same board."""
+    """Return the board's points (k, 3) in its frame, with the estimated shape if it is the same board."""
     points = board_points(board)
     found = calibration.quality.board
     if found is None or board != calibration.board:
@@ -83,11 +86,12 @@ def found_points(calibration: Calibration, board: BoardSpec) -> Array:
 def offset_covariance(
     calibration: Calibration, view: BoardView, now: BoardNow, corner_m: ArrayLike, tip_m: ArrayLike
 ) -> Array:
-    """(3, 3) of tip minus corner, in `board`, m², when the arm is sent to put the tip on the corner.
+    """Predict the covariance (3, 3) of tip minus corner, in `board`, m², when the arm is sent to a corner.
 
-    First order in the errors of X, of the board's pose in this one picture, and of the robot in the picture's
-    pose (eye-in-hand) and at the corner; the robot's scatter is the one that the calibration found.
-    `tip_m` (3,) in `flange`. Raises BadViewsError for a calibration that does not know its noise.
+    First order in the errors of X, of the board's pose in this image, and of the robot at the image's pose
+    (eye-in-hand) and at the corner; the robot's noise is the one that the calibration estimated.
+    `corner_m` (3,) in `board`, `tip_m` (3,) in `flange`. Raises BadViewsError for a calibration that states
+    no noise.
     """
     noise = Noise.of(calibration)
     corner, X, C = np.asarray(corner_m), calibration.transform.matrix, now.camera_from_board

@@ -17,7 +17,7 @@ from recordings.files import MAIN_CAMERA
 
 FILE = "checks.jsonl"
 FEWEST_FOR_TREND = 5
-"""Drift checks from which on a trend may be told."""
+"""Fewest drift checks from which a trend is estimated."""
 _TREND_P = 0.01
 
 
@@ -29,13 +29,13 @@ class CheckEntry(msgspec.Struct, frozen=True):
     shift: tuple[float, ...]
     """δt (m), δφ (rad)"""
     covariance: tuple[tuple[float, ...], ...]
-    """Covariance of `shift`, the installed calibration's own part included."""
+    """(6, 6) covariance of `shift`, that of the installed calibration included."""
     statistic: float
     threshold: float
 
 
 def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN_CAMERA) -> None:
-    """Raises InstallError when the state folder cannot be written."""
+    """Append a drift check to the history. Raises InstallError when the state folder cannot be written."""
     folder = calibrations_folder(root, camera)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -47,12 +47,12 @@ def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN
 
 
 def read_checks(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
-    """Oldest first."""
+    """Read the history of drift checks, oldest first; empty when there is none."""
     return read_lines(calibrations_folder(root, camera) / FILE, CheckEntry)
 
 
 def earlier_results(history: Sequence[CheckEntry], generation: int) -> list[bool]:
-    """List which checks of this installed version passed: one alarm alone may be chance."""
+    """List whether each check of this installed version passed, oldest first; one failure may be chance."""
     return [entry.passed for entry in history if entry.generation == generation]
 
 
@@ -76,9 +76,9 @@ class Trend:
 def find_trend(history: Sequence[CheckEntry], generation: int) -> Trend | None:
     """Look for a trend in the checks of this installed version; None where chance explains it.
 
-    Six straight lines through the shifts, weighted by their covariance; the installed calibration's own error
-    is the same in every check and moves the lines, not their slopes. Slopes are judged by χ² with 6 degrees
-    of freedom at 1 %.
+    A straight line is fitted to each of the six components of the shift, weighted by their covariance. The
+    installed calibration's own error is the same in every check, so it changes no slope. The slopes are
+    tested by χ² with 6 degrees of freedom at 1 %.
     """
     entries = [entry for entry in history if entry.generation == generation]
     if len(entries) < FEWEST_FOR_TREND:

@@ -1,8 +1,8 @@
-"""Drift check: a few new views, one statistical test, its power stated.
+"""Drift check: one statistical test of an installed calibration on a few new views, with its power.
 
-The shift δX of the camera is fitted to the new views together with the board's place (the board may have been
+The shift δX of the camera is fitted to the new views together with the board's pose (the board may have been
 moved since). If nothing changed, δX is normal with covariance S = S_fit + S_installed, so δᵀ S⁻¹ δ follows
-6·F(6, ν), ν the degrees of freedom that the noise scales were estimated with. δ as in `geometry.perturb`.
+6·F(6, ν), ν the degrees of freedom of the noise estimate. δ as in `geometry.perturb`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from recordings.schema.messages import CameraModel, Mount, SessionInfo, Source
 FEWEST_VIEWS = 3
 FALSE_ALARM = 0.05
 POWER = 0.95
-"""Detection probability of `SHIFT_M` and `TURN_RAD` beyond which no more views are needed."""
+"""Probability of detecting `SHIFT_M` and `TURN_RAD` that a check should have."""
 SHIFT_M, TURN_RAD = 0.5e-3, float(np.radians(0.1))
 _MOST_VIEWS = 30
-"""Whoever needs more for a check should calibrate."""
+"""Most views suggested for a check; above it, calibrating again costs no more."""
 _STEP = 1e-6
 _ITERATIONS = 4
 _SMALLEST_EIGENVALUE = 1e-9
@@ -48,18 +48,18 @@ class DriftCheck:
     threshold: float
     p_value: float
     power_translation: float
-    """Probability to notice a shift of `SHIFT_M` in the direction that is hardest to see."""
+    """Probability to detect a shift of `SHIFT_M` in the direction that is hardest to see."""
     power_rotation: float
-    """… a turn of `TURN_RAD`."""
+    """Probability to detect a turn of `TURN_RAD` about the axis that is hardest to see."""
     views_needed: int | None
-    """About how many views like these give both a probability of 95 %; None where not even 30 do."""
+    """Estimated number of views like these that make both probabilities 95 %; None where over 30."""
     disagreement: float
-    """Misfit after the best shift, per degree of freedom: about 1 when the noise is as it was."""
+    """Squared residuals after the best shift, per degree of freedom: about 1 if the noise is unchanged."""
     views: int
 
     @property
     def power(self) -> float:
-        """The lower of the two."""
+        """Probability of detection: the lower of translation and rotation."""
         return min(self.power_translation, self.power_rotation)
 
     @property
@@ -73,7 +73,7 @@ class DriftCheck:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations per axis."""
+    """Noise that the calibration estimated: standard deviations per axis."""
 
     corner_px: float
     robot_m: float
@@ -98,7 +98,7 @@ class Noise:
 
 
 def check_drift(views: ViewSet, calibration: Calibration) -> DriftCheck:
-    """Tests the calibration on views (3 or more) with board poses from its own lens.
+    """Test the calibration on new views (3 or more) with board poses from its own lens.
 
     Raises TooFewViewsError, or BadViewsError where the views do not determine a shift or one is there twice.
     """
@@ -116,7 +116,7 @@ def check_drift(views: ViewSet, calibration: Calibration) -> DriftCheck:
 
 
 def with_found_shape(views: ViewSet, calibration: Calibration) -> ViewSet:
-    """The views with the board as the calibration found it, board poses refined to it."""
+    """Return the views with the board shape that the calibration estimated, and board poses refined to it."""
     found = calibration.quality.board
     if found is None:
         return views
@@ -131,10 +131,10 @@ def with_found_shape(views: ViewSet, calibration: Calibration) -> ViewSet:
 
 
 def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Noise) -> DriftCheck:
-    """The test itself. installed: (4, 4) X; covariance: (6, 6) of it. Raises as `check_drift` does.
+    """Fit and test a shift. installed: (4, 4) X; covariance: (6, 6) of it. Raises as `check_drift` does.
 
-    δX and the board's place P by Gauss-Newton: each picture shows the board by r off from where X and P put
-    it, and r has the covariance of PnP plus that of the robot's pose, carried over to r.
+    Gauss-Newton over δX and the board's pose P. The residual r of a view is the difference between the board
+    pose seen and that implied by X and P; its covariance is that of PnP plus that of the robot's pose.
     """
     if len(views) < FEWEST_VIEWS:
         raise TooFewViewsError(
@@ -181,7 +181,7 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
 
 
 def _inverse(information: Array) -> Array:
-    """BadViewsError where a direction is not determined: eigenvalues are of the matrix scaled to ones."""
+    """Invert information, scaled to a unit diagonal. BadViewsError where a direction is not determined."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * scale * scale[:, None])
     if not values[0] > _SMALLEST_EIGENVALUE:
@@ -195,7 +195,7 @@ def _inverse(information: Array) -> Array:
 
 
 def powers(covariance: Array, nu: float) -> tuple[float, float]:
-    """Compute the powers to notice `SHIFT_M`, `TURN_RAD` in the worst direction; S: (6, 6) of a shift.
+    """Compute the powers to detect `SHIFT_M` and `TURN_RAD` in the worst direction; covariance S (6, 6).
 
     After a true shift d, δᵀ S⁻¹ δ / 6 follows the non-central F(6, nu) of noncentrality dᵀ S⁻¹ d.
     """
@@ -221,10 +221,10 @@ def _views_needed(fitted: Array, installed: Array, views: int, nu: float) -> int
 def _normal_equations(
     mount: Mount, flanges: Array, seen: Array, X: Array, P: Array, robot: Array, pnp: Array
 ) -> tuple[Array, Array, float]:
-    """(12, 12) information of [δX, δP], (12,) gradient, and the misfit r'Wr.
+    """Compute the information (12, 12) of [δX, δP], the gradient (12,), and the sum of squares rᵀWr.
 
-    flanges: base_from_flange; for eye-to-hand P is flange_from_board. `robot` (6, 6) is the covariance of the
-    deltas of base_from_flange for both: the robot turns its flange about the flange.
+    flanges: base_from_flange (n, 4, 4); eye-to-hand, P is flange_from_board. robot: (6, 6) covariance of the
+    deltas of base_from_flange, for both mountings.
     """
     steps = _STEP * np.eye(6)[:, None]
 
@@ -232,7 +232,7 @@ def _normal_equations(
         return difference(seen, board_in_camera(mount, F, X, P))
 
     def slope(moved: Array, r: Array) -> Array:
-        """(6, n, 6) misses after each step → (n, 6, 6) Jacobians."""
+        """Convert residuals (6, n, 6) after a step in each parameter to Jacobians (n, 6, 6)."""
         return np.moveaxis((moved - r) / _STEP, 0, 2)
 
     r = miss(flanges, X, P)
@@ -247,7 +247,7 @@ def _normal_equations(
 
 
 def pnp_covariance(points: Array, camera: CameraModel, camera_from_board: Array) -> Array:
-    """(6, 6) of the board's pose in `camera`, of its points (n, 3): (JᵀJ)⁻¹, for noise of 1 px per axis."""
+    """Compute the covariance (6, 6) of a PnP pose in `camera` of points (n, 3), for 1 px noise per axis."""
     base = project_at(camera, camera_from_board, points)
     moved = perturb(camera_from_board, _STEP * np.eye(6))
     J = np.stack([(project_at(camera, m, points) - base).ravel() / _STEP for m in moved], axis=1)
@@ -261,13 +261,13 @@ class OtherCellError(UsageError):
 
     @property
     def device(self) -> str:
-        """robot or camera; empty when more than that differs."""
+        """Which device differs, "robot" or "camera"; empty when something else or both do."""
         differs = str(self.values.get("differs", ""))
         return differs if differs in ("robot", "camera") else ""
 
 
 class CellIdentity(msgspec.Struct, frozen=True):
-    """Facts of a cell that its images state."""
+    """Mounting, source, robot and camera of a recording, as compared with those of a calibration."""
 
     mount: Mount
     source: Source
@@ -281,7 +281,7 @@ class CellIdentity(msgspec.Struct, frozen=True):
 
 
 def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) -> None:
-    """Raise OtherCellError for pictures of another mounting, source, robot or camera."""
+    """Raise OtherCellError for views of another mounting, source, robot or camera than the calibration's."""
     simulated = calibration.source == "simulated"
     for name, new, known, same in (
         ("mounting", seen.mount, calibration.mount, seen.mount == calibration.mount),

@@ -18,41 +18,42 @@ from recordings.files import read_file
 
 
 class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Limits by the gates' ids, as an owner writes them; None switches a gate off."""
+    """Limits of the gates, by their ids, as written in a limits file; None switches a gate off."""
 
     views: int | None = 8
     weight: float | None = 0.8
-    """Mean weight of the views: below it too much was left out of account."""
+    """Smallest mean weight of the views: below it too many were rejected or down-weighted."""
     session: bool | None = True
-    """The recording is what it says: no other reading of it as a whole explains it better."""
+    """No other reading of the recording (inverted poses, other square size, …) explains it better."""
     rotation_deg: float | None = 30.0
-    """Largest rotation between two views."""
+    """Smallest allowed value of the largest rotation between two views."""
     axis_spread: float | None = 0.1
-    """0: all rotations about one axis, 1: about all axes alike."""
+    """Smallest spread of the rotation axes; 0: all about one axis, 1: all axes alike."""
     view_rms_px: float | None = 1.5
     """Reprojection error of the worst view."""
     holdout_share: float | None = 0.01
     """Held-out translation error over the working distance."""
     cross_validation: float | None = 1.0
-    """Error of left-out views over the claimed one, in units of the largest that chance allows."""
+    """Cross-validated over predicted error, as a multiple of the largest ratio that chance explains."""
     predicted_error_m: float | None = 0.002
     """1σ of a point at the working distance."""
     coverage: float | None = 0.25
     """Share of the image in which corners were seen, when the intrinsics were estimated from these images."""
     lens_pull: float | None = 1.0
-    """Shift of X by believing the given intrinsics, beyond their tolerance, over the predicted error."""
+    """Shift of X caused by the given intrinsics, beyond their tolerance, over the predicted error."""
     board_pull: float | None = 1.0
-    """Shift of X by believing the stated board: size, print and flatness."""
+    """The same for the stated board: size, print and flatness."""
     clock_bound_s: float | None = 0.02
-    """The arm is settled: at the limit of 2 mrad/s this is 0.04 mm at one metre."""
+    """Largest uncertainty of image time against robot time. An arm counts as settled below 2 mrad/s, so this
+    is at most 0.04 mm at one metre."""
     robot_error_m: float | None = 0.002
     robot_error_deg: float | None = 0.3
     certificate: bool | None = None
-    """No effect: of files for earlier versions. The certificate is information."""
+    """No effect; accepted in files for earlier versions. The certificate is information only."""
     agreement_sigma: float | None = None
-    """No effect: of files for earlier versions."""
+    """No effect; accepted in files for earlier versions."""
     board_scale: float | None = None
-    """No effect: of files for earlier versions; see `board_pull`."""
+    """No effect; accepted in files for earlier versions; see `board_pull`."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,9 @@ class GateInputs:
     """Figures that the gates need besides the solution."""
 
     coverage: float | None = None
-    """None when the intrinsics were not estimated from these images."""
+    """Share of the image in which corners were seen; None: intrinsics are not from these images."""
     clock_bound_s: float | None = None
-    """Worst over the used views; None where no clocks were recorded."""
+    """Largest bound of the time offset over the used views; None where no clocks were recorded."""
 
 
 def read_limits(path: Path) -> GateLimits:
@@ -78,7 +79,7 @@ def read_limits(path: Path) -> GateLimits:
 
 
 def judge(solution: Solution, inputs: GateInputs, limits: GateLimits | None = None) -> tuple[Gate, ...]:
-    """Judge every gate that is switched on and can be judged, in the order a person would read them."""
+    """Judge every gate that is switched on and can be judged, in order of reading."""
     limits = limits or GateLimits()
     found = [_session_gate(solution)] if limits.session and solution.profile == "robust" else []
     for name, value, title, remedy in _measured(solution, inputs):
@@ -135,7 +136,7 @@ _RULES = {
 
 
 def _measured(solution: Solution, inputs: GateInputs) -> Iterator[tuple[str, float | None, str, str]]:
-    """A gate's id, its value in the rule's unit (None: not to be judged), end of its title, own remedy."""
+    """Yield each gate's id, value in its unit (None: not judged), end of its title, and own remedy or ""."""
     seen, folds, noise = solution.observability, solution.cross_validation, solution.noise
     predicted_m, distance_m = solution.predicted_error_m, solution.working_distance_m
     weights = list(solution.weights.values())

@@ -1,12 +1,12 @@
-"""The two tests: a posture that comes again against its own history, any postures against a common fit.
+"""The two tests for movement: a repeated posture against its own history, any posture against a common fit.
 
 Repeated postures are compared with their own earlier visits only. Errors of X, lens, table, tag size and the
-tag's place are the same at every visit of a posture: they cancel. Two means of n₁ and n₂ visits differ by
-noise of 1/n₁ + 1/n₂, so a posture's weight is n₁n₂/(n₁ + n₂).
+tag's pose are the same at every visit of a posture: they cancel. The difference of the means of n₁ and n₂
+visits has variance 1/n₁ + 1/n₂, so a posture's weight is n₁n₂/(n₁ + n₂).
 
-Free postures are compared with one fit of camera, tag, its size and the lens to the pictures before:
-y = J θ + (in the window) J δ + noise, θ with what is known of it beforehand. θ is eliminated (Schur
-complement), so what a wrong X or lens would do to new postures is no move.
+Other postures are compared with one fit of camera, tag, its size and the lens to the images before:
+y = J θ + (in the window) J δ + noise, with a prior on θ. θ is eliminated (Schur complement), so the effect of
+a wrong X or lens on new postures is not taken for a move.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from calibrate.quality.movement.window import (
 )
 
 _SAME = float(np.radians(0.2))
-"""Joints that differ by less are one posture; without joints, the twelve numbers of the flange's pose."""
+"""Difference below which two postures are one: of joints (rad), else of the entries of the flange pose."""
 _MOST_REPEATED, _MOST_NEW = 128, 256
-"""Postures remembered; of new ones the oldest are forgotten."""
+"""Most repeated and most new postures remembered; of new ones the oldest are forgotten."""
 FIRST_VISITS = 5
-"""Visits that make a posture a repeated one."""
+"""Visits after which a posture counts as repeated."""
 _FEWEST_BEFORE = 3
 _LATEST_VISITS = 15
 _ROOM = 8
@@ -44,7 +44,7 @@ Visit = tuple[int, Array]
 
 
 class RepeatedPostures(WindowTest[Visit]):
-    """The test for pictures of postures that come again."""
+    """Test of repeated postures against their own earlier visits."""
 
     limit = 13.8
 
@@ -61,7 +61,7 @@ class RepeatedPostures(WindowTest[Visit]):
         self._information = np.zeros((_ROOM, 144))
         self._visits: list[deque[Array]] = []
         self._anew: dict[int, list[Array]] = {}
-        """First visits after pictures were missing."""
+        """First visits of each posture after a gap in the images."""
         for posture in effects:
             self._open(posture)
         for number, y in zip(postures, learned.y, strict=True):
@@ -90,7 +90,7 @@ class RepeatedPostures(WindowTest[Visit]):
         self._information[number] = (of_poses.T @ of_poses).ravel()
 
     def _count(self, posture: int, y: Array, middle: Array) -> float:
-        """Take the visit in, shortened about `middle`; its whitened length before that."""
+        """Count a visit, its deviation from `middle` limited in length; return the length before that."""
         deviation, length = shortened(y - middle, LIMIT * self.noise)
         self._sums.append(np.append(middle + deviation, 1.0), posture)
         self._visits[posture].append(y)
@@ -145,7 +145,7 @@ class RepeatedPostures(WindowTest[Visit]):
 
 
 def _apart(after: Array, before: Array) -> tuple[Array, Array]:
-    """Weights (..., c) of postures, 0 with too few visits, and the differences (..., c, 6) of their means."""
+    """Compute weights (..., c) of postures, 0 with too few visits, and differences (..., c, 6) of means."""
     n2, n1 = after[..., 6], before[..., 6]
     h = np.where(n1 >= _FEWEST_BEFORE, n1 * n2 / np.maximum(n1 + n2, 1e-12), 0.0)
     means = (sums[..., :6] / np.maximum(sums[..., 6:], 1e-12) for sums in (after, before))
@@ -156,14 +156,14 @@ Row = tuple[Array, Array]
 """Effects (6, 20) and whitened deviation (6,) of a picture."""
 _FITTED = np.r_[CAMERA, TAG, SHARED]
 _LATEST = 300
-"""Pictures that the fit for shortening follows."""
+"""Latest images that the fit, from which outliers are measured, is made of."""
 _TAG_M, _TAG_RAD = 5e-3, 0.03
-"""1σ of the tag's place after learning; generous."""
+"""1σ of the tag's pose after learning, larger than expected."""
 _STEPS = 8
 
 
 class FreePostures(WindowTest[Row]):
-    """The test for pictures of postures that do not come again."""
+    """Test of postures that do not repeat, against one fit of camera, tag and lens."""
 
     limit = 18.0
 
@@ -178,7 +178,7 @@ class FreePostures(WindowTest[Row]):
         self._prior = prior * noise**2
         self._sums = RunningSums((16, 17))
         self._anew: list[Row] | None = None
-        """First pictures after some were missing."""
+        """First images after a gap."""
         self.log_likelihood = log_likelihood(learned, lengths, noise)
         for row in zip(learned.effects, learned.y, strict=True):
             self._recent += (self._count(row, theta) > LIMIT, 1)
@@ -187,7 +187,7 @@ class FreePostures(WindowTest[Row]):
 
     @staticmethod
     def _fit(effects: Array, y: Array, prior: Array) -> tuple[Array, Array, float]:
-        """θ (16,) of pictures, the lengths (n,) of what it leaves, and the noise; far ones weighed down."""
+        """Fit θ (16,) robustly; return it, the lengths (n,) of the residuals, and the noise."""
         J, noise = effects[..., _FITTED], 1.0
         weights: Array = np.ones(len(y))
         for _ in range(_STEPS):
@@ -230,7 +230,10 @@ class FreePostures(WindowTest[Row]):
         return self._without_fit(after[:, :12, :12], after[:, :12], before + after)
 
     def _without_fit(self, moves: Array, crossed: Array, all_: Array) -> tuple[Array, Array]:
-        """M and u of moves from their information (…, p, p), theirs with fit and y (…, p, 17), and all's."""
+        """Eliminate θ: compute M and u of moves.
+
+        moves: their information (…, p, p); crossed: that between them and [θ, y] (…, p, 17); all_: of [θ, y].
+        """
         by_fit, u = crossed[..., :16], crossed[..., 16:]
         solved = np.linalg.solve(
             all_[..., :16] + self._prior,
@@ -239,7 +242,7 @@ class FreePostures(WindowTest[Row]):
         return moves - by_fit @ solved[..., :-1], (u - by_fit @ solved[..., -1:])[..., 0]
 
     def _weighted(self, count: int, weights: Array) -> tuple[Array, Array, Array, Array]:
-        """Effects and deviations of the latest pictures; moves' information, and the same with fit and y."""
+        """Return the latest images' columns of moves and of [θ, y], and from these `moves` and `crossed`."""
         rows = [self.latest[place] for place in range(len(self.latest) - count, len(self.latest))]
         J, y = (np.array(part) for part in zip(*rows, strict=True))
         fitted = np.concatenate([J[..., _FITTED], y[..., None]], axis=-1)
@@ -265,7 +268,10 @@ class FreePostures(WindowTest[Row]):
 
 
 class PostureIndex:
-    """Numbers of postures, in bounded memory. The same corners must be seen: others have other errors."""
+    """Numbering of postures in bounded memory.
+
+    Two images are of one posture only if the same corners are seen, as other corners have other errors.
+    """
 
     def __init__(self) -> None:
         self._places = np.full((_MOST_REPEATED + _MOST_NEW, 12), np.inf)
@@ -273,7 +279,7 @@ class PostureIndex:
         self._repeated, self._new = 0, 0
 
     def find(self, picture: Picture) -> tuple[int, bool]:
-        """Slot of the picture's posture, and whether it was there; a new one replaces the oldest new one."""
+        """Return the number of the image's posture, and whether it was known; new ones replace the oldest."""
         place = _place(picture)
         for slot in np.flatnonzero((np.abs(self._places - place) < _SAME).all(axis=1)):
             if self._corners[slot] == picture.corners:
@@ -284,7 +290,7 @@ class PostureIndex:
         return fresh, False
 
     def keep(self, slot: int) -> int | None:
-        """Move a new posture to the ones that are kept: its slot there; None where there is no room."""
+        """Move a new posture to those that are kept; return its number there, None where there is no room."""
         if self._repeated == _MOST_REPEATED:
             return None
         kept = self._repeated

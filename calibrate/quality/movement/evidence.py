@@ -1,9 +1,10 @@
 """Likelihood ratios of moves against none, from information M and its gradient u, in `pictures.UNITS`.
 
-y = J δ + noise over a window gives M = Σ JᵀJ and u = Σ Jᵀy. If δ ~ N(0, V) beforehand, the marginal
+y = J δ + noise over a window gives M = Σ JᵀJ and u = Σ Jᵀy. With the prior δ ~ N(0, V), the marginal
 likelihood of y is N(0, I + J V Jᵀ), and by the matrix inversion and determinant lemmas its logarithm is
-½ uᵀ (V⁻¹ + M)⁻¹ u - ½ ln |V| |V⁻¹ + M| up to what is the same for all V. No move at all is V = I: the dead
-band. See K. P. Murphy, "Probabilistic Machine Learning: Advanced Topics" (2023), section 3.4.
+½ uᵀ (V⁻¹ + M)⁻¹ u - ½ ln |V| |V⁻¹ + M| up to a constant that does not depend on V. "No move" is V = I: small
+thermal motion within the dead band (`pictures.UNITS`). See K. P. Murphy, "Probabilistic Machine Learning:
+Advanced Topics" (2023), section 3.4.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from calibrate.quality.movement.pictures import DEAD_BAND_M, DEAD_BAND_RAD
 from recordings.schema.messages import Mount
 
 ODDS = 1000.0
-"""A cause is named when it is this much likelier than everything else."""
+"""Odds against every other cause from which a cause is named."""
 _CAMERA_MOVES = ((0.3e-3, 0.05), (1.5e-3, 0.25))
 _TAG_MOVE = (0.5e-3, 0.1)
-"""1σ of a move, metres and degrees per axis: a slip and a knock."""
+"""1σ of a move of the tag, metres and degrees per axis."""
 
 
 class Moved(StrEnum):
-    """Part that moved. The pictures cannot tell the members of a group apart."""
+    """What moved; each member covers causes that images cannot tell apart."""
 
     CAMERA = "camera-or-joint-6"
     CAMERA_BASE = "camera-base-or-joint-1"
@@ -38,7 +39,7 @@ class Moved(StrEnum):
 
 
 def _variances(camera: tuple[float, float] | None, tag: tuple[float, float] | None) -> Array:
-    """(12,) in squares of the dead band, which is there in any case."""
+    """Make prior variances (12,) of moves, in squared units of the dead band, whose variance is added."""
     found = []
     for move in (camera, tag):
         metres, degrees = move or (0.0, 0.0)
@@ -104,9 +105,9 @@ def move_size(M: Array, u: Array, moved: Moved) -> tuple[Array, Array]:
 
 
 def has_crept(M: Array, u: Array, tolerated: tuple[float, float]) -> bool:
-    """Whether camera or tag is surely (3σ) farther from where it was than is tolerated, metres and radians.
+    """Tell whether camera or tag has moved, with 3σ, by more than is tolerated (metres, radians).
 
-    M (12, 12), u (12,); whichever of them explains more is taken to have moved.
+    M (12, 12), u (12,); whichever of camera and tag explains more is taken to have moved.
     """
     log = log_marginal(M, u, _MOVES[1:])
     move, sigma = move_size(M, u, Moved.CAMERA if log[0] > log[1] else Moved.TAG)

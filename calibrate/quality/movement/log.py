@@ -1,9 +1,9 @@
-"""Corners and poses that a monitor has seen, on the disk, so that a restart goes on where it was.
+"""File of the corners and poses that a monitor has seen, so that it continues after a restart.
 
-    ROOT/calibrations/…/watch.jsonl     one line a picture, behind a line for the tag that is watched
+    ROOT/calibrations/…/watch.jsonl     first line: the tag that is watched; then one line for each image
 
-Lines are added and durable; beyond `_MOST` the file is replaced, in one step, by what was learned from and
-its latest part.
+Each line is durable once added. Above `_MOST` lines the file is replaced atomically by the learning images
+and the latest ones.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ _MOST, _LATEST = 12_000, 3_000
 
 
 class WatchedTag(msgspec.Struct, frozen=True):
-    """Tag that is watched, and the installed version that watches."""
+    """The tag that is watched, and the installed version whose camera pose is monitored."""
 
     version: int
     tag: BoardSpec
     pose: Matrix4 | None = None
-    """base_from_tag (eye-in-hand) or flange_from_tag, where the first pictures are gone."""
+    """base_from_tag (eye-in-hand) or flange_from_tag; given where the first images are deleted."""
 
 
 class WatchEntry(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A line of the file: a beginning (`begun`), a `gap`, or a picture; one without the tag has no pixels."""
+    """Line of the file: a start (`begun`), a `gap`, or an image; an image without the tag has no pixels."""
 
     begun: WatchedTag | None = None
     key: str = ""
-    """Source and number of the picture: no picture counts twice."""
+    """Source and number of the image, so that none is counted twice."""
     name: str = ""
     wall_s: float = 0.0
     base_from_flange: Matrix4 | None = None
@@ -47,10 +47,10 @@ class WatchEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     corners: tuple[int, ...] = ()
     pixels: tuple[tuple[float, float], ...] = ()
     gap: bool = False
-    """Pictures are missing here, between what was learned from and the latest."""
+    """Images were deleted here, between the learning images and the latest ones."""
 
     def picture(self, tag: BoardSpec) -> Picture:
-        """The picture that the monitor takes."""
+        """Convert to the monitor's input."""
         return Picture(
             self.name,
             np.array(self.base_from_flange),
@@ -62,10 +62,10 @@ class WatchEntry(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class MonitorLog:
-    """A monitor and the file that it goes on from; without a file nothing is kept."""
+    """A monitor with the file that keeps its input; without a file nothing is kept."""
 
     def __init__(self, path: Path | None, watched: WatchedTag, cell: CellModel) -> None:
-        """Raises OSError."""
+        """Read the file, where there is one for this tag and version. Raises OSError."""
         self._path, self._watched, self._cell = path, watched, cell
         self.monitor = MovementMonitor(cell)
         self._keys: deque[str] = deque(maxlen=_MOST)
@@ -93,7 +93,7 @@ class MonitorLog:
         self._lines = len(entries)
 
     def begin_anew(self) -> None:
-        """Learn from the next picture on: after a proof that the calibration holds, say. Raises OSError."""
+        """Forget everything and learn again, for instance after a passed drift check. Raises OSError."""
         self.monitor, self._lines = MovementMonitor(self._cell), 0
         if self._path is not None:
             append_line(self._path, WatchEntry(begun=self._watched))
@@ -121,7 +121,7 @@ class MonitorLog:
         self._known.add(key)
 
     def _shorten(self, path: Path) -> None:
-        """Keep what was learned from, with the tag's pose, and the latest pictures."""
+        """Replace the file by the learning images, the tag's pose and the latest images."""
         if self.monitor.P is None:
             return
         rows = tuple(tuple(row) for row in self.monitor.P.tolist())
@@ -134,7 +134,7 @@ class MonitorLog:
         self._lines = len(kept)
 
     def _learned(self, entries: list[WatchEntry]) -> int:
-        """How many of the entries were learned from."""
+        """Count the entries that were learned from."""
         for place, entry in enumerate(entries):
             if entry.gap:
                 return place

@@ -1,4 +1,4 @@
-"""Pictures in, events out: learning, the two tests, an alarm, and what moved."""
+"""Movement monitor: images in, events out (learning, testing, alarm, cause)."""
 
 from __future__ import annotations
 
@@ -37,31 +37,31 @@ from calibrate.views import BoardView
 from recordings.errors import Value
 
 NAMED_AFTER = 30
-"""Pictures after an alarm at which it is said what moved."""
+"""Images after an alarm at which the cause is named."""
 MISSED_AFTER = 50
-"""Pictures in a row without the tag at which that is said."""
+"""Images in a row without the tag at which it is reported missing."""
 LARGEST_MISFIT_PX = 20.0
-"""Median misfit of the learning pictures beyond which they show no fixed tag, or not this X."""
+"""Median deviation of the learning images above which the tag is not fixed, or X is another one."""
 _JUDGED_FOR = 20
-"""Pictures over which the fast lane's finding is judged: a move, or worse pictures."""
+"""Images over which a finding of the fast test is judged: a move, or only worse images."""
 _CHANCE = 0.999
-"""Quantile of the share of mere noise that a move must exceed."""
+"""Quantile of the share that noise alone would explain, which a move must exceed."""
 _FEWEST_POSTURES, _LEAST_TURN_RAD = 3, float(np.radians(5.0))
 """Fewest postures, and smallest turn (1σ) about the second axis, from which a cause is named."""
 _STARTS = 8
 _FACTORS = (0.25, 0.5, 1.0, 2.0)
-"""Sizes of an arm's errors that are tried."""
+"""Factors on the usual size of an arm's errors that are tried."""
 Test = RepeatedPostures | FreePostures
 
 
 class EventKind(StrEnum):
-    """Kinds of events."""
+    """Kind of an event of the monitor."""
 
     LEARNED = "learned"
     NOT_FIXED = "not-fixed"
-    """The learning pictures do not agree with one place of the tag: nothing can be watched."""
+    """The learning images do not agree with one pose of the tag: nothing can be monitored."""
     TESTING = "testing"
-    """From now on pictures of this kind are tested."""
+    """The test for this kind of images has begun."""
     ALARM = "alarm"
     NAMED = "named"
     PICTURES_WORSE = "pictures-worse"
@@ -72,9 +72,9 @@ class EventKind(StrEnum):
 class MovementEvent:
     kind: EventKind
     picture: str
-    """Name of the picture after which it is said."""
+    """Name of the image that caused the event."""
     pictures: int
-    """Pictures with the tag so far."""
+    """Number of images with the tag so far."""
     moved: Moved | None = None
     values: dict[str, Value] = field(default_factory=dict)
     """Figures; each name ends in its unit."""
@@ -86,19 +86,19 @@ class _Suspicion:
 
     test: Test
     since: int
-    """Pictures of that test since it moved."""
+    """Images of that test since the move."""
     after: int = 0
 
 
 class MovementMonitor:
     """Watches one tag in one cell; `add` pictures as they come.
 
-    The first `LEARNING` pictures place the tag and tell the noise. Memory is bounded. Once it is `finished`
-    (after NAMED or NOT_FIXED) nothing more is tested.
+    The first `LEARNING` images give the tag's pose and the noise. Memory is bounded. Once `finished` (after
+    NAMED or NOT_FIXED) nothing more is tested.
     """
 
     def __init__(self, cell: CellModel, P: Array | None = None) -> None:
-        """P: (4, 4) where the tag's place is known; else the first pictures tell it."""
+        """P: (4, 4) the tag's pose where it is known; None: from the first images."""
         self.cell = cell
         self.pictures = 0
         self.missed = 0
@@ -107,15 +107,16 @@ class MovementMonitor:
         self.repeated: RepeatedPostures | None = None
         self.free: FreePostures | None = None
         self.learned = 0
-        """Pictures until the latest test began."""
+        """Number of images before the latest test began."""
         self.alarmed = self.finished = False
         self._learning: list[Picture] = []
         self._index = PostureIndex()
         self._first: dict[int, list[Picture]] = {}
-        """First visits of each posture that may come again."""
+        """First visits of each posture that may repeat."""
         self._visits: list[tuple[int, Picture]] = []
-        """Visits of postures that came again, until their test begins; and pictures of the others."""
+        """Visits of repeated postures until their test begins."""
         self._others: list[Picture] = []
+        """Images of other postures until their test begins."""
         self._arm = ArmErrors()
         self._turns: dict[bool, deque[tuple[int, Array]]] = {
             kind: deque(maxlen=KEPT) for kind in (False, True)
@@ -124,13 +125,13 @@ class MovementMonitor:
 
     @property
     def needed(self) -> int:
-        """Pictures that are still needed before anything is tested; 0 when something is."""
+        """Images still needed before anything is tested; 0 once a test runs."""
         if self.repeated is not None or self.free is not None:
             return 0
         return LEARNING - max(len(self._learning), len(self._visits), len(self._others))
 
     def forget(self) -> None:
-        """Forget all pictures but those that were learned from: some are missing from here on."""
+        """Forget all images but the learning ones, because images are missing from here on."""
         for test in (self.repeated, self.free):
             if test is not None:
                 test.forget()
@@ -142,7 +143,7 @@ class MovementMonitor:
             yield self._event(EventKind.TAG_UNSEEN, name, in_a_row=self.missed)
 
     def add(self, pictures: Iterable[Picture]) -> Iterator[MovementEvent]:
-        """Judge pictures with the tag, oldest first. Many at once are faster, the events are the same."""
+        """Judge images with the tag, oldest first. Many at once are faster and give the same events."""
         waiting = list(pictures)
         if self.P is None and not self.finished:
             taken = LEARNING - len(self._learning)
@@ -160,7 +161,7 @@ class MovementMonitor:
                 group = yield from self._add_alike(group)
 
     def _add_alike(self, group: list[Picture]) -> Generator[MovementEvent, None, list[Picture]]:
-        """Judge pictures of equally many corners; those that are left when a test begins."""
+        """Judge images with equally many corners; return those left over when a test begins."""
         assert self.P is not None
         arm = self._arm
         again, anywhere = deviations(self.cell, self.P, group, arm)
@@ -179,7 +180,7 @@ class MovementMonitor:
         return self._event(kind, self._learning[-1].name, median_misfit_px=round(misfit_px, 3))
 
     def _tag_starts(self) -> list[Array]:
-        """Places (4, 4) of the tag by single pictures, every tilt that one leaves open."""
+        """List poses (4, 4) of the tag by single images, both solutions where the tilt is ambiguous."""
         starts = []
         for picture in self._learning[:: max(1, len(self._learning) // _STARTS)]:
             F, X = picture.base_from_flange, self.cell.X
@@ -208,7 +209,7 @@ class MovementMonitor:
             yield from self._judge(picture, self.repeated, self.repeated.add((slot, again)))
 
     def _first_visit(self, picture: Picture, slot: int, known: bool) -> Iterator[MovementEvent]:
-        """Collect the first visits of a posture, until it counts as a repeated one."""
+        """Collect the first visits of a posture until it counts as repeated."""
         visits = self._first[slot] = [*(self._first[slot] if known else ()), picture]
         if len(visits) < FIRST_VISITS or (number := self._index.keep(slot)) is None:
             del visits[: -FIRST_VISITS + 1]
@@ -225,7 +226,7 @@ class MovementMonitor:
         return all_deviations(self.cell, self.P, pictures, arm)
 
     def _begin_repeated(self, picture: Picture) -> Iterator[MovementEvent]:
-        """Begin with the repeatability of the arm that the visits make likeliest."""
+        """Begin the test of repeated postures with the most likely repeatability of the arm."""
         if len(self._visits) < LEARNING:
             return
         postures, visits = [number for number, _ in self._visits], [visit for _, visit in self._visits]
@@ -276,7 +277,7 @@ class MovementMonitor:
         return MovementEvent(kind, picture, self.pictures, None, values)
 
     def _share_of_noise(self, count: int) -> float:
-        """Share of the noise of n pictures that p unknowns seldom explain: Beta(p/2, (6 n - p)/2)."""
+        """Share of the noise of n images that p unknowns rarely explain by chance: Beta(p/2, (6 n - p)/2)."""
         moves = 12 if self.cell.arm is None else 16
         return float(special.betaincinv(moves / 2, (6 * count - moves) / 2, _CHANCE))
 
@@ -292,13 +293,13 @@ class MovementMonitor:
         )
 
     def _creep(self, picture: Picture, test: Test) -> Iterator[MovementEvent]:
-        """Say that something crept since the learning, and what."""
+        """Report a slow move since the learning, and its cause."""
         self.alarmed = True
         yield self._event(EventKind.ALARM, picture.name, crept=True, since_pictures=self.pictures)
         yield self._named(picture, test, CREEP_WINDOW, learned=True)
 
     def _name(self, picture: Picture, test: Test, suspicion: _Suspicion) -> Iterator[MovementEvent]:
-        """Say what moved, `NAMED_AFTER` pictures of the test that noticed it."""
+        """Name the cause, `NAMED_AFTER` images of the test after its alarm."""
         if test is not suspicion.test:
             return
         suspicion.after += 1
@@ -324,7 +325,7 @@ class MovementMonitor:
         return MovementEvent(EventKind.NAMED, picture.name, self.pictures, moved, values)
 
     def _variety(self, test: Test, count: int) -> tuple[int, float]:
-        """Postures of the test's latest pictures, and 1σ of their turns about the second axis, radians."""
+        """Count the postures of the latest images; compute 1σ of their turns about the second axis, rad."""
         turns = list(self._turns[test is self.repeated])[-count:]
         R = np.array([turn for _, turn in turns])
         apart = rotation_log(R @ project_to_rotation(R.mean(axis=0)).T)

@@ -1,7 +1,7 @@
-"""A picture as the deviation of the tag's pose from where calibration, arm and tag's place put it.
+"""An image as the deviation of the tag's pose from the one predicted by calibration, arm and tag pose.
 
-The corners' deviation r from the predicted ones is taken to the six numbers of the tag's pose in the camera
-by one linear step, y = (LᵀL)⁻¹ Lᵀ r: a lone tag's pose is never solved for, so it cannot flip its tilt.
+The deviation r of the corners from the predicted ones is converted to the six numbers of the tag's pose in
+the camera by one linear step, y = (LᵀL)⁻¹ Lᵀ r. No pose is solved from a single tag, whose tilt is ambiguous.
 Deltas are those of `geometry.perturb`. Eye-in-hand: C = (F X)⁻¹ P; eye-to-hand: C = X⁻¹ F P.
 """
 
@@ -18,22 +18,22 @@ from calibrate.views import board_in_camera
 from recordings.schema.messages import CameraModel, Mount
 
 DEAD_BAND_M, DEAD_BAND_RAD = 0.03e-3, float(np.radians(0.003))
-"""1σ of the warming and cooling of a sound cell, per axis: moves within it are no moves."""
+"""1σ of the thermal motion of a sound cell, per axis; it does not count as a move."""
 CAMERA, TAG, SHARED, MOVES = slice(0, 6), slice(6, 12), slice(16, 20), slice(0, 16)
-"""Columns: camera pose X, tag pose P, and size, focal length, cx, cy; moves: X, P, zeros of joints 2 to 5."""
+"""Columns: camera pose X, tag pose P; tag size, focal length, cx, cy; moves: X, P, zeros of joints 2 to 5."""
 _JOINT_RAD = float(np.radians(0.1))
 _SIZE_SHARE, _FOCAL_SHARE, _CENTRE_PX = 0.005, 0.005, 3.0
 UNITS = np.concatenate(
     [np.tile(np.repeat([DEAD_BAND_M, DEAD_BAND_RAD], 3), 2), np.full(4, _JOINT_RAD), np.ones(4)]
 )
-"""One of each column: the dead band, 0.1° of a joint, and 1σ of what is known of size and lens."""
+"""Unit of each column: the dead band, 0.1° of a joint, and the prior 1σ of size and lens."""
 _CORNER_PX = 0.2
 _REPEATS_M, _REPEATS_RAD = 0.05e-3, float(np.radians(0.004))
-"""1σ by which an arm comes back to a posture. All noise together is scaled by what learning finds."""
+"""1σ of an arm's repeatability. The learning images scale all noise together."""
 _TABLE_M, _TABLE_RAD = 0.2e-3, float(np.radians(0.02))
 """1σ of an arm's errors between postures."""
 _LENS_PX, _LENS_REACH_PX = 0.08, 250.0
-"""1σ of what a lens model leaves, and how far over the image it stays alike."""
+"""1σ of a lens model's residual errors, and their correlation length in the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class CellModel:
     X_covariance: Array
     """(6, 6)"""
     arm: RobotModel | None = None
-    """None: joints are not told apart."""
+    """None: moves of joints are not considered."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Deviations:
     y: Array
     """(n, 6)"""
     effects: Array
-    """(n, 6, 20) of one `UNITS` of each unknown on y."""
+    """(n, 6, 20) derivative of y by each unknown, per its `UNITS`."""
     log_density: Array
     """(n,) ln of the determinant of the whitening."""
 
@@ -139,13 +139,13 @@ def _carried(by_flange: Array, metres: float, radians: float) -> Array:
 
 
 def _alike(pixels: Array) -> Array:
-    """(n, k, k) covariance of the lens model's errors at corners (n, k, 2)."""
+    """Compute the covariance (n, k, k) of the lens model's errors at corners (n, k, 2)."""
     apart = ((pixels[:, :, None] - pixels[:, None]) ** 2).sum(axis=-1)
     return np.asarray(_LENS_PX**2 * np.exp(-apart / (2 * _LENS_REACH_PX**2)))
 
 
 def _effects_of_poses(cell: CellModel, flange: Array, P: Array) -> tuple[Array, Array, Array]:
-    """∂C/∂X, ∂C/∂P and ∂C/∂F, (n, 6, 6): the tag's motion in the camera by deltas of each."""
+    """Compute ∂C/∂X, ∂C/∂P and ∂C/∂F, (n, 6, 6): the tag's motion in the camera by deltas of each."""
     in_hand = cell.mount == "eye-in-hand"
     mount = inverse(flange) if in_hand else flange
     tag = transform_points(mount, P[:3, 3][None])[:, 0]
@@ -160,7 +160,7 @@ def _effects_of_poses(cell: CellModel, flange: Array, P: Array) -> tuple[Array, 
 
 
 def _turned_about(R: Array, lever: Array) -> Array:
-    """(n, 6, 6) motion, in the camera, of what is at `lever` (n, 3) from the origin of a frame that moves."""
+    """Compute the motion (n, 6, 6), in the camera, of a point at `lever` (n, 3) in a frame that moves."""
     moved = np.zeros((len(R), 6, 6))
     moved[:, :3, :3] = moved[:, 3:, 3:] = R
     moved[:, :3, 3:] = -R @ skew(lever)
@@ -175,9 +175,9 @@ def _effects_of_joints(cell: CellModel, pictures: list[Picture], by_flange: Arra
 
 
 def fitted_tag(cell: CellModel, pictures: list[Picture], starts: list[Array]) -> tuple[Array, float]:
-    """Fit the tag's place P (4, 4) to pictures, X held, from the best of several starts.
+    """Fit the tag's pose P (4, 4) to images, X taken as exact, from the best of several starts.
 
-    Far corners are weighed down (Huber). The second value is the pictures' median deviation, px.
+    Outliers are down-weighted (Huber). The second value is the images' median deviation, px.
     """
     P = min(starts, key=lambda start: _median_px(cell, start, pictures))
     for _ in range(_STEPS):

@@ -1,7 +1,7 @@
-"""Parts that both tests share: shortened outliers, windows of many lengths, and a fast lane for large moves.
+"""Base of both tests: limited outliers, windows of many lengths, and a fast test for large moves.
 
-A deviation from what the latest pictures showed is shortened to a limit before it counts, so one blurred
-picture cannot raise an alarm. A large move is then shortened too, over and over: the fast lane counts that.
+A deviation from the latest images is limited in length before it counts, so that one blurred image cannot
+raise an alarm. After a large move every image is limited: the fast test counts how often that happens.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from calibrate.quality.movement.evidence import move_score
 from calibrate.quality.movement.pictures import Deviations
 
 LEARNING = 60
-"""Pictures that a test needs before it judges."""
+"""Images that a test learns from before it judges."""
 REFERENCE = 1000
-"""Pictures before a window that it is compared with."""
+"""Images before a window that the window is compared with."""
 WINDOWS = 3 * 2 ** np.arange(8)
-"""3, 6 … 384 pictures."""
+"""Lengths of the windows: 3, 6 … 384 images."""
 CREEP_WINDOW = int(WINDOWS[-1])
-"""Pictures that are compared with those that were learned from."""
+"""Latest images that are compared with the learning images to detect slow moves."""
 KEPT = REFERENCE + int(WINDOWS[-1])
 CHI2_6_MEDIAN, _CHI2_6_99 = 5.348, 16.81
 LIMIT = float(np.sqrt(_CHI2_6_99))
-"""Whitened length to which a deviation is shortened; 1 % of good pictures are longer."""
+"""Limit of a deviation's whitened length; 1 % of good images exceed it."""
 _FAR_AFTER_MOVE, _FAST_LIMIT = 0.9, 13.8
-"""Share of pictures that a large move shortens, and the sum of log-odds (CUSUM) that is an alarm."""
+"""Share of images beyond `LIMIT` after a large move, and the sum of log-odds (CUSUM) that is an alarm."""
 _ROBUST_STEPS = 6
 _FAINT = 0.01
-"""Information beforehand on moves, per `UNITS` squared: only so that what nothing shows stays finite."""
+"""Prior information on moves, per `UNITS` squared: only keeps undetermined moves finite."""
 Entry = TypeVar("Entry")
 Counts = NDArray[np.intp]
 
 
 class RunningSums:
-    """Sums of the latest `KEPT` entries and of any latest part of them, in bounded memory."""
+    """Running sums from which the sum of any number of latest entries, up to `KEPT`, is taken."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._rows = np.zeros((2 * KEPT + 1, *shape))
@@ -90,11 +90,11 @@ class WindowFinding:
     """State of a test after a picture."""
 
     score: float
-    """ln of the likelihood ratio of a move, the highest of all windows; 0 before there is one."""
+    """ln of the likelihood ratio of a move, the highest of all windows; 0 before the first window."""
     window: int
     """Pictures of that window."""
     far: int
-    """Pictures since the fast lane began to count; 0 below its limit."""
+    """Images since the fast test began to count; 0 below its limit."""
     alarm: bool
 
 
@@ -114,11 +114,11 @@ class WindowTest(ABC, Generic[Entry]):
 
     def __init__(self, noise: float) -> None:
         self.noise = noise
-        """Standard deviation of whitened deviations, by the learning pictures."""
+        """Standard deviation of whitened deviations in the learning images."""
         self.latest: deque[Entry] = deque(maxlen=KEPT)
         self._cusum, self._since = 0.0, 0
         self._usual, self._recent = np.zeros(2), np.zeros(2)
-        """Shortened pictures and all of them: before the fast lane began to count, and since."""
+        """Counts of limited images and of all: before the fast test began to count, and since."""
 
     @abstractmethod
     def add(self, entry: Entry) -> WindowFinding:
@@ -126,33 +126,33 @@ class WindowTest(ABC, Generic[Entry]):
 
     @abstractmethod
     def contrasts(self, windows: Counts, learned: bool = False) -> tuple[Array, Array]:
-        """M (w, 12, 12) and u (w, 12) of these latest windows against what was before, unit noise.
+        """Compute M (w, 12, 12) and u (w, 12) of these latest windows against the images before, unit noise.
 
-        `learned`, here and below: against the pictures that were learned from instead.
+        `learned`, here and below: against the learning images instead.
         """
 
     @abstractmethod
     def contrast(self, count: int, weights: Array, learned: bool = False) -> tuple[Array, Array]:
-        """M (16, 16) and u (16,) of the latest `count` pictures, not shortened, against what was before."""
+        """Compute M (16, 16) and u (16,) of the latest `count` images, not limited, against those before."""
 
     @abstractmethod
     def rest(self, count: int, weights: Array, move: Array, learned: bool = False) -> Array:
-        """Deviations (m, 6) of the latest `count` pictures that a move (16,) leaves, whitened, not shortened.
+        """Compute the whitened residuals (m, 6) of the latest `count` images after a move (16,), not limited.
 
-        `count` pictures, or fewer where some have nothing to be compared with.
+        m is below `count` where some images have nothing to be compared with.
         """
 
     def _before(self, counts: Counts | int, learned: bool) -> Array:
         return self._learned if learned else self._sums.before(counts)
 
     def forget(self) -> None:
-        """Forget everything but what was learned: pictures are missing from here on."""
+        """Forget everything but what was learned, because images are missing from here on."""
         self._sums.clear()
         self.latest.clear()
         self._cusum, self._since = 0.0, 0
 
     def _judge(self, length: float) -> WindowFinding:
-        """Finding after the picture whose deviation has this whitened length."""
+        """Return the finding after an image whose deviation has this whitened length."""
         usual = (self._usual[0] + 1) / (self._usual[1] + 2)  # Laplace's rule of succession
         odds = _FAR_AFTER_MOVE / usual if length > LIMIT else (1 - _FAR_AFTER_MOVE) / (1 - usual)
         self._cusum = min(max(0.0, self._cusum + float(np.log(odds))), 1.5 * _FAST_LIMIT)
@@ -174,14 +174,14 @@ class WindowTest(ABC, Generic[Entry]):
         self._recent[:] = 0
 
     def creep(self) -> tuple[Array, Array] | None:
-        """M (12, 12) and u (12,) of a whole window against what was learned; None before there is one."""
+        """Compute M (12, 12) and u (12,) of a full window against the learning images; None until full."""
         if len(self.latest) < LEARNING + CREEP_WINDOW:
             return None
         M, u = self.contrasts(np.array([CREEP_WINDOW]), learned=True)
         return M[0] / self.noise**2, u[0] / self.noise**2
 
     def move_since(self, count: int, learned: bool = False) -> tuple[Array, Array]:
-        """M (16, 16) and u (16,) of the latest `count` pictures over the noise, far ones weighed down."""
+        """Compute M (16, 16) and u (16,) of the latest `count` images over the noise, weighted robustly."""
         weights: Array = np.ones(count)
         for _ in range(_ROBUST_STEPS):
             M, u = self.contrast(count, weights, learned)
@@ -191,10 +191,10 @@ class WindowTest(ABC, Generic[Entry]):
         return M / self.noise**2, u / self.noise**2
 
     def explained_share(self, count: int) -> tuple[float, int]:
-        """Share of the latest pictures' squared deviations that a move of camera, tag and joints explains.
+        """Compute the share of squared deviations that a move of camera, tag and joints explains.
 
-        The longest tenth is left out: one blurred picture would hide any move. The second value is the number
-        of pictures that are left.
+        Of the latest `count` images the worst tenth is left out, as one blurred image would hide any move.
+        The second value is the number of images used.
         """
         lengths: Array = np.linalg.norm(self.rest(count, np.ones(count), np.zeros(16)), axis=1)
         kept = lengths <= np.sort(lengths)[count - 1 - -(-count // 10)]
@@ -206,19 +206,20 @@ class WindowTest(ABC, Generic[Entry]):
 
 
 def shortened(deviation: Array, limit: float) -> tuple[Array, float]:
-    """A deviation (6,) no longer than `limit`, and the length that it had."""
+    """Limit a deviation (6,) to the length `limit`; return it and its original length."""
     length = float(np.sqrt(deviation @ deviation))
     return deviation * min(1.0, limit / max(length, 1e-300)), length
 
 
 def log_likelihood(learned: Deviations, lengths: Array, noise: float) -> float:
-    """ln of the likelihood of pictures with deviations of these lengths, far ones shortened."""
+    """Compute ln of the likelihood of images with deviations of these lengths, outliers limited."""
     squares = np.minimum(lengths / noise, LIMIT) ** 2
     return float((learned.log_density - squares / 2).sum() - learned.y.size * np.log(noise))
 
 
 def noise_of(lengths: Array, freedom: float = 1.0) -> float:
-    """Standard deviation of six whitened numbers from their lengths (n,), by the median; `freedom`: the share
-    that a fit left.
+    """Estimate the standard deviation of whitened deviations (6,) from the median of their lengths (n,).
+
+    freedom: share of the degrees of freedom that a fit left.
     """
     return float(np.sqrt(np.median(lengths**2) / (CHI2_6_MEDIAN * freedom)))

@@ -1,1 +1,1 @@
-"""Calibration file, installed versions, exports and words for people. The door is `calibrate` itself."""
+"""Calibration file, installed versions, exports and texts for people. Public names are in `calibrate`."""

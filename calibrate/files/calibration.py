@@ -1,4 +1,4 @@
-"""The calibration file, `format: handeye-calibration/1`: what it holds, writing, and reading it with proof.
+"""The calibration file, `format: handeye-calibration/1`: its fields, writing, and verified reading.
 
 Field by field in docs/integrator/calibration-file.md. Metres and radians unless the name says
 otherwise; covariances are of `geometry.perturb`'s delta.
@@ -76,7 +76,7 @@ class Sigma(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, covariance: ArrayLike) -> Sigma:
-        """Take it from a covariance that begins with those of δt (m) and δφ (rad)."""
+        """Compute it from a covariance whose first six rows are those of δt (m) and δφ (rad)."""
         shift, turn = np.sqrt(np.diag(np.asarray(covariance))[:6].reshape(2, 3).sum(axis=1)).tolist()
         return cls(1e3 * shift, math.degrees(turn))
 
@@ -91,7 +91,7 @@ class Views(msgspec.Struct, frozen=True, omit_defaults=True):
     rejected: list[RejectedView] = []
     turned: list[int] = []
     weights: list[ViewWeight] = []
-    """Weights below 1."""
+    """Only the views whose weight is below 1."""
 
 
 class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -104,7 +104,7 @@ class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
     found: Literal["from these pictures", "given"]
     sigma: dict[str, float] = {}
     held: list[str] = []
-    """No effect: of files of earlier versions."""
+    """No effect; accepted in files of earlier versions."""
 
     @property
     def model(self) -> CameraModel:
@@ -127,7 +127,7 @@ class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Folds(msgspec.Struct, frozen=True):
-    """Left-out views against what was claimed of them."""
+    """Cross-validation: errors of left-out views against those predicted for them."""
 
     rms_mm: float
     rms_deg: float
@@ -136,7 +136,7 @@ class Folds(msgspec.Struct, frozen=True):
 
 
 class SessionReading(msgspec.Struct, frozen=True):
-    """Reading of the recording as a whole."""
+    """Interpretation that explains the recording best: as recorded, or for instance with inverted poses."""
 
     hypothesis: str
     text: str
@@ -152,7 +152,7 @@ class TableError(msgspec.Struct, frozen=True):
 
 class Arm(msgspec.Struct, frozen=True):
     applied: bool
-    """The evidence for errors of the table is clear."""
+    """True when the evidence for systematic errors of the arm is clear."""
     log_bayes: float
     size_mm: float
     table: list[TableError]
@@ -173,20 +173,20 @@ class DhTable(msgspec.Struct, frozen=True):
 
 
 class HeldOutViews(msgspec.Struct, frozen=True):
-    """Views predicted from those taken elsewhere: rms distance by which the board's middle was missed."""
+    """Rms error of the board's middle in views predicted from views taken elsewhere."""
 
     without_table_mm: float
     with_table_mm: float
     views: int
     recording: str = ""
-    """Recording of the views, none of which took part."""
+    """File name of a recording whose views took no part; empty: left-out views of the calibration's own."""
 
 
 class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
-    """X and the arm's table as one result. `corrected` and `result` are there only where it is offered.
+    """X and the arm's corrected table as one result. `corrected` and `result` are given only where offered.
 
-    The X of this table serves no other: its frames are `corrected_base` and `corrected_flange`, which chain
-    with `base_from_flange` here and with nothing else. The file's own `result` serves the arm as it is.
+    This X is valid with this table only: its frames are `corrected_base` and `corrected_flange`, which chain
+    with `base_from_flange` here and with nothing else. The file's own `result` is for the arm as it is.
     """
 
     offered: bool
@@ -196,20 +196,20 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     nominal_source: Literal["published", "factory"]
     errors: list[TableError]
     held: dict[str, str]
-    """Parameter that keeps its nominal value → why."""
+    """Parameter that keeps its nominal value → the reason."""
     covariance: tuple[tuple[float, ...], ...]
     """(24, 24) of X's [δt, δφ] and of `errors`, in that order; metres, radians."""
     with_table_mm: float
-    """1σ of a point over the arm's workspace, working distance ahead."""
+    """1σ of a point at the working distance, averaged over the arm's workspace."""
     without_table_mm: float
     """The same for the uncorrected arm with `result` of the file."""
     if_measured_mm: dict[str, float] = {}
     """`with_table_mm` if this (board, intrinsics) were known to 0.02 %."""
     held_out: HeldOutViews | None = None
     verified: HeldOutViews | None = None
-    """By a recording of its own: distance of the board's middle from its mean place."""
+    """Verification by another recording: distance of the board's middle from its mean position."""
     refused: str = ""
-    """Why it is not offered: no-evidence, no-joints, not-nominal, not-better."""
+    """Reason why it is not offered: no-evidence, no-joints, not-nominal, not-better; empty: offered."""
     corrected: DhTable | None = None
     result: FramePose | None = None
     """corrected_flange_from_camera (eye-in-hand) or corrected_base_from_camera."""
@@ -238,7 +238,7 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     predicted_error_mm: float | None = None
     working_distance_m: float | None = None
     projection_sigma_px: dict[str, float] = {}
-    """centre, corner, worst: 1σ by which a lens found here may show a fixed direction wrongly; else empty."""
+    """centre, corner, worst: 1σ of the projection of a fixed direction by the estimated lens; else empty."""
     noise: dict[str, float] = {}
     """corner_px, robot_mm, robot_deg"""
     error_shares: dict[str, float] = {}
@@ -250,10 +250,10 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     session: SessionReading | None = None
     arm: Arm | None = None
     robot_systematics: str = ""
-    """No effect: of files from before version 0.2; see `arm`."""
+    """No effect; accepted in files from before version 0.2; see `arm`."""
     warnings: list[str] = []
     warning_codes: list[str] = []
-    """One for each of `warnings`."""
+    """Code of each of `warnings`."""
 
     @property
     def failed(self) -> list[Gate]:
@@ -274,7 +274,7 @@ class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Override(msgspec.Struct, frozen=True):
-    """A person installed in spite of something; written when installing."""
+    """A person's decision to install although something speaks against it; written when installing."""
 
     reason: str
     who: str
@@ -284,7 +284,7 @@ class Override(msgspec.Struct, frozen=True):
 class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     format: Literal["handeye-calibration/1"]
     created: str
-    """UTC; the only field that two runs on one recording differ in, and not part of the hash."""
+    """Time of the solve, UTC; not in the hash. Two runs on one recording differ in nothing else."""
     source: Source
     mount: Mount
     result: FramePose
@@ -301,9 +301,9 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     provenance: Provenance
     override: Override | None = None
     verification: list[Touch] = []
-    """Checks by hand, oldest first; see `touch`."""
+    """Touch tests, oldest first; see `touch`."""
     arm_table: CorrectedArm | None = None
-    """Where the arm's model is known. `result` is then for the arm as it is, without this table."""
+    """The arm's corrected table, where its model is known; `result` does not depend on it."""
 
     @property
     def transform(self) -> Transform:
@@ -312,7 +312,7 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def camera_name(self) -> str:
-        """Name under which it installs."""
+        """Name of the camera in the cell under which it is installed."""
         return self.camera.name or MAIN_CAMERA
 
     @property
@@ -326,7 +326,7 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
 def encode_calibration(calibration: Calibration) -> bytes:
     """YAML text of the file, hash included."""
     plain = msgspec.json.decode(msgspec.json.encode(calibration))
-    # The hash stands where people see it first.
+    # The hash comes first so that people see it.
     head = {"format": plain.pop("format"), "sha256": "", "created": plain.pop("created")}
     ordered = head | plain
     ordered["sha256"] = content_sha256(ordered)
@@ -342,7 +342,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
 
 
 def decode_calibration(content: bytes, where: str) -> Calibration:
-    """Prove and parse a file's bytes; CalibrationFileError says what is wrong."""
+    """Verify and parse a file's bytes; CalibrationFileError says what is wrong."""
     plain = proven_plain(content, where)
     try:
         calibration = msgspec.convert(plain, Calibration)
@@ -358,12 +358,12 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
-    """Write the file in one durable step. Raises CalibrationFileError."""
+    """Write the file atomically and durably. Raises CalibrationFileError."""
     write_output(path, encode_calibration(calibration))
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """Write a file for whoever asked for it, in one durable step. Raises CalibrationFileError."""
+    """Write a file that a user named, atomically and durably. Raises CalibrationFileError."""
     try:
         write_atomically(path, content, ASKED_FOR)
     except OSError as problem:
@@ -371,5 +371,5 @@ def write_output(path: Path, content: bytes) -> None:
 
 
 def source_stamp(source: Source) -> str:
-    """Stamp for everything that shows a calibration of no real cell; else empty."""
+    """Warning to show with a simulated, played-back or imported calibration; empty for a real one."""
     return _STAMPS.get(source, "")

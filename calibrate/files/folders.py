@@ -1,4 +1,4 @@
-"""Folders of installed calibrations: where they lie, which is current, whether it holds.
+"""Folders of installed calibrations: their paths, the current version, its validity.
 
 ROOT/calibrations/                  camera `main`: its versions, `current`, logs and validity
 ROOT/calibrations/cameras/NAME/     the same for every other camera of the cell
@@ -18,7 +18,7 @@ VERSION_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
 
 
 def calibrations_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
-    """Folder of one camera's installed calibrations. InstallError for what is no name of a camera."""
+    """Return the folder of a camera's installed calibrations. InstallError for an invalid camera name."""
     if not is_session_name(camera):
         raise InstallError(
             f"{camera!r} is no name of a camera.", code="camera-name", remedy="Use 1 to 40 of a-z, 0-9 and -."
@@ -28,7 +28,7 @@ def calibrations_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> P
 
 
 def readable_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
-    """Folder of the calibrations; InstallError where it may not be looked into."""
+    """Return the folder of a camera's installed calibrations; InstallError where it is not readable."""
     folder = calibrations_folder(root, camera)
     try:
         (folder / "gen").exists()
@@ -42,14 +42,14 @@ def readable_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
 
 
 def cameras(root: Path | str | None = None) -> list[str]:
-    """Names of the cameras for which something was ever installed below `root`, `main` first."""
+    """List the cameras for which something was ever installed below `root`, `main` first."""
     folder = readable_folder(root)
     others = sorted(path.parent.name for path in (folder / "cameras").glob("*/gen"))
     return [*([MAIN_CAMERA] if (folder / "gen").is_dir() else []), *filter(is_session_name, others)]
 
 
 def current_version(folder: Path) -> tuple[int, Path]:
-    """(number, file) of what `current` points to. InstallError when nothing is installed."""
+    """Return number and file of the current version. InstallError when nothing is installed."""
     try:
         name = (folder / "current").readlink().name
     except OSError:
@@ -65,18 +65,18 @@ def current_version(folder: Path) -> tuple[int, Path]:
 
 
 def read_validity(folder: Path) -> dict[int, Validity]:
-    """Read the last record of each version. OSError as it comes."""
+    """Read the last validity record of each version. Raises OSError."""
     path = folder / FILE
     return parse_validity(read_file(path, LOG_LIMIT_BYTES)) if path.exists() else {}
 
 
 def current_validity(folder: Path, now: datetime | None = None) -> Validity:
-    """Validity of what is installed there, at `now` (default: this moment). InstallError when nothing is."""
+    """Read the current version's validity at `now` (default: this moment). InstallError without one."""
     return validity_of(folder, current_version(folder)[0], now)
 
 
 def validity_of(folder: Path, number: int, now: datetime | None = None) -> Validity:
-    """Read the validity of one version: what is current may change while it is read."""
+    """Read the validity of version `number`, which need not be the current one, at `now`."""
     try:
         installed = datetime.fromtimestamp((folder / "current").lstat().st_mtime, UTC)
         found = read_validity(folder).get(number) or unrecorded(number, time_text(installed))

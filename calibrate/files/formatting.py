@@ -1,4 +1,4 @@
-"""A calibration in words: its verdict, pose, findings and, for the terminal, its summary."""
+"""Texts about a calibration: verdict, pose, findings, and the summary for the terminal."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ShownFigure:
-    """A figure of a calibration, as terminal, page and screen say it."""
+    """Figure of a calibration as shown by terminal, report and screen."""
 
     label: str
     value: str
     about: str = ""
-    """What it holds for, or what it counts: 'at 487 mm', 'passed'."""
+    """Condition or unit of the figure: 'at 487 mm', 'passed'."""
 
 
 def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str, ShownFigure]:
-    """The figures that a calibration is judged by, most important first; without what is not known."""
+    """Collect the figures that a calibration is judged by, most important first, without unknown ones."""
     quality, gates, views = calibration.quality, calibration.quality.gates, calibration.views
     shown = {"error": ShownFigure("camera position", f"± {calibration.sigma.translation_mm:.3g} mm (1σ)")}
     if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
@@ -55,7 +55,7 @@ def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str
 
 
 def error_text(calibration: Calibration) -> str:
-    """The error as a sentence with its limit."""
+    """Write the error and its limit as a sentence."""
     figure = figures(calibration)["error"]
     gates = [gate for gate in calibration.quality.gates if gate.name == "predicted_error_m"]
     limit = f" The limit is {gates[0].shown(gates[0].limit)}." if gates and figure.about else ""
@@ -63,14 +63,14 @@ def error_text(calibration: Calibration) -> str:
 
 
 def noise_text(calibration: Calibration) -> str:
-    """Measurement noise; empty where it was not estimated."""
+    """Write the measurement noise; empty where it was not estimated."""
     noise = calibration.quality.noise
     robot = f"robot {noise['robot_mm']:.3g} mm, {noise['robot_deg']:.3g}°" if noise else ""
     return f"Measurement noise (1σ): corners {noise['corner_px']:.3g} px, {robot}." if noise else ""
 
 
 def shares_text(calibration: Calibration) -> str:
-    """Sources of the error of X, the largest first."""
+    """List the sources of the error of X with their shares, the largest first."""
     shares = sorted(calibration.quality.error_shares.items(), key=lambda item: -item[1])
     return ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares if share > 0.005)
 
@@ -86,7 +86,7 @@ def override_text(override: Override) -> str:
 
 
 def pose_text(calibration: Calibration) -> str:
-    """Position in mm, then roll, pitch, yaw about fixed axes in degrees."""
+    """Write the position in mm, then roll, pitch, yaw about fixed axes in degrees."""
     x, y, z = (v * 1000 for v in calibration.result.translation_m)
     roll, pitch, yaw = Rotation.from_quat(calibration.result.rotation_xyzw).as_euler("xyz", degrees=True)
     return f"{x:.3f}  {y:.3f}  {z:.3f} mm,  roll {roll:.4f}°  pitch {pitch:.4f}°  yaw {yaw:.4f}°"
@@ -160,9 +160,9 @@ def _gate_table(calibration: Calibration) -> Table:
 
 
 _SAID = 3.0
-"""Sigmas from which a finding is told."""
+"""Sigmas from which a finding is mentioned."""
 _COSTLY = 0.2
-"""Share of X's variance from which its source is named with its remedy."""
+"""Share of X's variance from which an error source is named with its remedy."""
 _REMEDIES = {
     "intrinsics": "calibrate the intrinsics from more images",
     "board": "measure the board and state its tolerance (square_tolerance, flatness_m)",
@@ -174,7 +174,7 @@ _REMEDIES = {
 
 
 def cell_sentences(calibration: Calibration) -> list[str]:
-    """One sentence for each thing worth knowing, most telling first."""
+    """Write a sentence for each notable finding, most important first."""
     quality = calibration.quality
     sentences: list[str] = []
     if quality.board is not None:
@@ -197,11 +197,11 @@ _REFUSED = {
     "not-better": "it does not help on poses elsewhere",
 }
 WORTH_SAYING = 0.85
-"""A limiting cause of the table is named where knowing it leaves less than this share of the error."""
+"""Share of the error left without a cause below which that cause is named as the limit of the table."""
 
 
 def arm_sentences(calibration: Calibration) -> Iterator[str]:
-    """Say what the arm's table brings, what leaving it out costs, what limits it; nothing of a good arm."""
+    """Yield sentences on the accuracy with and without the arm's corrected table, and on what limits it."""
     arm = calibration.arm_table
     if arm is None or arm.refused == "no-evidence":
         return
@@ -260,7 +260,7 @@ def _board(board: BoardShape, square_mm: float) -> Iterator[str]:
 
 
 def pose_difference(first: Calibration, second: Calibration) -> tuple[float, float, float]:
-    """(mm, degrees, sigmas) between two results of the same frames.
+    """Compute the difference (mm, degrees, sigmas) between two results with the same frames.
 
     Sigmas: Mahalanobis distance with the sum of both covariances, as if the two were independent.
     """
@@ -274,7 +274,7 @@ PEER_HEAD = ("method", "e_t mm", "e_R", "spread mm", "spread °", "px", "σ from
 
 
 def peer_cells(peer: PeerResult) -> tuple[str, ...]:
-    """One row under PEER_HEAD."""
+    """Make the cells of a method's row in the table with the head PEER_HEAD."""
     numbers = (
         (peer.e_t_m, 1e3, 3),
         (peer.e_R, 1.0, 5),

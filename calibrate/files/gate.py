@@ -1,4 +1,4 @@
-"""A quality gate: its value, its limit, and the one place that words them."""
+"""Quality gate: value, limit and text."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ class Gate(msgspec.Struct, frozen=True):
     """A condition that a calibration must meet before it may be installed."""
 
     name: str
-    """The gate's id: the name of its limit in `GateLimits` (files of earlier versions hold other names)."""
+    """Id: the name of its limit in `GateLimits` (files of earlier versions hold other names)."""
     passed: bool
     value: float | None
-    """In `unit`; None in a file where it was no finite number."""
+    """Value in `unit`; None in a file where it was not a finite number."""
     limit: float | None
     text: str
     """Name, value, unit, limit, PASS or FAIL, and the remedy of a failed one."""
@@ -28,7 +28,7 @@ class Gate(msgspec.Struct, frozen=True):
     def measured(
         cls, name: str, title: str, value: float, sense: Sense, limit: float, unit: str, remedy: str
     ) -> Gate:
-        """Judge `value` against `limit` and render both: the only place that makes a gate's text."""
+        """Judge `value` against `limit` and make the gate's text."""
         passed = bool(np.isfinite(value) and (value >= limit if sense == "≥" else value <= limit))
         gate = cls(name, passed, float(value), float(limit), "", unit, "" if passed else remedy)
         limit_unit = _SHOWN[unit][1] if _SHOWN[unit][1] in ("°", " %") else ""
@@ -37,18 +37,18 @@ class Gate(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(gate, text=f"{text} PASS" if passed else f"{text} FAIL. {remedy}")
 
     def shown(self, figure: float | None) -> str:
-        """A figure of this gate with its unit, as people read it."""
+        """Format a figure of this gate with the unit for people (mm for m, for instance)."""
         factor, suffix = _SHOWN.get(self.unit, (1.0, ""))
         return "–" if figure is None else f"{figure * factor:.3g}{suffix}"
 
     @property
     def title(self) -> str:
-        """Its name for people."""
+        """Name for people."""
         return self.text.partition(":")[0] or self.name
 
     @property
     def sense(self) -> Sense | None:
-        """Side of the limit on which a value passes; None where the gate is no number."""
+        """Side of the limit on which a value passes; None for a gate without a number."""
         if self.value is None or self.limit is None:
             return None
         above = self.value >= self.limit
@@ -56,7 +56,7 @@ class Gate(msgspec.Struct, frozen=True):
 
     @property
     def narrow(self) -> bool:
-        """Passed, and within a tenth of its limit."""
+        """True when passed with less than a tenth of the limit to spare."""
         if not self.passed or self.value is None or not self.limit:
             return False
         return abs(self.value / self.limit - 1) <= _NARROW
@@ -71,5 +71,5 @@ _SHOWN = {
     "share": (100.0, " %"),
     "": (1.0, ""),
 }
-"""Unit inside → factor and unit where a person reads."""
+"""Stored unit → factor and unit shown to people."""
 _NARROW = 0.1

@@ -1,4 +1,4 @@
-"""Install a calibration, roll back, and say whether it still holds. Its folder: `versions`."""
+"""Install a calibration, roll back, withdraw, and record its validity. The folder: see `versions`."""
 
 from __future__ import annotations
 
@@ -58,16 +58,16 @@ _CELL_OF: dict[Source, Cell] = {
 _ARTICLE: dict[Cell, str] = {"real": "a", "imported": "an", "simulated": "a"}
 
 WORSE_TIMES = 1.5
-"""More than the estimates of two good sessions differ by chance."""
+"""Ratio of predicted errors above which a new calibration counts as worse, not different by chance."""
 REASON_LETTERS = 5
-"""Different ones; fewer are a pressed key, not words, in any script."""
+"""Fewest different letters that count as a reason in words, in any script; fewer may be one key held."""
 
 
 def installed_calibration(root: Path | None = None, camera: str = MAIN_CAMERA) -> Calibration:
-    """Everything in the installed calibration file, whatever its source and validity.
+    """Read the whole installed calibration file, whatever its source and validity.
 
     Raises InstallError when nothing is installed, CalibrationFileError when it is damaged. Programs that use
-    the camera call `load_installed`.
+    the camera should call `load_installed`, which checks both.
     """
     return read_calibration(current_version(readable_folder(root, camera))[1])
 
@@ -126,7 +126,7 @@ def install(
 
 
 def _first_validity(calibration: Calibration, max_age_days: float | None) -> Validity:
-    """Validity of what is being installed: proven by its own views, unless something speaks against it."""
+    """Choose the validity of a new installation: valid, unless it is imported or overridden."""
     state, reason = ValidityState.VALID, ValidityReason("installed")
     if calibration.source == "imported":
         text = "Images and poses are of unknown origin. Check it in the cell."
@@ -141,7 +141,7 @@ def _first_validity(calibration: Calibration, max_age_days: float | None) -> Val
 
 
 def _max_age_days(folder: Path, asked: float | None) -> float | None:
-    """The cell's rule: as asked, else as it was."""
+    """Return the oldest age of the last proof that is allowed: `asked`, else as for the version before."""
     if asked is not None:
         return asked or None
     recorded = read_validity(folder)
@@ -152,10 +152,10 @@ def _max_age_days(folder: Path, asked: float | None) -> float | None:
 def rollback(
     root: Path | None = None, to: int | None = None, reason: str = "", *, camera: str = MAIN_CAMERA
 ) -> InstalledVersion:
-    """Switch back: to the calibration before the current one, or to generation `to`. As `install` does.
+    """Make the calibration before the current one, or version `to`, the current one again.
 
-    What is rolled back to is unverified until a check passes, or in doubt if it was. `reason`: may be empty.
-    Raises InstallError.
+    It is unverified until a check passes, or in doubt if it was before. `reason`: may be empty. Raises
+    InstallError.
     """
     if reason.strip():
         _require_words(reason)
@@ -194,14 +194,14 @@ def _nothing_older(root: Path | None, camera: str, validity: Validity) -> Instal
 
 
 def withdraw(root: Path | None, reason: str, *, camera: str = MAIN_CAMERA) -> Validity:
-    """Take what is installed out of use. Raises InstallError, also for a reason that says nothing."""
+    """Take the installed calibration out of use. Raises InstallError, also for an empty reason."""
     _require_words(reason)
     cause = ValidityReason("withdrawn", reason.strip())
     return set_validity(root, ValidityState.WITHDRAWN, cause, camera=camera)
 
 
 def undo_line(root: Path | None = None, camera: str = MAIN_CAMERA) -> str:
-    """The command that undoes the last installation: back to the one before, or out of use without one."""
+    """Make the command that undoes the last installation: a rollback, or withdrawal where there is none."""
     if before_current(installed_versions(root, camera)) is None:
         return _withdraw_line(root, camera)
     return shlex.join(["calibrate", "rollback", *_where(root, camera)])
@@ -217,7 +217,7 @@ def _where(root: Path | None, camera: str) -> list[str]:
 
 
 def _validity_again(target: InstalledVersion, max_age_days: float | None) -> Validity:
-    """Validity of a version that becomes the current one again: nobody looked after it meanwhile."""
+    """Choose the validity of a version after a rollback: it was not checked while it was not current."""
     was = target.validity or unrecorded(target.number)
     if was.state is ValidityState.IN_DOUBT or target.current:
         return replace(was, max_age_days=max_age_days)
@@ -237,11 +237,10 @@ def set_validity(
     camera: str = MAIN_CAMERA,
     version: int | None = None,
 ) -> Validity:
-    """Say that the installed calibration of `camera` is valid, unverified, in doubt or withdrawn, and why.
+    """Record that the installed calibration of `camera` is valid, unverified, in doubt or withdrawn, and why.
 
-    The record grows by a line. `version`: the one that was judged; InstallError
-    (`other-version`) where another is installed by now, and `nothing-installed` where nothing is. VALID makes
-    now the time of the last proof.
+    `version`: the one that was judged. Raises InstallError: `other-version` where another one is installed by
+    now, `nothing-installed` where none is. VALID makes now the time of the last proof.
     """
     require_choice("state", state, ValidityState)
     state, now = ValidityState(state), time_text()
@@ -265,7 +264,7 @@ def note_check(
     camera: str = MAIN_CAMERA,
     version: int | None = None,
 ) -> Validity:
-    """Let a check change the validity by the rules of `Validity.after_check`; as `set_validity` otherwise."""
+    """Record the validity after a check, by the rules of `Validity.after_check`; else as `set_validity`."""
     return _change_validity(
         root, camera, version, lambda v: v.after_check(kind, passed, sensitive, when, reason, who())
     )
@@ -275,7 +274,7 @@ def _change_validity(
     root: Path | None, camera: str, version: int | None, change: Callable[[Validity], Validity]
 ) -> Validity:
     folder = calibrations_folder(root, camera)
-    current_version(readable_folder(root, camera))  # nothing is made where nothing is installed
+    current_version(readable_folder(root, camera))  # raises first, so that no folder is created in vain
     with locked(folder):
         number, _ = current_version(folder)
         if version not in (None, number):
@@ -294,7 +293,7 @@ def _change_validity(
 
 
 def reason_problem(reason: str) -> str:
-    """Problem with a person's reason for people; empty when it is accepted."""
+    """Say what is wrong with a person's reason; empty when it is accepted."""
     if len({letter for letter in reason.casefold() if letter.isalpha()}) >= REASON_LETTERS:
         return ""
     return "Say why, in a few words."
@@ -306,14 +305,14 @@ def _require_words(reason: str) -> None:
 
 
 def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
-    """Objections against following the installed one: another robot, camera or mounting, or less certain."""
+    """List objections against replacing the installed one: other robot, camera, mounting, or larger error."""
     before = _installed_before(root, calibration.camera_name)
     worse = [gate.text for gate in _regression(calibration, before)]
     return [*_objections(calibration, before, "", ""), *worse]
 
 
 def change_text(before: Calibration | None, after: Calibration) -> str:
-    """'0.120 mm, 0.0040° from the one before', lengths of δt and δφ; empty without one of the same mount."""
+    """Write '0.120 mm, 0.0040° from the one before'; empty without one of the same mounting before."""
     if before is None or before.mount != after.mount:
         return ""
     delta = difference(after.transform.matrix, before.transform.matrix)
@@ -322,14 +321,14 @@ def change_text(before: Calibration | None, after: Calibration) -> str:
 
 
 def _installed_before(root: Path | None, camera: str) -> Calibration | None:
-    """The current one; where that is damaged, the newest that is whole, so that the checks still hold."""
+    """Read the current calibration, or the newest undamaged one, to compare a new one with; else None."""
     known = [g for g in installed_versions(root, camera) if g.calibration is not None]
     current = [g for g in known if g.current]
     return (current or known)[-1].calibration if known else None
 
 
 def install_line(source: Source, path: Path, root: Path | None = None, override: str = "") -> str:
-    """The command that installs a file of this source: only what a real cell captured goes there unasked."""
+    """Make the command that installs a file of this source; only real ones go to the default root."""
     kind = _CELL_OF[source]
     words = ["calibrate", "install"]
     words += [] if kind == "real" else ["--cell", kind]
@@ -361,7 +360,10 @@ def _refuse_foreign_source(
 
 
 def _regression(calibration: Calibration, before: Calibration | None) -> list[Gate]:
-    """The failed gate of one much less certain than what it would replace, unless that failed its own."""
+    """Make a failed gate where the predicted error is much larger than that of the calibration replaced.
+
+    Empty where that one failed its own gates.
+    """
     if before is None or before.quality.failed:
         return []
     new, old = calibration.quality, before.quality
@@ -380,7 +382,7 @@ def _regression(calibration: Calibration, before: Calibration | None) -> list[Ga
 def _objections(
     calibration: Calibration, before: Calibration | None, robot_serial: str, camera_serial: str
 ) -> list[str]:
-    """Reasons against, other than gates: another robot or camera than the cell's."""
+    """List objections other than gates: another robot, camera or mounting than the cell's."""
     devices = (("robot", robot_serial), ("camera", camera_serial))
     found = []
     for name, serial in devices:

@@ -1,4 +1,4 @@
-"""Files of JSON lines that only grow: a line is durable when written, and a cut one costs only itself."""
+"""Append-only files of JSON lines: a line is durable once written, and a torn line loses only itself."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 
 def append_line(path: Path, entry: object) -> None:
-    """Append a struct or dataclass. Raises OSError. What a crash left half-written is ended first."""
+    """Append a struct or dataclass. Raises OSError. A line that a crash left half-written is ended first."""
     new = not path.exists()
     with os.fdopen(open_regular(path, os.O_RDWR | os.O_APPEND | os.O_CREAT), "a+b") as file:
         if new:
@@ -31,7 +31,7 @@ def append_line(path: Path, entry: object) -> None:
 
 
 def share(path: Path) -> None:
-    """Let the group write to what was just made here where it may write to the folder: operators share it."""
+    """Give a new file the group permissions of its folder, because several operators share it."""
     group_writes = path.parent.stat().st_mode & stat.S_IWGRP
     if group_writes:
         with suppress(PermissionError):  # another operator made it
@@ -39,7 +39,7 @@ def share(path: Path) -> None:
 
 
 def read_lines(path: Path, kind: type[S]) -> list[S]:
-    """Oldest first; empty when there is no file. Lines that are no `kind` are left out."""
+    """Read a file, oldest line first; empty when there is none. Lines that are no `kind` are skipped."""
     found = []
     for line in (read_file(path, LOG_LIMIT_BYTES) if path.exists() else b"").splitlines():
         try:

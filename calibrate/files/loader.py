@@ -1,4 +1,4 @@
-"""The installed calibration for programs that use a camera. NumPy and PyYAML are enough here."""
+"""Load the installed calibration in programs that use a camera. Needs only NumPy and PyYAML."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class InstalledDevice:
 
 @dataclass(frozen=True, eq=False)
 class InstalledLens:
-    """Pixel (0, 0) is the centre of the top left pixel, as in OpenCV."""
+    """Intrinsics. Pixel (0, 0) is the centre of the top left pixel, as in OpenCV."""
 
     width: int
     height: int
@@ -55,7 +55,7 @@ class InstalledLens:
 
     @property
     def model(self) -> CameraModel:
-        """The same as `calibrate` and `recordings` pass it on."""
+        """Convert to the `CameraModel` that `calibrate` and `recordings` use."""
         from recordings.schema.messages import CameraModel
 
         rows = tuple(tuple(row) for row in self.matrix.tolist())
@@ -70,7 +70,7 @@ class InstalledLens:
 
 @dataclass(frozen=True, eq=False)
 class InstalledArm:
-    """The arm's table with the X that belongs to it: their frames chain with each other and nothing else."""
+    """The arm's corrected table with the X that belongs to it; use neither without the other."""
 
     transform: Transform
     """corrected_flange_from_camera (eye-in-hand) or corrected_base_from_camera (eye-to-hand), metres."""
@@ -84,15 +84,15 @@ class InstalledArm:
 
 @dataclass(frozen=True, eq=False)
 class InstalledCalibration:
-    """Installed calibration as a program needs it. The whole file: `read_calibration(self.path)`."""
+    """Installed calibration for programs. The whole file: `read_calibration(self.path)`."""
 
     camera_name: str
     version: int
     path: Path
-    """The version's own file, which never changes."""
+    """File of this version, which never changes."""
     validity: Validity
     plain: dict[str, Any]
-    """Everything in the file, as it stands there."""
+    """Content of the file as plain data."""
 
     @cached_property
     def transform(self) -> Transform:
@@ -102,7 +102,7 @@ class InstalledCalibration:
 
     @cached_property
     def corrected_arm(self) -> InstalledArm:
-        """The arm's corrected table with the X that belongs to it. CalibrationFileError if not offered."""
+        """Return the arm's corrected table with its X. CalibrationFileError if none is offered."""
         found = self.plain.get("arm_table") or {"refused": "the arm's model is not known"}
         if not found.get("offered"):
             raise refused_table(str(found.get("refused", "")))
@@ -114,12 +114,12 @@ class InstalledCalibration:
 
     @cached_property
     def covariance(self) -> Array:
-        """(6, 6) of δt (m), δφ (rad), both in the parent frame."""
+        """Covariance (6, 6) of δt (m), δφ (rad), both in the parent frame."""
         return np.array(self.plain["covariance"], float)
 
     @cached_property
     def intrinsics(self) -> InstalledLens:
-        """The lens that belongs to this result."""
+        """Intrinsics that X was estimated with; use the two together."""
         lens = self.plain["intrinsics"]
         matrix, distortion = (np.array(lens[key], float) for key in ("matrix", "distortion"))
         return InstalledLens(lens["width"], lens["height"], matrix, distortion, lens["distortion_model"])
@@ -167,15 +167,15 @@ def load_installed(
     robot_serial: str = "",
     camera_serial: str = "",
 ) -> InstalledCalibration:
-    """Load the installed calibration of `camera`, proven by its hash: the call for programs that use it.
+    """Load the installed calibration of `camera`, verified by its hash: the function for programs to call.
 
-    `.validity` says whether it still holds. `require_valid`: None refuses what is in doubt or withdrawn, True
-    also what is unverified, False nothing. `robot_serial`, `camera_serial`: of the devices that are there;
-    another one than the calibration's puts it in doubt, for this call.
+    `.validity` says whether it still holds. `require_valid`: None refuses one in doubt or withdrawn, True
+    also an unverified one, False none. `robot_serial`, `camera_serial`: of the devices in use; if they differ
+    from the calibration's, it is in doubt for this call.
 
-    Raises InstallError when nothing is installed (`nothing-installed`), when it is simulated and that was not
-    asked for (`not-real`), when its validity is refused (`calibration-in-doubt`, `calibration-unverified`,
-    `calibration-withdrawn`); CalibrationFileError when it is damaged.
+    Raises InstallError when nothing is installed (`nothing-installed`), when it is not of a real cell and
+    `allow_simulated` is False (`not-real`), when its validity is refused (`calibration-in-doubt`,
+    `calibration-unverified`, `calibration-withdrawn`); CalibrationFileError when it is damaged.
     """
     found = _read(root, camera)
     if found.source in _NOT_REAL and not allow_simulated:
@@ -218,7 +218,7 @@ def _read(root: Path | str | None, camera: str) -> InstalledCalibration:
     return InstalledCalibration(camera, number, path, validity_of(folder, number), plain)
 
 
-# --- and when it changes ---
+# --- changes ---
 @dataclass(frozen=True, eq=False)
 class InstallationChange:
     """Change of a camera's installed calibration."""
@@ -238,17 +238,17 @@ def watch(
     stop_s: float | None = None,
     first: bool = False,
 ) -> Iterator[InstallationChange]:
-    """Yield every change of the installed calibration of `camera`: install, rollback, doubt, its end.
+    """Yield every change of the installed calibration of `camera`: install, rollback, change of validity.
 
     `first`: begin with what is installed now, so that nothing is missed between loading and watching.
 
-    Looks every `poll_s` seconds at two files' times, on any file system; reads only what changed. Also yields
-    when the last proof grows too old by the cell's rule. `stop_s`: seconds after which it ends; None: never.
-    Nothing real is asked for and nothing refused: look at `.installed.source` and `.installed.validity`.
+    Polls the times of two files every `poll_s` seconds, which works on any file system. Also yields when
+    the last proof grows too old by the cell's rule. `stop_s`: seconds after which it ends; None: never.
+    Nothing is refused, simulated ones neither: check `.installed.source` and `.installed.validity`.
     """
     folder = calibrations_folder(root, camera)
     ends_s = None if stop_s is None else time.monotonic() + stop_s
-    marks = _marks(folder)  # before looking: what changes meanwhile is seen at the next look
+    marks = _marks(folder)  # before reading, so that a change in between is seen at the next poll
     before = _look(root, camera, None)
     if first:
         yield before
@@ -266,7 +266,7 @@ def watch(
 
 
 def _marks(folder: Path) -> list[int]:
-    """Times of change of `current` and of the validity; 0 where there is none."""
+    """Read the modification times of `current` and of the validity file; 0 where there is none."""
     marks = []
     for name in ("current", FILE):
         try:

@@ -1,4 +1,4 @@
-"""Proof of a calibration file: its hash, and a result that a solve can have written. NumPy and PyYAML."""
+"""Verification of a calibration file: hash and consistency of the result. Needs only NumPy and PyYAML."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LIMIT_BYTES = 4 * 1024 * 1024
 
 
 def read_bounded(path: Path) -> bytes:
-    """The file's content, one byte over the limit at most. CalibrationFileError where it cannot be read."""
+    """Read a file, at most one byte over the size limit. CalibrationFileError where it cannot be read."""
     try:
         return read_beginning(path, _LIMIT_BYTES + 1)
     except OSError as problem:
@@ -33,7 +33,7 @@ _MEND = "Use the original, or solve the recording again."
 
 
 def proven_plain(content: bytes, where: str) -> dict[str, Any]:
-    """A calibration file's plain data without `sha256`: hash and result are proven.
+    """Parse a calibration file to plain data without `sha256`, after verifying hash and result.
 
     CalibrationFileError says what is wrong.
     """
@@ -81,15 +81,15 @@ def proven_plain(content: bytes, where: str) -> dict[str, Any]:
 
 
 def content_sha256(plain: dict[str, Any]) -> str:
-    """Over everything but `sha256` and `created`, independent of layout."""
+    """Compute the hash over everything but `sha256` and `created`, independent of layout."""
     content = {key: value for key, value in plain.items() if key not in ("sha256", "created")}
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()
 
 
 def canonical_json(value: object) -> str:
-    """JSON with sorted keys and no spaces, to the byte as `msgspec.json.encode(order="deterministic")`.
+    """Encode as JSON with sorted keys and no spaces, as `msgspec.json.encode(order="deterministic")` does.
 
-    TypeError for what JSON does not know, ValueError for other keys than text.
+    TypeError for types that JSON does not have, ValueError for keys that are not text.
     """
     if isinstance(value, str):
         return str(encode_basestring(value))
@@ -109,7 +109,7 @@ def canonical_json(value: object) -> str:
 
 
 def _number(value: float) -> str:
-    """The shortest digits that read back as `value`; 1e-5 is written 0.00001, and 1e16 without a +."""
+    """Format with the shortest digits that read back as `value`; 1e-5 as 0.00001, 1e16 without a +."""
     mantissa, _, exponent = repr(value).partition("e")
     if not exponent:
         return mantissa if np.isfinite(value) else "null"
@@ -120,7 +120,7 @@ def _number(value: float) -> str:
 
 
 def check_result(plain: dict[str, Any], where: str) -> None:
-    """Raise CalibrationFileError (code `contradiction`) for a result that no solve can have written."""
+    """Check that a result is consistent, else raise CalibrationFileError (code `contradiction`)."""
     result, mount = plain["result"], plain["mount"]
     matrix, quaternion, translation, covariance = (
         np.array(value, float)
@@ -157,7 +157,7 @@ def check_result(plain: dict[str, Any], where: str) -> None:
 
 
 def _wrong_table(arm: dict[str, Any] | None, parent: str) -> str:
-    """Tell what is wrong with an offered table of the arm; empty when nothing is."""
+    """Say what is wrong with an offered table of the arm; empty when nothing is."""
     if arm is None or not (arm["offered"] or arm.get("result") or arm.get("corrected")):
         return ""
     result = arm.get("result") or {}
@@ -173,13 +173,13 @@ def _wrong_table(arm: dict[str, Any] | None, parent: str) -> str:
 
 
 def _rotation(quaternion_xyzw: Array) -> Array:
-    """(3, 3) of a unit quaternion (4,): R = (w² - v·v) I + 2 v vᵀ + 2 w [v]× (Kuipers 1999, eq. 5.11)."""
+    """Convert a unit quaternion (4,): R = (w² - v·v) I + 2 v vᵀ + 2 w [v]× (Kuipers 1999, eq. 5.11)."""
     v, w = quaternion_xyzw[:3], quaternion_xyzw[3]
     return np.asarray((w * w - v @ v) * np.eye(3) + 2 * np.outer(v, v) + 2 * w * skew(v))
 
 
 def refused_table(reason: str) -> CalibrationFileError:
-    """Make the error of a calibration that offers no table of the arm."""
+    """Make the error for a calibration that offers no table of the arm."""
     return CalibrationFileError(
         f"This calibration offers no table of the arm ({reason}).",
         code="table-not-offered",

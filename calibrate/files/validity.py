@@ -1,8 +1,8 @@
 """Validity of an installed calibration: valid, unverified, in doubt or withdrawn; since when, and why.
 
-    …/validity.jsonl     one line for each install, check, doubt and withdrawal; the newest of a version holds
+    …/validity.jsonl     one line for each install, check, doubt and withdrawal; a version's last line counts
 
-The standard library is enough here: programs that only use the camera read it too (`loader`).
+Needs only the standard library, because programs that use the camera load it too (`loader`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WITHDRAWN_REMEDY = (
 class ValidityState(StrEnum):
     VALID = "valid"
     UNVERIFIED = "unverified"
-    """Nothing contradicts it, and nothing has proven it since."""
+    """Nothing contradicts it, but no check has passed since it was installed or rolled back to."""
     IN_DOUBT = "in-doubt"
     """A check contradicts it, robot or camera differ, or the last proof is too old."""
     WITHDRAWN = "withdrawn"
@@ -35,7 +35,7 @@ class ValidityState(StrEnum):
 
 @dataclass(frozen=True)
 class ValidityReason:
-    """Cause of a state."""
+    """Cause of a validity state."""
 
     code: str
     """installed, override, imported, rolled-back, no-record, drift-check, touch-test, watch, robot-changed,
@@ -48,7 +48,7 @@ class ValidityReason:
 
 @dataclass(frozen=True)
 class Validity:
-    """State of one installed version. Times are UTC in ISO format."""
+    """Validity of one installed version. Times are UTC in ISO format."""
 
     version: int
     state: ValidityState
@@ -58,10 +58,10 @@ class Validity:
     verified: str = ""
     """Time of the last proof: the views it was solved from, or a check that passed."""
     max_age_days: float | None = None
-    """Rule of the cell: the oldest that the last proof may be; None: none."""
+    """Age of the last proof from which it is in doubt; None: no limit."""
 
     def at(self, now: datetime) -> Validity:
-        """The state at that time: in doubt once the last proof is older than the cell's rule allows."""
+        """Return the validity at a time: in doubt once the last proof is older than `max_age_days`."""
         proven = parse_time(self.verified)
         if self.max_age_days is None or proven is None or self.state is ValidityState.WITHDRAWN:
             return self
@@ -80,11 +80,11 @@ class Validity:
     def after_check(
         self, kind: CheckKind, passed: bool, sensitive: bool, when: datetime, reason: ValidityReason, who: str
     ) -> Validity:
-        """The state after a check of kind `kind` on views taken at `when`.
+        """Return the validity after a check of kind `kind` on views taken at `when`.
 
-        A failure puts it in doubt, a pass makes it valid. A pass that could have missed what another check
-        saw (`sensitive` false) only lifts the doubt of its own kind; otherwise it stays unverified. Views
-        from before the last proof tell nothing of today, and no check brings back what was withdrawn.
+        A failure puts it in doubt, a pass makes it valid. If the check is not `sensitive` enough, a pass
+        makes it valid only after a doubt of the same kind of check; another doubt becomes unverified. Views
+        from before the last proof change nothing, and no check restores a withdrawn version.
         """
         proven = parse_time(self.verified)
         if self.state is ValidityState.WITHDRAWN or (proven is not None and when < proven):
@@ -103,9 +103,9 @@ class Validity:
 def require_usable(
     validity: Validity, what: str, anyway: str, *, proven: bool = False, **values: str | int
 ) -> None:
-    """Refuse what is in doubt or withdrawn, and with `proven` what is unverified too.
+    """Raise InstallError (code `calibration-STATE`) for one in doubt or withdrawn; `proven`: or unverified.
 
-    `anyway`: how to get it all the same. Raises InstallError with code `calibration-STATE`.
+    `what`: subject of the message; `anyway`: how to use it all the same, for the remedy.
     """
     refused = [
         ValidityState.IN_DOUBT,
@@ -128,7 +128,7 @@ def require_usable(
 
 
 def validity_text(validity: Validity) -> str:
-    """'in doubt since 2026-11-22 04:50 UTC: FAIL: camera shift 3.02 mm …', for people."""
+    """Write 'in doubt since 2026-11-22 04:50 UTC: FAIL: camera shift 3.02 mm …'."""
     words = validity.state.replace("-", " ")
     if validity.state is ValidityState.VALID:
         return f"{words}, verified {_shown(validity.verified)}"
@@ -138,15 +138,15 @@ def validity_text(validity: Validity) -> str:
 
 
 def parse_validity(content: bytes) -> dict[int, Validity]:
-    """Take the last record of each version, as it was then (`Validity.at` tells what it is now).
+    """Parse the last record of each version; `Validity.at` gives its state now.
 
-    Lines that are cut or of another shape are left out.
+    Torn lines and lines of another shape are skipped.
     """
     return {entry.version: entry for line in content.splitlines() if (entry := _parse(line)) is not None}
 
 
 def unrecorded(version: int, installed: str = "") -> Validity:
-    """Validity of a version from before there was a record; `installed`: when it was, where that is known."""
+    """Make the validity of a version without a record; `installed`: time of its installation, if known."""
     text = "Installed before validity was recorded. Run a drift check."
     return Validity(version, ValidityState.UNVERIFIED, installed, ValidityReason("no-record", text))
 
@@ -161,12 +161,12 @@ def _parse(line: bytes) -> Validity | None:
 
 
 def time_text(when: datetime | None = None) -> str:
-    """Write a time, now unless given."""
+    """Format a time (default: now) as UTC in ISO format."""
     return (when or datetime.now(UTC)).astimezone(UTC).isoformat(timespec="seconds")
 
 
 def parse_time(text: str) -> datetime | None:
-    """None where it is no time; one without a zone is UTC."""
+    """Parse a time; one without a zone is UTC. None where it is not a time."""
     try:
         found = datetime.fromisoformat(text)
     except ValueError:

@@ -1,13 +1,13 @@
 """Folder of installed calibrations, and the one atomic switch between them.
 
     ROOT/calibrations/gen/0007-1a2b3c4d.yaml     every calibration ever installed, never changed
-    ROOT/calibrations/current -> gen/0007-…      what consumers read
+    ROOT/calibrations/current -> gen/0007-…      the installed calibration, which programs read
     ROOT/calibrations/log.jsonl                  who switched to what, when and why
-    ROOT/calibrations/validity.jsonl             whether each still holds (`validity`)
+    ROOT/calibrations/validity.jsonl             validity of each version (`validity`)
 
 Camera `main` lies there, any other in ROOT/calibrations/cameras/NAME (`folders.calibrations_folder`).
 
-Whoever loses power or is killed at any moment finds the old calibration or the new one.
+After a power failure or kill at any moment, `current` is the old calibration or the new one, never neither.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class InstalledVersion:
     """Content; None when the file is damaged (`problem`)."""
     problem: str = ""
     validity: Validity | None = None
-    """Whether it holds now; of one that is not current: as when it was replaced."""
+    """Validity now; for a version that is not current, as when it was replaced."""
 
 
 class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -69,14 +69,14 @@ class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     generation: int
     who: str
     change: str = ""
-    """Against what was installed before; for "verify" what was found."""
+    """Difference to the version before; for "verify", the result of the touch test."""
     reason: str = ""
 
 
 def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[InstalledVersion]:
     """List everything ever installed, oldest first; damaged files are listed with their problem.
 
-    InstallError where the folder may not be looked into.
+    InstallError where the folder is not readable.
     """
     folder = readable_folder(root, camera)
     current, recorded, now = _current_name(folder), read_validity(folder), datetime.now(UTC)
@@ -98,17 +98,17 @@ def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> l
 
 
 def same_solve(one: Calibration, other: Calibration | None) -> bool:
-    """Tell whether two calibrations differ at most in what people added: a reason, or a check by hand."""
+    """Tell whether two calibrations differ at most in a person's override or touch tests."""
     if other is None:
         return False
     return msgspec.structs.replace(one, override=other.override, verification=other.verification) == other
 
 
 def before_current(known: list[InstalledVersion]) -> InstalledVersion | None:
-    """The newest whole one before the current one that is of another solve; None when there is none.
+    """Find the version that a rollback goes to, None when there is none.
 
-    A check by hand makes a version too: going back to the same numbers would undo nothing. What was withdrawn
-    is passed over.
+    It is the newest before the current one that is undamaged, not withdrawn, and of another solve: a touch
+    test makes a version too, and going back to the same numbers would undo nothing.
     """
     current = next((version for version in known if version.current), None)
     for older in reversed(known):
@@ -128,9 +128,9 @@ def read_log(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[LogEnt
 def add_version(
     folder: Path, calibration: Calibration, action: Action, validity: Validity, change: str, reason: str = ""
 ) -> InstalledVersion:
-    """A new version with this content becomes the current one and is logged. Inside `locked` only.
+    """Write a new version, make it the current one and log it. Call inside `locked` only.
 
-    It is on the disk, whole, and read back before anything points to it. InstallError, CalibrationFileError.
+    The file is durable and read back before `current` points to it. InstallError, CalibrationFileError.
     """
     content = encode_calibration(calibration)
     numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := VERSION_NAME.fullmatch(p.name))]
@@ -145,9 +145,9 @@ def add_version(
 def make_current(
     folder: Path, version: InstalledVersion, action: Action, validity: Validity, change: str, reason: str = ""
 ) -> InstalledVersion:
-    """Switch to it with this validity; log it. In `locked` only. InstallError: it does not read back."""
+    """Switch to a version and log it. Call inside `locked` only. InstallError where it reads back wrong."""
     validity = replace(validity, version=version.number)
-    append_line(folder / VALIDITY_FILE, validity)  # before anybody can ask for it
+    append_line(folder / VALIDITY_FILE, validity)  # before the switch, so that it is never missing
     _switch(folder, version.path.name, read_bounded(version.path))
     entry = LogEntry(time_text(), action, version.number, who(), change, reason)
     append_line(folder / LOG, entry)
@@ -155,7 +155,7 @@ def make_current(
 
 
 def content_name(content: bytes) -> str:
-    """First 8 hex digits of the content's own hash, as written in the file."""
+    """Return the first 8 hex digits of the hash that the file states."""
     found = re.search(rb"^sha256: '?([0-9a-f]{8})", content, re.MULTILINE)
     if found is None:
         raise CalibrationFileError("A calibration file without its hash cannot be installed.")
@@ -170,7 +170,7 @@ def _current_name(folder: Path) -> str:
 
 
 def _switch(folder: Path, name: str, content: bytes) -> None:
-    """`current` → gen/name by one rename, then read back through it."""
+    """Point `current` to gen/name by one rename, then compare what is read through it with `content`."""
     temporary = folder / "current.new"
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(Path("gen") / name)
@@ -186,7 +186,7 @@ def _switch(folder: Path, name: str, content: bytes) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """One installer at a time; the folders exist inside."""
+    """Hold the lock of installation, creating the folders where they are missing. Raises InstallError."""
     try:
         for part in (folder.parent, folder, folder / "gen", folder / "lock"):
             if not part.exists():
@@ -217,7 +217,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def no_such_version(folder: Path, number: int, known: list[InstalledVersion]) -> NoReturn:
-    """Raises InstallError, which names those that there are."""
+    """Raise InstallError that lists the versions that exist."""
     have = ", ".join(str(g.number) for g in known) or "none"
     raise InstallError(
         f"{folder}: there is no version {number}; there are: {have}.",
@@ -234,7 +234,7 @@ def who() -> str:
 
 
 def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
-    """Add them to a calibration file, atomically; nothing else in it changes. CalibrationFileError."""
+    """Add touch tests to a calibration file, atomically; nothing else changes. CalibrationFileError."""
     calibration = _with_touches(read_calibration(path), touches)
     write_calibration(calibration, path)
     return calibration
@@ -243,10 +243,10 @@ def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
 def note_installed(
     root: Path | None, touches: Sequence[Touch], camera: str = MAIN_CAMERA
 ) -> InstalledVersion:
-    """Add them to the installed calibration: a new version, for versions never change.
+    """Add touch tests to the installed calibration, as a new version, because versions never change.
 
-    A corner that is missed puts it in doubt. Raises InstallError where
-    no whole calibration is installed, or the folder or the disk does not allow it.
+    A failed corner puts it in doubt. Raises InstallError where no undamaged calibration is installed, or the
+    folder cannot be written.
     """
     folder = calibrations_folder(root, camera)
     with locked(folder):

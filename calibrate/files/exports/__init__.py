@@ -1,4 +1,4 @@
-"""Exports: the content of a file in each format of other programs, made from a calibration."""
+"""Exports of a calibration to the file formats of other programs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Format(NamedTuple):
     says: str
     make: Callable[[Calibration, FrameNames], str]
     of_table: bool = False
-    """It may hold the camera pose that belongs to the arm's corrected table."""
+    """True: can hold the camera pose that belongs to the arm's corrected table."""
 
 
 FORMATS: dict[str, Format] = {
@@ -44,7 +44,7 @@ FORMATS: dict[str, Format] = {
 def export(calibration: Calibration, name: str, frames: FrameNames | None = None) -> bytes:
     """Make the file's content. Raises ExportError for an unknown format, or one that cannot hold it.
 
-    What is installed (`frames.validity`) and in doubt or withdrawn is refused as by `load_installed`.
+    An installed calibration (`frames.validity`) in doubt or withdrawn is refused as by `load_installed`.
     """
     if name not in FORMATS:
         raise ExportError(
@@ -60,7 +60,7 @@ def export(calibration: Calibration, name: str, frames: FrameNames | None = None
 
 
 def _of_table(calibration: Calibration, name: str) -> Calibration:
-    """Put the X of the arm's table in place of that for the arm as it is. Raises as `installable`."""
+    """Replace X by the one that belongs to the arm's corrected table. Raises as `installable`."""
     if not FORMATS[name].of_table:
         able = ", ".join(other for other, one in FORMATS.items() if one.of_table)
         raise ExportError(

@@ -1,4 +1,4 @@
-"""Names of our frames elsewhere, the comment of every export, and rotations as others write them."""
+"""Names of the frames in exported files, the comment in every export, and roll, pitch, yaw."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BODY_FROM_OPTICAL: Array = pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 
 
 class ExportError(CalibrationError):
-    """Calibration that a format cannot hold, or no such format."""
+    """The format is unknown, or cannot hold this calibration."""
 
     code = "export-format"
     exit_code = 2
@@ -30,7 +30,7 @@ class ExportError(CalibrationError):
 
 @dataclass(frozen=True)
 class FrameNames:
-    """Names of our frames elsewhere.
+    """Names of the frames in an exported file.
 
     Defaults of the UR ROS driver: its `base` is the controller's (base_link is turned by 180°), and its
     `tool0` is the controller's flange (its `flange` is turned).
@@ -41,15 +41,15 @@ class FrameNames:
     camera: str = "camera_optical_frame"
     body: str = "camera_link"
     validity: Validity | None = None
-    """Validity of the installed calibration, for the comment; None: of a file that may never be installed."""
+    """Validity of the installed calibration, for the comment; None: the export is of a file."""
     follow: tuple[str, ...] = ()
-    """Command that prints every change of the installed calibration; empty: of a file."""
+    """Command that prints every change of the installed calibration; empty: the export is of a file."""
     with_table: bool = False
-    """The camera pose that belongs to the arm's corrected table, not the one for the arm as it is."""
+    """True: export the camera pose that belongs to the arm's corrected table."""
 
     @classmethod
     def of_camera(cls, name: str) -> FrameNames:
-        """Names of the frames of this camera of a cell: those of `main` have no name of their own."""
+        """Make the frame names of a cell's camera: its name is a prefix, except for `main`."""
         return cls() if name == MAIN_CAMERA else cls(camera=f"{name}_optical_frame", body=f"{name}_link")
 
     def parent(self, calibration: Calibration) -> str:
@@ -57,21 +57,21 @@ class FrameNames:
 
     @property
     def node(self) -> str:
-        """The camera's name as ROS allows it: letters, digits and underscores."""
+        """Name of the camera's ROS node: letters, digits and underscores."""
         name = re.sub(r"\W", "_", self.body.removesuffix("_link"), flags=re.ASCII)
         return name if name[:1].isalpha() else f"camera{name}"
 
 
 def follow_command(root: Path | None, camera: str) -> tuple[str, ...]:
-    """The command that tells another program of every change here, wherever that is started."""
+    """Make the command that prints every change of the installed calibration, from any working directory."""
     place = ("--root", str(state_root(root).resolve()), "--camera", camera)
     return (sys.executable, "-I", "-m", "calibrate.cli", "follow", *place)  # without the caller's PYTHONPATH
 
 
 def comment(calibration: Calibration, frames: FrameNames) -> str:
-    """One line on where this comes from, stamped where it must be.
+    """Make the comment on the origin of an export, with a warning for a calibration of no real cell.
 
-    One line whatever the file says: the rest of a name must not become a line of a launch file or a script.
+    Always one line: a line break in a name must not become a line of a launch file or a script.
     """
     stamp = source_stamp(calibration.source)
     origin = f"{calibration.provenance.session}, solved {calibration.created}"
@@ -90,10 +90,10 @@ def commented_yaml(calibration: Calibration, frames: FrameNames, plain: dict[str
 
 
 def roll_pitch_yaw(R: Array) -> tuple[float, float, float]:
-    """Radians, of R (3, 3). Yaw is what is left after the roll: Rz(yaw) Ry(pitch) = R Rx(roll)ᵀ.
+    """Convert R (3, 3) to roll, pitch, yaw about fixed axes, radians.
 
-    So the three are right together at a pitch of 90° too, where SciPy's lose half the digits: the body frame
-    of a camera that looks straight along the flange is pitched so.
+    Yaw is computed after the roll, Rz(yaw) Ry(pitch) = R Rx(roll)ᵀ. So the three stay accurate together near
+    a pitch of 90°, where SciPy's lose half the digits and where a camera that looks along the flange is.
     """
     roll = np.arctan2(R[2, 1], R[2, 2])
     pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))

@@ -26,7 +26,7 @@ from calibrate.kinematics import MODELS, RobotModel, link_frames
 
 
 def urdf(calibration: Calibration, frames: FrameNames) -> str:
-    """A whole URDF: the robot's frame, the camera's body and its optical frame."""
+    """Make a complete URDF: the robot's frame, the camera's body and its optical frame."""
     parent = frames.parent(calibration)
     name = quoteattr(f"{frames.node}_calibrated")
     return (
@@ -70,9 +70,9 @@ _JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wris
 
 
 def link_origins(table: DhTable) -> Array:
-    """Compute the fixed transforms (6, 4, 4) before each joint's turn about z, as URDF chains them.
+    """Compute the fixed transforms (6, 4, 4) before each joint's rotation about z, as URDF chains them.
 
-    Raises ExportError where the table moves the flange behind the last joint, which that chain cannot say.
+    Raises ExportError where the table has a transform after the last joint, which that chain cannot hold.
     """
     a, d, alpha, theta, beta = (getattr(table, name) for name in table.__struct_fields__)
     model, after = RobotModel("corrected", a, d, alpha, theta, beta), [a[5], alpha[5], beta[5]]
@@ -99,7 +99,7 @@ def table_of(calibration: Calibration) -> CorrectedArm:
 
 
 def table_origins(calibration: Calibration, frames: FrameNames) -> tuple[Array, str]:
-    """The corrected arm's origins (6, 4, 4), and a comment with the one X that belongs to them."""
+    """Return the corrected arm's joint origins (6, 4, 4), and a comment with the X that belongs to them."""
     arm = table_of(calibration)
     table, X = arm.installable()
     values = _numbers([*X.translation_m, *X.quaternion_xyzw])
@@ -112,21 +112,21 @@ def table_origins(calibration: Calibration, frames: FrameNames) -> tuple[Array, 
 
 
 def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
-    """`kinematics_params_file` of ROS 2's ur_description: x y z, and URDF's roll pitch yaw, of each link."""
+    """Make the `kinematics_params_file` of ROS 2's ur_description: x y z, roll pitch yaw of each link."""
     origins, note = table_origins(calibration, frames)
     names = ("x", "y", "z", "roll", "pitch", "yaw")
     plain: dict[str, Any] = {
         link: dict(zip(names, (*T[:3, 3].tolist(), *roll_pitch_yaw(T[:3, :3])), strict=True))
         for link, T in zip(_LINKS, origins, strict=True)
     }
-    # The driver compares it with the controller's own table and says that they differ: they do.
+    # The driver compares this with the hash of the controller's table and warns, rightly, that they differ.
     plain["hash"] = f"calib_station_{content_sha256(plain)[:16]}"
     commented = "".join(f"# {line}\n" for line in note.splitlines())
     return commented + str(yaml.safe_dump({"kinematics": plain}, sort_keys=False))
 
 
 def arm_urdf(calibration: Calibration, frames: FrameNames) -> str:
-    """A whole URDF: the arm with corrected origins (no shapes), and the camera of this table."""
+    """Make a complete URDF: the arm with corrected joint origins (no shapes), and the camera."""
     origins, note = table_origins(calibration, frames)
     arm = table_of(calibration)
     _, X = arm.installable()
@@ -148,8 +148,8 @@ def arm_urdf(calibration: Calibration, frames: FrameNames) -> str:
 
 
 def arm_json(calibration: Calibration, frames: FrameNames) -> str:
-    """Only the arm's table and the X that belongs to it."""
-    table_origins(calibration, frames)  # refused where none is offered
+    """Make a JSON file of the arm's corrected table and the X that belongs to it, nothing else."""
+    table_origins(calibration, frames)  # raises where no table is offered
     plain = {
         "of": comment(calibration, replace(frames, with_table=True)),
         "mount": calibration.mount,

@@ -11,7 +11,7 @@ from calibrate.projection import camera_matrix, distortion
 
 
 def ros_camera_info(calibration: Calibration, frames: FrameNames) -> str:
-    """ROS camera_info YAML, in the order of camera_calibration_parsers."""
+    """Make a ROS camera_info YAML, keys in the order of camera_calibration_parsers."""
     camera = calibration.intrinsics.model
     K, D = camera_matrix(camera), distortion(camera)
     plain = {
@@ -33,7 +33,7 @@ def _matrix(values: Array) -> dict[str, object]:
 
 
 def easy_handeye2(calibration: Calibration, frames: FrameNames) -> str:
-    """`.calib` YAML: parent = effector (in hand) or base, child = tracking_base_frame."""
+    """Make easy_handeye2's `.calib` YAML: parent effector (in hand) or base, child tracking_base_frame."""
     in_hand = calibration.mount == "eye-in-hand"
     plain = {
         "parameters": {
@@ -56,7 +56,7 @@ def easy_handeye2(calibration: Calibration, frames: FrameNames) -> str:
 
 
 def _publisher_arguments(calibration: Calibration, frames: FrameNames) -> list[str]:
-    """--x … --child-frame-id C; the quaternion, not angles, so that nothing can be misread."""
+    """Make static_transform_publisher's arguments; with a quaternion, as angles have several conventions."""
     values = (*calibration.result.translation_m, *calibration.result.rotation_xyzw)
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     found = [part for name, value in zip(names, values, strict=True) for part in (name, repr(float(value)))]
@@ -85,7 +85,7 @@ def generate_launch_description():
 
 
 def ros_launch_follow(calibration: Calibration, frames: FrameNames) -> str:
-    """Launch file that starts itself as a node: that sends what `calibrate follow` prints, while it holds."""
+    """Make a launch file that runs itself as a node, which publishes what `calibrate follow` prints."""
     if not frames.follow:
         raise ExportError(
             "A file never changes: there is nothing to follow.",
@@ -102,8 +102,8 @@ def ros_launch_follow(calibration: Calibration, frames: FrameNames) -> str:
 
 _FOLLOWING = """\
 # {comment}
-# The values are not in this file: it sends what is installed, and again whenever that changes. A calibration
-# in doubt or withdrawn is never sent, but /tf_static keeps what was sent before.
+# This file holds no values: it publishes the installed calibration, and again whenever that changes. One in
+# doubt or withdrawn is not published, but /tf_static keeps what was published before.
 import json
 import subprocess
 import sys

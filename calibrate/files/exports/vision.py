@@ -17,7 +17,7 @@ from calibrate.projection import camera_matrix, distortion
 
 
 def opencv(calibration: Calibration, frames: FrameNames) -> str:
-    """OpenCV FileStorage YAML; the transform's node is named by its frames."""
+    """Make an OpenCV FileStorage YAML; the transform's node is named by its frames."""
     camera = calibration.intrinsics.model
     storage = cv2.FileStorage(
         "memory.yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
@@ -37,7 +37,7 @@ def opencv(calibration: Calibration, frames: FrameNames) -> str:
 
 
 def ur_tool(calibration: Calibration, frames: FrameNames) -> str:
-    """Numbers to type on the UR pendant: mm, and a rotation vector in radians."""
+    """Make a text with the numbers to type on the UR pendant: mm, and a rotation vector in radians."""
     matrix = calibration.transform.matrix
     x, y, z = matrix[:3, 3] * 1000
     rx, ry, rz = rotation_log(matrix[:3, :3])

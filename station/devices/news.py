@@ -94,12 +94,12 @@ class Evidence(NamedTuple):
 def largest_gap(
     history: Iterable[RobotState], since_s: float, until_s: float, period_s: float
 ) -> tuple[float, float]:
-    """The longest time between two arrivals within a span (host monotonic), and how much of it the
-    controller's clock left out, seconds."""
-    stamps = (s.stamps for s in history if since_s < s.stamps.host_monotonic_ns / 1e9 <= until_s)
+    """The longest time between two arrivals that ended within a span (host monotonic), and how much of it
+    the controller's clock left out, seconds."""
     gaps = (
         ((b.host_monotonic_ns - a.host_monotonic_ns) / 1e9, b.controller_s - a.controller_s - period_s)
-        for a, b in pairwise(stamps)
+        for a, b in pairwise(state.stamps for state in history)
+        if since_s < b.host_monotonic_ns / 1e9 <= until_s
     )
     return max(gaps, default=(0.0, 0.0))
 

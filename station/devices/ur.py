@@ -25,7 +25,6 @@ from station.devices.base import fresh, ready
 from station.devices.news import (
     RESTING_S,
     Evidence,
-    is_loopback,
     longest_silence_s,
 )
 from station.devices.rtde import RuntimeState
@@ -145,7 +144,7 @@ class UrRobot(UrLink):
             if (why := self._why_stopped()) and isinstance(error, RobotError):
                 raise _stopped(f" while control was starting{why}") from None
             raise
-        self.control = True
+        self.control, self._played_s = True, time.monotonic()
 
     async def _heard(self, child: ControlChild) -> None:
         """Raises what kept the program from taking the first heartbeat."""
@@ -203,8 +202,7 @@ class UrRobot(UrLink):
         try:
             await self._ready_to_move(child)
             sample = self.newest()
-            self._played_s = time.monotonic()
-            watch = MoveWatch(sample.state.joints_rad, joints_rad, sample.operation, self._played_s)
+            watch = MoveWatch(sample.state.joints_rad, joints_rad, sample.operation, time.monotonic())
             self._sent = True
             await self._follow(watch, child, child.move(joints_rad, speed_rad_s, acceleration_rad_s2))
         except BaseException as error:
@@ -247,8 +245,7 @@ class UrRobot(UrLink):
             sent.result()
         self.news()
         sample = self.newest()
-        if sample.state.runtime_state == RuntimeState.PLAYING:
-            self._played_s = sample.state.stamps.host_monotonic_ns / 1e9
+        self._note_playing(sample.state)
         if watch.step(sample.state, sample.operation, time.monotonic()) and sent.done():
             return True
         if (now_s := time.monotonic()) > self._tool_looked_s + TOOL_S:
@@ -308,7 +305,7 @@ class UrRobot(UrLink):
         until_s = now_s if late else next((t for t in after_s if t > self._played_s), now_s)
         since_s = (self._played_s if late else until_s) - OUTLIVED_S[self.control_path]
         silence_s = 0.0 if late else longest_silence_s(child.kicks_s, since_s, until_s)
-        return Evidence(silence_s, *self.largest_gap(since_s, until_s), is_loopback(self.config.host))
+        return self.evidence(silence_s, since_s, until_s)
 
     async def _other_program(self, wait_s: float) -> str | None:
         """Name of another program that began to play since ours was last seen playing; '' if it has none.
@@ -448,7 +445,12 @@ class UrRobot(UrLink):
             assert isinstance(cause, RobotError)
             self._ended_by = cause
             raise cause from None
-        self._played_s = time.monotonic()
+        if state is not None:
+            self._note_playing(state)
+
+    def _note_playing(self, state: RobotState) -> None:
+        if state.runtime_state == RuntimeState.PLAYING:
+            self._played_s = state.stamps.host_monotonic_ns / 1e9
 
     def _program_trouble(self, state: RobotState) -> RobotError | None:
         """Say what state and dashboard hold against the control program."""

@@ -54,6 +54,8 @@ class UrLink:
         """The state stream's counters; another object after a lost connection."""
         self._before_ns = 0
         """Arrival of the newest sample of the connection before."""
+        self._unread_s = 0.0
+        """When this computer last had no processor to read late news (host monotonic)."""
         self.guided = False
         """A person moves the arm by hand: it may move at any moment."""
         self.dashboard: Dashboard | None = None
@@ -233,7 +235,8 @@ class UrLink:
         """
         age_s = self._age_s()
         if age_s > CURRENT_S and self.reader is not None:
-            self.reader.read_waiting()
+            if not self.reader.read_waiting():
+                self._unread_s = time.monotonic()
             age_s = self._age_s()
         return age_s
 
@@ -267,8 +270,14 @@ class UrLink:
 
     def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
         """What made a resting arm's news late since then (host monotonic); None: nothing did."""
-        found = Evidence(pause_s, *self.largest_gap(since_s, time.monotonic()), is_loopback(self.config.host))
-        return found.error(effect="")
+        return self.evidence(pause_s, since_s, time.monotonic()).error(effect="")
+
+    def evidence(self, pause_s: float, since_s: float, until_s: float) -> Evidence:
+        """What was late in a span (host monotonic). `pause_s`: for how long this computer kicked nothing."""
+        gap_s, clock_gap_s = self.largest_gap(since_s, until_s)
+        if self._unread_s > since_s:
+            pause_s = max(pause_s, gap_s)
+        return Evidence(pause_s, gap_s, clock_gap_s, is_loopback(self.config.host))
 
     def largest_gap(self, since_s: float, until_s: float) -> tuple[float, float]:
         """See `news.largest_gap`."""

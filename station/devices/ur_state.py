@@ -142,19 +142,21 @@ class StateReader(threading.Thread):
             self._stop_write.close()
         self.join(HANDSHAKE_S + 1.0)
 
-    def read_waiting(self) -> None:
+    def read_waiting(self) -> bool:
         """Reads what came and waits unread, because this thread had no processor yet. From any thread.
 
-        What ends the connection is kept for the reader's own thread, which says so.
+        What ends the connection is kept for the reader's own thread, which says so. False: that thread is
+        reading, and has no processor to go on.
         """
         if not self._reading.acquire(timeout=READING_WAIT_S):
-            return
+            return False
         try:
             self._read()
         except (OSError, RtdeError) as error:
             self._broken = error
         finally:
             self._reading.release()
+        return True
 
     def _handshake(self, link: RtdeLink) -> Recipe:
         begun = time.perf_counter()

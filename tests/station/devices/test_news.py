@@ -33,9 +33,10 @@ class Reader:
     def _come(self, age_s: float) -> None:
         self.newest = SimpleNamespace(state=arrived(time.monotonic() - age_s))
 
-    def read_waiting(self) -> None:
+    def read_waiting(self) -> bool:
         if self._unread:
             self._come(0.0)
+        return True
 
 
 def link(age_s: float, *, moving: bool = False, **how: Any) -> UrLink:
@@ -100,9 +101,9 @@ def test_what_came_late_is_told_from_evidence(evidence: Evidence, blamed: Delay 
 
 def test_the_largest_gap_is_between_arrivals_and_knows_what_the_controller_left_out() -> None:
     states = [arrived(host_s, clock_s) for host_s, clock_s in ((1, 0), (1.5, 0.5), (2, 0.52), (2.3, 0.82))]
-    assert largest_gap(states, 1.2, 3.0, 0.02) == pytest.approx((0.5, 0.0))
-    assert largest_gap(states, 1.6, 3.0, 0.02) == pytest.approx((0.3, 0.28))
-    assert largest_gap(states, 1.6, 2.1, 0.02) == (0.0, 0.0)
+    assert largest_gap(states, 1.6, 3.0, 0.02) == pytest.approx((0.5, 0.0))
+    assert largest_gap(states, 2.1, 3.0, 0.02) == pytest.approx((0.3, 0.28))
+    assert largest_gap(states, 2.1, 2.2, 0.02) == (0.0, 0.0)
 
 
 def test_a_silence_is_the_watchdogs_business_only_before_the_program_ended() -> None:

@@ -134,6 +134,7 @@ _JOINTS = "[0, -1.5708, 1.5708, -1.5708, -1.5708, 0.01]"
         f"movej({_JOINTS}, a=1.5, v=1.06)",
         f"movej({_JOINTS}, a=1.6, v=0.5)",
         f"movep(get_forward_kin({_JOINTS}))",
+        f"optimovej({_JOINTS})",
         f"servoj({_JOINTS})",
         "speedj([0, 0, 0, 0, 0, 0.1], 1, 0.01)",
         "direct_torque([0, 0, 0, 0, 0, 1])",

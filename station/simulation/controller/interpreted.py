@@ -1,6 +1,6 @@
 """Uploaded programs: URScript's interpreter joined to this controller's arm.
 
-One table of builtins: what only computes (`script_pure`), registers, inputs and outputs
+One table of builtins: what only computes (`script_pure`), registers, inputs, outputs and sockets
 (`script_io`), what moves the arm (`script_motion`), and here what asks for its state or sets it.
 """
 
@@ -11,7 +11,7 @@ from functools import wraps
 from math import inf
 
 from station.simulation.controller.kinematics import forward
-from station.simulation.controller.script_io import Wait, inputs_and_outputs, registers
+from station.simulation.controller.script_io import Sockets, Wait, inputs_and_outputs, registers
 from station.simulation.controller.script_motion import ArmMotions
 from station.simulation.controller.script_pure import PURE, pose_of, six, text_of
 from station.simulation.controller.state import ControllerState
@@ -34,11 +34,13 @@ class InterpretedProgram:
     def __init__(self, robot: ControllerState, name: str, text: str) -> None:
         self.name, self.text = name, text
         self._robot = robot
+        self._sockets = Sockets(robot)
         self._motions = ArmMotions(robot, lambda: self._run.thread)
         states = {**inputs_and_outputs(robot), **self._states()}
         builtins = {
             **PURE,
             **registers(robot),
+            **self._sockets.builtins(),
             **{name: self._logged(name, builtin) for name, builtin in states.items()},
             **self._motions.builtins(),
         }
@@ -63,8 +65,9 @@ class InterpretedProgram:
         return goes_on
 
     def end(self) -> None:
-        """Kills every thread and leaves its modes."""
+        """Kills every thread, closes what it opened and leaves its modes."""
         self._run.end()
+        self._sockets.close()
         self._robot.freedrive = self._robot.force_mode = False
 
     # -- state ------------------------------------------------------------------------------------------
@@ -134,6 +137,7 @@ class InterpretedProgram:
             "protective_stop": lambda: robot.protective_stop("the script asked for it"),
             "rtde_set_watchdog": self._set_watchdog,
             "textmsg": self._textmsg,
+            "popup": self._popup,
         }
 
     def _sync(self) -> Wait:
@@ -147,6 +151,21 @@ class InterpretedProgram:
         text = text_of(s1) + text_of(s2)
         self._robot.journal.note("controller", "textmsg", text=text)
         self._robot.tell("text", text=text)
+
+    def _popup(
+        self,
+        s: object,
+        title: str = "Popup",
+        warning: bool = False,
+        error: bool = False,
+        blocking: bool = False,
+    ) -> Wait:
+        robot = self._robot
+        robot.popup = text_of(s)
+        robot.journal.note("controller", "popup", text=robot.popup, title=title)
+        robot.tell("popup", title=title, text=robot.popup, warning=warning, error=error)
+        while blocking and robot.popup is not None:
+            yield
 
     def _set_tcp(self, pose: Pose, tcp_name: str = "") -> None:
         self._robot.tcp = six(pose)

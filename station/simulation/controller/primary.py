@@ -19,7 +19,7 @@ from station.simulation.controller.robot import SimulatedRobot
 PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT = 30001, 30002, 30003
 STATE_PERIOD_S = 0.1
 _ROBOT_STATE, _ROBOT_MESSAGE = 16, 20
-_TEXT, _VERSION, _KEY, _RUNTIME_EXCEPTION = 0, 3, 7, 10
+_TEXT, _POPUP, _VERSION, _KEY, _RUNTIME_EXCEPTION = 0, 2, 3, 7, 10
 _SOURCE_CONTROLLER = 7
 _KINEMATICS, _CONFIGURATION = 5, 6
 _ROBOT_TYPES = {"UR5": 1, "UR10": 2, "UR3": 3, "UR16": 4}
@@ -62,13 +62,17 @@ def version_message(robot: SimulatedRobot) -> bytes:
 
 
 def messages(robot: SimulatedRobot, kind: str, details: dict[str, object]) -> bytes:
-    """Encode a message of a program: text, key (title, text) or exception (line, text)."""
+    """Encode a message of a program: text, popup, key (title, text) or exception (line, text)."""
     text = str(details.get("text", "")).encode()
+    title = str(details.get("title", "")).encode()[:255]
+    titled = bytes([len(title)]) + title + text
     if kind == "text":
         return _message(robot, _TEXT, text)
+    if kind == "popup":
+        flags = struct.pack(">iBB", 0, bool(details.get("warning")), bool(details.get("error")))
+        return _message(robot, _POPUP, flags + titled)
     if kind == "key":
-        title = str(details["title"]).encode()[:255]
-        return _message(robot, _KEY, struct.pack(">iiB", 0, 0, len(title)) + title + text)
+        return _message(robot, _KEY, struct.pack(">ii", 0, 0) + titled)
     line = details.get("line")
     where = struct.pack(">ii", line if isinstance(line, int) else 1, 1)
     return _message(robot, _RUNTIME_EXCEPTION, where + text)

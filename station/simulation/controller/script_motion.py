@@ -38,6 +38,10 @@ KILLED_RAD_S2 = 40.0
 ROTATION_WEIGHT_M = 0.1
 """servoc turns a radian in the time in which it goes so far."""
 ARRIVED_M = 1e-5
+JOINT_RAD_S2 = 40.0
+"""The largest acceleration that the configuration message states."""
+TOOL_M_S = 1.0
+"""All that optimovel goes; the ramps take as long as those of optimovej."""
 
 
 class ArmMotions:
@@ -60,7 +64,7 @@ class ArmMotions:
     def builtins(self) -> dict[str, Builtin]:
         """What has no underscore below is called so by scripts."""
         names = [n for n in vars(ArmMotions) if n[0] != "_" and n not in ("brake_orphan", "builtins")]
-        return {name: getattr(self, name) for name in names} | self._torques()
+        return {name: getattr(self, name) for name in names} | self._new()
 
     # -- kinematics -------------------------------------------------------------------------------------
 
@@ -110,8 +114,7 @@ class ArmMotions:
         return rigid(target) if isinstance(target, Pose) else self._tool(six(target))
 
     def movej(self, q: list[float], a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Wait:
-        goal = self._joints(q)
-        return self._move("movej", goal, lambda start: JointPath(start, goal), a, v, t)
+        return self._turn("movej", q, a, v, t)
 
     def movel(self, pose: list[float], a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Wait:
         return self._line("movel", pose, a, v, t)
@@ -131,6 +134,10 @@ class ArmMotions:
         via, goal, tcp = self._pose(pose_via), self._pose(pose_to), from_pose(self._robot.tcp)
         make_path = lambda start: ArcPath(self._robot.table, tcp, start, via, goal)  # noqa: E731
         return self._move("movec", to_pose(goal), make_path, a, v, 0)
+
+    def _turn(self, name: str, target: list[float], a: float, v: float, t: float = 0) -> Wait:
+        goal = self._joints(target)
+        return self._move(name, goal, lambda start: JointPath(start, goal), a, v, t)
 
     def _line(self, name: str, target: list[float], a: float, v: float, t: float = 0) -> Wait:
         goal, tcp = self._pose(target), from_pose(self._robot.tcp)
@@ -211,6 +218,14 @@ class ArmMotions:
 
         yield from self._hold(self._robot.arm.stream(wanted, a), over)
 
+    def _optimovej(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
+        """a and v are shares of what the arm can do, as in optimovel."""
+        return self._turn("optimovej", goal, a * JOINT_RAD_S2, v * JOINT_SPEED_RAD_S)
+
+    def _optimovel(self, goal: list[float], a: float = 0.3, v: float = 0.3, r: float = 0) -> Wait:
+        slower = JOINT_RAD_S2 * TOOL_M_S / JOINT_SPEED_RAD_S
+        return self._line("optimovel", goal, a * slower, v * TOOL_M_S)
+
     def stopj(self, a: float = 2.0) -> Wait:
         return self._stop("stopj", self._robot.arm.brake, a)
 
@@ -244,11 +259,14 @@ class ArmMotions:
 
     # -- torques ----------------------------------------------------------------------------------------
 
-    def _torques(self) -> dict[str, Builtin]:
-        """List functions that e-Series has from 5.23 on. Torques with scales of friction came with 5.25.1."""
+    def _new(self) -> dict[str, Builtin]:
+        """List functions that e-Series has from 5.21 or 5.23 on; the scales of friction came with 5.25.1."""
         robot, arm, settings = self._robot, self._robot.arm, self._robot.settings
-        if not settings.is_e_series or settings.version < (5, 23):
+        if not settings.is_e_series or settings.version < (5, 21):
             return {}
+        optimal: dict[str, Builtin] = {"optimovej": self._optimovej, "optimovel": self._optimovel}
+        if settings.version < (5, 23):
+            return optimal
         drives = DRIVES[settings.model]
 
         def posture() -> Posture:
@@ -258,15 +276,7 @@ class ArmMotions:
             x, y, z = robot.payload_cog
             return [*drives.bodies, Body(6, robot.payload_kg, (x, y, z))]
 
-        def direct_torque(
-            torque: Sequence[float],
-            viscous_scale: Sequence[float] = (1.0,) * 6,
-            coulomb_scale: Sequence[float] = (1.0,) * 6,
-            friction_comp: bool = True,
-        ) -> Wait:
-            for scale in (viscous_scale, coulomb_scale):
-                if len(scale) != 6 or not all(0 <= s <= 1 for s in scale):
-                    raise ScriptRuntimeError(f"direct_torque with a scale of {text_of(list(scale))}")
+        def turn(torque: Sequence[float]) -> Wait:
             asked, load = six(torque), bodies()
 
             def wanted(joints: Vector, dt_s: float) -> Vector:
@@ -279,14 +289,27 @@ class ArmMotions:
 
             return self._flow("direct_torque", wanted, inf, robot.dt_s, lambda: True)
 
-        found: dict[str, Builtin] = {
+        def scaled(
+            torque: Sequence[float],
+            viscous_scale: Sequence[float] = (1.0,) * 6,
+            coulomb_scale: Sequence[float] = (1.0,) * 6,
+            friction_comp: bool = True,
+        ) -> Wait:
+            for scale in (viscous_scale, coulomb_scale):
+                if len(scale) != 6 or not all(0 <= s <= 1 for s in scale):
+                    raise ScriptRuntimeError(f"direct_torque with a scale of {text_of(list(scale))}")
+            return turn(torque)
+
+        return optimal | {
+            "direct_torque": scaled
+            if settings.version >= (5, 25, 1)
+            else lambda torque, friction_comp=True: turn(torque),
             "get_mass_matrix": lambda: posture().mass_matrix(bodies()),
             "get_coriolis_and_centrifugal_torques": lambda: posture().coriolis(bodies()),
             "get_jacobian": lambda: posture().jacobian(self._tool(arm.actual)),
             "get_jacobian_time_derivative": lambda: posture().jacobian_rate(self._tool(arm.actual)),
             "get_target_joint_accelerations": lambda: list(robot.outputs.vector("target_qdd")),
         }
-        return found if settings.version < (5, 25, 1) else found | {"direct_torque": direct_torque}
 
 
 class _ToolSpeed:

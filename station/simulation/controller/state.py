@@ -232,6 +232,7 @@ class ControllerState(ABC):
         self.remote = settings.remote
         self.payload_inertia: Vector = (0.0,) * 6
         self.freedrive = self.force_mode = False
+        self.popup: str | None = None
         self.loaded = ""
         """The program that the dashboard loaded."""
         self.user_role, self.operational_mode = "PROGRAMMER", "NONE"

@@ -71,3 +71,24 @@ def test_after_a_long_halt_of_this_process_what_waited_is_as_old_as_it_is(
     came_ns, stamp = clocks.now_ns, clocks.stamp()
     clocks.now_ns += 15 * S
     assert reader._arrival(stamp)[0] == came_ns
+
+
+def test_one_slow_answer_at_the_start_bounds_no_time(
+    reader: StateReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A busy computer's first round trip took 43 ms: no image of the session was placed well enough."""
+    now_s, trips_s = 0.0, iter([0.043, 0.008, 0.0006, 0.05])
+
+    class Link:
+        def version(self) -> tuple[int, int, int, int]:
+            nonlocal now_s
+            now_s += next(trips_s)
+            return 5, 11, 0, 0
+
+        def outputs(self, rate_hz: float, names: object) -> None: ...
+
+        def start(self) -> None: ...
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now_s)
+    reader._handshake(Link())  # type: ignore[arg-type]
+    assert reader.clock.latency_s == pytest.approx(0.0003) and next(trips_s) == 0.05

@@ -17,7 +17,7 @@ from calibrate.load import LoadedViews
 from calibrate.quality.gates import GateLimits
 from calibrate.views import ViewSet
 from recordings.reader import Recording
-from recordings.schema.messages import BoardSpec, CameraModel, TimeCorrection
+from recordings.schema.messages import BoardSpec, CameraModel
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,6 @@ class JobOptions:
     working_distance_m: float | None = None
     without: tuple[int, ...] = ()
     """Numbers, from 1, of the poses that a person leaves out."""
-    time_offset: TimeCorrection | None = None
-    """Poses are read from the robot states so much later than the frames' times."""
     threads: int | None = None
     """Threads of the board detection; the result does not depend on it."""
 

@@ -289,7 +289,12 @@ def _too_few(
     recording: Recording, found: int, total: int, missing: list[RejectedView], fewest: int
 ) -> TooFewViewsError:
     if total == 0:
-        return TooFewViewsError(f"{recording.path} holds no image with a robot pose.", views=0, needed=fewest)
+        return TooFewViewsError(
+            f"{recording.path} holds no image with a robot pose.",
+            remedy="Images of a sweep have none: record poses with `station capture`.",
+            views=0,
+            needed=fewest,
+        )
     text = f"{recording.path}: the board is seen in {found} of {total} images; {fewest} views are needed."
     if missing:
         text += f" First reason, view {missing[0].index + 1} ({missing[0].name}): {missing[0].reason}."

@@ -26,7 +26,6 @@ from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.load import FEWEST_VIEWS, Progress, load_views, without_views
 from calibrate.projection import intrinsics_names
 from calibrate.quality.gates import GateInputs, judge
-from calibrate.quality.sweep import at_time_offset
 from calibrate.views import ViewSet
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import BoardSpec, CameraModel
@@ -81,9 +80,6 @@ def prepare_views(
     loaded = load_views(recording, board, camera, progress, options.threads, fewest)
     if options.without:
         loaded = without_views(loaded, options.without, fewest)
-    if options.time_offset is not None:
-        moved = at_time_offset(recording, loaded.views, options.time_offset.offset_s)
-        loaded = replace(loaded, views=moved)
     watch.lap("detect")
     views, intrinsics = loaded.views, None
     if views.camera.matrix is None:
@@ -127,7 +123,7 @@ def solve_recording(
     verified = None
     if verify is not None:
         same = replace(options, board=loaded.board, square_m=None, camera=solution.camera, without=())
-        same = replace(same, find_intrinsics=False, time_offset=None)
+        same = replace(same, find_intrinsics=False)
         elsewhere = prepare_views(verify, same, progress, 1)
         verified = verify_elsewhere(solution, elsewhere.views, verify.name)
         solution = _judged_by(verified, solution)

@@ -16,7 +16,6 @@ from calibrate.cli.contracts import (
     InstalledJson,
     ListedJson,
     SolveJson,
-    SweepJson,
     WatchEventJson,
 )
 from calibrate.cli.follow import Followed
@@ -41,7 +40,6 @@ TYPES: dict[str, tuple[str, Any]] = {
     "calibration": ("A calibration file (YAML); `calibrate show --json` without `sha256`", Calibration),
     "solve": ("calibrate solve --json", SolveJson),
     "compare": ("calibrate compare --json", CompareJson),
-    "sweep": ("calibrate sweep --json", SweepJson),
     "batch": ("A line of calibrate batch --json, and of results.jsonl", BatchResult),
     "list": ("calibrate list --json", list[ListedJson]),
     "install": ("calibrate install --json, calibrate rollback --json", InstalledJson),

@@ -120,10 +120,6 @@ PLACES: dict[str, Place] = {
     "board": ("board.yaml", _command(calibrate, "solve", SAMPLE, "--board", "FILE", "-o", "NEW")),
     "camera": ("camera.yaml", _command(calibrate, "solve", SAMPLE, "--camera", "FILE", "-o", "NEW")),
     "limits": ("gates.yaml", _command(calibrate, "solve", SAMPLE, "--gates", "FILE", "-o", "NEW")),
-    "time offset": (
-        "offset.yaml",
-        _command(calibrate, "solve", SAMPLE, "--time-offset", "FILE", "-o", "NEW"),
-    ),
     "scheduler": (
         "scheduler.json",
         _command(calibrate, "batch", SAMPLE, "-o", "NEW", "--scheduler-file", "FILE"),

@@ -5,7 +5,11 @@ from __future__ import annotations
 from recordings.cli.lazy import LazyCommand, LazyGroup
 
 _SOLVE, _FILES = "calibrate.cli.solve", "calibrate.cli.installed"
-_GONE_FROM_SOLVE = {"--accept-move": "The message names what moved and when. Record again."}
+_NO_TIME_OFFSET = {"--time-offset": "Poses are taken at rest: leave it out."}
+_GONE_FROM_SOLVE = {
+    "--accept-move": "The message names what moved and when. Record again.",
+    **_NO_TIME_OFFSET,
+}
 COMMANDS = {
     "solve": LazyCommand(
         f"{_SOLVE}:solve",
@@ -18,6 +22,7 @@ COMMANDS = {
     "compare": LazyCommand(
         f"{_SOLVE}:compare",
         ("calibrate compare session.mcap", "calibrate compare session.mcap --camera cell.yaml"),
+        gone=_NO_TIME_OFFSET,
     ),
     "report": LazyCommand(
         f"{_SOLVE}:report", ("calibrate report session.mcap -o cell.html",), gone=_GONE_FROM_SOLVE
@@ -90,10 +95,6 @@ COMMANDS = {
             "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",
         ),
     ),
-    "sweep": LazyCommand(
-        "calibrate.cli.sweep:sweep",
-        ("calibrate sweep sweep.mcap", "calibrate sweep sweep.mcap --calibration cell.yaml"),
-    ),
 }
 CALIBRATE = LazyGroup(
     COMMANDS,
@@ -103,5 +104,8 @@ CALIBRATE = LazyGroup(
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 done with loss, 4 a gate or a "
     "drift check failed.",
     aliases={"check": "drift-check"},
-    gone={"fleet": "Run `calibrate metrics` on each cell."},
+    gone={
+        "fleet": "Run `calibrate metrics` on each cell.",
+        "sweep": "Frame times carry their own bound; `station doctor` shows it.",
+    },
 )

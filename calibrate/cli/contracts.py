@@ -21,7 +21,7 @@ from calibrate.files.calibration import (
 from calibrate.files.gate import Gate
 from calibrate.files.validity import Validity
 from calibrate.results import BoardShape, HoldoutScore, RejectedView
-from recordings.schema.messages import Matrix4, Mount, TimeSource
+from recordings.schema.messages import Matrix4, Mount
 
 
 class ViewsJson(msgspec.Struct, frozen=True):
@@ -82,21 +82,6 @@ class CompareJson(msgspec.Struct, frozen=True):
     mount: Mount
     views: list[int]
     methods: list[MethodJson]
-
-
-class SweepJson(msgspec.Struct, frozen=True):
-    """`calibrate sweep --json`"""
-
-    offset_s: float
-    """A frame of time t was taken at t + offset on the robot's clock."""
-    sigma_s: float
-    agrees: bool
-    source: TimeSource | None
-    bound_s: float | None
-    derived_s: float | None
-    rms_deg: float
-    pairs: int
-    lost: tuple[str, ...]
 
 
 class ListedJson(msgspec.Struct, frozen=True):

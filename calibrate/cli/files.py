@@ -15,7 +15,7 @@ from calibrate.lens.intrinsics import LensModel
 from calibrate.projection import camera_matrix, distortion
 from recordings import strict_yaml
 from recordings.files import read_file
-from recordings.schema.messages import BoardSpec, CameraModel, TimeCorrection
+from recordings.schema.messages import BoardSpec, CameraModel
 
 T = TypeVar("T")
 
@@ -41,11 +41,6 @@ def read_camera(path: Path) -> CameraModel:
     camera_matrix(camera)
     distortion(camera)
     return camera
-
-
-def read_time_offset(path: Path) -> TimeCorrection:
-    """Read what `calibrate sweep -o` wrote, or any YAML with `time_offset:` in it."""
-    return _strictly(path, TimeCorrection, "time_offset")
 
 
 def read_lens_sigma(path: Path) -> dict[str, float]:

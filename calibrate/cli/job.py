@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calibrate.cli.files import read_board, read_camera, read_lens_sigma, read_time_offset
+from calibrate.cli.files import read_board, read_camera, read_lens_sigma
 from calibrate.errors import UsageError
 from calibrate.handeye.solution import Profile
 from calibrate.job import JobOptions
@@ -40,9 +40,6 @@ Find = Annotated[
 LensKind = Annotated[LensModel, typer.Option("--lens", help="Lens model of estimated intrinsics")]
 GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other gate limits")]
 Without = Annotated[str | None, typer.Option(help="Poses to exclude, e.g. 3,7")]
-TimeOffsetFile = Annotated[
-    Path | None, typer.Option("--time-offset", help="File of `calibrate sweep -o`: poses taken so much later")
-]
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads of the board detection")]
 Distance = Annotated[
     float | None,
@@ -87,7 +84,6 @@ def picture_options(
     find_intrinsics: Find = False,
     lens: LensKind = "plumb_bob",
     without: Without = None,
-    time_offset: TimeOffsetFile = None,
     threads: Threads = None,
 ) -> JobOptions:
     """Options of reading images."""
@@ -105,7 +101,6 @@ def picture_options(
         camera_sigma={} if camera is None else read_lens_sigma(camera),
         lens_model=lens,
         find_intrinsics=find_intrinsics,
-        time_offset=None if time_offset is None else read_time_offset(time_offset),
         without=() if without is None else _numbers(without),
         threads=threads,
     )

@@ -1,13 +1,9 @@
-"""Time of a frame: the middle of its exposure on the host's clock, with a bound and a source.
-
-Live cameras and offline work share this, so that times can be derived again from a recording's raw readings.
-"""
+"""Time of a frame: the middle of its exposure on the host's clock, with a bound and a source."""
 
 from __future__ import annotations
 
-from bisect import bisect
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from recordings.schema.clocks import DRIFT_LIMIT, DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
@@ -136,23 +132,6 @@ def by_clock(start_device_ns: int, exposure_us: float, fit: ClockFit, source: Ti
     device_s = start_device_ns / 1e9
     beyond_s = fit.drift_uncertainty * abs(device_s - fit.reference_s)
     return FrameTime(fit.to_host_ns(device_s) + round(exposure_us * 500), fit.bound_s + beyond_s, source)
-
-
-def derived_again(
-    frames: Iterable[tuple[int, float, FrameTime]], readings: Sequence[ClockReading]
-) -> Iterator[tuple[FrameTime, FrameTime]]:
-    """(recorded, derived) times of the frames that a clock placed, from a recording's raw readings.
-
-    `frames`: (camera's stamp ns, exposure µs, recorded time). Knows the readings after a frame as well as
-    those before, which the daemon did not.
-    """
-    asked = [reading.asked_monotonic_ns for reading in readings]
-    for device_ns, exposure_us, recorded in frames:
-        place = bisect(asked, recorded.host_monotonic_ns)
-        near = readings[max(0, place - READINGS_KEPT // 2) : place + READINGS_KEPT // 2]
-        fit = DeviceClock(near).fit
-        if fit is not None and device_ns and recorded.source in ("ptp", "chunk", "latched"):
-            yield recorded, by_clock(device_ns, exposure_us, fit, recorded.source)
 
 
 def by_trigger(

@@ -162,20 +162,6 @@ class FrameTime(msgspec.Struct, frozen=True):
     source: TimeSource
 
 
-class TimeCorrection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Offset of a camera's frame times that a sweep measured, and its source."""
-
-    offset_s: float
-    """Add it to a frame's time of that source."""
-    sigma_s: float
-    source: TimeSource
-    recording: str = ""
-    """Name of the sweep's file"""
-    recording_sha256: str = ""
-    measured: str = ""
-    """Date of the sweep, ISO"""
-
-
 class ClockReading(msgspec.Struct, frozen=True, omit_defaults=True):
     """One reading of a camera's clock, as it was: it showed `device_ns` between question and answer."""
 

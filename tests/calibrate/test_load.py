@@ -152,6 +152,17 @@ def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recordi
         load_views(recording)
 
 
+def test_a_sweep_of_an_earlier_version_is_refused_by_name(source: Recording, tmp_path: Path) -> None:
+    """It holds images, and no robot pose that belongs to one."""
+    with RecordingWriter(tmp_path / "sweep.mcap", source.info) as writer:
+        for _, picture in source.images():
+            writer.image(picture)
+        path = writer.finish()
+    with raises_code(TooFewViewsError, "too-few-views", views=0) as refused:
+        load_views(open_recording(path))
+    assert "sweep" in refused.value.remedy
+
+
 def test_a_damaged_container_is_refused_whole(source: Recording, tmp_path: Path) -> None:
     path = copied(source, tmp_path / "a.mcap", range(6))
     data = bytearray(path.read_bytes())

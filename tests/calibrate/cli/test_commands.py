@@ -232,6 +232,9 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(session_file: Path, tmp_
     assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
     refused(run("batch", "s3://robots/a.mcap", cwd=tmp_path), 2, "gone")
     refused(run("fleet", "cells", cwd=tmp_path), 2, "gone", "calibrate metrics")
+    refused(run("sweep", "sweep.mcap", cwd=tmp_path), 2, "gone", "station doctor")
+    for command in ("solve", "compare", "report"):
+        refused(run(command, recordings[0], "--time-offset=a.yaml", cwd=tmp_path), 2, "gone", "at rest")
     for command in ("solve", "report"):
         refused(run(command, recordings[0], "--accept-move", cwd=tmp_path), 2, "gone", "Record again")
     refused(run("export", "--to", "json", cwd=tmp_path), 2, "gone", "calibrate show --json")

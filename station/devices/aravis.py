@@ -1,4 +1,4 @@
-"""GenICam cameras: one worker thread per camera, because with a lost camera a single call takes seconds."""
+"""GenICam cameras, each with its own worker thread, because calls to a lost camera block for seconds."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _GLIMPSE_S = 1.0
 
 
 class AravisCamera:
-    """`station.devices.base.Camera`. With `trigger: hardware` the box given here fires it."""
+    """GenICam camera behind `devices.base.Camera`; with `camera.trigger: hardware` fired by `trigger`."""
 
     def __init__(self, config: CameraConfig, trigger: Trigger | None = None) -> None:
         if config.trigger == "hardware" and trigger is None:
@@ -55,7 +55,7 @@ class AravisCamera:
         return self._clock.timing
 
     def counts(self) -> CameraCounts:
-        """The network's since the camera was opened (again)."""
+        """Counts of frames; those of the network since the camera was last opened."""
         device = self._device
         return self.counter.counts(StreamCounts() if device is None else device.counts())
 
@@ -65,7 +65,7 @@ class AravisCamera:
         return self.identity
 
     async def settings(self) -> dict[str, object]:
-        """Reads the settings back from the camera."""
+        """Read the settings back from the camera."""
         async with self._busy:
             return await self._worker.run(lambda: self._live().settings())
 
@@ -75,7 +75,7 @@ class AravisCamera:
             return self._newest
 
     async def glimpse(self) -> Image | None:
-        """Triggered as every image is, by the box too."""
+        """Take an image that is not recorded, triggered like any other, by the trigger box too."""
         async with self._busy:
             return await self._one(_GLIMPSE_S, sequenced=False)
 
@@ -95,13 +95,13 @@ class AravisCamera:
         sequence = self.counter.accept(picture.frame_id, count, sequenced=sequenced)
         told = msgspec.structs.replace(picture, sequence=sequence, trigger_count=count)
         chunks = self._live().chunks
-        if not chunks.issuperset(CHUNKS):  # held before the exposure: they must hold after it, too
+        if not chunks.issuperset(CHUNKS):  # checked before the exposure: a change during it must show, too
             exposure_us, gain_db = await self._worker.run(lambda: self._live().check_settings())
             told = msgspec.structs.replace(told, exposure_us=exposure_us, gain_db=gain_db)
         return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse, chunk=chunks.issuperset(TIME_CHUNKS))
 
     async def preview(self) -> Image | None:
-        """A fresh image where the camera is idle and can be triggered by software, else the newest one."""
+        """Take a new image where the camera is idle and software-triggered, else return the newest one."""
         if self._busy.locked() or self._config.trigger == "hardware":
             return self._newest
         async with self._busy:
@@ -127,7 +127,7 @@ class AravisCamera:
             device.latch(self._clock.readings)
 
     def _live(self) -> GenicamDevice:
-        """The device; opened again, by its serial, after it was lost."""
+        """Return the open device; after it was lost, open it again by its serial number."""
         if self._device is None:
             raise CameraError("the camera is not open", code="not-open")
         if self._device.lost:
@@ -161,7 +161,7 @@ class AravisCamera:
         return picture
 
     def _began_since(self, asked_ns: int, picture: Image) -> bool:
-        """A frame that came by itself was not being exposed already when it was asked for."""
+        """Tell whether a free-running frame's exposure began after `asked_ns` (host monotonic)."""
         fit, exposure_us = self._clock.readings.fit, picture.exposure_us
         told = by_arrival(picture.stamps.host_monotonic_ns, exposure_us)
         if fit is not None and picture.stamps.device_ns:

@@ -1,4 +1,4 @@
-"""One GenICam camera through Aravis, blocking. The only module with `gi`, loaded when a camera is opened."""
+"""One GenICam camera through Aravis; all calls block. Imports `gi` only when a camera is opened."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ if TYPE_CHECKING:
 
 BUFFERS = 12
 FRAME_RETENTION_S = 0.5
-"""So long a frame may wait for its last packets before it is given up as incomplete."""
+"""Time for which a frame waits for missing packets before it counts as incomplete."""
 SOCKET_BUFFER_BYTES = 32 * 2**20
-"""Size of the kernel's packet queue; it gives what net.core.rmem_max permits."""
+"""Requested size of the kernel's packet queue; the kernel limits it to net.core.rmem_max."""
 _STREAM_PRIORITY = -15
-"""Niceness of Aravis's receiving thread: the kernel keeps a fifth of a second of packets."""
+"""Niceness of Aravis's receiving thread: the kernel buffers only a fifth of a second of packets."""
 _LATCH_WAIT_S = 0.02
 _POP_S = 0.1
-"""So often a waiting capture looks whether the camera was lost."""
+"""Period at which a waiting capture checks whether the camera was lost."""
 LEAST_FRAMES_HZ = 4.0
-"""Gaps between packets that are negotiated never make a frame slower than this."""
+"""Lowest frame rate to which automatically lengthened gaps between packets may lead."""
 
 
 def _aravis() -> tuple[Any, Any]:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ImportWarning)  # PyGObject 3.42 has an importer of the old kind
+            warnings.simplefilter("ignore", ImportWarning)  # PyGObject 3.42 has a deprecated importer
             import gi
 
             gi.require_version("Aravis", "0.8")
@@ -61,7 +61,7 @@ def _aravis() -> tuple[Any, Any]:
 
 
 class GenicamDevice:
-    """One opened camera; blocking, for one thread. All methods raise CameraError."""
+    """One GenICam camera; blocking, for use by one thread. All methods raise CameraError."""
 
     def __init__(self, config: CameraConfig) -> None:
         self._config = config
@@ -78,10 +78,10 @@ class GenicamDevice:
 
     @property
     def lost(self) -> bool:
-        """Gone without our doing, as far as is known by now. From any thread.
+        """True once the connection is known to be lost. Callable from any thread.
 
-        Polled: while a handler of Aravis's `control-lost` runs, a thread of Aravis holds the device. When
-        that becomes the last reference, the thread waits for its own end, and GLib ends the process.
+        Polled, because a handler of Aravis's `control-lost` could crash: there an Aravis thread holds the
+        device, and if that is the last reference, the thread waits for its own end and GLib aborts.
         """
         camera = self._camera
         if self._controls and camera is not None and not camera.get_device().is_controller():
@@ -90,7 +90,7 @@ class GenicamDevice:
 
     @property
     def frame_ids(self) -> FrameIds:
-        """Numbering of frames by its transport."""
+        """Width of the frame ids by the camera's transport."""
         mode = "GevGVSPExtendedIDMode"
         camera = self._camera
         if not camera.is_gv_device() or (
@@ -100,7 +100,7 @@ class GenicamDevice:
         return FrameIds.BLOCK
 
     def open(self, serial: str = "") -> CameraIdentity:
-        """Finds, sets up and starts the camera. `serial`: only this very one."""
+        """Find, set up and start the camera. `serial`: accept only this one; empty: as configured."""
         bits_per_pixel(self._config.pixel_format)
         try:
             self._open(serial or self._config.device)
@@ -129,7 +129,7 @@ class GenicamDevice:
             _hurry(_threads() - before)
             if self._camera.is_gv_device():
                 self._stream.set_property("frame-retention", round(FRAME_RETENTION_S * 1e6))
-                # By itself Aravis asks for the size of one image, whatever the system would permit.
+                # By default Aravis requests the size of one image, even if the system permits more.
                 self._stream.set_property("socket-buffer", self._aravis.GvStreamSocketBuffer.FIXED)
                 self._stream.set_property("socket-buffer-size", SOCKET_BUFFER_BYTES)
             payload = self._camera.get_payload()
@@ -139,7 +139,7 @@ class GenicamDevice:
         self.check_settings()
 
     def close(self) -> None:
-        """Takes seconds when the camera is gone; never raises."""
+        """Close the camera: takes seconds when it is lost; never raises."""
         lost, camera = self.lost, self._camera
         self._camera = self._stream = None
         if camera is None or lost:
@@ -147,20 +147,20 @@ class GenicamDevice:
         try:
             camera.stop_acquisition()
             if camera.is_gv_device():
-                # Others may hold a reference still, in a traceback for instance: let go of the camera now.
+                # Others may still hold a reference, a traceback for instance: free the camera at once.
                 camera.get_device().leave_control()
         except self._glib.Error:
             self._lost = True
 
     def settings(self) -> dict[str, object]:
-        """Read back from the camera now, for the recording."""
+        """Read the settings back from the camera, for the recording."""
         with self._explained("reading the camera's settings"):
             return read_settings(self._camera)
 
     def check_settings(self) -> tuple[float, float]:
-        """Exposure (µs) and gain (dB) as they are; CameraError when they are not what was asked for.
+        """Read exposure (µs) and gain (dB); CameraError when they are not what was set.
 
-        A gain in another unit is 0 dB here: it stands in the settings.
+        A gain in another unit is returned as 0 dB; its value is part of `settings`.
         """
         applied = self._require_applied()
         with self._explained("reading the camera's settings"):
@@ -174,18 +174,18 @@ class GenicamDevice:
 
     @property
     def chunks(self) -> frozenset[str]:
-        """Chunks that come with every frame, of `genicam_settings.CHUNKS`."""
+        """Those of `genicam_settings.CHUNKS` that come with every frame."""
         return frozenset() if self._applied is None else self._applied.chunks
 
     def _find_ptp_status(self) -> str:
-        """Name of the feature that tells of IEEE 1588; empty where it is off or there is none."""
+        """Find the feature that reports the state of IEEE 1588; empty where it is off or missing."""
         for switch, status in (("PtpEnable", "PtpStatus"), ("GevIEEE1588", "GevIEEE1588Status")):
             if all(self._camera.is_feature_available(name) for name in (switch, status)):
                 return status if self._camera.get_boolean(switch) else ""
         return ""
 
     def _synchronized(self) -> bool:
-        """The camera says that it follows a master, or is the master that this computer may follow."""
+        """True when the camera reports that it is an IEEE 1588 slave, or master."""
         if not self._ptp_status:
             return False
         if self._ptp_status == "PtpStatus" and self._camera.is_feature_available("PtpDataSetLatch"):
@@ -193,7 +193,7 @@ class GenicamDevice:
         return self._camera.get_string(self._ptp_status) in ("Slave", "Master")
 
     def latch(self, clock: DeviceClock) -> None:
-        """One reading of the camera's clock, where it has one that can be latched."""
+        """Add a reading of the camera's clock to `clock`, where the camera supports latching it."""
         for command, value in (
             ("GevTimestampControlLatch", "GevTimestampValue"),
             ("TimestampLatch", "TimestampLatchValue"),
@@ -201,7 +201,7 @@ class GenicamDevice:
             if not self._camera.is_feature_available(command):
                 continue
             with self._explained("reading the camera's clock"):
-                if self._latched_ns is None:  # what an earlier client latched is not the time of now
+                if self._latched_ns is None:  # an earlier client's latched value is not the time now
                     self._latched_ns = self._to_ns(self._camera.get_integer(value))
                 asked_ns = time.monotonic_ns()
                 self._camera.execute_command(command)
@@ -216,13 +216,13 @@ class GenicamDevice:
             return
 
     def _to_ns(self, ticks: int) -> int:
-        """Read anew: with IEEE 1588 the same clock ticks nanoseconds."""
+        """Convert ticks to ns by the present tick rate, which IEEE 1588 changes to 1 GHz."""
         feature = "GevTimestampTickFrequency"
         rate_hz = self._camera.get_integer(feature) if self._camera.is_feature_available(feature) else 0
         return ticks if rate_hz in (0, 1_000_000_000) else round(ticks * 1e9 / rate_hz)
 
     def drain(self) -> int:
-        """Throws away what arrived without being asked for; how many frames that was."""
+        """Discard frames that arrived without a trigger; return their number."""
         count = 0
         while (buffer := self._stream.try_pop_buffer()) is not None:
             self._stream.push_buffer(buffer)
@@ -230,7 +230,7 @@ class GenicamDevice:
         return count
 
     def counts(self) -> StreamCounts:
-        """Since the camera was opened. From any thread."""
+        """Counts of frames on the network since the camera was opened. Callable from any thread."""
         stream = self._stream
         if stream is None:
             return StreamCounts()
@@ -249,7 +249,7 @@ class GenicamDevice:
             self._camera.software_trigger()
 
     def frame(self, timeout_s: float) -> Image | None:
-        """The next frame, complete; None when none comes in time."""
+        """Wait for the next complete frame; None when none comes in time."""
         end_s = time.monotonic() + timeout_s
         buffer = None
         while buffer is None:
@@ -264,7 +264,7 @@ class GenicamDevice:
             self._stream.push_buffer(buffer)
 
     def fresh_frame(self, timeout_s: float, began_since: Callable[[Image], bool]) -> Image | None:
-        """Free-running: the next complete one that `began_since` it was asked for."""
+        """Wait for the next complete free-running frame for which `began_since` is true; None in time-out."""
         self.drain()
         end_s = time.monotonic() + timeout_s
         while (left_s := end_s - time.monotonic()) > 0:
@@ -313,7 +313,7 @@ class GenicamDevice:
         )
 
     def _told(self, buffer: Any, applied: Applied) -> tuple[int, float, float]:
-        """Stamp (ns), exposure (µs) and gain of a frame: its own, as far as it brings them along."""
+        """Return stamp (ns), exposure (µs) and gain of a frame: from its chunks, else from the settings."""
         device_ns, exposure_us, gain = int(buffer.get_timestamp()), self._config.exposure_us, applied.gain
         if not applied.chunks:
             return device_ns, exposure_us, gain
@@ -328,13 +328,13 @@ class GenicamDevice:
         return device_ns, exposure_us, gain
 
     def _calm_down(self) -> None:
-        """After a frame that lost packets: longer gaps between them, where none were configured."""
+        """Lengthen the gaps between packets after a frame that lost some, unless they are configured."""
         camera, config = self._camera, self._config
         if config.packet_delay_us is not None or config.trigger == "free-running":
             return
         if not camera.is_gv_device() or not camera.is_feature_available("GevSCPD"):
             return
-        with suppress(self._glib.Error):  # more than this camera can: what there is must do
+        with suppress(self._glib.Error):  # beyond the camera's range: keep the present gap
             size = camera.gv_get_packet_size()
             packets = camera.get_payload() // size + 1
             gap_ns = max(
@@ -344,7 +344,7 @@ class GenicamDevice:
                 camera.gv_set_packet_delay(gap_ns)
 
     def _frame_id(self, buffer: Any) -> int | None:
-        """GigE Vision's block id 0 says that there is none; the upper half of 64 bits reads as negative."""
+        """Return the frame id; None for 0, which means "no id". Negative ids are unsigned 64-bit ones."""
         number = int(buffer.get_frame_id())
         if number == 0 and self._camera.is_gv_device():
             return None
@@ -374,7 +374,7 @@ def _threads() -> set[int]:
 
 
 def _hurry(threads: set[int]) -> None:
-    """Lets Aravis's receiving thread go before others, where the system permits."""
+    """Raise the priority of Aravis's receiving thread, where the system permits."""
     for thread in threads:
         with suppress(OSError):
             if (Path("/proc/self/task") / str(thread) / "comm").read_text().strip() == "arv_gv_stream":
@@ -382,7 +382,7 @@ def _hurry(threads: set[int]) -> None:
 
 
 def found_cameras() -> list[tuple[str, str, str]]:
-    """Model, serial number and address of every camera that answers. Raises CameraError without Aravis."""
+    """List model, serial number and address of every camera that answers. CameraError without Aravis."""
     aravis, _ = _aravis()
     aravis.update_device_list()
     return [
@@ -392,7 +392,7 @@ def found_cameras() -> list[tuple[str, str, str]]:
 
 
 def _find(aravis: Any, wanted: str) -> str:
-    """Aravis's id of the camera with this serial, address or name; of the only one when none is wanted."""
+    """Find Aravis's id of the camera with this serial, address or name; "" takes the only one."""
     if wanted.count(".") == 3 and wanted.replace(".", "").isdigit():
         return wanted
     aravis.update_device_list()

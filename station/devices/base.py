@@ -1,4 +1,4 @@
-"""The protocols behind which real, simulated and played-back devices are equals; the thread of a driver."""
+"""Protocols that real, simulated and played-back devices implement, and the worker thread of a driver."""
 
 from __future__ import annotations
 
@@ -18,30 +18,31 @@ T = TypeVar("T")
 
 
 class DeviceThread:
-    """The one thread that calls a blocking driver, which may be stuck in it for seconds."""
+    """Worker thread that makes all calls to a blocking driver, so that the event loop never waits for it."""
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._pool: ThreadPoolExecutor | None = None
 
     def run(self, job: Callable[[], T]) -> asyncio.Future[T]:
-        """Begin a job behind those that were begun before."""
+        """Queue a job; the future gives its result."""
         if self._pool is None:
             self._pool = ThreadPoolExecutor(1, self._name)
-        return asyncio.get_running_loop().run_in_executor(self._pool, _letting_go, job)
+        return asyncio.get_running_loop().run_in_executor(self._pool, _run_and_release, job)
 
     async def close(self, last: Callable[[], object]) -> None:
-        """Run a last job and end the thread; nothing where it never ran."""
+        """Run a last job and end the thread; does nothing when no job was ever run."""
         if (pool := self._pool) is not None:
             self._pool = None
             await asyncio.get_running_loop().run_in_executor(pool, last)
             pool.shutdown(wait=False)
 
 
-def _letting_go(job: Callable[[], T]) -> T:
-    """Does it. What a failed job held is let go here: an error may be kept, and by its traceback the device.
+def _run_and_release(job: Callable[[], T]) -> T:
+    """Run the job; on failure clear the frames of the traceback, else a stored error keeps the device open.
 
-    The end of a camera that is gone takes seconds; in the loop's thread, the arm would be without heartbeat.
+    Clearing happens in this thread because closing a lost camera takes seconds, and the event loop must send
+    the arm's heartbeat.
     """
     try:
         return job()
@@ -54,88 +55,90 @@ def _letting_go(job: Callable[[], T]) -> T:
 
 
 class ArmNews(Protocol):
-    """What an arm tells of itself; how late that may come: `devices.news`."""
+    """The states that an arm reports. `devices.news` defines how late they may be."""
 
     guided: bool
-    """A person moves the arm by hand: its news may be late by no more than those of an arm in motion."""
+    """True while a person moves the arm by hand: states may then be no later than during a move."""
 
     def latest(self) -> RobotState:
-        """Newest state; StaleStateError when older than 100 ms. For who looks again anyway; who decides waits
-        for the news: `fresh`, `ready`."""
+        """Return the newest state; StaleStateError when it is older than 100 ms.
+
+        For callers that poll. To decide something, wait for a current state by `fresh` or `ready`.
+        """
 
     def news(self) -> RobotState | None:
-        """Newest state; None while it is late, but may still come. StaleStateError after 0.25 s in motion,
-        1 s at rest."""
+        """Return the newest state; None while it is late. StaleStateError after `MOVING_S` in motion,
+        `RESTING_S` at rest (`devices.news`)."""
 
     def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
-        """What made news late since then (host monotonic), by `devices.news`; None: nothing did.
+        """Name what made states late since `since_s` (host monotonic), by `devices.news`; None: nothing did.
 
         `pause_s`: how long this computer was busy.
         """
 
     def check(self) -> RobotState | None:
-        """`news`; raises RobotError for what speaks against capturing now: safety stop, TCP changed."""
+        """Return `news`; RobotError where nothing may be captured, as after a safety stop or TCP change."""
 
 
 class Robot(ArmNews, Protocol):
-    """An arm. Connecting is read-only; only `start_control` (by an approval) replaces the robot's program."""
+    """An arm. Connecting only reads; `start_control`, after an approval, replaces the robot's program."""
 
     @property
     def identity(self) -> RobotIdentity: ...
 
     @property
     def control(self) -> bool:
-        """The control program runs and obeys us."""
+        """True while the control program runs on the robot and takes moves from this station."""
 
     @property
     def control_path(self) -> str:
-        """Driver of the arm: ur_rtde or script; empty where nothing real moves."""
+        """Driver of the arm: ur_rtde or script; empty where no real arm moves."""
 
     @property
     def kinematics(self) -> ArmKinematics | None:
-        """The maker's calibration of this arm, that its poses follow; None where it is not known."""
+        """The maker's calibration of this arm, with which its poses are computed; None: unknown."""
 
     @property
     def notice(self) -> str:
-        """Notice to a person while a move is under way, though it is no fault; empty = nothing."""
+        """Hint for people during a move that is no fault, such as a low speed slider; empty: none."""
 
     @property
     def remote(self) -> bool | None:
-        """Remote control is on; None where there is no such switch or it is not known."""
+        """Whether remote control is on; None where there is no such switch or it is not known."""
 
     async def connect(self) -> RobotIdentity:
-        """Reads identity and starts the state stream. Raises RobotError."""
+        """Read the identity and start the state stream. Raises RobotError."""
 
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
-        """Every sample, in order, at the full rate, from the reader's thread: the callback must be quick."""
+        """Call back with every state in order, from the reader's thread: the callback must be quick."""
 
     def at(self, host_monotonic_ns: int) -> RobotState:
-        """State interpolated at a host time within the last 10 s; StaleStateError outside."""
+        """Interpolate the state at a host time within the last 10 s; StaleStateError outside."""
 
     def clock(self) -> ClockFit | None:
-        """The controller's clock against the host's; None while not known."""
+        """Return the controller's clock against the host's; None while not known."""
 
     async def start_control(self) -> None:
-        """Spawns the control child. Only in answer to a motion approval. RobotError when refused."""
+        """Start the control process. Call only after a motion approval. RobotError when refused."""
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
-        """Moves the joints and returns when arrived. RobotError, SafetyStopError, StaleStateError."""
+        """Move the joints; return on arrival. Raises RobotError, SafetyStopError, StaleStateError."""
 
     def heartbeat(self) -> None:
-        """Called by the session loop at least every 50 ms while control lives; without it the arm stops."""
+        """Keep the arm's watchdog from stopping it: call at least every 50 ms while control is started."""
 
     @property
     def payload(self) -> tuple[float, ...]:
-        """Mass (kg) and centre (m, in `flange`) as the controller tells them; empty: not told."""
+        """Mass (kg) and centre (m, in `flange`) reported by the controller; empty: not reported."""
 
     def stop_one_way(self, way: StopWay) -> None:
-        """Ends the move under way by one way alone, for a stop test. RobotError where that is not there."""
+        """End the move by only this stop path, for a stop test. RobotError where the path is missing."""
 
     async def stop(self, reason: str) -> None:
-        """Decelerates now, by both paths; idempotent, in any state, never raises."""
+        """Decelerate now, by both stop paths; idempotent, in any state, never raises."""
 
     async def end_control(self) -> None:
-        """Stops the script and ends the child."""
+        """Stop the control program and end its process."""
 
     async def close(self) -> None: ...
 
@@ -144,14 +147,14 @@ NEWS_POLL_S = 0.005
 
 
 async def fresh(robot: ArmNews) -> RobotState:
-    """Where the arm is now. News that are late are waited for. StaleStateError when they do not come."""
+    """Wait for a current state of the arm and return it. StaleStateError when none comes."""
     while (state := robot.news()) is None:
         await asyncio.sleep(NEWS_POLL_S)
     return state
 
 
 async def ready(robot: ArmNews) -> RobotState:
-    """`fresh`, and nothing speaks against capturing. Raises RobotError for what does."""
+    """Wait as `fresh` does; RobotError where nothing may be captured now (see `ArmNews.check`)."""
     while (state := robot.check()) is None:
         await asyncio.sleep(NEWS_POLL_S)
     return state
@@ -162,46 +165,46 @@ class Camera(Protocol):
     def identity(self) -> CameraIdentity: ...
 
     async def open(self) -> CameraIdentity:
-        """Raises CameraError with the remedy."""
+        """Open the camera and read its identity. Raises CameraError with the remedy."""
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        """One trigger, one frame, with its `time`. Raises CameraError; never returns an older frame.
+        """Trigger once and return that frame with its `time`, never an older one. Raises CameraError.
 
-        `frames.FrameClock` finds the time; a camera of another kind fills in source and bound by itself.
+        Drivers get the time from `frames.FrameClock`, or fill in source and bound themselves.
         """
 
     @property
     def timing(self) -> FrameTiming | None:
-        """Accuracy of its frames' times now; None while not known. At once, from any thread."""
+        """Accuracy of frame times now; None while not known. Does not block; from any thread."""
 
     def counts(self) -> CameraCounts:
-        """Since it was made. At once, from any thread."""
+        """Counts of frames since this object was made. Does not block; from any thread."""
 
     async def settings(self) -> dict[str, object]:
-        """Settings that the camera reports now, for the recording; JSON types only. Raises CameraError.
+        """Read the camera's settings for the recording; JSON types only. Raises CameraError.
 
-        `region`, where it has one: x, y, width, height of its images.
+        `region`, where there is one: x, y, width, height of the images, pixels.
         """
 
     async def glimpse(self) -> Image | None:
-        """An image exposed after this call, of any size, that takes no number and is never recorded.
+        """Take an image, exposed after this call and of any size, that is not numbered or recorded.
 
-        None where there is no such thing (played images). Raises CameraError within about a second.
+        None from a camera that cannot (playback). Raises CameraError within about a second.
         """
 
     async def preview(self) -> Image | None:
-        """A recent image for the screen; None when there is none. Never recorded."""
+        """Return a recent image for the screen, never recorded; None when there is none."""
 
     async def close(self) -> None: ...
 
 
 class Trigger(Protocol):
     async def open(self) -> str:
-        """Identity text. Raises TriggerError."""
+        """Open the box and return its identity text. Raises TriggerError."""
 
     @property
     def pulses(self) -> int:
-        """Counted by the box since it was opened, whoever caused them."""
+        """Pulses that the box counted since it was opened, from any cause."""
 
     async def fire(self) -> TriggerPulse: ...
 

@@ -1,4 +1,4 @@
-"""A cell: the devices that one configuration describes, behind their protocols."""
+"""Cell: the devices that a configuration describes, behind their protocols."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ class Cell:
     robot: Robot
     camera: Camera
     source: Source
-    """`real` only when arm and camera both are."""
+    """`real` only when both arm and camera are real."""
     trigger: Trigger | None = None
     config_text: bytes = b""
-    """The file's bytes, for the recording."""
+    """Content of the configuration file, for the recording."""
     config_path: str = ""
-    """The file, for commands that are suggested; empty: there is none."""
+    """Path of the configuration file, for suggested commands; empty: none."""
     attachments: dict[str, bytes] = field(default_factory=dict)
-    """More for every recording of this cell: a simulated one's truth."""
+    """Further attachments of every recording: for a simulated cell, its true geometry."""
     plan: Plan | None = None
-    """Loaded at the start: what a played-back cell can show."""
+    """Plan to load at the start: the recorded poses of a played-back cell."""
     ended: Callable[[], None] = lambda: None
-    """Called once the devices are closed: ends child processes of a simulated cell."""
+    """Called after the devices are closed, to end the processes of a simulated cell."""
 
     @property
     def simulated(self) -> bool:
@@ -41,7 +41,7 @@ class Cell:
 
     @property
     def subject(self) -> ArmSubject:
-        """The arm as it is now: what an acceptance is bound to."""
+        """Arm, firmware, payload and control path, to which an acceptance test is bound."""
         robot, identity = self.robot, self.robot.identity
         firmware = identity.controller_version
         return ArmSubject(
@@ -49,7 +49,7 @@ class Cell:
         )
 
     def acceptance_trouble(self, root: Path) -> str:
-        """Why the stops of this real arm are not accepted; empty: they are, or nothing real moves."""
+        """Say why a real arm's stops are not accepted; empty: they are, or no real arm moves."""
         if self.source != "real" or not self.robot.identity.serial or not self.robot.control_path:
             return ""
         speed_m_s = min(self.config.limits.speed_m_s, SPEED_CAP_M_S)
@@ -65,5 +65,5 @@ class Cell:
 
     @property
     def camera_model(self) -> CameraModel | None:
-        """Trustworthy intrinsics only; None where they are to be found from the images."""
+        """Known intrinsics; None where they are rough, or are to be estimated from the images."""
         return None if self.config.camera.model_is_rough else self.config.camera.model

@@ -1,8 +1,9 @@
-"""GigE and USB3 Vision cameras on this computer's wires: what they are, and why one cannot be used.
+"""Discovery of GigE and USB3 Vision cameras at this computer, usable or not, and why not.
 
-Networks are asked by GVCP itself, and answer by broadcast: a camera of another network answers too, which no
-library that opens cameras can reach. Addresses are those of the standard's bootstrap registers, which the
-answer to DISCOVERY_CMD repeats from 0 on. USB is read as the kernel lists it: also what nobody may open.
+GigE: a GVCP discovery command is broadcast and its answers too, so that cameras with an address of another
+network answer, which libraries do not find. Addresses in the code are those of the standard's bootstrap
+registers, which the answer to DISCOVERY_CMD repeats from 0 on. USB: as listed by the kernel, including
+cameras that this user may not open.
 """
 
 from __future__ import annotations
@@ -21,19 +22,19 @@ import msgspec
 
 _PORT = 3956
 _DISCOVERY = struct.pack(">BBHHH", 0x42, 0x11, 0x0002, 0, 1)
-"""Answers may be broadcast."""
+"""Packet DISCOVERY_CMD with the flag that allows broadcast answers."""
 _ANSWER = struct.Struct(">HHHH")
 _DISCOVERY_ANSWER, _READ_ANSWER = 0x0003, 0x0081
 _ADDRESS, _MASK = 0x24, 0x34
 _TEXTS = ((0x48, 32), (0x68, 32), (0x88, 32), (0xD8, 16))
-"""Vendor, model, firmware, serial: address and length"""
+"""Address and length of vendor, model, firmware and serial number"""
 _LENGTH = 248
 _PRIVILEGE, _PRIMARY_ADDRESS = 0xA00, 0xA14
 _GET_ADDRESS, _GET_MASK = 0x8915, 0x891B
 """Linux: SIOCGIFADDR, SIOCGIFNETMASK"""
 _DEVICES, _NODES = Path("/sys/bus/usb/devices"), Path("/dev/bus/usb")
 _CONTROL = {"bInterfaceClass": "ef", "bInterfaceSubClass": "05", "bInterfaceProtocol": "00"}
-"""USB3 Vision's interface for control; by the same values udev's rules for all such cameras choose."""
+"""The kernel's values for USB3 Vision's control interface, as used by udev rules for such cameras"""
 USB3_MBIT_S = 5000
 
 
@@ -43,29 +44,29 @@ class FoundCamera(msgspec.Struct, frozen=True):
     serial: str
     firmware: str
     address: str
-    """With its mask, as the camera has it: 192.168.1.20/24"""
+    """Address and mask of the camera: 192.168.1.20/24"""
     seen_from: str
-    """The same of this computer, on the network that it answered on"""
+    """Address and mask of this computer on the network that the answer came from"""
     controlled: bool = False
     controlled_from: str = ""
-    """Address of the program that has it; empty = not told"""
+    """Address of the computer that controls the camera; empty: none, or not told"""
 
     @property
     def reachable(self) -> bool:
-        """Camera and computer are in each other's network."""
+        """True when camera and computer are in each other's network."""
         camera, here = IPv4Interface(self.address), IPv4Interface(self.seen_from)
         return camera.ip in here.network and here.ip in camera.network
 
 
 def discover(wait_s: float = 0.5) -> list[FoundCamera]:
-    """Broadcasts on every network that is up, and takes the answers that come in time; blocking."""
+    """Broadcast on every network that is up and collect answers for `wait_s`; blocking."""
     asked = []
     try:
         for name, here in _interfaces():
             link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             asked.append((link, here))
             link.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            with suppress(OSError):  # not permitted everywhere; then one network may answer on all
+            with suppress(OSError):  # where not permitted, cameras of one network may be listed for all
                 link.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, name.encode())
             for to in {"255.255.255.255", str(here.network.broadcast_address)}:
                 with suppress(OSError):
@@ -99,13 +100,13 @@ def _camera(answer: bytes, here: IPv4Interface) -> FoundCamera | None:
     )
     try:
         address = str(IPv4Interface(f"{ip}/{mask}"))
-    except ValueError:  # a mask with holes
+    except ValueError:  # a mask whose ones are not contiguous
         address = f"{ip}/32"
     return FoundCamera(vendor, model, serial, firmware, address, str(here))
 
 
 def _with_user(camera: FoundCamera) -> FoundCamera:
-    """Says whether a program controls it: anybody may read that."""
+    """Add which program controls the camera, read from a register that needs no control."""
     if not camera.reachable:
         return camera
     address = camera.address.partition("/")[0]
@@ -131,7 +132,7 @@ def _register(address: str, register: int, wait_s: float = 0.3) -> int | None:
 
 
 def _interfaces() -> list[tuple[str, IPv4Interface]]:
-    """Networks that are up and have an IPv4 address."""
+    """List networks that are up and have an IPv4 address."""
     found = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         for _, name in socket.if_nameindex():
@@ -151,11 +152,11 @@ class UsbCamera(msgspec.Struct, frozen=True):
     serial: str
     firmware: str
     port: str
-    """Place as the kernel counts: bus, then the ports of the hubs on the way"""
+    """Port as the kernel names it: bus, then the ports of the hubs"""
     speed_mbit_s: float
-    """Speed of the link as it came up"""
+    """Negotiated speed of the link"""
     permitted: bool
-    """This program may open it."""
+    """True when this program may open it."""
 
 
 def discover_usb(devices: Path = _DEVICES, nodes: Path = _NODES) -> list[UsbCamera]:
@@ -182,7 +183,7 @@ def discover_usb(devices: Path = _DEVICES, nodes: Path = _NODES) -> list[UsbCame
 
 
 def kernel_text(file: Path) -> str:
-    """Content of a file of the kernel's; nothing where it is not, or the camera has just gone."""
+    """Read a file of the kernel; empty where it is missing, as after unplugging."""
     try:
         return file.read_text(errors="replace").strip()
     except OSError:

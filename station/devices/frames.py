@@ -1,4 +1,4 @@
-"""Which trigger a frame belongs to, and when it was exposed: by counters and clocks, never by order alone."""
+"""Assignment of frames to triggers, and their exposure times, by counters and clocks, not by order alone."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ RETAKE = "Retake this pose."
 
 
 class StreamCounts(msgspec.Struct, frozen=True):
-    """The network's effects on a camera's frames since it was opened."""
+    """Counts of frames damaged or lost on the network since the camera was opened."""
 
     complete: int = 0
     incomplete: int = 0
-    """Frames that arrived with holes"""
+    """Frames with missing packets"""
     unbuffered: int = 0
-    """Frames that found no free buffer: the program was too slow"""
+    """Frames lost for want of a free buffer: the program was too slow"""
     missing_packets: int = 0
     resend_requests: int = 0
     resent_packets: int = 0
@@ -36,41 +36,41 @@ class CameraCounts(msgspec.Struct, frozen=True):
     """Counts of a camera's frames, for the status."""
 
     frames: int = 0
-    """Came, glimpses and previews included"""
+    """Frames that came, glimpses and previews included"""
     missing: int = 0
-    """Triggered or numbered by the camera, but never came whole"""
+    """Frames triggered or numbered by the camera that never came complete"""
     paired: int = 0
-    """Came for a pulse of the trigger box"""
+    """Frames that belong to a pulse of the trigger box"""
     stream: StreamCounts = StreamCounts()
 
 
 class FrameCounter:
     """Accepts a frame only as the answer to the one outstanding trigger.
 
-    One trigger, then one frame with the next frame id, where the transport numbers frames. After any
-    disagreement the count starts afresh with the next frame: one lost frame costs one pose and no more.
+    Each trigger must give one frame, with the next frame id where the transport numbers frames. After an
+    error counting restarts with the next frame, so that a lost frame costs one pose only.
     """
 
     def __init__(self, ids: FrameIds = FrameIds.WIDE) -> None:
         self.ids = ids
-        """Set by the driver that knows the transport."""
+        """Width of frame ids, set by the driver."""
         self.frames = 0
-        """Accepted; the newest one's sequence number is one less."""
+        """Numbered frames accepted; the newest has this sequence number minus 1."""
         self.missing = 0
         self.unexpected = 0
         self.seen = 0
-        """Accepted, previews included."""
+        """Frames accepted, previews included."""
         self.paired = 0
-        """Those accepted for a pulse of the trigger box."""
+        """Frames accepted for a pulse of the trigger box."""
         self._last_id: int | None = None
         self._last_pulse: int | None = None
 
     def restart(self) -> None:
-        """The camera was opened or acquisition started anew: the next frame id may be any."""
+        """Accept any next frame id: call after opening the camera or restarting acquisition."""
         self._last_id = self._last_pulse = None
 
     def accept(self, frame_id: int | None, pulse_count: int | None = None, *, sequenced: bool = True) -> int:
-        """The frame's sequence number. `pulse_count`: of the trigger box, for its trigger.
+        """Check a frame; return its sequence number. `pulse_count`: of the trigger box, for this trigger.
 
         `sequenced=False`: a preview, which takes no sequence number.
         Raises CameraError for a frame that is not the next one or a pulse count that did not grow by one.
@@ -115,7 +115,7 @@ class FrameCounter:
         if last_id is None or frame_id is None:
             return 1
         if last_id == frame_id == 0:
-            return 1  # two zeros: this camera numbers nothing
+            return 1  # 0 twice: this camera does not number frames
         if frame_id > LAST_BLOCK_ID:  # extended ids of a camera that does not announce them
             self.ids = FrameIds.WIDE
         return frames_between(last_id, frame_id, self.ids)
@@ -124,13 +124,13 @@ class FrameCounter:
         return CameraCounts(self.seen, self.missing, self.paired, stream or StreamCounts())
 
     def lost(self, pulse_count: int | None = None) -> None:
-        """A trigger, with this count of the trigger box, had no frame."""
+        """Note a trigger without a frame; `pulse_count`: count of the trigger box at it."""
         self.missing += 1
         self.restart()
         self._last_pulse = pulse_count
 
     def surplus(self, frames: int) -> CameraError:
-        """The error for frames that came without a trigger."""
+        """Note frames that came without a trigger; return the error to raise."""
         self.unexpected += frames
         self.restart()
         return CameraError(
@@ -142,32 +142,33 @@ class FrameCounter:
 
 
 class FrameTiming(msgspec.Struct, frozen=True):
-    """Accuracy of a camera's frame times, for doctor and screen."""
+    """Accuracy of a camera's frame times, as shown to people."""
 
     source: TimeSource
     bound_s: float
-    """95 % bound of the newest frame's time, or of one taken now"""
+    """95 % bound of the time of the newest frame, or of a frame taken now"""
     clock: ClockFit | None = None
-    """The camera's clock against the host's; None where it has none that can be read"""
+    """The camera's clock against the host's; None where it cannot be read"""
     impossible: int = 0
-    """Frames whose stamp lay before their trigger or after their arrival: it is no start of exposure"""
+    """Frames with a stamp before their trigger or after their arrival, so not the start of exposure"""
 
 
 class TriggerPulse(msgspec.Struct, frozen=True):
     count: int
     host_monotonic_ns: int
     bound_s: float = 0.0
-    """The pulse began within this of `host_monotonic_ns`"""
+    """Bound of `host_monotonic_ns` as the start of the pulse"""
 
 
 class FrameClock:
-    """Gives a camera's frames their times, from the best source that the frame itself bears out.
+    """Finds the exposure times of a camera's frames from the best available source.
 
-    For a camera's driver, which feeds it readings of the camera's clock where there is one.
+    Sources that contradict the frame (before its trigger, after its arrival) are not used. The camera's
+    driver adds readings of the camera's clock where there is one.
     """
 
     def __init__(self, trigger_delay_us: float = 0.0) -> None:
-        """`trigger_delay_us`: set in the camera."""
+        """`trigger_delay_us`: delay that is set in the camera."""
         self.readings = DeviceClock()
         self._delay_us = trigger_delay_us
         self._newest: FrameTime | None = None
@@ -175,13 +176,13 @@ class FrameClock:
         self._opened = False
 
     def restart(self) -> None:
-        """The camera was opened: its clock may be another."""
+        """Forget the clock's readings: call after opening the camera, which may have reset it."""
         self.readings.restart()
         self._newest, self._impossible, self._opened = None, 0, True
 
     @property
     def timing(self) -> FrameTiming | None:
-        """None before the camera was opened."""
+        """Accuracy of frame times now; None before the camera was opened."""
         fit = self.readings.fit
         if self._newest is not None:
             return FrameTiming(self._newest.source, self._newest.bound_s, fit, self._impossible)
@@ -197,9 +198,9 @@ class FrameClock:
         pulse: TriggerPulse | None = None,
         chunk: bool = False,
     ) -> Image:
-        """The image with its time and the readings since the one before.
+        """Return the image with its time and the clock readings since the previous image.
 
-        `asked_ns`: host time just before its trigger; None = it came by itself. `pulse`: of the trigger box.
+        `asked_ns`: host time just before its trigger; None: free-running. `pulse`: of the trigger box.
         `chunk`: stamp and exposure came with the frame.
         """
         arrival_ns, fit = image.stamps.host_monotonic_ns, self.readings.fit
@@ -220,7 +221,7 @@ class FrameClock:
 
 
 def _possible(told: FrameTime, image: Image, asked_ns: int | None) -> bool:
-    """An exposure begins after its trigger, and ends before its first packet arrives."""
+    """Tell whether a time is possible: exposure begins after the trigger and ends before the arrival."""
     half_ns, bound_ns = image.exposure_us * 500, told.bound_s * 1e9
     ended = told.host_monotonic_ns + half_ns - bound_ns <= image.stamps.host_monotonic_ns
     return ended and (asked_ns is None or told.host_monotonic_ns - half_ns + bound_ns >= asked_ns)

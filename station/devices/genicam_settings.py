@@ -1,4 +1,4 @@
-"""A GenICam camera's settings by its features: made, read back, and proven. Needs no Aravis of its own."""
+"""Settings of a GenICam camera: applying, reading back and checking them. Imports no Aravis itself."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ Region = tuple[int, int, int, int]
 """x, y, width, height, pixels"""
 _EXPOSURE_TOLERANCE = 0.02
 _GAIN_TOLERANCE = 0.2
-"""dB, or the camera's unit"""
+"""Largest accepted difference between set and read gain, dB or the camera's unit"""
 TIME_CHUNKS = ("Timestamp", "ExposureTime")
 CHUNKS = (*TIME_CHUNKS, "Gain")
-"""Facts that a frame can bring along"""
+"""Chunk data that a frame may carry"""
 
 
 class Applied(NamedTuple):
-    """Settings that the camera was given."""
+    """Settings that were applied to the camera."""
 
     region: Region
     gain: float
     """In the camera's unit"""
     gain_in_db: bool
     chunks: frozenset[str]
-    """Those of CHUNKS that come with every frame"""
+    """Those of `CHUNKS` that come with every frame"""
 
 
 def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
-    """Everything the configuration says, automatics off. Raises CameraError for what it cannot do."""
+    """Apply the configuration, automatic functions off. CameraError for what the camera cannot do."""
     camera.set_range_check_policy(aravis.RangeCheckPolicy.ENABLE)
     camera.stop_acquisition()
     camera.clear_triggers()
@@ -37,7 +37,7 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
         if camera.is_feature_available(automatic):
             camera.set_string(automatic, "Off")
     camera.set_pixel_format_from_string(config.pixel_format)
-    # Cameras keep the region of whoever used them last.
+    # Cameras keep the region that the last program set.
     region: Region = config.region or (0, 0, *camera.get_sensor_size())
     camera.set_region(*region)
     camera.set_exposure_time(config.exposure_us)
@@ -71,7 +71,7 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
 
 
 def _set_chunks(aravis: Any, camera: Any) -> frozenset[str]:
-    """Lets frames bring their own stamp and settings, where the camera can."""
+    """Switch on chunk data (stamp and settings in each frame), where the camera supports it."""
     if not camera.are_chunks_available():
         return frozenset()
     offered = set(camera.dup_available_enumerations_as_strings("ChunkSelector"))
@@ -83,7 +83,7 @@ def _set_chunks(aravis: Any, camera: Any) -> frozenset[str]:
 
 
 def _set_trigger(camera: Any, config: CameraConfig) -> None:
-    """One trigger per frame, with delay and edge: cameras keep those of whoever used them last."""
+    """Set one frame per trigger, delay and edge, all explicitly, as cameras keep earlier settings."""
     hardware = config.trigger == "hardware"
     camera.set_trigger(config.trigger_line if hardware else "Software")
     delay_us = config.trigger_delay_us if hardware else 0.0
@@ -102,7 +102,7 @@ def _set_trigger(camera: Any, config: CameraConfig) -> None:
 
 
 def _set_line(camera: Any, line: str, values: dict[str, str], inverted: bool = False) -> None:
-    """Settings of one line; an input of a camera that has no LineSelector needs none."""
+    """Apply settings of an I/O line; an input of a camera without LineSelector needs none."""
     output = values["LineMode"] == "Output"
     if not camera.is_feature_available("LineSelector"):
         if output or inverted:
@@ -127,7 +127,7 @@ def _cannot(what: str, key: str) -> CameraError:
 
 
 def gain_unit(camera: Any) -> str:
-    """Read the camera's unit of gain: dB, or something else; empty = it names none."""
+    """Read the camera's unit of gain, such as dB; empty: not stated."""
     for name in ("Gain", "GainRaw", "GainAbs"):
         if camera.is_feature_available(name):
             node = camera.get_device().get_feature(name)
@@ -140,7 +140,7 @@ def _knows_db(camera: Any) -> bool:
 
 
 def _wanted_gain(camera: Any, config: CameraConfig) -> float:
-    """In the camera's unit. 0 dB of a camera without dB is the least that it amplifies."""
+    """Return the configured gain in the camera's unit; without dB, 0 dB is the camera's smallest gain."""
     if config.gain is not None:
         return config.gain
     if _knows_db(camera):
@@ -159,7 +159,7 @@ def _wanted_gain(camera: Any, config: CameraConfig) -> float:
 
 
 def read_settings(camera: Any) -> dict[str, object]:
-    """Reads the settings back; JSON types only."""
+    """Read the settings back; JSON types only."""
     x, y, width, height = _region(camera)
     gain = camera.get_gain() if camera.is_gain_available() else 0.0
     told: dict[str, object] = {
@@ -180,7 +180,7 @@ def read_settings(camera: Any) -> dict[str, object]:
 
 
 def require_settings(camera: Any, wanted_us: float, applied: Applied) -> tuple[float, float]:
-    """Exposure (µs) and gain (its unit) as they are; CameraError when they are not what was asked for."""
+    """Read exposure (µs) and gain (camera's unit); CameraError when they are not as set."""
     exposure_us = float(camera.get_exposure_time())
     gain = float(camera.get_gain()) if camera.is_gain_available() else 0.0
     require_exposed(exposure_us, gain, wanted_us, applied)
@@ -190,7 +190,7 @@ def require_settings(camera: Any, wanted_us: float, applied: Applied) -> tuple[f
 
 
 def require_exposed(exposure_us: float, gain: float, wanted_us: float, applied: Applied) -> None:
-    """CameraError when a frame says that it was exposed otherwise."""
+    """Check a frame's own exposure (µs) and gain; CameraError when they are not as set."""
     off_us = abs(exposure_us - wanted_us)
     if off_us > _EXPOSURE_TOLERANCE * wanted_us or abs(gain - applied.gain) > _GAIN_TOLERANCE:
         raise _changed(exposure_us, gain, wanted_us, applied)

@@ -1,8 +1,8 @@
-"""News from the robot: how late they may be, and what made them late. Pure; knows no clock.
+"""News (state messages) from the robot: how late they may be, and what delayed them. Pure functions.
 
-The one rule (docs/operator/safety.md). An arm is in motion from the moment that a move is sent until news
-that came later say that it ended, and while a person guides it: `MOVING_S` without news end that. Otherwise
-it rests, and late news are waited for up to `RESTING_S`: who decides decides on them, never on older ones.
+The rule (docs/operator/safety.md): an arm counts as in motion from the moment that a move is sent until later
+news say that it ended, and while a person guides it; it is stopped after `MOVING_S` without news. Otherwise
+it rests, and late news are waited for up to `RESTING_S`. No decision is made on older news.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from station.cell.errors import StaleStateError
 from station.devices.ur_condition import APPROVE_AGAIN
 
 CURRENT_S = 0.1
-"""News that are not older tell where the arm is now."""
+"""Largest age of news that count as the present state of the arm."""
 MOVING_S = 0.25
 RESTING_S = 1.0
 TOLD_S = 0.3
-"""News of a resting arm that were later than this are told of, with what made them late."""
+"""Delay of a resting arm's news above which the delay and its cause are reported."""
 SILENCE_S = 0.15
-"""A silence that can have tripped the control program's watchdog (1/5 s, and ticks)."""
+"""Shortest silence that can have tripped the control program's watchdog (0.2 s less some cycles)."""
 
 
 class Delay(StrEnum):
-    """What came late. The values are the error's codes."""
+    """Cause of a delay; the values are error codes."""
 
     COMPUTER = "computer-late"
     CONTROLLER = "controller-late"
@@ -36,24 +36,24 @@ class Delay(StrEnum):
 
 
 class Evidence(NamedTuple):
-    """What is known of the time before an arm was stopped."""
+    """Measurements of the time before an arm was stopped, from which the cause of a delay is derived."""
 
     pause_s: float
-    """The longest time in which this computer did not kick the control program's watchdog; 0: it is not
-    known, or does not matter."""
+    """Longest time in which this computer did not reset the control program's watchdog; 0: not known, or
+    irrelevant."""
     gap_s: float
-    """The longest time between the arrivals of two states, as the kernel stamped them."""
+    """Longest time between the arrivals of two states, by the kernel's stamps."""
     clock_gap_s: float
-    """How far the controller's clock went on in that time beyond the period of its states."""
+    """Advance of the controller's clock over that time, less the period of its states."""
     loopback: bool
-    """No network lies between this computer and the controller."""
+    """True when the controller runs on this computer, with no network between."""
 
     @property
     def delay(self) -> Delay | None:
-        """None: nothing was late for long enough to stop an arm.
+        """Derive the cause; None: no delay was long enough to stop an arm.
 
-        A busy computer holds up all three, so it is looked at first. A controller that was held up leaves
-        states out; what a network holds up still comes.
+        A busy computer delays everything, so it is tested first. A busy controller skips states, a slow
+        network only delays them.
         """
         if self.pause_s > max(SILENCE_S, self.gap_s / 2):
             return Delay.COMPUTER
@@ -64,7 +64,7 @@ class Evidence(NamedTuple):
         return Delay.NETWORK
 
     def error(self, effect: str = ": the arm was stopped") -> StaleStateError | None:
-        """What a person is told; None without a delay."""
+        """Make the error for people; None without a delay. `effect`: what followed from it."""
         pause_ms, gap_ms = 1000 * self.pause_s, 1000 * self.gap_s
         match self.delay:
             case Delay.COMPUTER:
@@ -94,8 +94,10 @@ class Evidence(NamedTuple):
 def largest_gap(
     history: Iterable[RobotState], since_s: float, until_s: float, period_s: float
 ) -> tuple[float, float]:
-    """The longest time between two arrivals that ended within a span (host monotonic), and how much of it
-    the controller's clock left out, seconds."""
+    """Find the longest time (s) between two arrivals, the later one within a span (host monotonic).
+
+    The second value is by how much more than a period the controller's clock advanced in it (s).
+    """
     gaps = (
         ((b.host_monotonic_ns - a.host_monotonic_ns) / 1e9, b.controller_s - a.controller_s - period_s)
         for a, b in pairwise(state.stamps for state in history)
@@ -105,13 +107,13 @@ def largest_gap(
 
 
 def longest_silence_s(kicks_s: Iterable[float], since_s: float, until_s: float) -> float:
-    """The longest time without a kick of the watchdog that began within a span, up to its end; 0: no kick."""
+    """Find the longest time (s) without a reset of the watchdog within a span; 0: there was no reset."""
     inside = [kick_s for kick_s in kicks_s if since_s < kick_s < until_s]
     return max((b - a for a, b in pairwise([*inside, until_s])), default=0.0)
 
 
 def is_loopback(host: str) -> bool:
-    """An address of this very computer. A name may be anything: it is taken for another's."""
+    """Tell whether an address is a loopback one. A host name counts as another computer."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

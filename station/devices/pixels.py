@@ -1,4 +1,4 @@
-"""Pixel formats as GenICam names them: bytes from the wire to images, and back for the simulated camera."""
+"""GenICam pixel formats: decoding bytes to images, and encoding for the simulated camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FORMATS = (
 
 
 def bits_per_pixel(pixel_format: str) -> int:
-    """On the wire. CameraError for a format that is not supported."""
+    """Return the bits per pixel on the wire. CameraError for a format that is not supported."""
     if pixel_format not in FORMATS:
         raise CameraError(
             f"pixel format '{pixel_format}' is not supported",
@@ -42,9 +42,9 @@ def bits_per_pixel(pixel_format: str) -> int:
 
 
 def decode(data: bytes, width: int, height: int, pixel_format: str) -> Pixels:
-    """(height, width) uint8 or uint16 (10 and 12 bits keep their values), or (height, width, 3) uint8 BGR.
+    """Decode to (height, width) uint8 or uint16 (10 and 12 bits unscaled), or (height, width, 3) uint8 BGR.
 
-    A colour mosaic stays as it came. CameraError when there are too few bytes.
+    A Bayer mosaic stays a mosaic. CameraError when there are too few bytes.
     """
     size = (width * height * bits_per_pixel(pixel_format) + 7) // 8
     if len(data) < size:
@@ -67,7 +67,11 @@ def decode(data: bytes, width: int, height: int, pixel_format: str) -> Pixels:
 
 
 def _unpack(raw: NDArray[np.uint8], count: int, pixel_format: str) -> NDArray[np.uint16]:
-    """Packed: two pixels in three bytes, low bits in the middle one (GigE Vision 1). …p: a bit stream."""
+    """Unpack 10 or 12 bit pixels.
+
+    Formats "…Packed" (GigE Vision 1) hold two pixels in three bytes, the low bits in the middle one; "…p" are
+    a bit stream.
+    """
     if pixel_format in ("Mono10Packed", "Mono12Packed"):
         triple = np.resize(raw, (count + 1) // 2 * 3).reshape(-1, 3).astype(np.uint16)
         shift, mask = (4, 0xF) if pixel_format == "Mono12Packed" else (2, 0x3)
@@ -82,7 +86,7 @@ def _unpack(raw: NDArray[np.uint8], count: int, pixel_format: str) -> NDArray[np
 
 
 def encode(grey: NDArray[np.uint8], pixel_format: str) -> bytes:
-    """A grey image as a camera would send it; colour formats carry grey."""
+    """Encode a grey image (height, width) in a pixel format; in colour formats all channels are grey."""
     wide = grey.astype(np.uint16)
     if bits_per_pixel(pixel_format) == 8:
         return grey.tobytes()

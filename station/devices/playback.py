@@ -1,6 +1,6 @@
-"""Plays a recording as camera and robot together.
+"""Playback of a recording as camera and robot.
 
-Nothing played is ever taken for real: its driver is `playback`, and so is the source of what is recorded.
+Driver and source of new recordings are `playback`, so that played-back data never pass for real.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from station.devices.frames import CameraCounts, FrameTiming
 
 STATE_RATE_HZ = 100.0
 MOVE_S = 0.2
-"""Every move takes this long, whatever the recorded one took."""
+"""Duration of every played-back move."""
 _SAME_JOINTS_RAD = 0.02
 _STAMP_BOUND_S = 1e-6
 _HOST_CLOCK = ClockFit(
@@ -52,12 +52,12 @@ _HOST_CLOCK = ClockFit(
     latency_s=_STAMP_BOUND_S,
     span_s=0.0,
 )
-"""Played images are stamped by the host's own clock."""
+"""Clock of played-back images: the host's own."""
 CONFIG_NAME = "config.yaml"
 
 
 class PlaybackCamera:
-    """`station.devices.base.Camera` that shows what a played robot looks at."""
+    """Camera that returns the recorded image of the view at which the played-back robot stands."""
 
     def __init__(self, robot: PlaybackRobot) -> None:
         recorded = robot.camera
@@ -92,7 +92,7 @@ class PlaybackCamera:
         return {"device": str(self._robot.path)}
 
     async def glimpse(self) -> Image | None:
-        """None: a played image was taken once, how it moved then cannot be seen in it."""
+        """Return None: a recorded image cannot show whether the image moves now."""
         return None
 
     async def preview(self) -> Image | None:
@@ -105,10 +105,7 @@ class PlaybackCamera:
 
 
 class PlaybackRobot:
-    """`station.devices.base.Robot` that stands where the recorded arm stood.
-
-    It can move only to joints that the recording has an image from.
-    """
+    """Robot that stands where the recorded arm stood, and moves only to joints of recorded images."""
 
     def __init__(self, recording: Path) -> None:
         """Raises RobotError for a recording that cannot be read or has no joints."""
@@ -143,7 +140,7 @@ class PlaybackRobot:
         return Plan(self.identity.model, self._recording.info.mount, poses, note="playback")
 
     def picture(self) -> Image:
-        """Image of the view the arm stands at; CameraError between two, or when it cannot be decoded."""
+        """Return the image of the view at which the arm stands. CameraError during a move, or undecodable."""
         view, moving = self._standing()
         if moving:
             raise CameraError("playback has images only from where the recorded arm stood", code="no-image")
@@ -209,7 +206,7 @@ class PlaybackRobot:
         self.control = True
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
-        """RobotError where the recording was never at these joints."""
+        """Move to joints (6,), rad; RobotError where the recording has no image from there."""
         target = np.asarray(joints_rad, dtype=float)
         off = [float(np.abs(np.array(v.joints_rad) - target).max()) for v in self.views]
         nearest = int(np.argmin(off))
@@ -246,7 +243,7 @@ class PlaybackRobot:
             return self._to, self._fraction(time.monotonic()) < 1
 
     def _fraction(self, at_s: float) -> float:
-        """Share of the current move, 0 … 1."""
+        """Return the share of the current move that is done, 0 … 1."""
         if self._halted_at is not None:
             return self._halted_at
         return float(np.clip((at_s - self._move_start_s) / MOVE_S, 0.0, 1.0))
@@ -264,7 +261,7 @@ def _joints(view: View) -> Vector6:
 
 
 def playback_cell(recording: Path) -> Cell:
-    """Everything is marked as playback; its plan is the recorded poses.
+    """Make a cell that plays back a recording; its plan is the recorded poses.
 
     RobotError or ConfigError for a recording that is damaged, has no joints or no configuration in it.
     """

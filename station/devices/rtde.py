@@ -1,4 +1,4 @@
-"""RTDE, the real-time data exchange of Universal Robots controllers (version 2): packets and questions.
+"""RTDE, the real-time data exchange of Universal Robots controllers (version 2): packets and handshake.
 
 One packet = uint16 size of the whole packet, uint8 type, payload; everything big-endian. Shared by the
 state reader (client) and the simulated controller (server). Source: Universal Robots, "Real-Time Data
@@ -142,13 +142,13 @@ def packet(kind: PacketType, payload: bytes = b"") -> bytes:
 
 
 class PacketReader:
-    """Cuts a byte stream into packets. Holds at most one unfinished packet (64 kB)."""
+    """Splits a byte stream into packets; buffers at most one incomplete packet (64 kB)."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
-        """All packets (type, payload) that are complete now. Raises RtdeError on an impossible size."""
+        """Add bytes; return the packets (type, payload) now complete. RtdeError for an impossible size."""
         data = self._rest + data if self._rest else data
         packets = []
         start, end = 0, len(data)
@@ -166,7 +166,7 @@ class PacketReader:
 
 @dataclass(frozen=True)
 class Recipe:
-    """An agreed list of variables, and how their values lie in a data packet."""
+    """List of variables agreed with the controller, and the layout of their values in a data packet."""
 
     id: int
     names: tuple[str, ...]
@@ -182,11 +182,11 @@ class Recipe:
         object.__setattr__(self, "packer", struct.Struct(">HBB" + codes))
 
     def pack(self, elements: Sequence[bool | int | float]) -> bytes:
-        """Flat elements (vectors spread out) → a whole data packet."""
+        """Pack elements (vectors flattened) to a complete data packet."""
         return self.packer.pack(self.packer.size, PacketType.DATA, self.id, *elements)
 
     def unpack_elements(self, payload: bytes) -> tuple[float, ...]:
-        """A data packet's payload (recipe id first) → flat elements. Raises RtdeError on a wrong length."""
+        """Unpack a data packet's payload (recipe id first) to elements. RtdeError for a wrong length."""
         if len(payload) != self.packer.size - HEADER.size:
             raise RtdeError(
                 f"a data packet of recipe {self.id} has {len(payload)} bytes, "
@@ -203,7 +203,7 @@ def join_names(names: Iterable[str]) -> bytes:
 
 
 def split_names(payload: bytes) -> tuple[str, ...]:
-    """Comma-separated names; a trailing comma is allowed. Raises RtdeError when they are not ASCII."""
+    """Split comma-separated names; a trailing comma is allowed. RtdeError when they are not ASCII."""
     try:
         text = payload.decode("ascii")
     except UnicodeDecodeError:
@@ -212,7 +212,7 @@ def split_names(payload: bytes) -> tuple[str, ...]:
 
 
 class RtdeLink:
-    """On a connected socket. Raises RtdeError, OSError, and TimeoutError for an answer that does not come."""
+    """RTDE client on a connected socket. Calls raise RtdeError, OSError, and TimeoutError without answer."""
 
     def __init__(self, link: socket.socket) -> None:
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -220,7 +220,7 @@ class RtdeLink:
         self._link = link
         self.packets = PacketReader()
         self.pending: deque[tuple[int, bytes]] = deque()
-        """Data that arrived and was not yet read: after `start`, the first data."""
+        """Packets received with an answer and not yet handled: after `start`, the first data packets."""
         accepted = self._ask(PacketType.PROTOCOL_VERSION, struct.pack(">H", PROTOCOL_VERSION))
         if accepted != b"\x01":
             raise RtdeError(f"the controller does not speak RTDE version {PROTOCOL_VERSION}")
@@ -233,12 +233,12 @@ class RtdeLink:
         return major, minor, bugfix, build
 
     def outputs(self, rate_hz: float, names: Sequence[str]) -> Recipe:
-        """Asks for these variables, so many times a second."""
+        """Request these output variables at `rate_hz`; return their recipe."""
         answer = self._ask(PacketType.OUTPUT_SETUP, struct.pack(">d", rate_hz) + join_names(names))
         return _recipe(answer, names)
 
     def inputs(self, names: Sequence[str]) -> Recipe:
-        """Claims these variables for this connection. RtdeError `registers-in-use` where another owns one."""
+        """Claim these input variables; RtdeError `registers-in-use` where another connection has one."""
         answer = self._ask(PacketType.INPUT_SETUP, join_names(names))
         if IN_USE in split_names(answer[1:]):
             raise RtdeError(
@@ -253,7 +253,7 @@ class RtdeLink:
             raise RtdeError("the controller refused to send its state")
 
     def _ask(self, kind: PacketType, payload: bytes = b"") -> bytes:
-        """The reply's payload; what else arrives before it (messages) is skipped."""
+        """Send a request; return the payload of its reply. Messages before it are skipped."""
         self._link.sendall(packet(kind, payload))
         give_up_s = time.monotonic() + HANDSHAKE_S
         while time.monotonic() < give_up_s:

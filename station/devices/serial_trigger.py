@@ -1,6 +1,6 @@
-"""The serial trigger box, and the plain mode that pulses RTS or DTR of any USB-serial adapter.
+"""Serial trigger box, and a mode that pulses RTS or DTR of any USB-serial adapter.
 
-The only module that touches `serial`. All waiting happens in one worker thread.
+The only module that uses `serial`. All waiting happens in one worker thread.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from station.devices.frames import TriggerPulse
 
 ANSWER_TIMEOUT_S = 1.0
 HANDSHAKE_TIMEOUT_S = 3.0
-"""Many boards restart when their port is opened, and take two seconds for it."""
+"""Time for the first answer: many boards restart when their port is opened, which takes two seconds."""
 BAD_LINES_LIMIT = 50
 _COUNTS = 1 << 32
 LINE_LIMIT = 120
-"""Bytes; a longer line is garbage."""
+"""Longest valid line, bytes."""
 BAUD = 115_200
 PRODUCT = "calibration-trigger"
 PROTOCOL = "1"
 
 
 def checksum(text: str) -> str:
-    """XOR of all bytes as two hexadecimal digits, as in NMEA 0183."""
+    """Compute the XOR of all bytes as two hexadecimal digits, as in NMEA 0183."""
     return f"{reduce(lambda a, b: a ^ b, text.encode('ascii'), 0):02X}"
 
 
@@ -38,29 +38,29 @@ def frame(text: str) -> bytes:
 
 
 class LineReader:
-    """Bytes in, good lines out. Whatever else comes is counted and skipped up to the next newline."""
+    """Splits bytes into lines with a valid checksum; other lines are counted and skipped."""
 
     def __init__(self) -> None:
         self.bad_lines = 0
         self._pending = b""
 
     def feed(self, data: bytes) -> list[str]:
-        """Return the complete good lines, without checksum. Never raises; memory is bounded."""
+        """Add bytes; return the complete valid lines, without checksum. Never raises; memory is bounded."""
         *lines, rest = (self._pending + data).split(b"\n")
-        self._pending = rest[: LINE_LIMIT + 1]  # how much too long a line is does not matter
+        self._pending = rest[: LINE_LIMIT + 1]  # enough to see that a line is too long
         texts = [_checked(line) for line in lines]
         self.bad_lines += texts.count(None)
         return [text for text in texts if text is not None]
 
     def restart(self) -> None:
-        """Forget a line that has only begun: what comes next starts a new one."""
+        """Forget an incomplete line: the next byte begins a new one."""
         self.bad_lines += bool(self._pending)
         self._pending = b""
 
 
 def _checked(line: bytes) -> str | None:
     try:
-        # A space is under the checksum; a carriage return stands behind it.
+        # Trailing spaces are part of the checksum, a carriage return follows it.
         text, _, given = line.decode("ascii").rstrip("\r").rpartition("*")
     except UnicodeDecodeError:
         return None
@@ -68,7 +68,7 @@ def _checked(line: bytes) -> str | None:
 
 
 class SerialTrigger:
-    """`station.devices.base.Trigger`. `open_port` is for tests of adapters that no pty has."""
+    """Trigger box behind `devices.base.Trigger`. `open_port`: for tests of lines that a pty does not have."""
 
     def __init__(self, config: TriggerConfig, open_port: Callable[[str], Any] | None = None) -> None:
         self._config = config
@@ -79,16 +79,16 @@ class SerialTrigger:
         self._boot_id = ""
         self._opened = False
         self._count = self._first_count = 0
-        """Pulses, unwrapped: the box's own count starts over at 2^32."""
+        """Pulses now and at opening, unwrapped: the box's own count overflows at 2^32."""
 
     @property
     def bad_lines(self) -> int:
-        """Garbage seen on the line so far."""
+        """Number of invalid lines so far."""
         return self._lines.bad_lines
 
     @property
     def pulses(self) -> int:
-        """Since it was opened, whoever caused them."""
+        """Pulses since the box was opened, from any cause."""
         return self._count - self._first_count
 
     async def open(self) -> str:
@@ -152,12 +152,12 @@ class SerialTrigger:
 
     def _fire(self) -> TriggerPulse:
         if self._port is None and self._opened:
-            self._connect()  # it was lost; the next go begins with a new count
+            self._connect()  # it was lost; counting restarts
         asked_ns = time.monotonic_ns()
         try:
             boot_id, count, _ = self._ask(f"FIRE {self._config.pulse_us}", "FIRED", 3)
         except _BoxSilentError:
-            # Whether the camera was triggered decides what its next frame belongs to: ask.
+            # Ask whether the camera was triggered: its next frame must not be taken for another trigger's.
             before = self._count
             self._settle_count(*self._status())
             if (self._count - before) != 1:
@@ -183,7 +183,7 @@ class SerialTrigger:
         self._count += (count - self._count) % _COUNTS
 
     def _status(self) -> tuple[str, int]:
-        """Boot id, pulses so far."""
+        """Ask for boot id and count of pulses."""
         try:
             boot_id, count, _ = self._ask("STATUS?", "STATUS", 3)
         except _BoxSilentError as error:
@@ -191,7 +191,7 @@ class SerialTrigger:
         return boot_id, _number(count)
 
     def _ask(self, request: str, answer: str, fields: int, timeout_s: float = ANSWER_TIMEOUT_S) -> list[str]:
-        """The answer's fields. Lines that are no answer to this are skipped; garbage is counted."""
+        """Send a request; return the fields of its answer. Other lines are skipped, invalid ones counted."""
         port = self._require_port()
         end_s = time.monotonic() + timeout_s
         try:

@@ -1,7 +1,7 @@
-"""A Universal Robots arm behind `devices.base.Robot`: one control process per approval, two ways to stop.
+"""A Universal Robots arm behind `devices.base.Robot`: one control process per approval, two stop paths.
 
-Everything here runs in one event loop and returns to it within milliseconds; the state stream has its own
-thread, ur_rtde its own process. Rules: docs/operator/safety.md, faults: docs/contributor/fault-tests.md.
+Runs in one event loop and never blocks it for more than milliseconds; the state stream has its own thread,
+ur_rtde its own process. Rules: docs/operator/safety.md, faults: docs/contributor/fault-tests.md.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.005
 TOOL_S = 0.04
-"""Between two looks at TCP and payload in a move: each takes the loop up to a millisecond."""
+"""Period of the checks of TCP and payload during a move; each takes up to a millisecond."""
 ONE_WAY_S = 1.0
 RESTING_RAD_S = 0.005
 STOP_WAIT_S = 0.05
 OUTLIVED_S: dict[ControlPath, float] = {"ur_rtde": 0.3, "script": 0.6}
-"""A program that still plays so long after a pause began did not stop for it. Our script plays until the arm
-rests: at its fastest it brakes for 0.26 s."""
+"""If the control program still plays so long after a pause of this computer began, that pause did not stop
+it. The station's own script plays until the arm rests, after up to 0.26 s of braking."""
 OUR_PROGRAMS = ("rtde_control", "station_control")
 REPLACED_S = 0.1
-"""A program that replaces ours plays so soon after ours ended."""
+"""Time after the end of our program within which another one that replaced it starts to play."""
 MAY_BE_REPLACED = ("program-ended", "watchdog", "off-path", "ended-short", "no-progress")
 PROGRAM_START_NS = 200_000_000
 LEFTOVER_WAIT_NS = 2_000_000_000
@@ -72,38 +72,38 @@ def control_path(config: RobotConfig) -> ControlPath:
 
 @cache
 def library_installed() -> bool:
-    """Looked up once: what drives an arm does not change under a running daemon."""
+    """Tell whether ur_rtde is installed; looked up once, so that the driver stays the same while running."""
     return find_spec("rtde_control") is not None
 
 
 def control_trouble(path: str) -> tuple[str, str]:
-    """Say what speaks against driving an arm that way, and what to do; empty: nothing."""
+    """Say why this control path cannot be used, and the remedy; both empty: it can."""
     if path == "ur_rtde" and not library_installed():
         return "ur_rtde is not installed", LIBRARY_REMEDY
     return "", ""
 
 
 class UrRobot(UrLink):
-    """`log_dir`: where the control process's words go."""
+    """Universal Robots arm with control. `log_dir`: folder for the control process's log."""
 
     def __init__(self, config: RobotConfig, log_dir: Path) -> None:
         super().__init__(config)
         self.notice = ""
-        """Notice to a person while a move is under way, though it is no fault; empty = nothing."""
+        """Hint for people during a move that is no fault, such as a low speed slider; empty: none."""
         self._log_path = log_dir / "control.log"
         self._child: ControlChild | None = None
         self.control = False
-        """The control program runs and obeys us."""
+        """True while the control program runs on the robot and takes moves from this station."""
         self._moving = self._sent = False
         self._stop_reason = self._link_loss = ""
         self._ended_by: RobotError | None = None
-        """What ended control between two moves."""
+        """Error that ended control between two moves."""
         self._one_way_s: float | None = None
-        """When a stop test gave its one way (host monotonic); until then, and afterwards, None."""
+        """When the stop test triggered its single stop (host monotonic); None before and after it."""
         self._played_s = 0.0
         """When the control program was last seen playing (host monotonic)."""
         self._tool_looked_s = 0.0
-        """When TCP and payload were last looked at in a move."""
+        """When TCP and payload were last checked during a move (host monotonic)."""
         self._background: set[asyncio.Task[object]] = set()
 
     @property
@@ -119,14 +119,14 @@ class UrRobot(UrLink):
         return self._sent or super().in_motion
 
     async def start_control(self) -> None:
-        """Spawns the control process, which loads its program; returns when that heard a first heartbeat.
+        """Start the control process, which loads its program; return when that took a first heartbeat.
 
-        Only in answer to a motion approval. Raises RobotError.
+        Call only after a motion approval. Raises RobotError.
         """
         if self._child is not None:
             raise RobotError("control is already started", code="control-started")
         self._stop_reason, self._ended_by = "", None
-        await self.idle()  # a child that is still ending holds the registers
+        await self.idle()  # a child that is still ending keeps the registers
         await ready(self)
         await self._may_start()
         if why := self._why_stopped():
@@ -147,15 +147,15 @@ class UrRobot(UrLink):
         self.control, self._played_s = True, time.monotonic()
 
     async def _heard(self, child: ControlChild) -> None:
-        """Raises what kept the program from taking the first heartbeat."""
+        """Wait for the program's first heartbeat; raise the reason why it was not taken."""
         try:
             await child.heard()
         except RobotError as error:
             raise await self._look_again(self._program_trouble(self.latest()) or error, child) from None
 
     async def _may_start(self) -> None:
-        """Raises RobotError, with the remedy, while starting control would disturb somebody or must fail."""
-        # A connection that was opened in local mode stays refused: e-Series want a new one.
+        """Check that control can be started without replacing a program; else RobotError with remedy."""
+        # e-Series controllers keep refusing commands on a connection that was opened in local mode.
         dashboard = await self.renew_dashboard()
         self.remote = await dashboard.remote()
         state = await fresh(self)
@@ -170,12 +170,12 @@ class UrRobot(UrLink):
         await check_port(self.config.host, SCRIPT_PORT)
 
     def heartbeat(self) -> None:
-        """Called by the session loop at least every 50 ms while control lives; without it the arm stops."""
+        """Keep the arm's watchdog from stopping it: call at least every 50 ms while control is started."""
         if self._child is not None:
             self._child.beat()
 
     async def end_control(self) -> None:
-        """Stops the script and ends the child."""
+        """Stop the control program and end its process."""
         child, self._child, self.control = self._child, None, False
         if child is None:
             return
@@ -183,10 +183,10 @@ class UrRobot(UrLink):
         await self._stop_leftover_program()
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
-        """Moves the joints and returns when arrived. Whatever else ends it stops the arm and control.
+        """Move the joints; return on arrival. Any other end of the move stops the arm and ends control.
 
-        Raises RobotError, SafetyStopError, StaleStateError. Paths are checked by the planner; here only the
-        caps on speed, acceleration and joint range are kept.
+        Raises RobotError, SafetyStopError, StaleStateError. The planner checks paths; here only the limits of
+        speed, acceleration and joint range are enforced.
         """
         check_goal(joints_rad, speed_rad_s, acceleration_rad_s2, self.model.joint_limit_rad)
         child = self._child
@@ -217,19 +217,19 @@ class UrRobot(UrLink):
             self.notice, self._one_way_s = "", None
 
     async def _ready_to_move(self, child: ControlChild) -> None:
-        """Returns with current news of an arm that may move and a heartbeat that was just heard."""
+        """Wait until the state is current, the arm may move, and the control process heard a heartbeat."""
         while True:
             await ready(self)
             await child.heard()
             if self._child is not child:
-                raise _stopped()  # while we waited
+                raise _stopped()  # the arm was stopped during the wait
             if self.check() is not None:
                 return
 
     async def _follow(
         self, watch: MoveWatch, child: ControlChild, sending: Coroutine[object, object, None]
     ) -> None:
-        """Sends the move and watches it until the arm arrived."""
+        """Send the move and watch it until the arm has arrived."""
         sent = asyncio.ensure_future(sending)
         try:
             while not await self._step(watch, child, sent):
@@ -238,7 +238,7 @@ class UrRobot(UrLink):
             sent.cancel()
 
     async def _step(self, watch: MoveWatch, child: ControlChild, sent: asyncio.Future[None]) -> bool:
-        """True when the arm arrived."""
+        """Check the move once; True when the arm has arrived."""
         if self._stop_reason:
             raise _stopped(f": {self._stop_reason}")
         if sent.done():
@@ -256,7 +256,7 @@ class UrRobot(UrLink):
         return False
 
     def _explain(self, error: BaseException, child: ControlChild) -> BaseException:
-        """The cause behind a symptom, as far as it is known at once: STOP first, then safety, the link."""
+        """Find the cause of an error as far as known at once: STOP, then a safety stop, then a lost link."""
         if not isinstance(error, RobotError):
             return error
         if self._stop_reason:
@@ -266,13 +266,13 @@ class UrRobot(UrLink):
         stop = safety_stop(state) or not_powered(state) if state is not None else None
         if stop is not None:
             return stop
-        if self._link_loss:  # the link may be on its way back already
+        if self._link_loss:  # even if the link is back by now
             return link_lost(self._link_loss)
-        child.read_waiting()  # its last words say when it kicked; after the stop there are no more
+        child.read_waiting()  # its last messages tell when the watchdog was reset
         return error
 
     async def _look_again(self, error: BaseException, child: ControlChild) -> BaseException:
-        """What only news tell that come after the stop: a safety stop, the arm's power, the switch to local
+        """Find a cause that only news after the stop tell: a safety stop, lost power, the switch to local
         control, and what was late when the watchdog or late news ended the program."""
         if not isinstance(error, RobotError) or isinstance(error, SafetyStopError):
             return error
@@ -297,7 +297,7 @@ class UrRobot(UrLink):
         return program_ended(RuntimeState.STOPPED) if error.code == "watchdog" else error
 
     def _evidence(self, child: ControlChild, late: bool) -> Evidence:
-        """What was late before the control program ended, or (`late`) since its last news."""
+        """Measure what was late before the control program ended, or (`late`) since the last news."""
         states = self.reader.history.copy() if self.reader is not None else ()
         ended = (s for s in states if s.runtime_state != RuntimeState.PLAYING)
         after_s = (s.stamps.host_monotonic_ns / 1e9 for s in ended)
@@ -308,9 +308,9 @@ class UrRobot(UrLink):
         return self.evidence(silence_s, since_s, until_s)
 
     async def _other_program(self, wait_s: float) -> str | None:
-        """Name of another program that began to play since ours was last seen playing; '' if it has none.
+        """Find a program of another client that started after ours: its name, '' if unnamed, None if none.
 
-        None: none did. It may have been ended by our own stop already.
+        Our own stop may already have ended it.
         """
         give_up_s = time.monotonic() + wait_s
         while True:
@@ -324,15 +324,15 @@ class UrRobot(UrLink):
             await asyncio.sleep(POLL_S)
 
     def _plays_again(self) -> bool:
-        """A program stopped and one played since ours was last seen playing."""
+        """Tell whether a program stopped, and one played, since ours was last seen playing."""
         states = self.reader.history.copy() if self.reader is not None else ()
         since = [s.runtime_state for s in states if s.stamps.host_monotonic_ns > self._played_s * 1e9]
         return RuntimeState.STOPPED in since and since[-1] == RuntimeState.PLAYING
 
     async def stop(self, reason: str) -> None:
-        """Decelerates now, by both paths; idempotent, in any state, never raises. Control ends with it.
+        """Decelerate now, by both stop paths, and end control; idempotent, in any state, never raises.
 
-        Without control of ours the dashboard's stop is sent all the same: it ends a foreign program too.
+        The dashboard's stop is sent also without control: it ends another client's program, too.
         """
         self._stop_reason = self._stop_reason or reason
         child, self._child, self.control = self._child, None, False
@@ -344,15 +344,15 @@ class UrRobot(UrLink):
                 reply = self.dashboard.send(STOP)
         except Exception:
             log.exception("a path of the stop failed")
-        self._later(self._finish_stop(child, reply))  # whatever failed above
+        self._later(self._finish_stop(child, reply))  # even if a path failed above
         both = (reply, child.stop_acknowledged if child is not None else None)
         if waits := [w for w in both if w is not None]:
             await asyncio.wait(waits, timeout=STOP_WAIT_S)
 
     def stop_one_way(self, way: StopWay) -> None:
-        """Ends the move under way by one way alone: the others follow at rest, or after `ONE_WAY_S`.
+        """End the move by only one stop path, for a stop test; others follow at rest or after `ONE_WAY_S`.
 
-        For a stop test. STOP, a lost lease and a fault of the session use all ways at once, then too.
+        STOP, lost control and faults use all paths at once, also during a stop test.
         """
         child = self._child
         if child is None:
@@ -369,7 +369,7 @@ class UrRobot(UrLink):
             raise RobotError("the dashboard is not connected", code="dashboard")
 
     async def _one_way_ends(self) -> None:
-        """Waits for the rest of an arm that one way alone was to stop, but not for long."""
+        """Wait, at most `ONE_WAY_S`, until an arm that was stopped by one path alone rests."""
         while self._one_way_s is not None and time.monotonic() < self._one_way_s + ONE_WAY_S:
             await asyncio.sleep(POLL_S)
             try:
@@ -379,12 +379,12 @@ class UrRobot(UrLink):
                 return
 
     async def idle(self) -> None:
-        """Returns when everything behind a stop is done: control ended, its process gone."""
+        """Wait until a stop is completely carried out: control ended, its process gone."""
         while self._background:
             await asyncio.wait(self._background)
 
     async def _finish_stop(self, child: ControlChild | None, reply: asyncio.Future[str] | None) -> None:
-        """Behind the stop: the dashboard by a new connection if it did not answer, the end of the child."""
+        """Complete a stop: repeat the dashboard's on a new connection if it did not answer; end the child."""
         answered = reply is not None and await came(reply, STOP_WAIT_S)
         ending = [child.end_after_stop(STOP_WAIT_S)] if child is not None else []
         if not answered:
@@ -394,14 +394,16 @@ class UrRobot(UrLink):
             await self._stop_leftover_program()
 
     async def _stop_leftover_program(self) -> None:
-        """A killed child may have left its program playing, or one that it had just sent starts only now:
-        it moves nothing, but it would look like somebody else's. Waits for news that is newer than this."""
+        """Stop a program that a killed child left playing, or that starts only now.
+
+        It moves nothing, but would look like another client's. Waits for news newer than the kill.
+        """
         state = await self._state_after(time.monotonic_ns() + PROGRAM_START_NS, LEFTOVER_WAIT_NS)
         if state is not None and state.runtime_state == RuntimeState.PLAYING and self._child is None:
             await self._dashboard_stop_anew()
 
     async def _state_after(self, moment_ns: int, wait_ns: int) -> RobotState | None:
-        """The first news that came after the moment (monotonic clock); None: none within `wait_ns` of it."""
+        """Wait for the first state after a moment (monotonic ns); None: none within `wait_ns` of it."""
         while time.monotonic_ns() < moment_ns + wait_ns:
             sample = self.reader.newest if self.reader is not None else None
             if sample is not None and sample.state.stamps.host_monotonic_ns > moment_ns:
@@ -420,7 +422,7 @@ class UrRobot(UrLink):
             log.warning("dashboard stop: %s", error)
 
     def on_link_lost(self, why: str) -> None:
-        """ur_rtde would now reconnect by itself and load its program again: its process ends first."""
+        """End the control process at once: ur_rtde would reconnect by itself and load its program again."""
         self._link_loss = why
         if self._child is not None and not self._moving:
             self._later(self.stop(f"connection to the robot lost ({why})"))
@@ -428,7 +430,7 @@ class UrRobot(UrLink):
             self._child.kill()
 
     async def supervise_more(self) -> None:
-        """Between moves: a program, a process or a switch that failed ends control, and says why."""
+        """Between moves, end control when program or process ended or local control is on, and keep why."""
         await super().supervise_more()
         child = self._child
         if child is None or not self.control or self._moving:
@@ -453,13 +455,13 @@ class UrRobot(UrLink):
             self._played_s = state.stamps.host_monotonic_ns / 1e9
 
     def _program_trouble(self, state: RobotState) -> RobotError | None:
-        """Say what state and dashboard hold against the control program."""
+        """Find what is wrong with the control program by state and dashboard; None: nothing."""
         if self.remote is False:
             return _local_control()
         return safety_stop(state) or not_powered(state) or program_not_running(state)
 
     async def close(self) -> None:
-        """Stops what moves, ends control and every connection."""
+        """Stop the arm, end control and close every connection."""
         if self._moving:
             await self.stop("the station is closing the robot")
         await self.end_control()

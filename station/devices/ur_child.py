@@ -1,4 +1,4 @@
-"""The parent's side of the control process: one per approval, deadlines on everything, killed on doubt."""
+"""Parent's side of the control process: one per approval, a deadline for every call, killed on any doubt."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ log = logging.getLogger(__name__)
 CONNECT_S = 8.0
 HEARD_S = 1.0
 HEARD_NS = 50_000_000
-"""Younger heartbeats leave a move time to get to the process, which takes none after 100 ms."""
+"""Largest age of the last heartbeat before a move is sent; the process refuses moves after 100 ms."""
 ACKNOWLEDGE_S = 1.0
 END_S = 1.0
 REAP_S = 2.0
 LOG_LIMIT_BYTES = 1_000_000
 STOP_DECELERATION = 4.0
-"""Of the joints, rad/s². From full speed the arm rests after 0.26 s, as with our own script."""
+"""Deceleration of the joints, rad/s². From full speed the arm rests after 0.26 s."""
 KEPT = 64
-"""Kicks of the watchdog that are remembered: more than a second of them."""
+"""Number of watchdog resets that are remembered: more than a second of them."""
 
 
 class _Answer(msgspec.Struct):
-    """A message of the control process (`ur_control`), or that it died."""
+    """Message of the control process (`ur_control`), or the news of its death."""
 
     tcp: tuple[float, ...] | None = None
     refused: ErrorData | None = None
@@ -61,36 +61,36 @@ _ANSWER = msgspec.json.Decoder(_Answer)
 
 
 class ControlChild:
-    """Belongs to the event loop it was started in. Not reusable: after `end` or `kill` start a new one."""
+    """The control process, of the event loop it was started in; after `end` or `kill` start a new one."""
 
     def __init__(self, process: subprocess.Popen[bytes], channel: socket.socket, log_path: Path) -> None:
         self._process = process
         self._channel = channel
-        channel.setblocking(False)  # the loop waits for no process, least of all for one that hangs
+        channel.setblocking(False)  # the event loop must not wait for a process that hangs
         self._log_path = log_path
         self._loop = asyncio.get_running_loop()
         self._ready: asyncio.Future[_Answer] = self._loop.create_future()
         self._kicked_ns = 0
-        """Time of the newest heartbeat that kicked the watchdog."""
+        """Time of the newest heartbeat that reset the watchdog (host monotonic)."""
         self._news = asyncio.Event()
         self._moves: dict[int, asyncio.Future[_Answer]] = {}
         self._number = 0
         self._beat_ns = 0
         self._answered_ns = 0
         self.kicks_s: deque[float] = deque(maxlen=KEPT)
-        """When the newest heartbeats kicked the watchdog (host monotonic)."""
+        """When the newest heartbeats reset the watchdog (host monotonic)."""
         self.stop_acknowledged: asyncio.Future[None] = self._loop.create_future()
         self.kicks_refused = False
-        """The child says that the control script does not take kicks any more."""
+        """True once the control program no longer accepts resets of its watchdog."""
         self.gone = asyncio.Event()
         """The process ended or was killed."""
         self._loop.add_reader(channel, self._receive)
 
     @classmethod
     def spawn(cls, host: str, log_path: Path, path: ControlPath = "ur_rtde") -> ControlChild:
-        """Starts the process (milliseconds). From the loop's thread: the child dies with that thread.
+        """Start the process (milliseconds). Call from the event loop's thread: the child dies with it.
 
-        Raises RobotError when this computer does not let it.
+        Raises RobotError when it cannot be started.
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command = [sys.executable, "-m", "station.devices.ur_control", path, host, str(theirs.fileno())]
@@ -118,7 +118,7 @@ class ControlChild:
         return self._process.pid
 
     async def ready(self, timeout_s: float = CONNECT_S) -> tuple[float, ...] | None:
-        """Waits for the control script to run; the TCP offset if readable. Kills it and raises RobotError."""
+        """Wait for the control program to run; return the TCP offset if readable. Kill it on RobotError."""
         try:
             async with asyncio.timeout(timeout_s):
                 answer = await asyncio.shield(self._ready)
@@ -128,7 +128,7 @@ class ControlChild:
             raise self._trouble(
                 f"the control process was not ready within {timeout_s:g} s and was killed", limit_s=timeout_s
             ) from None
-        self._beat_ns = 0  # beats that waited for it to be ready are no sign of hanging
+        self._beat_ns = 0  # heartbeats unanswered until now are no sign that the process hangs
         if answer.refused is not None or answer.died:
             self.kill()
             await self.reap()
@@ -140,7 +140,7 @@ class ControlChild:
         return answer.tcp or None
 
     async def heard(self) -> None:
-        """Waits for a fresh heartbeat that kicked the watchdog: without, no move is taken. RobotError."""
+        """Wait until a fresh heartbeat reset the watchdog: moves are refused before. Raises RobotError."""
         try:
             async with asyncio.timeout(HEARD_S):
                 while time.monotonic_ns() - self._kicked_ns > HEARD_NS:
@@ -159,13 +159,13 @@ class ControlChild:
         self.check()
 
     def beat(self) -> None:
-        """Passes the session loop's heartbeat on. Never blocks: a child that does not read gets none."""
+        """Pass the session loop's heartbeat on. Never blocks; dropped when the child does not read."""
         now_ns = time.monotonic_ns()
         if self._send({"do": "beat", "ns": now_ns}) and self._beat_ns <= self._answered_ns:
             self._beat_ns = now_ns
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
-        """Asks for an asynchronous move and waits until the script has taken it. Raises RobotError."""
+        """Request an asynchronous move; return when the control program accepted it. Raises RobotError."""
         self._number += 1
         answer: asyncio.Future[_Answer] = self._loop.create_future()
         self._moves[self._number] = answer
@@ -194,11 +194,11 @@ class ControlChild:
             raise RobotError(f"the move was not started: {reply.error}", code="move-refused")
 
     def stop(self) -> None:
-        """Puts the stop on the wire to the child, now. Never raises."""
+        """Send the stop request to the child now. Never raises."""
         self._send({"do": "stop", "deceleration": STOP_DECELERATION})
 
     def check(self, patience_s: float = ACKNOWLEDGE_S) -> None:
-        """Raises RobotError when the process died, hangs, or its script takes no kicks."""
+        """Raise RobotError when the process died or hangs, or its program accepts no watchdog resets."""
         if self.gone.is_set():
             raise self._death()
         if self._beat_ns > self._answered_ns and time.monotonic_ns() - self._beat_ns > patience_s * 1e9:
@@ -224,7 +224,7 @@ class ControlChild:
         return True
 
     async def end(self, timeout_s: float = END_S) -> None:
-        """Ends script and process in good order, by force when that takes too long. Reaps it."""
+        """End program and process in good order, or kill the process after `timeout_s`. Reaps it."""
         self._send({"do": "end"})
         try:
             async with asyncio.timeout(timeout_s):
@@ -232,11 +232,11 @@ class ControlChild:
         except TimeoutError:
             pass
         finally:
-            self.kill()  # cancelled, too: a process left behind would keep the robot's registers
+            self.kill()  # also when cancelled: a process left behind would keep the robot's registers
         await self.reap()
 
     async def end_after_stop(self, moment_s: float) -> None:
-        """Leaves a moment to pass the stop on, then ends the process."""
+        """Give the process `moment_s` to pass the stop on, then end it."""
         await asyncio.wait([self.stop_acknowledged], timeout=moment_s)
         self.kill()
         await self.reap()
@@ -248,7 +248,7 @@ class ControlChild:
         self._close()
 
     async def reap(self) -> None:
-        """Waits for the killed process; not for one that hangs in the kernel."""
+        """Wait for the killed process to end, with a limit, as it may hang in the kernel."""
         give_up_s = time.monotonic() + REAP_S
         while self._process.poll() is None:
             if time.monotonic() > give_up_s:
@@ -266,16 +266,16 @@ class ControlChild:
         return f" (exit code {code})"
 
     def read_waiting(self) -> None:
-        """Takes the messages that wait unread, because this computer was busy."""
+        """Read all waiting messages, without waiting for the event loop to do so."""
         while self._receive():
             pass
 
     def _receive(self) -> bool:
-        """Takes a message; False: there was none."""
+        """Read and handle one message; False: there was none."""
         try:
             message = self._channel.recv(65536)
         except (BlockingIOError, ConnectionResetError):
-            return False  # a reset tells of heartbeats it never read; its last words come with the next call
+            return False  # reset, because it died with unread heartbeats; its last messages can still be read
         except OSError:
             message = b""
         if not message:
@@ -314,7 +314,7 @@ class ControlChild:
 
 
 def _log(path: Path) -> BinaryIO:
-    """Open for more; what grew too long is put aside once."""
+    """Open a log for appending; one that grew too long is renamed, replacing the last one renamed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileNotFoundError):
         if path.stat().st_size > LOG_LIMIT_BYTES:

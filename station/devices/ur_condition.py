@@ -1,4 +1,4 @@
-"""Robot states in a person's terms: why the arm cannot or must not move, and what to do about it."""
+"""Reasons in words why the arm cannot or must not move, and their remedies, from the robot's state."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NOT_STARTED_REMEDY = (
     "Clear the pendant's messages, and look there why programs from the network are not started."
 )
 _RELEASE = "Release the brakes on the pendant"
-# What holds the arm, the gravest first: bits, modes, code, what it is, what to do.
+# Safety conditions that hold the arm, the gravest first: bits, modes, code, text, remedy.
 _SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str, str, str], ...] = (
     (
         SafetyStatus.EMERGENCY_STOPPED
@@ -98,7 +98,7 @@ _MODES: dict[int, tuple[str, str]] = {
 
 
 def safety_stop(state: RobotState) -> SafetyStopError | None:
-    """The reason why safety holds the arm, or None. Bits and mode both count: either may come first."""
+    """Make the error for a safety stop; None without one. Bits and mode both count: either may come first."""
     if (held := _held(state)) is None:
         return None
     code, what, remedy = held
@@ -108,17 +108,17 @@ def safety_stop(state: RobotState) -> SafetyStopError | None:
 
 
 def _held(state: RobotState) -> tuple[str, str, str] | None:
-    """Code, what it is and what to do."""
+    """Find the safety condition that holds the arm: code, text, remedy; None: none does."""
     for bits, modes, *held in _SAFETY:
         if state.safety_status_bits & bits or state.safety_mode in modes:
             return held[0], held[1], held[2]
-    if state.safety_mode > SafetyMode.FAULT:  # all that came later are stops
+    if state.safety_mode > SafetyMode.FAULT:  # all modes that were added later are stops
         return "safety-stop", f"held by safety mode {safety_word(state)}", "Read the pendant"
     return None
 
 
 def what_holds(state: RobotState) -> str:
-    """Why the arm cannot move now, and what to do about it; empty: nothing holds it."""
+    """Say why the arm cannot move now, and the remedy; empty: it can."""
     if (held := _held(state)) is not None:
         return f"{held[1]}: {held[2]}"
     return str(not_powered(state) or "")
@@ -133,12 +133,12 @@ def not_powered(state: RobotState) -> RobotError | None:
 
 
 def program_not_running(state: RobotState) -> RobotError | None:
-    """Finds our own control script not playing, as it must while control lives."""
+    """Make the error where the control program does not play, as it must; None where it does."""
     return None if state.runtime_state == RuntimeState.PLAYING else program_ended(state.runtime_state)
 
 
 def program_ended(runtime_state: int) -> RobotError:
-    """Our own control script plays no more."""
+    """Make the error for a control program that stopped or paused."""
     by = (
         "on the pendant, by another client, by the switch to local control, or by its watchdog (network or "
         "computer too slow)"
@@ -154,7 +154,7 @@ def program_ended(runtime_state: int) -> RobotError:
 
 
 def program_replaced(name: str) -> RobotError:
-    """Another client's program took the place of our own."""
+    """Make the error for another client's program that replaced the control program."""
     return RobotError(
         f"another client's program {f'({name}) ' if name else ''}replaced the control program",
         code="program-replaced",
@@ -164,7 +164,7 @@ def program_replaced(name: str) -> RobotError:
 
 
 def foreign_program(state: RobotState, name: str) -> RobotError | None:
-    """Why control cannot start: somebody else's program would be replaced by it."""
+    """Make the error where starting control would replace another program; None where none runs."""
     if state.runtime_state == RuntimeState.STOPPED:
         return None
     return RobotError(
@@ -176,17 +176,17 @@ def foreign_program(state: RobotState, name: str) -> RobotError | None:
 
 
 def program_word(state: RobotState) -> str:
-    """'playing', 'paused' …"""
+    """Name the program's state: 'playing', 'paused' …"""
     return _word(RuntimeState, state.runtime_state, "IN STATE").lower()
 
 
 def safety_word(state: RobotState) -> str:
-    """'PROTECTIVE STOP' …"""
+    """Name the safety mode: 'PROTECTIVE STOP' …"""
     return _word(SafetyMode, state.safety_mode, "SAFETY MODE")
 
 
 def mode_word(state: RobotState) -> str:
-    """'RUNNING' …"""
+    """Name the robot mode: 'RUNNING' …"""
     return _word(RobotMode, state.robot_mode, "MODE")
 
 

@@ -1,16 +1,16 @@
-"""The disposable process that controls the arm, by ur_rtde or by our own script: `python -m …ur_control`.
+"""Control process of the arm, by ur_rtde or by the station's own script: `python -m …ur_control`.
 
-Everything that can hang, crash or abort inside that library happens here and costs only this process. It is
-started by `ur_child`, answers requests on one inherited socket (one JSON object per message) and dies with
-its parent. It never reconnects, never uploads its script a second time and never moves by itself.
+ur_rtde may hang, crash or abort, so it runs in this process, which can be killed. It is started by
+`ur_child`, answers requests on one inherited socket (one JSON object per message) and dies with its parent.
+It never reconnects, never uploads its script twice and never moves without a request.
 
-Requests: {"do": "beat", "ns": N}   N = host monotonic time of the session loop; kicks the watchdog if fresh
+Requests: {"do": "beat", "ns": N}   N: host monotonic time of the session loop; resets the watchdog if fresh
           {"do": "move", "id": I, "joints": [6], "speed": rad/s, "acceleration": rad/s²}
           {"do": "stop", "deceleration": …}
           {"do": "end"}
 Answers:  {"ready": true, "tcp": [6] | null} · {"refused": an `ErrorData`}
-          {"beat": N, "ns": N, "kicked": bool, "lost": bool}   kicked: at `ns`, for the beat was fresh and the
-                                                               script took it
+          {"beat": N, "ns": N, "kicked": bool, "lost": bool}   kicked: the beat was fresh and the script took
+                                                               it, at `ns`; lost: the script is gone
           {"id": I, "ok": bool, "error": text} · {"stopped": true}
 """
 
@@ -37,7 +37,7 @@ from station.devices.ur_condition import NOT_STARTED_REMEDY
 
 BEAT_FRESH_NS = 100_000_000
 WATCHDOG_HZ = 5.0
-"""The controller stops the script after 1/5 s without a kick."""
+"""Frequency of the controller's watchdog: it stops the script after 1/5 s without a reset."""
 MESSAGE_LIMIT = 4096
 LIBRARY_WORDS = {
     "in use": (
@@ -56,7 +56,7 @@ LIBRARY_WORDS = {
         NOT_STARTED_REMEDY,
     ),
 }
-"""Words of ur_rtde's refusals, in small letters, as it has no codes: code, what it is, what to do."""
+"""Parts of ur_rtde's messages (it has no error codes), in lower case → code, text, remedy."""
 LIBRARY_REMEDY = "Install it and restart the daemon, or set robot.control: script in the configuration."
 
 
@@ -70,7 +70,7 @@ class MotionServer:
         self._stopped = False
 
     def serve(self) -> None:
-        """Until the parent says `end` or closes the socket."""
+        """Answer requests until the parent sends `end` or closes the socket."""
         while message := self._channel.recv(MESSAGE_LIMIT):
             request = json.loads(message)
             verb = request["do"]
@@ -81,8 +81,8 @@ class MotionServer:
                 self.answer({"id": request["id"], "ok": not error, "error": error})
             elif verb == "stop":
                 self._stopped = True
-                # Asynchronously, ur_rtde 1.6.5's script brakes the tool (stopl), whatever it is asked for.
-                # The stop is sent at once all the same; the call returns when the joints rest.
+                # Synchronously, because ur_rtde 1.6.5 carries out an asynchronous stopJ as a stopl of the
+                # tool. The stop is sent at once; the call returns when the joints rest.
                 self._control.stopJ(float(request["deceleration"]), False)
                 self.answer({"stopped": True})
             elif verb == "end":
@@ -96,7 +96,7 @@ class MotionServer:
         return time.monotonic_ns() - self._beat_ns <= BEAT_FRESH_NS
 
     def _beat(self, beat_ns: int) -> None:
-        """A beat that waited too long kicks nothing. A script that took no kick is never kicked again."""
+        """Reset the watchdog for a fresh heartbeat; never again once the script did not take one."""
         self._beat_ns, kicked = beat_ns, False
         if self._fresh() and not self._script_lost:
             armed = self._armed or self._arm()
@@ -111,7 +111,7 @@ class MotionServer:
         self.answer(told)
 
     def _arm(self) -> bool:
-        """From now on the script lives only as long as it is kicked."""
+        """Arm the watchdog: from now on the script ends without regular resets."""
         self._armed = bool(self._control.setWatchdog(WATCHDOG_HZ))
         return self._armed
 
@@ -123,7 +123,7 @@ class MotionServer:
             return "a stop was asked for"
         if not self._fresh():
             return "the session's heartbeat is missing"
-        # Before every move: a connection that dropped unseen would have loaded the script anew, unwatched.
+        # Before every move: after an unnoticed reconnection the script runs anew, without its watchdog.
         if self._script_lost or not self._arm():
             return "the control program is not running or its watchdog could not be armed"
         try:
@@ -134,7 +134,7 @@ class MotionServer:
 
 
 def open_control(path: str, host: str) -> Any:
-    """The interface of ur_rtde, or what has the same calls. Raises RobotError with a code, OSError."""
+    """Connect by ur_rtde or `ScriptControl`, which has the same calls. Raises RobotError, OSError."""
     if path == "script":
         from station.devices.ur_script import ScriptControl
 
@@ -154,7 +154,7 @@ def open_control(path: str, host: str) -> Any:
 
 
 def main(path: str, host: str, descriptor: int, parent_pid: int) -> NoReturn:
-    """`descriptor`: the inherited socket. Leaves by os._exit: the library's destructors can hang or abort."""
+    """Serve the inherited socket `descriptor`. Ends by os._exit: ur_rtde's destructors can hang or abort."""
     die_with_parent(parent_pid)
     go_before_others(DAEMON_NICENESS)
     control_in_real_time()

@@ -1,7 +1,7 @@
-"""Client of the dashboard server (port 29999): questions, and the one order this station may give: `stop`.
+"""Client of the dashboard server (port 29999): queries, and the only command this station sends: `stop`.
 
 Source: Universal Robots, "Dashboard Server e-Series / CB-Series, port 29999". One line per command, one line
-per reply, in order. Nothing here can unlock, power or reset a robot: what is not in ALLOWED is never sent.
+per reply, in order. Commands that are not in ALLOWED, such as unlock, power on or reset, are never sent.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ LINE_LIMIT = 4096
 
 
 class DashboardError(RobotError):
-    """The dashboard is silent, gone or does not speak its protocol."""
+    """The dashboard server does not answer, is gone or does not speak its protocol."""
 
     code = "dashboard"
 
 
 def in_words(error: OSError | ValueError) -> str:
-    """'Connection refused': asyncio's own words are numbers, and repeat the address."""
+    """Describe a connection error, as 'Connection refused': asyncio's text is a number and the address."""
     number = error.errno if isinstance(error, OSError) else None
     return os.strerror(number) if number and number > 0 else str(error)
 
 
 def connect_trouble(error: OSError | ValueError, service: str) -> str:
-    """Why a port does not take a connection, and what to look at."""
+    """Say why a port refuses a connection, and what to check."""
     if isinstance(error, ConnectionRefusedError):
         return (
             f"{in_words(error)}: another address, a robot that is starting, or its {service} is off "
@@ -46,7 +46,7 @@ def connect_trouble(error: OSError | ValueError, service: str) -> str:
 
 
 class Dashboard:
-    """One connection, for one event loop. A reply that is too late breaks it: its order would be lost."""
+    """Connection to the dashboard server. A late reply closes it: replies could not be assigned any more."""
 
     def __init__(self, host: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._host = host
@@ -57,7 +57,7 @@ class Dashboard:
 
     @classmethod
     async def open(cls, host: str, timeout_s: float = 2.0) -> Dashboard:
-        """Connects and waits for the greeting. Raises DashboardError."""
+        """Connect and wait for the greeting. Raises DashboardError."""
         where = f"dashboard of {host} (port {PORT})"
         writer = None
         try:
@@ -87,7 +87,7 @@ class Dashboard:
         return not self._task.done() and not self._writer.is_closing()
 
     def send(self, command: str) -> asyncio.Future[str]:
-        """Puts the line on the wire before it returns; the future gives the reply."""
+        """Send a command before returning; the future gives the reply."""
         if command not in ALLOWED:
             raise ValueError(f"the dashboard command {command!r} is never sent by this station")
         reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -99,7 +99,7 @@ class Dashboard:
         return reply
 
     async def ask(self, command: str, timeout_s: float = 1.0) -> str:
-        """The reply line. Raises DashboardError when it does not come in time."""
+        """Send a command and return its reply. DashboardError when it does not come in time."""
         try:
             async with asyncio.timeout(timeout_s):
                 return await self.send(command)
@@ -111,7 +111,7 @@ class Dashboard:
             ) from None
 
     async def remote(self) -> bool | None:
-        """Remote control is on; None where there is no such switch (CB3)."""
+        """Ask whether remote control is on; None where there is no such switch (CB3)."""
         reply = (await self.ask("is in remote control")).strip().lower()
         return {"true": True, "false": False}.get(reply)
 
@@ -135,7 +135,7 @@ class Dashboard:
             waiter = self._waiting.popleft()
             if not waiter.done():
                 waiter.set_exception(DashboardError(f"dashboard of {self._host}: {why}"))
-                waiter.exception()  # the caller may be gone; that is no warning
+                waiter.exception()  # mark as retrieved: without a caller asyncio would log it
 
     async def close(self) -> None:
         self._break("closed")
@@ -144,6 +144,6 @@ class Dashboard:
 
 
 async def came(reply: asyncio.Future[str], moment_s: float) -> bool:
-    """The reply is there within a moment, and is no failure."""
+    """Wait at most `moment_s` for a reply; True when it came and is not an error."""
     await asyncio.wait([reply], timeout=moment_s)
     return reply.done() and not reply.cancelled() and reply.exception() is None

@@ -1,6 +1,6 @@
-"""The read-only half of an arm: identity, state stream, dashboard questions. Changes nothing on the robot.
+"""Read-only connection to an arm: identity, state stream, dashboard queries. Changes nothing on the robot.
 
-Enough for free-drive capture. A lost connection is opened again by itself: reading cannot hurt.
+Enough for capture in freedrive. A lost connection is reopened automatically, as reading is harmless.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 FIRST_STATE_S = 4.0
 SUPERVISE_S = 0.2
 _BUSY_SHARE = 0.5
-"""Share of time spent waiting for a processor from which a gap is more likely ours than the cable's."""
+"""Share of time waiting for a processor above which a gap is blamed on this computer, not the network."""
 RECONNECT_S = (0.2, 0.5, 1.0, 2.0)
 
 
@@ -49,18 +49,18 @@ class UrLink:
         self.config = config
         self.model = arm_model(config)
         self.remote: bool | None = None
-        """Remote control is on; None where there is no such switch (CB3)."""
+        """Whether remote control is on; None where there is no such switch (CB3)."""
         self.reader: StateReader | None = None
-        """The state stream's counters; another object after a lost connection."""
+        """Reader of the state stream, with its counters; a new one after a lost connection."""
         self._before_ns = 0
-        """Arrival of the newest sample of the connection before."""
+        """Arrival of the newest sample of the previous connection (host monotonic)."""
         self._unread_s = 0.0
         """When this computer last had no processor to read late news (host monotonic)."""
         self.guided = False
-        """A person moves the arm by hand: it may move at any moment."""
+        """True while a person moves the arm by hand."""
         self.dashboard: Dashboard | None = None
         self.lost = 0
-        """Connections that ended by themselves."""
+        """Number of connections lost."""
         self._ended_reader: StateReader | None = None
         self._lock: RobotLock | None = None
         self.identity = RobotIdentity(model=config.model)
@@ -74,11 +74,11 @@ class UrLink:
 
     @property
     def payload(self) -> tuple[float, ...]:
-        """Mass (kg) and centre (m, in `flange`) at connect; empty: not told."""
+        """Mass (kg) and centre (m, in `flange`) at connect; empty: not reported."""
         return (self._payload.mass_kg, *self._payload.centre_m) if self._payload is not None else ()
 
     async def connect(self) -> RobotIdentity:
-        """Reads identity and starts the state stream; changes nothing on the robot. Raises RobotError."""
+        """Read the identity and start the state stream; changes nothing on the robot. Raises RobotError."""
         if self._supervisor is not None:
             return self.identity
         if not self.config.host:
@@ -168,7 +168,7 @@ class UrLink:
         )
 
     async def close(self) -> None:
-        """Ends every connection and gives the robot free for others."""
+        """Close every connection and release the lock on the robot."""
         if self._supervisor is not None:
             self._supervisor.cancel()
             await asyncio.gather(self._supervisor, return_exceptions=True)
@@ -196,7 +196,7 @@ class UrLink:
             await dashboard.close()
 
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
-        """Every sample, in order, at the full rate, from the reader's thread: the callback must be quick."""
+        """Call back with every state in order, from the reader's thread: the callback must be quick."""
         self._subscribers.append(callback)
 
     def _deliver(self, state: RobotState) -> None:
@@ -213,11 +213,11 @@ class UrLink:
 
     @property
     def connected(self) -> bool:
-        """The state stream lives; whether its news are fresh says `latest`."""
+        """True while the state stream is connected; how current its news are, tells `latest`."""
         return self.reader is not None and self.reader.ended is None and self.reader.newest is not None
 
     def newest(self) -> Sample:
-        """Whatever came last, however old. Raises StaleStateError when nothing ever came."""
+        """Return the last sample, however old. StaleStateError when none ever came."""
         sample = self.reader.newest if self.reader is not None else None
         if sample is None:
             raise not_connected(self.config.host)
@@ -225,13 +225,13 @@ class UrLink:
 
     @property
     def in_motion(self) -> bool:
-        """News may be late by much less than at rest: see `devices.news`."""
+        """True while the arm counts as in motion, when news may be late by less (`devices.news`)."""
         return self.guided
 
     def age_s(self) -> float:
-        """Age of the newest sample; a controller time that stands still makes none.
+        """Return the age of the newest sample whose controller time advanced.
 
-        What waits unread in the socket is read before: a busy computer makes no news old.
+        Waiting data are read first, so that a busy computer does not make news old.
         """
         age_s = self._age_s()
         if age_s > CURRENT_S and self.reader is not None:
@@ -244,21 +244,21 @@ class UrLink:
         return (time.monotonic_ns() - self._newest_ns()) / 1e9 if self._newest_ns() else float("inf")
 
     def _newest_ns(self) -> int:
-        """Arrival of the newest sample (host monotonic), of this connection or the one before; 0: none."""
+        """Return the newest sample's arrival (host monotonic), if need be of the last connection; 0: none."""
         sample = self.reader.newest if self.reader is not None else None
         return self._before_ns if sample is None else sample.state.stamps.host_monotonic_ns
 
     def latest(self) -> RobotState:
-        """Newest state; StaleStateError when older than 100 ms or its controller time stands still."""
+        """Return the newest state; StaleStateError when over 100 ms old, or if its controller time stands."""
         age_s = self.age_s()
         if age_s > CURRENT_S or not self.connected:
             raise self.stale(age_s, CURRENT_S)
         return self.newest().state
 
     def news(self) -> RobotState | None:
-        """Newest state; None while it is late, but not later than the arm's rest or motion allows.
+        """Return the newest state; None while it is late, within the limit for rest or motion.
 
-        StaleStateError after that, and at once when the connection of an arm in motion ended.
+        StaleStateError beyond the limit, and at once when the connection to an arm in motion ended.
         """
         age_s = self.age_s()
         if age_s <= CURRENT_S and self.connected:
@@ -269,7 +269,7 @@ class UrLink:
         return None
 
     def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
-        """What made a resting arm's news late since then (host monotonic); None: nothing did."""
+        """Name what made a resting arm's news late since `since_s` (host monotonic); None: nothing did."""
         return self.evidence(pause_s, since_s, time.monotonic()).error(effect="")
 
     def evidence(self, pause_s: float, since_s: float, until_s: float) -> Evidence:
@@ -280,14 +280,14 @@ class UrLink:
         return Evidence(pause_s, gap_s, clock_gap_s, is_loopback(self.config.host))
 
     def largest_gap(self, since_s: float, until_s: float) -> tuple[float, float]:
-        """See `news.largest_gap`."""
+        """Find the longest gap between arrivals, and the controller's part; see `news.largest_gap`."""
         reader = self.reader
         if reader is None or not reader.rate_hz:
             return 0.0, 0.0
         return largest_gap(reader.history.copy(), since_s, until_s, 1 / reader.rate_hz)
 
     def stale(self, age_s: float, limit_s: float) -> StaleStateError:
-        """Why the newest state is too old."""
+        """Make the error that says why the newest state is too old."""
         reader = self.reader
         if reader is None or (reader.ended is None and reader.newest is None):
             return not_connected(self.config.host)
@@ -303,17 +303,17 @@ class UrLink:
         return StaleStateError(text, remedy=remedy, age_s=age_s, limit_s=limit_s)
 
     def at(self, host_monotonic_ns: int) -> RobotState:
-        """State interpolated at a host time within the last 10 s; StaleStateError outside."""
+        """Interpolate the state at a host time within the last 10 s; StaleStateError outside."""
         if self.reader is None:
             raise StaleStateError("not connected to the robot", code="not-connected")
         return state_at(self.reader.history.copy(), self.clock(), host_monotonic_ns)
 
     def clock(self) -> ClockFit | None:
-        """The controller's clock against the host's; None before there is enough to tell."""
+        """Return the controller's clock against the host's; None before there are enough samples."""
         return self.reader.clock.fit() if self.reader is not None else None
 
     def check(self) -> RobotState | None:
-        """`news`, or raises what speaks against capturing here and now: safety stop, TCP changed …"""
+        """Return `news`; RobotError where nothing may be captured, as after a safety stop or TCP change."""
         state = self.news()
         if state is None:
             return None
@@ -326,14 +326,14 @@ class UrLink:
         return state
 
     def check_tool(self, sample: Sample) -> None:
-        """Raises RobotError when TCP or payload are other ones than at connect; in motion, too."""
+        """Raise RobotError when TCP or payload differ from those at connect; works in motion, too."""
         if self._tool is not None and self._primary is not None:
             self._tool.check(sample.state, self._primary.installation)
         if self._payload is not None:
             check_payload(sample.payload, self._payload)
 
     def _reader_ended(self, reader: StateReader, why: str) -> None:
-        """Once for each reader: its own word may come after the supervision saw it."""
+        """Handle the end of a reader, once: reader and supervision may both report it."""
         if reader is self.reader and reader is not self._ended_reader and self._supervisor is not None:
             self._ended_reader = reader
             self.lost += 1
@@ -341,7 +341,7 @@ class UrLink:
             self.on_link_lost(why)
 
     def on_link_lost(self, why: str) -> None:
-        """For the half that moves the arm."""
+        """Hook for the subclass that controls the arm: called when the connection is lost."""
 
     async def _supervise(self) -> None:
         failures = 0
@@ -364,7 +364,7 @@ class UrLink:
                 log.exception("the robot's supervision failed; it goes on")
 
     async def renew_dashboard(self) -> Dashboard:
-        """Opens a fresh connection in place of the present one. Raises DashboardError."""
+        """Replace the dashboard connection by a new one. Raises DashboardError."""
         fresh = await Dashboard.open(self.config.host)
         old, self.dashboard = self.dashboard, fresh
         if old is not None:
@@ -372,7 +372,7 @@ class UrLink:
         return fresh
 
     async def supervise_more(self) -> None:
-        """Asks the dashboard what the state stream does not say. Raises StationError."""
+        """Ask the dashboard what the state stream does not tell. Raises StationError."""
         if self.dashboard is None or not self.dashboard.alive:
             await self.renew_dashboard()
         assert self.dashboard is not None
@@ -396,5 +396,5 @@ def link_lost(why: str) -> StaleStateError:
 
 
 def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: object) -> None:
-    with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to tell
+    with contextlib.suppress(RuntimeError):  # the loop is closed
         loop.call_soon_threadsafe(function, *arguments)

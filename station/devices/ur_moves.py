@@ -1,4 +1,4 @@
-"""Watches one asynchronous move from the state stream: arrived, under way, or why not. Pure; knows no clock.
+"""Monitoring of one asynchronous move by the state stream: arrived, under way, or failed. Pure functions.
 
 ur_rtde's script reports asynchronous operations in output_int_register_2: bits 24–30 count operations,
 bit 15 = running. The word is written by another thread of the script, so a move that was just accepted may
@@ -25,11 +25,11 @@ from station.devices.ur_condition import (
 
 ARRIVED_RAD = 0.01
 STRAYED_RAD = 0.05
-"""Further beside the straight path than any arm that follows it: 65 mm at 1.3 m."""
+"""Deviation of a joint from the straight path above which the arm has left it: 65 mm at 1.3 m."""
 PROGRESS_RAD = 5e-4
 NO_PROGRESS_S = 3.0
 SLIDER_ZERO_S = 10.0
-"""An arm that waits longer for its slider gives up: nobody should be surprised by it."""
+"""Longest wait for a speed slider at 0; the move then ends, lest the arm start unexpectedly."""
 SLIDER_STILL = 0.005
 JOINT_SPEED_LIMIT_RAD_S = 1.05
 JOINT_ACCELERATION_LIMIT_RAD_S2 = 1.5
@@ -38,7 +38,7 @@ JOINT_ACCELERATION_LIMIT_RAD_S2 = 1.5
 def check_goal(
     joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float, limit_rad: float
 ) -> None:
-    """Raises RobotError: ur_rtde sends NaN and wrong lengths to the controller as they are."""
+    """Raise RobotError for an invalid goal: ur_rtde would send NaN and wrong lengths to the controller."""
     if len(joints_rad) != 6 or not all(math.isfinite(q) and abs(q) <= limit_rad for q in joints_rad):
         raise RobotError(
             f"not six joint angles within ± {limit_rad:.2f} rad: {list(joints_rad)}",
@@ -71,9 +71,9 @@ def is_running(word: int) -> bool:
 
 
 def beside(start_rad: Vector6, target_rad: Sequence[float], joints_rad: Vector6) -> tuple[int, float]:
-    """The joint that is furthest from the straight path, counted from 0, and by how much (rad).
+    """Find the joint furthest from the straight path, counted from 0, and its deviation (rad).
 
-    A joint move is straight in joint space, all joints in step: that is what the check of its path assumes.
+    A joint move is straight in joint space, all joints in step, as the check of its path assumes.
     """
     way = [b - a for a, b in zip(start_rad, target_rad, strict=True)]
     gone = [q - a for a, q in zip(start_rad, joints_rad, strict=True)]
@@ -86,13 +86,13 @@ def beside(start_rad: Vector6, target_rad: Sequence[float], joints_rad: Vector6)
 @dataclass
 class MoveWatch:
     start_rad: Vector6
-    """Where the arm stood when the move was asked for."""
+    """Joints (6,) when the move was requested."""
     target_rad: Sequence[float]
     operation_before: int
-    """The word before the move was asked for."""
+    """The status word before the move was requested."""
     begun_s: float
     notice: str = ""
-    """Notice to a person, though it is no fault; empty = nothing."""
+    """Hint for people that is no fault, such as a low speed slider; empty: none."""
     _last_progress_s: float = field(init=False)
     _distance_rad: float = field(init=False, default=float("inf"))
     _ended_s: float | None = field(init=False, default=None)
@@ -101,7 +101,7 @@ class MoveWatch:
         self._last_progress_s = self.begun_s
 
     def step(self, state: RobotState, word: int, now_s: float) -> bool:
-        """True when arrived. Raises what ended the move otherwise."""
+        """Check a state; True when arrived. Raises RobotError where the move ended otherwise."""
         trouble = safety_stop(state) or not_powered(state) or program_not_running(state)
         if trouble is not None:
             raise trouble

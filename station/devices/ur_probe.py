@@ -1,4 +1,4 @@
-"""Looks at a robot from outside, with time-outs, changing nothing: is it there, and what is it."""
+"""Read-only check whether a robot is reachable, and of which model; every query has a time-out."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from station.devices.ur_dashboard import Dashboard, DashboardError, connect_trou
 
 SCRIPT_PORT = 30002
 POLYSCOPE_X = 10
-"""Its first major version. It has no dashboard server, the second way of every stop."""
+"""First major version of PolyScope X, which has no dashboard server, the second stop path."""
 _SERVICES = {SCRIPT_PORT: "Secondary Client interface", RTDE_PORT: "RTDE service"}
 CONNECT_S = 2.0
 ASIDE_S = 0.7
-"""For a question that only makes an error clearer."""
+"""Time-out of a query that only makes an error message clearer."""
 
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """The dashboard's answers. Empty or None where this controller has none."""
+    """Answers of the dashboard; empty or None where the controller gives none."""
 
     model: str = ""
     serial: str = ""
@@ -36,11 +36,11 @@ class ProbeResult:
     problems: tuple[str, ...] = field(default=())
     """Problems, each with its remedy; empty = reachable and complete."""
     answers: bool = True
-    """Anything does, at any port."""
+    """True when any port answers."""
 
 
 async def probe(host: str) -> ProbeResult:
-    """Asks all ports at once; takes at most a few seconds and never raises."""
+    """Query all ports in parallel; takes at most a few seconds and never raises."""
     result, *answers = await asyncio.gather(
         _ask_dashboard(host), _port_problem(host, SCRIPT_PORT), _port_problem(host, RTDE_PORT)
     )
@@ -49,7 +49,7 @@ async def probe(host: str) -> ProbeResult:
 
 
 async def identify(dashboard: Dashboard) -> ProbeResult:
-    """Model, serial, version and mode by an open dashboard connection. Raises DashboardError."""
+    """Ask an open dashboard connection for model, serial, version and mode. Raises DashboardError."""
     version = _version(await dashboard.ask("PolyscopeVersion"))
     model = (await dashboard.ask("get robot model")).strip()
     serial = (await dashboard.ask("get serial number")).strip()
@@ -65,7 +65,7 @@ async def identify(dashboard: Dashboard) -> ProbeResult:
 
 
 def lock_name(host: str, serial: str) -> str:
-    """Name of the single-owner lock. Simulated controllers share a serial but not an address."""
+    """Make the name of a robot's lock: by address if simulated, as these share a serial number."""
     try:
         loopback = ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -86,7 +86,7 @@ async def _ask_dashboard(host: str) -> ProbeResult:
 
 
 async def why_no_dashboard(host: str, error: DashboardError) -> RobotError:
-    """`error`, or that this controller has no dashboard server at all: RTDE tells its version, too."""
+    """Return `error`, or that this controller has no dashboard server, by its version over RTDE."""
     try:
         async with asyncio.timeout(ASIDE_S):
             version = await asyncio.to_thread(_rtde_version, host)
@@ -119,13 +119,16 @@ def unsupported_model(model: str, host: str) -> RobotError:
 
 
 async def check_port(host: str, port: int) -> None:
-    """Raises RobotError unless something accepts a connection there, and greets where it must."""
+    """Raise RobotError unless the port accepts a connection, and sends a greeting where it must."""
     if problem := await _port_problem(host, port):
         raise problem
 
 
 async def _port_problem(host: str, port: int) -> RobotError | None:
-    """Within 2 s. A controller tells its state on the script port as soon as a client is there."""
+    """Find what is wrong with a port, within 2 s; None: nothing.
+
+    On the script port a controller sends its state as soon as a client connects.
+    """
     where, accepted = f"{host}:{port}", False
     try:
         async with asyncio.timeout(CONNECT_S):
@@ -158,7 +161,10 @@ def _version(text: str) -> tuple[int, ...]:
 
 
 class RobotLock:
-    """Held from construction to `release`. Raises RobotError that names the present owner."""
+    """Lock of a robot for one station on this computer, held from construction to `release`.
+
+    Raises RobotError that names the present owner.
+    """
 
     def __init__(self, name: str) -> None:
         address = f"\0calibration-station/robot/{re.sub(r'[^A-Za-z0-9.-]', '-', name)[:60]}"
@@ -179,7 +185,7 @@ class RobotLock:
 
 
 def _owner(address: str) -> str:
-    """'pid 4711, anna'; empty when it is gone already, or does not listen."""
+    """Name the owner of a lock: 'pid 4711, anna'; empty when it is gone or does not listen."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
         link.setblocking(False)
         try:

@@ -1,10 +1,10 @@
-"""Control of an arm by a script of our own, where ur_rtde does not exist: the six calls of `ur_control`.
+"""Control of an arm by the station's own script, where ur_rtde is not available.
 
-The script is uploaded once. It obeys one RTDE data packet that carries everything: sequence, verb, keepalive,
-six joints, speed, acceleration. A verb counts once, when its sequence is new; the script answers with that
-sequence, negative for what it refuses. Once armed it ends by itself when the keepalive stands still for
-0.2 s: it kills the thread that moves, brakes and halts, as Universal Robots' own library does. Every other
-end is the same. A lost connection is never opened again: the script is lost with it.
+The script is uploaded once. Every RTDE data packet carries everything: sequence, verb, keepalive, six joints,
+speed, acceleration. A verb is carried out once, when its sequence is new; the script answers with that
+sequence, negative if it refuses. Once armed, the script ends when the keepalive does not change for 0.2 s: it
+kills the thread that moves, brakes and halts, as Universal Robots' own library does. It ends the same way for
+any other reason. A lost connection is never reopened, and the script ends with it.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEE
 
 SCRIPT_PORT = 30002
 FIRST_REGISTER = 24
-"""The upper half of the registers is for RTDE clients, the lower for field buses."""
+"""First register used: the upper half is for RTDE clients, the lower for field buses."""
 SILENCE_S = 0.2
-"""Without a new keepalive for so long the script stops the arm and ends."""
+"""Time without a new keepalive after which the script stops the arm and ends."""
 STOP_RAD_S2 = 4.0
 RATE_HZ = 125.0
 START_S = 5.0
 SETTLE_SAMPLES = 5
-"""The first packet must act before the script starts: it refuses registers that somebody else left."""
+"""Samples to wait until the first packet is in the registers: the script refuses old contents."""
 ANSWER_S = 0.25
 STOP_ANSWER_S = 0.04
 END_S = 0.5
 STALE_S = 0.5
-"""Without news for so long the script counts as lost. The session gives up sooner."""
+"""Time without news after which the script counts as lost. The session gives up earlier."""
 
 
 class Command(IntEnum):
-    """Commands that the script obeys. Any other number ends it."""
+    """Commands to the script; any other number ends it."""
 
     NONE = 0
     ARM = 1
@@ -168,7 +168,7 @@ end
 
 
 def script(sequence: int) -> str:
-    """The program that obeys whoever wrote this sequence into its register before it started."""
+    """Make the program; it starts only if its sequence register holds this value."""
     return SCRIPT.format(
         r=FIRST_REGISTER, sequence=sequence, joint_limit=2 * math.pi, speed_limit=JOINT_SPEED_LIMIT_RAD_S,
         acceleration_limit=JOINT_ACCELERATION_LIMIT_RAD_S2, silence=SILENCE_S, stop=STOP_RAD_S2,
@@ -190,7 +190,7 @@ _OUTPUTS = (
 
 
 class Told(NamedTuple):
-    """One sample of what the controller and the script say."""
+    """Sample of the states of controller and script."""
 
     controller_s: float
     program: int
@@ -201,16 +201,16 @@ class Told(NamedTuple):
 
 
 class ScriptControl:
-    """The calls have ur_rtde's names and meaning. Belongs to one thread; nothing blocks for long."""
+    """Control by the script, with the names and meanings of ur_rtde's calls. For one thread."""
 
     def __init__(self, host: str) -> None:
-        """Uploads the script and waits until it answers.
+        """Upload the script and wait until it answers.
 
         Raises RobotError `registers-in-use`, `no-state`, `program-playing`, `script-not-started`; OSError.
         """
         self._told = Told(-1.0, RuntimeState.STOPPED, 0, 0, ())
         self._told_s = time.monotonic()
-        """When its clock last advanced."""
+        """When the controller's clock last advanced (host monotonic)."""
         self._samples = 0
         self._lost = self._broken = False
         self._keepalive = 0
@@ -223,7 +223,7 @@ class ScriptControl:
             raise
 
     def close(self) -> None:
-        """Without a word to the script: it ends by itself."""
+        """Close the connection; the script then ends by itself."""
         self._lost = self._broken = True
         self._link.close()
 
@@ -235,7 +235,7 @@ class ScriptControl:
         for kind, payload in self._rtde.pending:
             self._take(kind, payload)
         self._link.setblocking(False)
-        sequence = random.randrange(1, 2**30)  # an answer left by an earlier script is never ours
+        sequence = random.randrange(1, 2**30)  # so that an earlier script's answer is not taken for ours
         self._write(sequence, Command.NONE)
         if not self._wait(lambda: self._samples > SETTLE_SAMPLES, HANDSHAKE_S):
             raise RtdeError(f"no robot state came within {HANDSHAKE_S:g} s", code="no-state")
@@ -247,7 +247,7 @@ class ScriptControl:
             )
         with socket.create_connection((host, SCRIPT_PORT), HANDSHAKE_S) as upload:
             upload.sendall(script(sequence).encode("ascii"))
-            # Open until the script answers: closed with unread data, it could take the text with it.
+            # Keep it open until the script answers: closing with unread data could discard the text.
             if not self._wait(lambda: self._plays() and self._told.answer == sequence, START_S):
                 raise RobotError(
                     "the control program did not start",
@@ -258,15 +258,15 @@ class ScriptControl:
     # -- the six calls ----------------------------------------------------------------------------------
 
     def getTCPOffset(self) -> list[float]:
-        """Flange to TCP as the script read it at its start: metres, rotation vector."""
+        """Return flange_from_tcp, read by the script at its start: metres, rotation vector (rad)."""
         return list(self._told.tcp)
 
     def setWatchdog(self, minimum_hz: float) -> bool:
-        """Let the script live from now on only as long as its keepalive advances; the time is its own."""
+        """Arm the watchdog: the script then ends after `SILENCE_S` (not `minimum_hz`) without keepalive."""
         return self._ask(Command.ARM)
 
     def kickWatchdog(self) -> bool:
-        """Sends the next keepalive. False, and none is sent, when the script is lost."""
+        """Send the next keepalive; False, without sending, when the script is lost."""
         if not self._alive():
             return False
         self._keepalive = self._keepalive % (2**31 - 1) + 1
@@ -274,11 +274,11 @@ class ScriptControl:
         return not self._lost
 
     def moveJ(self, q: Sequence[float], speed: float, acceleration: float, asynchronous: bool) -> bool:
-        """True when the script has taken the move. Speeds beyond its own limits are lowered to them."""
+        """Start a move; True when the script accepted it. Speeds above the script's limits are lowered."""
         return self._ask(Command.MOVE, (*q, speed, acceleration))
 
     def stopJ(self, deceleration: float, asynchronous: bool) -> None:
-        """The script brakes the joints with its own deceleration, then ends. Waits a moment for its word."""
+        """Stop: the script brakes with its own deceleration, then ends. Waits briefly for its answer."""
         sequence = self._write(self._command[0] + 1, Command.STOP)
         self._wait(lambda: self._told.answer == sequence or not self._plays(), STOP_ANSWER_S)
 
@@ -289,7 +289,7 @@ class ScriptControl:
     # -- the connection ---------------------------------------------------------------------------------
 
     def _ask(self, verb: Command, numbers: Sequence[float] = (0.0,) * 8) -> bool:
-        """A verb and the script's answer. Without one the script is lost."""
+        """Send a command and wait for the answer; without one the script counts as lost."""
         if not self._alive():
             return False
         sequence = self._write(self._command[0] + 1, verb, numbers)
@@ -301,30 +301,30 @@ class ScriptControl:
         return not self._lost and self._told.program == RuntimeState.PLAYING
 
     def _alive(self) -> bool:
-        """The script plays and obeys, by news that are not old. What is lost stays lost."""
+        """Tell by current news whether the script plays and obeys; once lost it stays lost."""
         self._read()
         if time.monotonic() - self._told_s > STALE_S or self._told.state == State.ENDED or not self._plays():
             self._lose()
         return not self._lost
 
     def _lose(self) -> None:
-        """A program that was only paused must find STOP when it goes on, not a move that nobody waits for."""
+        """Mark the script as lost, and leave STOP in the registers for a paused one that is resumed."""
         if not self._lost:
             self._lost = True
             self._write(self._command[0] + 1, Command.STOP)
 
     def _write(self, sequence: int, verb: Command, numbers: Sequence[float] = (0.0,) * 8) -> int:
-        """One packet, that acts as a whole. A connection that does not take it at once is lost."""
+        """Send one packet; a connection that does not take it at once is closed. Returns the sequence."""
         self._command = (sequence, verb, numbers)
         try:
             if not self._broken:
                 self._link.sendall(self._inputs.pack((sequence, verb, self._keepalive, *numbers)))
         except OSError:
-            self.close()  # nothing may follow half a packet: it would be read as the rest of it
+            self.close()  # after half a packet the next one would be read as its rest
         return sequence
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Reads until it holds. False at the deadline, or when the connection is lost."""
+        """Read until `condition` holds; False at the deadline, or when the connection is lost."""
         give_up_s = time.monotonic() + timeout_s
         while not condition():
             left_s = give_up_s - time.monotonic()
@@ -335,7 +335,7 @@ class ScriptControl:
         return True
 
     def _read(self) -> None:
-        """Everything that has arrived."""
+        """Read and handle everything that has arrived."""
         try:
             while not self._broken:
                 data = self._link.recv(65536)

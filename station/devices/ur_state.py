@@ -1,7 +1,6 @@
-"""Reads the controller's state at its full rate, in its own thread, keeping every sample. Read-only.
+"""Reader of the controller's state at its full rate, in its own thread, keeping every sample. Read-only.
 
-A reader lives as long as its connection: when that ends it says why and is not used again. A trace recorder
-opens the next one.
+A reader lasts as long as its connection; for the next connection a new one is made.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ log = logging.getLogger(__name__)
 HISTORY_S = 10.0
 RECONNECT_S = 0.3
 SILENCE_S = 2.0
-"""Without data for this long the connection is given up."""
+"""Time without data after which the connection is closed."""
 SO_TIMESTAMPNS = 35
 """Linux, 64 bit: receive time by the kernel, wall clock; `socket` does not name it."""
 RECEIVE_BUFFER_BYTES = 1 << 20
@@ -46,9 +45,9 @@ ROUND_TRIPS, QUICK_S = 10, 0.002
 """So often the controller is asked for a quick answer: half of it bounds the time of every state."""
 READ_BYTES = 1 << 16
 READING_WAIT_S = 0.02
-"""Longer than a full buffer takes to read."""
+"""Longest wait for waiting data to be read; a full buffer takes less."""
 WALL_STEP_NS = 1_000_000
-"""Between two packets no wall clock is slewed by so much: it was set."""
+"""Change of the wall clock between two packets above which it was set, not slewed."""
 _TIMESPEC = struct.Struct("@qq")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
 
@@ -58,7 +57,7 @@ NAMES = (
     "output_int_register_2",
 )  # fmt: skip
 PAYLOAD_SINCE = {3: (3, 11), 5: (5, 5)}
-"""First versions that report the payload."""
+"""First minor version, per major version, that reports the payload."""
 
 
 class Payload(NamedTuple):
@@ -72,13 +71,16 @@ class Payload(NamedTuple):
 class Sample(NamedTuple):
     state: RobotState
     operation: int
-    """ur_rtde's word about asynchronous moves, see `ur_moves`."""
+    """Status word of asynchronous moves, see `ur_moves`."""
     payload: Payload
 
 
 class StateReader(threading.Thread):
-    """`on_state` is called for every sample, in order, one at a time, and must be quick: from this thread, or
-    from one that asked to read what waits. `on_end` once, at the end."""
+    """Thread that reads the state stream of one connection.
+
+    `on_state` is called for every sample, in order, one at a time, from this thread or one that calls
+    `read_waiting`; it must be quick. `on_end` is called once, at the end, with the reason.
+    """
 
     def __init__(
         self, host: str, on_state: Callable[[RobotState], None], on_end: Callable[[str], None]
@@ -93,18 +95,18 @@ class StateReader(threading.Thread):
         self.history: deque[RobotState] = deque(maxlen=1)
         self.clock = ClockEstimator()
         self.lost = 0
-        """Samples that the controller made and that never came."""
+        """Number of samples that the controller skipped or that were lost."""
         self.frozen = 0
-        """Packets whose controller time did not advance."""
+        """Number of packets whose controller time did not advance."""
         self.stands_still = False
-        """The newest packet was such a one."""
+        """True when the controller time of the newest packet did not advance."""
         self.ended: str | None = None
         """Why the connection is over; None while it lives."""
         self._on_state = on_state
         self._on_end = on_end
         self._reading = threading.Lock()
         self._read: Callable[[], None] = lambda: None
-        """Takes all that waits in the socket; nothing but while the connection lives. Under the lock."""
+        """Reads all waiting data while connected, else does nothing. Call with the lock held."""
         self._broken: OSError | RtdeError | None = None
         self._stop_read, self._stop_write = socket.socketpair()
         self._wall_ahead_ns = _wall_ahead_ns()
@@ -115,7 +117,7 @@ class StateReader(threading.Thread):
         why = "closed here"
         try:
             with socket.socket() as link:
-                # A controller skips samples when the receiver is full: seconds of them fit into this.
+                # A controller skips samples when the receiver's buffer is full; this one holds seconds.
                 link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
                 link.settimeout(HANDSHAKE_S)
                 link.connect((self.host, PORT))
@@ -139,15 +141,15 @@ class StateReader(threading.Thread):
             self._on_end(why)
 
     def close(self) -> None:
-        """Ends the thread; returns when it has ended (milliseconds, or the connect timeout)."""
+        """End the thread; return when it has ended (milliseconds, or the connect time-out)."""
         with contextlib.suppress(OSError):
             self._stop_write.close()
         self.join(HANDSHAKE_S + 1.0)
 
     def read_waiting(self) -> bool:
-        """Reads what came and waits unread, because this thread had no processor yet. From any thread.
+        """Read waiting data at once, in case the reader's thread got no processor yet. From any thread.
 
-        What ends the connection is kept for the reader's own thread, which says so. False: that thread is
+        An error that ends the connection is kept for the reader's own thread to report. False: that thread is
         reading, and has no processor to go on.
         """
         if not self._reading.acquire(timeout=READING_WAIT_S):
@@ -227,7 +229,7 @@ class StateReader(threading.Thread):
                 self.stands_still = True
                 return
             if gap < 0:
-                self.history.clear()  # the controller's clock was set back
+                self.history.clear()  # the controller's clock went back
             self.lost += max(0, round(gap) - 1)
         state = RobotState(
             stamps=Stamps(host_monotonic_ns=monotonic_ns, host_wall_ns=wall_ns, controller_s=controller_s),
@@ -254,10 +256,10 @@ class StateReader(threading.Thread):
         self._on_state(state)
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> tuple[int, int]:
-        """Host monotonic and wall time of the newest bytes, as the kernel saw them come.
+        """Return host monotonic and wall time of the newest bytes, from the kernel's stamp.
 
-        A stamp from before the wall clock was set is none: these bytes come now. However old another one is,
-        after a long halt of this process, it holds.
+        A stamp from before the wall clock was set is replaced by the time now. Otherwise an old stamp is
+        right, also after a long halt of this process.
         """
         ahead_ns = _wall_ahead_ns()
         if abs(ahead_ns - self._wall_ahead_ns) > WALL_STEP_NS:
@@ -274,12 +276,12 @@ class StateReader(threading.Thread):
 
 
 def _wall_ahead_ns() -> int:
-    """Wall time minus monotonic; of two looks, for a thread held up between the clocks sees too much."""
+    """Return wall minus monotonic time; the smaller of two readings, in case one was interrupted."""
     return min(-time.monotonic_ns() + time.time_ns() for _ in range(2))
 
 
 def state_at(history: Sequence[RobotState], clock: ClockFit | None, host_monotonic_ns: int) -> RobotState:
-    """Interpolated at a host time; modes and bits are the older neighbour's. StaleStateError outside."""
+    """Interpolate at a host time; modes and bits are the older neighbour's. StaleStateError outside."""
     if clock is None or len(history) < 2:
         raise StaleStateError("too few robot states yet to tell where the arm was", code="no-history")
     controller_s = clock.to_device_s(host_monotonic_ns)
@@ -319,7 +321,7 @@ def _mix_poses(first: Vector6, second: Vector6, fraction: float) -> Vector6:
 
 
 class TraceRecorder:
-    """Every sample between `begin` and `end`, again and again; a connection that is cut is opened anew."""
+    """Recorder of every state between `begin` and `end`; reusable, reconnects when the connection is lost."""
 
     def __init__(self, host: str) -> None:
         self._host = host
@@ -328,13 +330,13 @@ class TraceRecorder:
         self._keeper: asyncio.Task[None] | None = None
 
     async def begin(self) -> None:
-        """Returns once samples come. RobotError when none do."""
+        """Begin recording; return once samples come. RobotError when none do."""
         self._states = []
         await self._open()
         self._keeper = asyncio.create_task(self._keep())
 
     async def end(self) -> list[RobotState]:
-        """All samples since `begin`, in order."""
+        """End recording; return all samples since `begin`, in order."""
         if self._keeper is not None:
             self._keeper.cancel()
             await asyncio.gather(self._keeper, return_exceptions=True)
@@ -353,7 +355,7 @@ class TraceRecorder:
             await asyncio.to_thread(reader.close)
 
     async def _keep(self) -> None:
-        """A lost connection is opened again until it comes."""
+        """Reopen a lost connection, as often as needed."""
         while True:
             await asyncio.sleep(RECONNECT_S)
             if self._reader is None or self._reader.ended is not None:

@@ -1,13 +1,13 @@
-"""Guards against a mixed-up TCP or payload: what lies between our flange pose and the controller's tool pose.
+"""Checks of TCP and payload: our flange pose must agree with the controller's tool pose and TCP offset.
 
 flange_from_tcp = forward(joints)⁻¹ · base_from_tcp, from one and the same sample. It must be the offset that
-the controller states, and it must not change. The controller knows the factory calibration of its arm and our
-nominal table does not: they differ by some millimetres, so the check is fine only when the controller states
-its kinematics too, or when the configuration does.
+the controller states, and it must not change. The controller uses the factory calibration of its arm, which
+differs from our nominal table by some millimetres. So the check is precise only when controller or
+configuration give the calibrated kinematics.
 
-It states both on its primary interface (port 30001, read-only), ten times a second. One message = int32 size,
-uint8 type (16 = robot state), then sub-packages of int32 size, uint8 type, payload; everything big-endian.
-Source: Universal Robots, "Remote control via TCP/IP: client interfaces".
+The controller states both on its primary interface (port 30001, read-only), ten times a second. One message =
+int32 size, uint8 type (16 = robot state), then sub-packages of int32 size, uint8 type, payload; everything
+big-endian. Source: Universal Robots, "Remote control via TCP/IP: client interfaces".
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ LONGEST_M = 1.0
 PAYLOAD_TOLERANCE_KG = 0.005
 CENTRE_TOLERANCE_M = 0.001
 SKEW_S = 0.016
-"""Two cycles of a CB3: joints and tool pose of one sample may be of neighbouring cycles."""
+"""Largest time between joints and tool pose of one sample: two cycles of a CB3."""
 _MODEL_REMEDY = "Check robot.model and robot.kinematics in the configuration."
 _CHANGED = "the TCP offset on the pendant was changed during the session"
 _CHANGED_REMEDY = "Set it back, or finish this session and restart the daemon."
@@ -67,10 +67,10 @@ _CHANGED_REMEDY = "Set it back, or finish this session and restart the daemon."
 @dataclass(frozen=True)
 class Installation:
     tcp_offset: Vector6 | None = None
-    """flange_from_tcp as set on the pendant"""
+    """flange_from_tcp as set on the pendant: metres, rotation vector (rad)"""
     dh: tuple[Vector6, Vector6, Vector6, Vector6] | None = None
-    """theta, a, d, alpha of this very arm (standard Denavit-Hartenberg), factory corrections included; sent
-    once, at the beginning of a connection"""
+    """theta, a, d, alpha of this arm (standard Denavit-Hartenberg), factory corrections included; sent once,
+    at the beginning of a connection"""
 
 
 class PrimaryError(RobotError):
@@ -80,7 +80,7 @@ class PrimaryError(RobotError):
 
 
 def read_state(payload: bytes) -> Installation:
-    """The sub-packages of a robot state message. Raises PrimaryError on impossible sizes."""
+    """Parse the sub-packages of a robot state message. PrimaryError for impossible sizes."""
     offset: Vector6 | None = None
     dh: tuple[Vector6, Vector6, Vector6, Vector6] | None = None
     at = 0
@@ -99,7 +99,7 @@ def read_state(payload: bytes) -> Installation:
 
 
 def program_started(payload: bytes) -> str:
-    """Name of the program whose start a robot message tells; empty for any other message."""
+    """Parse a robot message: name of a program that started; empty for any other message."""
     if len(payload) < _KEY.size:
         return ""
     *_, kind, _, _, length = _KEY.unpack_from(payload)
@@ -115,19 +115,19 @@ def _six(values: Sequence[float]) -> Vector6:
 
 
 class PrimaryReader:
-    """Follows the installation until the connection ends; `dead` then says why. Sends nothing, ever."""
+    """Reads TCP offset and kinematics until the connection ends; `dead` then says why. Sends nothing."""
 
     def __init__(self, host: str) -> None:
         self.installation = Installation()
         self.dead = ""
         self.started = ""
-        """The program that last started."""
+        """Name of the program that started last."""
         self._host = host
         self._first = asyncio.Event()
         self._task = asyncio.create_task(self._run(), name=f"installation of {host}")
 
     async def first(self) -> Installation:
-        """Waits for the first statement; empty when none comes in time (a firewalled or old controller)."""
+        """Wait for the first message; empty when none comes in time (firewall, old controller)."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(FIRST_S):
                 await self._first.wait()
@@ -177,12 +177,12 @@ async def _message(reader: asyncio.StreamReader) -> tuple[int, bytes]:
 
 
 class TcpCheck:
-    """`model`: with the configuration's kinematics, if it has any (`calibrated`)."""
+    """Check of the TCP offset. `model`: the arm's, with the configured calibration if `calibrated`."""
 
     def __init__(
         self, model: RobotModel, calibrated: bool, first: RobotState, installation: Installation
     ) -> None:
-        """Raises RobotError when pose, kinematics and stated offset do not fit together."""
+        """Take the offset at connect. RobotError when pose, kinematics and stated offset do not agree."""
         self._model = model
         self._tolerance = CALIBRATED_TOLERANCE if calibrated else NOMINAL_TOLERANCE
         self._source: Literal["controller", "configuration"] | None = "configuration" if calibrated else None
@@ -206,10 +206,10 @@ class TcpCheck:
             self.agree(self._stated)
 
     def _try_controllers_model(self, model: RobotModel, first: RobotState) -> None:
-        """Uses the controller's own kinematics if they explain its own tool pose, as they should.
+        """Use the controller's own kinematics if they explain its tool pose.
 
-        Raises RobotError when they are those of another model: a factory calibration moves the flange by
-        millimetres (though single lengths in it may be far off, where axes are parallel).
+        Raises RobotError when they are of another model: a factory calibration moves the flange by only
+        millimetres (though single lengths may differ much, where axes are parallel).
         """
         assert self._stated is not None
         ours, theirs = (forward(m, first.joints_rad) for m in (self._model, model))
@@ -224,7 +224,7 @@ class TcpCheck:
 
     @property
     def kinematics(self) -> ArmKinematics | None:
-        """The table of this very arm that explains the controller's tool pose; None for the published one."""
+        """Calibrated table of this arm that explains the controller's tool pose; None: the published one."""
         m = self._model
         if self._source is None:
             return None
@@ -233,20 +233,20 @@ class TcpCheck:
 
     @property
     def offset(self) -> Vector6:
-        """flange_from_tcp: x y z [m], rotation vector [rad]; the controller's words where it has any."""
+        """flange_from_tcp: x y z [m], rotation vector [rad]; stated by the controller, else computed."""
         if self._stated is not None:
             return self._stated
         return pose_vector(self._first)
 
     def agree(self, stated: Vector6) -> None:
-        """Raises RobotError unless the offset that the controller states explains its tool pose."""
+        """Raise RobotError unless the stated offset explains the controller's tool pose."""
         what = "our flange pose and the controller's tool pose do not fit its TCP offset"
         _compare(self._first, _pose(stated), self._tolerance, what, "tcp-mismatch", _MODEL_REMEDY)
 
     def check(self, state: RobotState, installation: Installation) -> None:
-        """Raises RobotError when the TCP on the pendant is another one than at connect.
+        """Raise RobotError when the TCP on the pendant differs from that at connect.
 
-        In motion the tool pose counts less exactly, what the controller states as exactly as at rest.
+        In motion the tolerance of the tool pose is larger, that of the stated offset is not.
         """
         offset = installation.tcp_offset
         if self._stated is not None and offset is not None and offset != self._stated:
@@ -260,7 +260,7 @@ class TcpCheck:
 
 
 def check_payload(now: Payload, first: Payload) -> None:
-    """Raises RobotError when the payload on the pendant is another one than at connect."""
+    """Raise RobotError when the payload on the pendant differs from that at connect."""
     centre_off_m = math.dist(now.centre_m, first.centre_m)
     if abs(now.mass_kg - first.mass_kg) > PAYLOAD_TOLERANCE_KG or centre_off_m > CENTRE_TOLERANCE_M:
         raise RobotError(

@@ -1,6 +1,6 @@
-"""Webcams and other cameras of the system, through `cv2.VideoCapture`: for those who start with these.
+"""Webcams and other cameras of the operating system, through `cv2.VideoCapture`.
 
-No trigger and no clock: pictures come by themselves, and when they were exposed is known only by their
+They have no trigger and no clock: images come free-running, and their exposure time is known only from their
 arrival, to ±0.1 s.
 """
 
@@ -27,7 +27,7 @@ from station.devices.frames import RETAKE, CameraCounts, FrameTiming
 
 T = TypeVar("T")
 LATENCY_S = 0.2
-"""Assumed, not measured: readout, compression, USB and the driver take no longer than this."""
+"""Longest time from exposure to arrival (readout, compression, USB, driver); assumed, not measured."""
 _GLIMPSE_S = 1.0
 _OPEN_S = 20.0
 _PATIENCE_S = 0.5
@@ -35,12 +35,12 @@ _EXPOSURE_UNIT_US = 100.0
 """Unit of V4L2's absolute exposure"""
 _MANUAL_EXPOSURE = 1
 _FOUND_AT_S = 1.0
-"""A stamp of the driver that is older is none of the monotonic clock."""
+"""Largest age of a driver's stamp that is taken as of the monotonic clock."""
 _SYSTEM = Path("/sys/class/video4linux")
 
 
 class WebcamCamera:
-    """`station.devices.base.Camera` over `config.device`: a number or a path."""
+    """Webcam behind `devices.base.Camera`; `config.device` is a number or a path."""
 
     def __init__(self, config: CameraConfig) -> None:
         self._config = config
@@ -48,7 +48,7 @@ class WebcamCamera:
         self._worker = DeviceThread("webcam")
         self._newest: Image | None = None
         self._fixed: dict[str, float] = {}
-        """Exposure and focus as they were when it was opened; what the camera has not is not in it"""
+        """Exposure and focus at opening; only those that the camera has"""
         self._frames = self._seen = self._missing = 0
         self.identity = CameraIdentity(driver="webcam")
 
@@ -64,7 +64,7 @@ class WebcamCamera:
         return self.identity
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        """A frame whose exposure began after this call, which costs `LATENCY_S` more than a frame."""
+        """Return a frame whose exposure began after this call; takes `LATENCY_S` longer than a frame."""
         try:
             image = await self._run(partial(self._fresh, timeout_s), timeout_s)
         except CameraError:
@@ -89,7 +89,7 @@ class WebcamCamera:
         await self._worker.close(self._release)
 
     async def _run(self, job: Callable[[], T], timeout_s: float | None = None) -> T:
-        """CameraError when the driver is stuck for longer."""
+        """Run a job in the driver's thread; CameraError when it does not end in time."""
         running = self._worker.run(job)
         done, _ = await asyncio.wait({running}, timeout=timeout_s and timeout_s + _PATIENCE_S)
         if not done:
@@ -108,7 +108,7 @@ class WebcamCamera:
     def _open(self) -> None:
         self._release()
         device = self._config.device or "0"
-        # The daemon tries again and again, and says itself what is missing.
+        # The daemon retries and reports failures itself.
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
         video = cv2.VideoCapture(int(device) if device.isdecimal() else device)
         if not video.isOpened():
@@ -141,7 +141,7 @@ class WebcamCamera:
         if config.frame_rate_hz is not None:
             video.set(cv2.CAP_PROP_FPS, config.frame_rate_hz)
         video.set(cv2.CAP_PROP_AUTOFOCUS, 0)
-        if "focus" in self._fixed:  # opened again: the lens must be the one of the pictures before
+        if "focus" in self._fixed:  # opened again: the focus must be that of the images before
             video.set(cv2.CAP_PROP_FOCUS, self._fixed["focus"])
         if video.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE):
             video.set(cv2.CAP_PROP_EXPOSURE, config.exposure_us / _EXPOSURE_UNIT_US)
@@ -166,7 +166,7 @@ class WebcamCamera:
             video.release()
 
     def _live(self) -> cv2.VideoCapture:
-        """The device; opened again after it was lost."""
+        """Return the open device; after it was lost, open it again."""
         if self._video is None:
             if not self.identity.serial:
                 raise CameraError("the camera is not open", code="not-open")
@@ -185,7 +185,7 @@ class WebcamCamera:
         }
 
     def _fresh(self, timeout_s: float) -> Image:
-        """The first frame that cannot have begun before now, whatever waited in the driver's queue."""
+        """Return the first frame that was certainly exposed after now, discarding queued ones."""
         asked_ns, video = time.monotonic_ns(), self._live()
         self._check(video)
         while time.monotonic_ns() < asked_ns + timeout_s * 1e9:
@@ -204,7 +204,7 @@ class WebcamCamera:
             )
 
     def _grab(self, video: cv2.VideoCapture) -> int:
-        """Host monotonic time (ns) when the next frame came: by the driver's stamp where it has one."""
+        """Grab the next frame; return its arrival (host monotonic ns), by its stamp if there is one."""
         if not video.grab():
             self._release()
             raise CameraError(
@@ -238,7 +238,7 @@ class WebcamCamera:
         )
 
     def _exposure_us(self) -> float:
-        """0 where the camera does not say."""
+        """Read the exposure (µs); 0 where the camera does not tell."""
         return self._fixed.get("exposure_us", 0.0)
 
     def _numbered(self, image: Image) -> Image:
@@ -247,7 +247,7 @@ class WebcamCamera:
 
 
 def _wanted_size(config: CameraConfig) -> tuple[int, int] | None:
-    """Width, height; CameraError for a part of the image, which a webcam cannot send."""
+    """Return the configured width and height; CameraError for a region that is not at the origin."""
     if config.region is None:
         return (config.model.width, config.model.height) if config.model is not None else None
     x, y, width, height = config.region
@@ -261,7 +261,7 @@ def _wanted_size(config: CameraConfig) -> tuple[int, int] | None:
 
 
 def _readable(video: cv2.VideoCapture) -> dict[str, float]:
-    """Exposure (µs) and focus (the camera's own unit), where it has them: OpenCV says -1 or 0 for none."""
+    """Read exposure (µs) and focus (camera's unit), where it has them: OpenCV returns -1 or 0 for none."""
     known = {
         "exposure_us": video.get(cv2.CAP_PROP_EXPOSURE) * _EXPOSURE_UNIT_US,
         "focus": video.get(cv2.CAP_PROP_FOCUS),
@@ -271,7 +271,7 @@ def _readable(video: cv2.VideoCapture) -> dict[str, float]:
 
 
 def _identity(device: str) -> CameraIdentity:
-    """By what the kernel knows of it; a device without a serial number is named by its path."""
+    """Make the identity from the kernel's data; without a serial number, from the path."""
     node = f"video{device}" if device.isdecimal() else Path(device).resolve().name
     return CameraIdentity(
         vendor=kernel_text(_SYSTEM / node / "device/../manufacturer"),

@@ -1,4 +1,4 @@
-"""`station serve`: one process that makes and owns the cell: session, control socket, systemd, signals."""
+"""`station serve`: the daemon process, owner of cell, session and sockets; systemd, signals."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ GATHER_S = 0.04
 
 
 def freeze_startup() -> None:
-    """Keeps what was loaded out of garbage collection, which would hold up heartbeat and STOP."""
+    """Exclude loaded objects from garbage collection, whose pauses would delay heartbeat and STOP."""
     gc.collect()
     gc.freeze()
 
 
 def notify(line: str) -> None:
-    """Tells systemd 'READY=1', 'STATUS=…' (sd_notify), where it listens. Never blocks."""
+    """Send 'READY=1', 'STATUS=…' to systemd (sd_notify), where it listens. Never blocks."""
     if not (address := os.environ.get("NOTIFY_SOCKET", "")):
         return
     if address.startswith("@"):
@@ -49,7 +49,7 @@ def notify(line: str) -> None:
 
 
 def watchdog_period_s() -> float | None:
-    """Half of systemd's watchdog period; None when it does not watch us."""
+    """Return half of systemd's watchdog period; None without a watchdog."""
     if os.environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return None
     try:
@@ -68,7 +68,7 @@ class Daemon:
         told_to_end: Callable[[], None] = lambda: None,
         real_time: RealTimeThreads | None = None,
     ) -> None:
-        """`told_to_end` is called when SIGTERM, SIGINT or `end` begins the end."""
+        """`told_to_end` is called when SIGTERM, SIGINT or `end` begins the shutdown."""
         self.session = Session(cell, root)
         dispatcher = SessionDispatcher(self.session)
         self._control = ControlServer(control, dispatcher, newest=lambda: self.session.store.status)
@@ -83,7 +83,7 @@ class Daemon:
         self._real_time = real_time
 
     async def run(self, ready: Callable[[], None] = lambda: None) -> None:
-        """Until SIGTERM or SIGINT. `ready` is called once the socket listens. Raises StationError."""
+        """Run until SIGTERM or SIGINT. `ready` is called once the socket listens. Raises StationError."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self.end)
@@ -99,7 +99,7 @@ class Daemon:
             await self._ending.wait()
             telling.cancel()
         finally:
-            # The order matters: the arm stands, the recording is finished, then everybody is told.
+            # The order matters: stop the arm, finish the recording, then tell the clients.
             await self.session.close()
             notify("STOPPING=1")
             await self._control.close()
@@ -121,7 +121,7 @@ class Daemon:
             return None
 
     async def _tell(self) -> None:
-        """Watchers are told of changes, gathered for a moment; the same loop serves their requests."""
+        """Send changes of the status to watchers, gathered for a moment."""
         while True:
             self._served_s = time.monotonic()
             with contextlib.suppress(TimeoutError):
@@ -133,7 +133,7 @@ class Daemon:
             await asyncio.sleep(GATHER_S)
 
     def _ping(self) -> None:
-        """Pings systemd from the working loop, and only while the loop and the recorder do their work."""
+        """Ping systemd's watchdog, only while event loop and recorder work."""
         if self._real_time is not None:
             self._real_time.sweep()
         now_s = time.monotonic()
@@ -144,7 +144,7 @@ class Daemon:
             notify("WATCHDOG=1")
 
     def _healthy(self) -> bool:
-        """systemd may restart us when this stays false."""
+        """Tell whether session and recorder work; systemd restarts the daemon if this stays false."""
         recorder = self.session.context.recorder
         writing = recorder is None or recorder.error is not None or recorder.alive
         return writing and time.monotonic() - self._served_s < CONTROL_SERVED_S
@@ -160,7 +160,7 @@ class Daemon:
 
 
 def configured_cell(config: StationConfig, text: bytes, log_dir: Path) -> Cell:
-    """Nothing is connected yet. ConfigError for devices that must not be combined."""
+    """Make the cell of a configuration, not connected. ConfigError for devices that exclude each other."""
     from station.devices.ur import UrRobot
 
     trigger = _trigger(config)

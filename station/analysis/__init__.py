@@ -1,4 +1,4 @@
-"""Work for the daemon's worker process: looking at images, the running estimate.
+"""Work of the daemon's worker process: board detection, running estimate, checks of plans.
 
-Plain functions of plain data; `pool.Workers` calls them, the daemon's loop never does.
+Plain functions of plain data, called through `pool.Workers`, never in the daemon's event loop.
 """

@@ -1,4 +1,4 @@
-"""The running estimate: a quick look at X after each pose, and how sure it is. Never the final one."""
+"""Running estimate: a quick X with its uncertainty after each pose, never used as the result."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
 def running_estimate(
     config: StationConfig, lens_is_known: bool, seen: Sequence[CapturedView]
 ) -> EstimateStatus:
-    """Few views or degenerate motion give an answer without numbers and with advice."""
+    """Estimate from the views so far; with too few views or too little motion only advice, no numbers."""
     camera, goal_m = config.camera.model, config.capture.goal_m
     assert camera is not None
     shown = [image_coverage(camera, [view.pixels]) for view in seen]
@@ -71,7 +71,7 @@ def running_estimate(
 
 
 def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[int, ...], ...]:
-    """Corners in each part of the image, COVERAGE_ROWS × COVERAGE_COLUMNS."""
+    """Count corners in each part of the image, COVERAGE_ROWS × COVERAGE_COLUMNS."""
     points = np.concatenate([np.zeros((0, 2)), *pixels])
     counts = count_in_parts(camera, points, COVERAGE_ROWS, COVERAGE_COLUMNS)
     return tuple(tuple(int(n) for n in row) for row in counts)
@@ -80,7 +80,7 @@ def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[
 def solve_quickly(
     mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[CapturedView]
 ) -> tuple[ViewSet, Array, Array]:
-    """Views with the lens they were read by, X and Y.
+    """Estimate quickly; return the views with the lens used, X (4, 4) and Y (4, 4).
 
     CalibrationError, cv2.error or LinAlgError when the views are degenerate.
     """
@@ -90,14 +90,14 @@ def solve_quickly(
     )
     views = ViewSet(mount, found, camera)
     if not lens_is_known and len(found) >= FEWEST_FOR_LENS:
-        with contextlib.suppress(CalibrationError):  # the rough lens will do
+        with contextlib.suppress(CalibrationError):  # else keep the rough lens
             views = replace(views, camera=calibrate_intrinsics(views).camera)
     views = solve_pnp(views, board)
     return views, *_quick_solution(views)
 
 
 def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
-    """X and Y in closed form (Park & Martin 1994, by OpenCV), from all views."""
+    """Compute X and Y in closed form (Park & Martin 1994, by OpenCV) from all views."""
     flange, board = views.base_from_flange, views.camera_from_board
     gripper = flange if views.mount == "eye-in-hand" else inverse(flange)
     R, t = cv2.calibrateHandEye(
@@ -114,7 +114,7 @@ def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
 
 
 def quick_sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> tuple[float, float]:
-    """1σ of X: translation (m) and rotation (rad), roots of the summed variances."""
+    """Predict 1σ of X: translation (m) and rotation (rad), roots of the summed variances."""
     points = board_points(board)
     flange = views.base_from_flange
     each = view_information(views.mount, views.camera, flange, X, Y, points, USUAL_NOISE)
@@ -123,7 +123,7 @@ def quick_sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens:
 
 
 def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:
-    """The views of a recording that show the board; an image that cannot be read shows none.
+    """Detect the board in a recording; return the views that show it, skipping undecodable images.
 
     RecordingError for a recording that cannot be read.
     """

@@ -1,4 +1,4 @@
-"""One worker process for everything that would hold up the daemon's loop. It is disposable."""
+"""Worker process for work that would block the daemon's event loop; replaced when it hangs or dies."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ REAP_S = 5.0
 
 
 class WorkerError(StationError):
-    """The worker died or took too long; it is replaced, and what it was asked is not answered."""
+    """The worker process died or took too long; it is replaced, its call has no result."""
 
 
 class Workers:
-    """Calls run one after the other, in the order they were made."""
+    """Runs calls in the worker process, one after the other, in order."""
 
     def __init__(self, initializer: Callable[[], None], warm_up: Callable[[], object]) -> None:
-        """`initializer` runs in each new process first, then `warm_up`, which loads what is needed."""
+        """`initializer` runs first in each new process, then `warm_up`, which imports what is needed."""
         self._initializer, self._warm_up = initializer, warm_up
         self._pool: ProcessPoolExecutor | None = None
         self._turn = asyncio.Lock()
         self._closed = False
         self.waiting = 0
-        """Calls under way: a preview is not worth queueing for."""
+        """Number of calls under way; previews are skipped while it is not 0."""
 
     async def start(self) -> None:
-        """Returns when the worker has loaded what it needs (about a second)."""
+        """Start the worker; return when it has imported what it needs (about a second)."""
         await self.call(self._warm_up)
 
     async def call(
         self, function: Callable[..., R], *args: object, timeout_s: float = 60.0, **named: object
     ) -> R:
-        """The function's result or exception. WorkerError when the process fails or is too slow.
+        """Return the function's result or raise its exception; WorkerError when the process fails or is late.
 
-        `timeout_s`: from when its turn comes and the worker is there, so that no call ends another one.
+        `timeout_s` counts from the start of the call in a ready worker, not from its queueing.
         """
         self.waiting += 1
         try:
@@ -86,7 +86,7 @@ class Workers:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.kill()
-        # In a thread: the loop that beats the arm's heart waits for no process to end.
+        # In a thread: the event loop sends the arm's heartbeat and must not wait for a process to end.
         threading.Thread(target=_reap, args=(processes,), name="worker reaper", daemon=True).start()
 
 

@@ -1,8 +1,8 @@
-"""The work of the daemon's worker process: looking at images, checking plans.
+"""Functions of the daemon's worker process: analysis of images, checks of plans.
 
-Images: the board in one, motion between several (a ringing bracket, a swinging cable, unknown to the joints),
-and the exposure assistant, whose levels are shares of full scale of a linear sensor, as industrial ones are.
-Plain functions of plain data, so that they cross a process border; the daemon's loop never runs them.
+Images: board detection, motion between images (a ringing bracket or swinging cable that joints do not show),
+and advice on exposure, whose levels are shares of full scale of a linear sensor, as in industrial cameras.
+Plain functions of plain data, because they are called in another process.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ from station.cell.status import DetectionStatus
 from station.protocol.verbs import PreviewImage
 
 JPEG_LIMIT_BYTES = 40_000
-"""In base64 it must fit into one line of the protocol."""
+"""Largest JPEG: in base64 it must fit into one line of the protocol."""
 _QUALITIES = (75, 50, 30, 15)
 
 WIDTH_PX = 640
-"""Images are made this small first: it averages their noise, and takes a few milliseconds."""
+"""Width to which images are reduced before measuring motion, to average noise and save time."""
 FLAT_GREY = 3.0
-"""An image that varies less than this (1σ, of 255) shows nothing whose motion could be seen."""
+"""Variation (1σ, of 255) below which an image is too flat to measure motion."""
 _BOARD_GROWTH = 1.6
-"""The board is looked for in a square this much wider than its expected outline."""
+"""Factor on the board's expected outline for the square in which its motion is measured."""
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom, as shares of the image's sides."""
 
 TARGET_WHITE = 0.75
-"""The board's white: bright, with room for uneven light before it saturates."""
+"""Wanted level of the board's white, with room for uneven light before saturation."""
 _KEEP = (0.8, 1.25)
-"""Factors not worth a change"""
+"""Range of factors on the light for which no change is advised"""
 _SATURATED, _SATURATED_SHARE = 0.98, 0.005
 _DARK_WHITE, _BRIGHT_WHITE = 0.35, 0.95
 _LOW_CONTRAST = 0.25
 _BLUR_PX = 2.0
 LONGEST_EXPOSURE_US = 40_000.0
-"""The arm is at rest, but not for ever: beyond this, gain is raised instead."""
+"""Longest exposure that is advised; beyond it gain is raised instead, to keep captures short."""
 SHORTEST_EXPOSURE_US = 50.0
 HIGHEST_GAIN_DB = 12.0
 
@@ -63,7 +63,7 @@ _NICENESS = 5
 
 @dataclass(frozen=True, eq=False)
 class BoardDetection:
-    """The board in one image."""
+    """Result of looking for the board in one image."""
 
     status: DetectionStatus
     indices: NDArray[np.intp]
@@ -73,16 +73,16 @@ class BoardDetection:
 
 
 def start_worker() -> None:
-    """Capture and recording come first on a small machine; one thread leaves a core to them."""
+    """Set up the worker process: low priority and one thread, to leave a processor for the capture."""
     if (parent := multiprocessing.parent_process()) is not None and parent.pid is not None:
         die_with_parent(parent.pid)
-    with contextlib.suppress(OSError):  # a service may be forbidden to
+    with contextlib.suppress(OSError):  # a service may not be permitted to
         os.nice(_NICENESS)
     cv2.setNumThreads(1)
 
 
 def warm_up() -> int:
-    """The worker's process id, once it has imported everything."""
+    """Import everything needed; return the worker's process id."""
     return os.getpid()
 
 
@@ -93,9 +93,9 @@ def sight(
     thorough: bool = True,
     exposure: tuple[float, float] | None = None,
 ) -> BoardDetection:
-    """Looks for the board; distance and tilt where a lens, even a rough one, is given.
+    """Look for the board; distance and tilt are given where a lens, even a rough one, is known.
 
-    `exposure`: what the image was taken with (µs, dB); with it comes advice on what to set.
+    `exposure`: exposure (µs) and gain (dB) of the image; with it the result holds advice on both.
     """
     found = detect(image, board, thorough)
     distance_m = tilt_rad = None
@@ -124,7 +124,7 @@ def sight(
 def _distance_and_tilt(
     pixels: Array, points: Array, camera: CameraModel
 ) -> tuple[float | None, float | None]:
-    """Distance (m) of the board's points' centre, angle (rad) between the optical axis and the normal."""
+    """Compute distance (m) to the board's centre, and angle (rad) of its normal to the optical axis."""
     K = np.array(camera.matrix)
     ok, rotation, translation = cv2.solvePnP(
         points, pixels, K, np.array(camera.distortion or (0.0,) * 5), flags=cv2.SOLVEPNP_IPPE
@@ -138,13 +138,13 @@ def _distance_and_tilt(
 
 
 def check_run(config: StationConfig, plan: Plan, start_joints_rad: Vector6) -> PlanCheck:
-    """Checks the whole path, from where the arm is."""
+    """Check the whole path of a plan from the arm's present joints (6,), rad."""
     return check_plan(plan, start_joints_rad, geometry_from(config, start_joints_rad))
 
 
 @dataclass(frozen=True, eq=False)
 class CapturedView:
-    """A view that counts."""
+    """A captured view that counts: flange pose and detected corners."""
 
     index: int
     """The pose number."""
@@ -160,13 +160,13 @@ class CapturedView:
 class ExposureAdvice:
     exposure_us: float
     gain_db: float
-    """Settings advised; those in use where they are good."""
+    """Advised exposure and gain; the present ones where these are good."""
     white: float
     black: float
     saturated: float
-    """Share of pixels"""
+    """Share of saturated pixels"""
     blur_px: float | None
-    """Sigma of the sharpest edges; None where there is too little contrast to tell."""
+    """Sigma of the sharpest edges; None where the contrast is too low to measure it."""
     warnings: dict[str, str]
     """Sentences for people by their cause (over-exposed, under-exposed, low-contrast, blurred)."""
 
@@ -177,12 +177,12 @@ def assess(
     exposure_us: float,
     gain_db: float,
 ) -> ExposureAdvice:
-    """Advises on an image (h, w[, 3]) taken at this exposure and gain.
+    """Advise on exposure and gain from an image (h, w[, 3]) and the settings it was taken with.
 
-    `corners`: the board's detected points (k, 2), None when it was not found: the whole image counts then.
+    `corners`: the board's detected points (k, 2); None when it was not found: the whole image is used.
     """
     grey = _levels(image)
-    # A board is half white; without one, the few brightest pixels are what may saturate.
+    # Half of a board is white; without a board take the few brightest pixels, which may saturate.
     region, share = (grey, 97.0) if corners is None else (_inside(grey, corners), 85.0)
     black, white = (float(v) for v in np.percentile(region, (8.0, share)))
     saturated = float((region >= _SATURATED).mean())
@@ -207,7 +207,7 @@ def _levels(image: Pixels) -> NDArray[np.float32]:
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
     if grey.dtype == np.uint8:
         return grey.astype(np.float32) / np.float32(255)
-    # 10, 12 and 16 bit images all come as uint16: the smallest range that holds the image is meant.
+    # 10, 12 and 16 bit images all come as uint16: assume the smallest range that holds the image.
     full = next(f for f in (1023, 4095, 65535) if grey.max() <= f)
     return grey.astype(np.float32) / np.float32(full)
 
@@ -219,16 +219,16 @@ def _inside(grey: NDArray[np.float32], corners: Array) -> NDArray[np.float32]:
 
 
 def _factor(black: float, white: float, saturated: float) -> float:
-    """By how much the light must grow for white to reach its target."""
+    """Compute the factor on the light by which white reaches its target."""
     if saturated > _SATURATED_SHARE:
-        # Clipped levels say only "too much": the more of them, the bolder the step.
+        # Clipped levels do not tell how much is too much: the more of them, the larger the step.
         return 0.5 if saturated < 0.2 else 0.25
     factor = TARGET_WHITE / max(white, 0.01)
     return 1.0 if _KEEP[0] <= factor <= _KEEP[1] else min(factor, 16.0)
 
 
 def _settings(exposure_us: float, gain_db: float, factor: float) -> tuple[float, float]:
-    """Light is spent on exposure first; gain comes last and goes first."""
+    """Split a change of light: exposure is raised before gain, and gain is lowered before exposure."""
     if factor == 1.0:
         return exposure_us, gain_db
     total_us = exposure_us * 10 ** (gain_db / 20) * factor
@@ -238,7 +238,7 @@ def _settings(exposure_us: float, gain_db: float, factor: float) -> tuple[float,
 
 
 def _blur(grey: NDArray[np.float32], contrast: float) -> float | None:
-    """Gaussian sigma of the sharpest edges: their slope is contrast / (sigma √(2π))."""
+    """Measure the Gaussian sigma of the sharpest edges: their slope is contrast / (sigma √(2π))."""
     if contrast < _LOW_CONTRAST:
         return None
     dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8)
@@ -248,7 +248,7 @@ def _blur(grey: NDArray[np.float32], contrast: float) -> float | None:
 
 
 def board_box(view: ExpectedView | None, width: int, height: int) -> Box | None:
-    """Predict where the board stands in an image of this size (px); None where that is not known."""
+    """Predict the board's square in an image of this size (px); None where it is not known."""
     if view is None or view.coverage <= 0 or width <= 0 or height <= 0:
         return None
     half = _BOARD_GROWTH * np.sqrt(view.coverage * width * height) / 2
@@ -269,7 +269,7 @@ def image_motion(images: Sequence[Pixels], full_width: int = 0, box: Box | None 
     if newest.std() < FLAT_GREY:
         return None
     window = cv2.createHanningWindow((newest.shape[1], newest.shape[0]), cv2.CV_32F)
-    # A copy each: OpenCV lays the window over the very arrays it is given.
+    # Copies, because OpenCV multiplies its input arrays by the window in place.
     shifts = [cv2.phaseCorrelate(image, newest.copy(), window)[0] for image in earlier]
     share = 1.0 if box is None else box[2] - box[0]
     scale = (full_width or images[-1].shape[1]) * share / newest.shape[1]
@@ -277,7 +277,7 @@ def image_motion(images: Sequence[Pixels], full_width: int = 0, box: Box | None 
 
 
 def _reduced(image: Pixels, box: Box | None) -> NDArray[np.float32]:
-    """Grey, 0…255, at most `WIDTH_PX` wide."""
+    """Convert to grey, 0…255, at most `WIDTH_PX` wide."""
     height, width = image.shape[:2]
     if box is not None:
         left, top, right, bottom = box
@@ -295,9 +295,9 @@ def _reduced(image: Pixels, box: Box | None) -> NDArray[np.float32]:
 
 
 def preview_image(taken: Image, corners: Array, width: int, height: int, sequence: int) -> PreviewImage:
-    """A JPEG that fits into width × height, px; empty where none is small enough.
+    """Make a JPEG that fits into width × height, px; empty where none is small enough.
 
-    `corners`: (n, 2) of the image, px. `sequence`: another number for another image.
+    `corners`: (n, 2) of the image, px. `sequence`: number that differs for every image.
     """
     image = eight_bits(viewable(taken.pixels, taken.pixel_format), taken.pixel_format)
     sides = image.shape[1::-1]

@@ -1,1 +1,1 @@
-"""The daemon's sockets: control, STOP, and the dispatch of verbs. For `station.daemon` alone."""
+"""The daemon's sockets for control and STOP, and the dispatch of verbs; used by `station.daemon` only."""

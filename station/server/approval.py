@@ -1,7 +1,7 @@
-"""Permission to approve motion: decided by the daemon from the kernel's word and its configuration.
+"""Permission to approve motion, decided from what the kernel tells of a client and from the configuration.
 
-What a client says of itself counts for nothing here. A person counts as present when the client is in the
-foreground of a terminal that its user owns; what that proves and what it does not: docs/operator/safety.md.
+What a client says of itself does not count. A person counts as present when the client is in the foreground
+of a terminal that its user owns; what that proves and what it does not: docs/operator/safety.md.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from station.cell.errors import RefusedError
 
 @dataclass(frozen=True)
 class Process:
-    """A client's process as /proc shows it."""
+    """Process of a client, from /proc."""
 
     user: int
     began_ticks: int
-    """Since the computer's start; another process with the same number began later."""
+    """Start since boot, in clock ticks: tells apart processes that have the same number one after another."""
     terminal: str
-    """'pts/3' when it is in the foreground of its terminal; empty: nobody sees what it shows."""
+    """Terminal in whose foreground it is, such as 'pts/3'; empty: none."""
 
 
 def process(pid: int) -> Process | None:
-    """None when it ended, or when this process may not see it (systemd: ProtectProc=)."""
+    """Look a process up; None when it ended, or may not be seen (systemd: ProtectProc=)."""
     try:
         place = Path(f"/proc/{pid}")
         user = place.stat().st_uid
@@ -51,27 +51,27 @@ def _terminal_name(number: int) -> str:
 
 @dataclass
 class Peer:
-    """Process at the other end, by the kernel's word, and what is known of it when it asks for motion."""
+    """Client process of a connection: what the kernel tells of it, and what it says."""
 
     client_id: int
-    """0: it sent STOP without a connection."""
+    """Number of the connection; 0: it sent STOP without one."""
     pid: int
     uid: int
     told: str = ""
-    """Name that it gave."""
+    """Name that the client gave."""
     user: str = ""
-    """The user's name, once that was looked up."""
+    """Name of the user; empty until it is looked up."""
     began_ticks: int | None = None
     """Start of the process that made the connection; None: not known."""
 
     @property
     def who(self) -> str:
-        """Its name in log, status and recording."""
+        """Name of the client in log, status and recording."""
         return f"{self.told or f'uid {self.uid}'} (pid {self.pid})"
 
 
 class ApprovalRule:
-    """`see`: looks a process up."""
+    """Rule that decides who may approve motion. `see`: function that looks a process up."""
 
     def __init__(
         self, config: ApprovalConfig, simulated: bool, see: Callable[[int], Process | None] = process
@@ -79,7 +79,7 @@ class ApprovalRule:
         self._config, self._simulated, self._see = config, simulated, see
 
     def by_person(self, asks: Peer, what: str) -> str:
-        """Returns how a person approves, for the log. RefusedError unless a person may approve it there."""
+        """Check that a person may approve from this client; return how, for the log. Else RefusedError."""
         if self._simulated:
             return "a simulated cell"
         if terminal := self._terminal(asks):
@@ -92,7 +92,7 @@ class ApprovalRule:
         )
 
     def approve(self, asks: Peer, plan_sha256: str, offered_sha256: str) -> str:
-        """Like `by_person`; a service named in the configuration may approve the plan whose hash it knows."""
+        """Check as `by_person`, or that a configured service names the hash of the offered plan."""
         if plan_sha256 and offered_sha256 and plan_sha256 != offered_sha256:
             raise RefusedError("The approved plan is not the one that is loaded.", code="other-plan")
         if self._simulated or self._terminal(asks):

@@ -1,6 +1,6 @@
-"""The control socket: anyone in the group may watch and STOP; whoever has control may command.
+"""Control socket: every member of the group may watch and STOP, the client that has control may command.
 
-A client that is slow, hostile or stuck costs a bounded amount of memory and is dropped, never waited for.
+The server never waits for a slow, hostile or stuck client: its memory is bounded and it is disconnected.
 """
 
 from __future__ import annotations
@@ -40,46 +40,46 @@ OPEN_REQUESTS_LIMIT = 8
 HANG_UP_S = 1.0
 ACCEPT_BATCH = 32
 ACCEPT_PAUSE_S = 0.01
-"""Between batches: a flood of connections costs the working loop no more than that."""
+"""Pause between batches of new connections, so that a flood of them cannot block the event loop."""
 NEW_PER_S = 200
-"""Connections that one user may open within a second."""
+"""Most connections that one user may open within a second."""
 
 
 class Handler(Protocol):
-    """The daemon's side of requests."""
+    """Carries out requests; implemented by `server.dispatch`."""
 
     def stop_now(self, peer: Peer) -> Awaitable[object] | None:
-        """STOP, from anyone: under way when it returns, should the client leave. May return an awaitable."""
+        """Begin STOP, from any client; it goes on if the client leaves. May return an awaitable."""
 
     async def handle(self, peer: Peer, verb: str, args: dict[str, object]) -> object:
-        """The result; what a person can act on (CodedError) becomes the reply's problem."""
+        """Carry out a verb and return its result; a CodedError becomes the reply's `problem`."""
 
     def gone(self, peer: Peer) -> None:
-        """The connection ended; if it had control, the arm must decelerate now."""
+        """Handle the end of a connection; if it had control, the arm must decelerate now."""
 
 
 class ControlServer:
-    """Serves until `close`. `publish` sends every watcher what changed."""
+    """Server of the control socket until `close`; `publish` sends changes of the status to watchers."""
 
     def __init__(
         self, path: Path, handler: Handler, newest: Callable[[], StationStatus] | None = None
     ) -> None:
-        """`newest`: what a watcher that has just come is told; what was published may be a moment older."""
+        """`newest`: returns the status for a new watcher; the last one published may be older."""
         self._path, self._handler = path, handler
         self._status = StationStatus()
         self._newest = newest or (lambda: self._status)
         self._listening: socket.socket | None = None
         self._connections: set[_Connection] = set()
         self._serving: dict[asyncio.Task[None], int] = {}
-        """Connections, and whose they are."""
+        """Task of each connection → user id."""
         self._next_client_id = 1
         self._opened: dict[int, deque[float]] = defaultdict(lambda: deque(maxlen=NEW_PER_S))
-        """When each user's newest connections were opened."""
+        """User id → times of the user's newest connections."""
 
     async def start(self) -> None:
-        """Binds with mode 0660; a stale socket is replaced.
+        """Bind the socket with mode 0660, replacing a stale one.
 
-        StationError when another daemon serves here, or when others could put a socket in its place.
+        StationError when another daemon serves it, or when other users could replace it.
         """
         make_folder(self._path.parent)
         _remove_stale(self._path)
@@ -147,7 +147,7 @@ class ControlServer:
         loop.call_later(ACCEPT_PAUSE_S, self._listen)
 
     def _full_for(self, uid: int) -> RefusedError | None:
-        """Say why this user is not let in now; None: there is room."""
+        """Make the error where this user may not connect now; None: there is room."""
         if len(self._serving) >= CLIENT_LIMIT:
             return _full(f"{CLIENT_LIMIT} clients are connected already", CLIENT_LIMIT)
         if list(self._serving.values()).count(uid) >= USER_CLIENT_LIMIT:
@@ -177,7 +177,7 @@ class ControlServer:
 
 
 class _Connection:
-    """One client: its lines in, its answers and notices out."""
+    """Connection of one client: reads its requests, sends replies and notices."""
 
     def __init__(
         self,
@@ -187,14 +187,14 @@ class _Connection:
         handler: Handler,
         publish: Callable[[], StationStatus],
     ) -> None:
-        """`publish`: tells every watcher what changed; returns the newest status."""
+        """`publish`: sends changes of the status to every watcher; returns the newest status."""
         self.peer = peer
         self.watching = False
         self._reader, self._writer, self._handler = reader, writer, handler
         self._publish = publish
         self._tasks: set[asyncio.Task[None]] = set()
         self._pieces = bytearray()
-        """Pieces of a request that is longer than a line."""
+        """Pieces received of a request that is longer than a line."""
 
     async def run(self) -> None:
         decoder = msgspec.json.Decoder(Request)
@@ -204,7 +204,7 @@ class _Connection:
                     self._take(decoder.decode(line))
                 except (ValueError, RecursionError) as error:  # msgspec's, base64's
                     self.refuse(0, RefusedError(f"not a request: {error}", code="not-a-request"))
-                await asyncio.sleep(0)  # readline gives lines that wait without a pause: STOP of others first
+                await asyncio.sleep(0)  # readline never pauses while lines wait: let others' STOP in
         except ValueError:  # readline: the line is longer than the limit
             self.drop(f"a line of more than {LINE_LIMIT_BYTES} bytes")
         except OSError:
@@ -216,7 +216,7 @@ class _Connection:
 
     def _take(self, request: Request) -> None:
         if request.verb == "stop":
-            # In this very call: no limit holds it up, and nothing that is read later comes before it.
+            # Before any limit is checked and any later line is read.
             stopping = self._handler.stop_now(self.peer)
             self._spawn(self._answer_stop(request.id, stopping))
         elif request.verb == "part":
@@ -263,7 +263,7 @@ class _Connection:
     async def _answer(self, request: Request) -> None:
         try:
             result = await self._handler.handle(self.peer, request.verb, request.args)
-            status = self._publish()  # who was answered knows what came of it, and nothing older
+            status = self._publish()  # before the reply, so that the client never sees an older status
             self.reply(Reply(request.id, True, result))
             if request.verb == "watch" and not self.watching:
                 self.send(msgspec.json.encode(Notice(status=status)) + b"\n")
@@ -297,7 +297,7 @@ class _Connection:
         self.hang_up()
 
     def hang_up(self) -> None:
-        """A client that does not read would hold a polite close open for ever."""
+        """Abort the connection: an orderly close would wait for ever for a client that does not read."""
         self._writer.close()
         asyncio.get_running_loop().call_later(HANG_UP_S, self._writer.transport.abort)
 
@@ -309,7 +309,7 @@ def _full(text: str, limit: int) -> RefusedError:
 
 
 def _remove_stale(path: Path) -> None:
-    """A socket that nobody serves is what a crash leaves behind."""
+    """Remove a socket that a crash left. StationError where a daemon serves it or it is no socket."""
     if not path.is_socket():
         if path.exists():
             raise StationError(f"{path} is not a socket.", code="socket", remedy="Move it.")

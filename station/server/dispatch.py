@@ -1,4 +1,4 @@
-"""Carries out the verbs of `station.protocol.verbs` with the session: one method a verb, by its name."""
+"""Dispatch of the verbs of `station.protocol.verbs` to the session: one method for each verb, by its name."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from station.session.session import Session
 from station.session.threads import ASKED, NAMES
 
 CONNECTION = {"watch", "stop", "part", "whole"}
-"""Verbs that the connection itself carries out."""
+"""Verbs that `server.control` carries out itself."""
 _WHO_LIMIT = 60
 
 
 class SessionDispatcher:
-    """Behind `station.server.control.Handler`."""
+    """Implementation of `server.control.Handler` by a session."""
 
     def __init__(self, session: Session, see: Callable[[int], Process | None] = process) -> None:
         self._session, self._see = session, see
@@ -39,15 +39,15 @@ class SessionDispatcher:
         self._callers: dict[int, Peer] = {}
         self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
-        """Users by their number, once they were looked up."""
+        """User id → name, once looked up."""
         self._methods = {name: getattr(self, f"_{name}") for name in VERBS.keys() - CONNECTION}
 
     def stop_now(self, peer: Peer) -> Awaitable[object]:
-        """STOP is on its way to the arm before anything else is looked at."""
+        """Begin STOP at once; return an awaitable for its end."""
         return self._to_the_end(self._session.stop(peer.who))
 
     def stop_from(self, sender: Peer) -> None:
-        """STOP without a connection; who has one as well is known by what was said there."""
+        """Begin STOP for a sender without a connection, named by the connection of its process if any."""
         known = (c for c in self._callers.values() if (c.pid, c.uid) == (sender.pid, sender.uid))
         caller = next(known, None)
         user = self._names.get(sender.uid, f"uid {sender.uid}")
@@ -58,24 +58,24 @@ class SessionDispatcher:
 
     async def _name(self, uid: int) -> str:
         if uid not in self._names:
-            # In a thread: where users come from the network, a name may take seconds.
+            # In a thread: where users come from a directory server, a name may take seconds.
             self._names[uid] = await NAMES.run(user_name, uid)
         return self._names[uid]
 
     def gone(self, peer: Peer) -> None:
-        """The arm decelerates at once when this was the commander."""
+        """Handle the end of a connection; the arm decelerates at once if it had control."""
         self._callers.pop(peer.client_id, None)
         self._to_the_end(self._session.lease_lost(peer.client_id))
 
     def _to_the_end(self, work: Coroutine[object, object, object]) -> asyncio.Future[object]:
-        """A client that leaves takes its requests with it, but not these."""
+        """Run work that goes on when the client disconnects."""
         task = asyncio.create_task(work)
         self._leaving.add(task)
         task.add_done_callback(self._leaving.discard)
         return asyncio.shield(task)
 
     async def handle(self, peer: Peer, verb: str, args: dict[str, object]) -> object:
-        """RefusedError for wrong arguments, in a wrong state, or without the control that it needs."""
+        """Carry out a verb. RefusedError for wrong arguments, in a wrong state, or without control."""
         if verb == "watch":
             return {}
         kind = VERBS[verb]
@@ -95,7 +95,7 @@ class SessionDispatcher:
         return peer
 
     async def _hello(self, caller: Peer, args: verbs.Hello) -> verbs.Welcome:
-        user = caller.user = await self._name(caller.uid)  # the kernel's word; the place is the client's
+        user = caller.user = await self._name(caller.uid)  # from the kernel; `who` is the client's own claim
         said = "".join(c for c in args.who if c.isprintable())[:_WHO_LIMIT] or user
         caller.told = said if said.split(" ")[0] == user else f"{user} ({said})"
         context = self._session.context
@@ -156,7 +156,7 @@ class SessionDispatcher:
         await self._to_the_end(self._session.finish(caller.client_id))
 
     async def _edit(self, caller: Peer, args: Verb[object]) -> verbs.PoseNumber | None:
-        """A change of the poses: the queue has a method with the verb's name and arguments."""
+        """Change the poses by the queue's method that has the verb's name and arguments."""
         change = methodcaller(args.verb(), *msgspec.structs.astuple(args))
         index: int | None = await self._session.edit(type(args), caller.client_id, change)
         return None if index is None else verbs.PoseNumber(index)
@@ -182,5 +182,5 @@ class SessionDispatcher:
         return self._session.context.cell.config
 
     async def _sessions(self, caller: Peer, args: verbs.Sessions) -> list[SessionSummary]:
-        # In a thread: hundreds of files are read, and the arm's heartbeat does not wait.
+        # In a thread: reading hundreds of files must not delay the arm's heartbeat.
         return await ASKED.run(list_sessions, self._session.context.root)

@@ -1,7 +1,7 @@
-"""STOP's own socket: every datagram that comes is STOP, whatever it says and whoever sent it.
+"""STOP's own socket: every datagram is STOP, whatever its content and sender.
 
-So the queue can be filled with nothing but STOPs: a flood from one user stops the arm for all, and holds up
-nobody's. It needs no connection, no control and no answer; what came of it stands on the motion page.
+A flood from one user can therefore fill the queue with STOPs only, and cannot delay another user's. STOP
+needs no connection, control or answer; its effect is told by the motion page (`protocol.stop_client`).
 """
 
 from __future__ import annotations
@@ -26,19 +26,22 @@ log = logging.getLogger(__name__)
 
 BATCH = 32
 PAUSE_S = 0.02
-"""The first datagram is read at once, the next ones together after a pause: so little does a flood cost."""
+"""Pause after a datagram before the next ones are read together, so that a flood costs little."""
 REPEAT_S = 0.1
-"""A latched STOP is repeated to an arm that rests no more often than this."""
+"""Shortest period at which a latched STOP is sent again to a resting arm."""
 RESTING_RAD_S = 0.01
 SETTLE_S = 0.05
-"""An arm counts as resting only so long after STOP: a move may just have begun."""
+"""Time after STOP before an arm can count as resting, as a move may just have begun."""
 _CREDENTIALS = struct.Struct("3i")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_CREDENTIALS.size)
 
 
 class StopServer:
-    """`stop` is called at once, in the working loop. `latched`: STOP holds. `speed_rad_s`: of the fastest
-    joint, None where it is not known."""
+    """Server of the STOP socket and writer of the motion page.
+
+    `stop` is called at once, in the event loop. `latched` tells whether STOP is latched. `speed_rad_s`
+    returns the fastest joint's speed, None where it is not known.
+    """
 
     def __init__(
         self,
@@ -52,15 +55,15 @@ class StopServer:
         self._link: socket.socket | None = None
         self._stops = 0
         self._latched_s = self._repeated_s = float("-inf")
-        """When STOP was latched, and when it was last carried out."""
+        """When STOP was latched, and when it was last carried out (monotonic)."""
         self._descriptor = -1
         self._said = self._page()
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="motion-page")
-        """A disk that hangs must not hold the working loop."""
+        """Thread that writes the motion page, as a hanging disk must not block the event loop."""
         self._writing: Future[None] | None = None
 
     def start(self) -> None:
-        """The caller has made sure that no other daemon serves here. Raises StationError."""
+        """Open socket and page, after the caller made sure that no other daemon runs. Raises StationError."""
         make_folder(self._socket_path.parent)
         link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         old = os.umask(0o117)
@@ -79,7 +82,7 @@ class StopServer:
         self._listen()
 
     def round(self) -> None:
-        """Once in every round of the working loop, before anything else."""
+        """Read waiting datagrams and update the motion page; call first in every round of the event loop."""
         if self._link is not None:
             self._read()
             self._tell()
@@ -128,7 +131,7 @@ class StopServer:
         if not self._latched():
             self._latched_s = now_s
         elif not self._moves() and now_s - self._repeated_s < REPEAT_S:
-            return  # the page is brought up to date in the next round
+            return  # the next round updates the page
         self._repeated_s = now_s
         self._stop(sender)
         self._tell()
@@ -147,7 +150,7 @@ class StopServer:
         return speed_rad_s is not None and speed_rad_s > RESTING_RAD_S
 
     def _tell(self) -> None:
-        """Writes the page when it changed; what is being written now goes first."""
+        """Write the page if it changed, unless a write is still under way."""
         if self._writing is not None and not self._writing.done():
             return
         if (page := self._page()) != self._said:

@@ -1,6 +1,6 @@
-"""Result of `station accept`, kept with the cell: whether this arm's ways to stop passed.
+"""Result of `station accept`: whether every way to stop this arm passed its test.
 
-It holds for one arm with one firmware, payload and control path. Another one of these makes it void.
+It is valid for one arm with one firmware, payload and control path.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ _LIMIT_BYTES = 1024 * 1024
 ACCEPTANCE_NAME = "acceptance.json"
 """Below the daemon's root."""
 STOP_TESTED = "stop-tested"
-"""Cause of the state after a move of the test, however it ended."""
+"""Cause (`StationStatus.cause`) of the state after a move of the test, however it ended."""
 STOP_GIVEN = "stop-given"
-"""Code of the event that tells when: `moment_ns`, host monotonic."""
+"""Code of the event that tells when the stop was given: value `moment_ns`, host monotonic."""
 PAYLOAD_TOLERANCE = 0.005
-"""kg, and m of its centre: less is rounding on the way through RTDE."""
+"""Difference of mass (kg) or centre (m) up to which two payloads are the same: RTDE rounds them."""
 
 
 class StopWay(StrEnum):
@@ -34,11 +34,11 @@ class StopWay(StrEnum):
     KILLED = "control-killed"
     """The control process is killed."""
     FROZEN = "daemon-frozen"
-    """The daemon's working loop stands still for a second: the watchdog alone is left."""
+    """The daemon's event loop is blocked for a second, so that only the watchdog can stop the arm."""
 
 
 class ArmSubject(msgspec.Struct, frozen=True):
-    """Arm, firmware, payload and control path that an acceptance holds for."""
+    """Arm, firmware, payload and control path for which an acceptance is valid."""
 
     source: str
     """real, or simulated"""
@@ -46,11 +46,11 @@ class ArmSubject(msgspec.Struct, frozen=True):
     serial: str
     controller_version: str
     payload: tuple[float, ...]
-    """Mass (kg) and centre of gravity (m, flange) as set on the pendant; empty: not told."""
+    """Mass (kg) and centre of gravity (m, flange) as set on the pendant; empty: not reported."""
     control_path: str
 
     def difference(self, other: ArmSubject) -> str:
-        """The first thing that is another one there; empty: none."""
+        """Name the first thing that differs; empty: none."""
         pairs = zip(self.payload, other.payload, strict=False)
         same_payload = len(self.payload) == len(other.payload) and all(
             abs(a - b) <= PAYLOAD_TOLERANCE for a, b in pairs
@@ -81,15 +81,15 @@ class StopTestOffer(msgspec.Struct, frozen=True):
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """One measured figure of a stop against the most that it may be."""
+    """Measured figure of a stop, with its limit."""
 
     name: str
     value: float | None
-    """None: it never came."""
+    """Measured value; None: the event was not observed."""
     unit: str
     limit: float
     source: str
-    """Where the limit comes from."""
+    """Reason for the limit."""
 
     @property
     def passed(self) -> bool:
@@ -97,17 +97,17 @@ class Figure(msgspec.Struct, frozen=True):
 
 
 class StopResult(msgspec.Struct, frozen=True):
-    """One move of the test, and how it ended."""
+    """Result of one move of the test."""
 
     way: str
-    """A `StopWay`, or one of an earlier release."""
+    """A `StopWay`, or a value of an earlier release."""
     speed_m_s: float
     """Speed of the fastest modelled point, as approved."""
     figures: tuple[Figure, ...]
     repeated: int = 0
-    """Moves before it that were not measured."""
+    """Number of moves before it whose stop could not be measured."""
     not_measured: str = ""
-    """Why it tells nothing of the arm; empty: it was measured."""
+    """Why the stop could not be measured; empty: it was."""
 
     @property
     def failed(self) -> tuple[Figure, ...]:
@@ -119,7 +119,7 @@ class StopResult(msgspec.Struct, frozen=True):
 
 
 class Acceptance(msgspec.Struct, frozen=True):
-    """One test of an arm, whether it passed or not."""
+    """Test of an arm, passed or not."""
 
     subject: ArmSubject
     accepted: bool
@@ -132,14 +132,14 @@ class Acceptance(msgspec.Struct, frozen=True):
 
 
 def write_acceptance(root: Path, acceptance: Acceptance) -> Path:
-    """Raises OSError."""
+    """Write the result below `root`; return the file. Raises OSError."""
     path = root / ACCEPTANCE_NAME
     write_atomically(path, msgspec.json.format(msgspec.json.encode(acceptance)))
     return path
 
 
 def read_acceptance(root: Path) -> Acceptance | None:
-    """The newest test below this root; None: there is none, or its file cannot be read."""
+    """Read the newest test below `root`; None: there is none, or its file is unreadable."""
     try:
         return msgspec.json.decode(read_file(root / ACCEPTANCE_NAME, _LIMIT_BYTES), type=Acceptance)
     except (OSError, msgspec.DecodeError):

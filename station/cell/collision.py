@@ -1,7 +1,7 @@
-"""Coarse solids of arm, tool, camera and board, and how far they are from each other and from walls.
+"""Collision model: capsules for arm, tool, camera and board, and their distances to each other and to walls.
 
-Everything is a capsule (a segment with a radius), so one formula serves all. Radii are generous; a
-margin of zero means "touching after the wanted clearance was taken off".
+A capsule is a segment with a radius. Radii are larger than the real bodies; a margin of zero means that the
+distance equals the wanted clearance.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from station.cell.config import Capsule, LimitsConfig, vector3
 
 ARM_BODIES = ("base column", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3")
 SPACING_M = 0.01
-"""No modelled point moves further between two checked samples; margins are reduced by half of it."""
+"""Largest motion of a modelled point between two checked samples; half of it is taken off all margins."""
 _SELF_PAIRS = (
     *((0, b) for b in (3, 4, 5, 6)),
     *((1, b) for b in (3, 4, 5, 6)),
@@ -26,7 +26,7 @@ _SELF_PAIRS = (
     (3, 6),
 )
 _SELF_BODIES_FOR_TOOL = (0, 1, 2, 3, 4)
-"""Arm bodies that a solid on the flange may run into; the last two wrists are its neighbours."""
+"""Arm bodies checked against solids on the flange: all but the last two wrists, which are next to it."""
 
 _SIDEWAYS_M = {
     "UR3": (0.1198, 0.0273),
@@ -37,12 +37,12 @@ _SIDEWAYS_M = {
     "UR10e": (0.1762, 0.0393),
     "UR16e": (0.1760, 0.0390),
 }
-"""Upper arm and forearm stand this far beside the plane of the first DH frames (maker's visual model)."""
+"""Offsets of upper arm and forearm from the plane of the first DH frames (maker's visual model)."""
 
 
 @dataclass(frozen=True, eq=False)
 class CellGeometry:
-    """A cell as the checks know it. Frames: `base` for obstacles, `flange` for solids."""
+    """Geometry and limits of a cell for checks before motion. Obstacles are in `base`, solids in `flange`."""
 
     model: RobotModel
     limits: LimitsConfig
@@ -52,9 +52,9 @@ class CellGeometry:
     """Fixed, in `base`: the board, a fixed camera."""
     obstacle_clearance_m: float = 0.10
     watched_m: tuple[tuple[float, float, float], ...] = ()
-    """Further points in `flange` (camera centre, board corners) that speed and workspace limits hold for."""
+    """Further points in `flange` (camera centre, board corners) to which speed and workspace limits apply."""
     mount: Mount | None = None
-    """Mounting that a plan must be made for; None: not known."""
+    """Mounting that a plan must have; None: any."""
     body_names: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -62,7 +62,7 @@ class CellGeometry:
 
 
 def body_segments(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, Array, Array]:
-    """Joints (n, 6) → segment starts and ends (n, bodies, 3) in `base`, and radii (bodies,), metres."""
+    """Place the capsules for joints (n, 6): starts and ends (n, bodies, 3) in `base`, radii (bodies,), m."""
     model = geometry.model
     frames = link_frames(model, joints_rad)
     o, z = frames[:, :, :3, 3], frames[:, :, :3, 2]
@@ -81,7 +81,7 @@ def body_segments(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, Arr
 
 
 def gap_to_arm(geometry: CellGeometry, joints_rad: Array, starts: Array, ends: Array) -> Array:
-    """(n,) distance from the arm in one posture (6,) to segments on its flange, (n, 3) each in `base`."""
+    """Compute distances (n,) of the arm at joints (6,) to segments, (n, 3) each, on its flange in `base`."""
     first, last, radii = body_segments(geometry, joints_rad[None])
     bodies = list(_SELF_BODIES_FOR_TOOL)
     gap = segment_distance(first[:, bodies], last[:, bodies], starts[:, None], ends[:, None])
@@ -89,10 +89,11 @@ def gap_to_arm(geometry: CellGeometry, joints_rad: Array, starts: Array, ends: A
 
 
 def surface_speeds(geometry: CellGeometry, joints_rad: Array, joint_speeds_rad_s: Array) -> Array:
-    """(n, 6) and (n, 6) or (6,) → (n, k) m/s: the fastest point of every body's surface at both of its ends.
+    """Compute speeds (n, k), m/s, of the fastest surface point at both ends of every body.
 
-    Between them no point is faster. A point of a rigid body has v = ω × p − Σ ω_j × o_j; of all points at a
-    distance r from p the fastest has √(v∥² + (v⊥ + r·|ω|)²), parts along and across ω.
+    For joints (n, 6) and their speeds (n, 6) or (6,). Points between the ends are not faster. A point of a
+    rigid body has v = ω × p − Σ ω_j × o_j; of all points at a distance r from p the fastest has
+    √(v∥² + (v⊥ + r·|ω|)²), with the parts of v along and across ω.
     """
     starts, ends, radii = body_segments(geometry, joints_rad)
     frames = link_frames(geometry.model, joints_rad)
@@ -115,7 +116,7 @@ def surface_speeds(geometry: CellGeometry, joints_rad: Array, joint_speeds_rad_s
 
 
 def moving_points(geometry: CellGeometry, joints_rad: Array) -> Array:
-    """(n, 6) → points (n, k, 3) in `base` whose way counts: ends of every body beyond the shoulder."""
+    """Compute points (n, k, 3) in `base` whose motion sets the sampling: ends of all moving bodies."""
     starts, ends, _ = body_segments(geometry, joints_rad)
     points = [starts[:, 2:], ends[:, 2:]]
     if geometry.watched_m:
@@ -125,11 +126,11 @@ def moving_points(geometry: CellGeometry, joints_rad: Array) -> Array:
 
 
 _TINY = 1e-24
-"""Square of a length that is a point."""
+"""Squared length below which a segment is a point."""
 
 
 def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
-    """Shortest distance between segments a0–a1 and b0–b1, broadcast over (..., 3).
+    """Compute the shortest distance between segments a0–a1 and b0–b1, broadcast over (..., 3).
 
     Source: C. Ericson, "Real-Time Collision Detection" (2005), section 5.1.9.
     """
@@ -140,7 +141,7 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     c = np.einsum("...i,...i->...", d1, r)
     f = np.einsum("...i,...i->...", d2, r)
     parallel = a * e - b * b
-    # Below a millionth of a radian rounding decides; what parallel costs then is that angle times the length.
+    # Below 1e-6 rad they are taken as parallel, as rounding would decide; the error is angle times length.
     s = np.where(
         parallel > 1e-12 * a * e, np.clip((b * f - c * e) / np.maximum(parallel, _TINY**2), 0.0, 1.0), 0.0
     )
@@ -152,7 +153,7 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
 
 
 class Contact(NamedTuple):
-    """Two things that must keep apart, or a point and a side of the workspace."""
+    """Pair that must keep a distance: two bodies, or a point and a side of the workspace."""
 
     body: str
     other: str
@@ -165,7 +166,7 @@ class Contact(NamedTuple):
 
 
 def margins(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, tuple[Contact, ...]]:
-    """Joints (n, 6) → margins (n, m) in metres, negative = violated, and the m contacts they belong to."""
+    """Compute margins (n, m), metres, negative where violated, and their m contacts, for joints (n, 6)."""
     joints_rad = np.asarray(joints_rad, dtype=float).reshape(-1, 6)
     starts, ends, radii = body_segments(geometry, joints_rad)
     limits, names, movers = geometry.limits, geometry.body_names, slice(2, None)
@@ -185,7 +186,7 @@ def margins(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, tuple[Con
     for plane in limits.planes:
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
         height = np.minimum((starts - plane.point_m) @ normal, (ends - plane.point_m) @ normal)
-        # The upper arm's near end is the shoulder, which stands where it was bolted down.
+        # The upper arm's near end is the shoulder, which does not move.
         height[:, 2] = (ends[:, 2] - plane.point_m) @ normal
         columns.append(height[:, movers] - radii[movers] - limits.clearance_m)
         contacts += [Contact(body, plane.name, "plane") for body in names[movers]]
@@ -203,7 +204,7 @@ def margins(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, tuple[Con
 
 
 def plate(name: str, frame: Array, low_m: Array, high_m: Array, rods: int = 5) -> tuple[Capsule, ...]:
-    """A flat plate low…high (2,) in the xy plane of `frame` (4, 4), as parallel capsules that cover it."""
+    """Cover a plate, low…high (2,) in the xy plane of `frame` (4, 4), by parallel capsules."""
     spacing = float(high_m[1] - low_m[1]) / rods
     ys = low_m[1] + spacing * (np.arange(rods) + 0.5)
     ends = np.array([[(low_m[0], y, 0.0), (high_m[0], y, 0.0)] for y in ys])

@@ -1,4 +1,4 @@
-"""The station's configuration: strict types, every unit in the name. Loading is `load_config`'s job."""
+"""The station's configuration as strict types, with units in the names. Loaded by `config_file`."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 
 def vector3(values: Iterable[float]) -> Vector3:
-    """Three numbers, an array's too, as files and messages take them."""
+    """Convert three numbers, from an array for instance, to a tuple for files and messages."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 
 
 def vector6(values: Iterable[float]) -> Vector6:
-    """Six numbers, likewise."""
+    """Convert six numbers, from an array for instance, to a tuple for files and messages."""
     a, b, c, d, e, f = (float(value) for value in values)
     return a, b, c, d, e, f
 
 
 def matrix4(rows: Iterable[Iterable[float]]) -> Matrix4:
-    """A 4×4 matrix, likewise."""
+    """Convert a 4×4 matrix, from an array for instance, to tuples for files and messages."""
     return tuple(tuple(float(value) for value in row) for row in rows)
 
 
@@ -45,7 +45,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 
 
 class PoseGuess(Section, frozen=True):
-    """A rough rigid transform, good to `sigma_m` and `sigma_rad`."""
+    """Rough rigid transform with its 1σ per axis, `sigma_m` and `sigma_rad`."""
 
     translation_m: Vector3
     rotation_xyzw: tuple[float, float, float, float]
@@ -54,7 +54,7 @@ class PoseGuess(Section, frozen=True):
 
 
 class KinematicsDeltas(Section, frozen=True):
-    """Factory-calibrated DH corrections of this very arm."""
+    """Factory-calibrated DH corrections of this arm."""
 
     a_m: Vector6 = (0.0,) * 6
     d_m: Vector6 = (0.0,) * 6
@@ -63,21 +63,21 @@ class KinematicsDeltas(Section, frozen=True):
 
 
 ControlPath = Literal["ur_rtde", "script"]
-"""Driver of the arm: the library, or a script of our own where the library does not exist."""
+"""Driver of the arm: the library, or the station's own script where there is no library."""
 
 
 class RobotConfig(Section, frozen=True):
     model: str = "UR10"
     host: str = ""
     serial: str = ""
-    """When given, another arm is refused."""
+    """Serial number; when given, other arms are refused."""
     kinematics: KinematicsDeltas | None = None
     control: ControlPath | None = None
-    """None = ur_rtde where it is installed, else script"""
+    """Control path; None: ur_rtde where it is installed, else script"""
 
 
 REAL_DRIVERS = ("aravis", "webcam")
-"""The others never stand beside an arm that really moves: their image would be a wrong calibration."""
+"""Camera drivers allowed with a real arm; images of the others would make a wrong calibration."""
 
 
 class CameraConfig(Section, frozen=True):
@@ -91,32 +91,32 @@ class CameraConfig(Section, frozen=True):
     trigger: Literal["software", "hardware", "free-running"] = "software"
     pixel_format: str = "Mono8"
     frame_rate_hz: float | None = None
-    """free-running: None = the camera's own"""
+    """Frame rate when free-running; None: the camera's own"""
     exposure_us: Positive = 10_000.0
     gain_db: float = 0.0
     gain: float | None = None
-    """In the camera's own unit, instead of `gain_db`: for cameras that know no dB."""
+    """Gain in the camera's own unit, instead of `gain_db`, for cameras without dB."""
     region: tuple[int, int, int, int] | None = None
-    """x, y, width, height"""
+    """x, y, width, height, pixels"""
     packet_size: int | None = None
-    """None = negotiated"""
+    """Packet size, bytes; None: negotiated"""
     packet_delay_us: float | None = None
-    """Between packets; None = none, and more after each frame that lost some"""
+    """Gap between packets; None: 0, raised after each frame that lost packets"""
     trigger_line: str = "Line0"
-    """hardware: the input that the box is wired to"""
+    """Input that the trigger box is wired to, for `trigger: hardware`"""
     trigger_activation: Literal["RisingEdge", "FallingEdge", "AnyEdge", "LevelHigh", "LevelLow"] = (
         "RisingEdge"
     )
     trigger_delay_us: float = 0.0
     invert_trigger_line: bool = False
     exposure_line: str = ""
-    """Output that is active while the camera exposes; empty = none"""
+    """Output that is active during exposure; empty: none"""
     ptp: bool = False
-    """The camera's clock follows the network's master (IEEE 1588)"""
+    """Synchronise the camera's clock to the network's master (IEEE 1588)"""
     model: CameraModel | None = None
-    """Known intrinsics; None = found from the session's images."""
+    """Known intrinsics; None: estimated from the session's images."""
     model_is_rough: bool = False
-    """`model` is only good enough to plan with; the lens is found from the session's images."""
+    """`model` is used for planning only; intrinsics are estimated from the session's images."""
 
 
 class TriggerConfig(Section, frozen=True):
@@ -127,7 +127,7 @@ class TriggerConfig(Section, frozen=True):
 
 
 class Capsule(Section, frozen=True):
-    """A solid on the flange (tool, camera, cable guard): the segment from–to, thickened."""
+    """Capsule for a solid on the flange (tool, camera, cable guard): a segment from–to with a radius."""
 
     name: str
     from_m: Vector3
@@ -136,7 +136,7 @@ class Capsule(Section, frozen=True):
 
 
 class Plane(Section, frozen=True):
-    """A table, wall or ceiling in `base`; the arm stays on the side the normal points to."""
+    """Table, wall or ceiling in `base`; the arm stays on the side that the normal points to."""
 
     name: str
     point_m: Vector3
@@ -144,17 +144,17 @@ class Plane(Section, frozen=True):
 
 
 SPEED_CAP_M_S = 0.25
-"""Of any modelled point, in code: no configuration raises it."""
+"""Largest speed of any modelled point; no configuration can raise it."""
 
 
 SLOWEST_RAD_S, SLOWEST_RAD_S2 = 0.001, 0.01
-"""Least speed and acceleration of a joint move. Half a turn takes 50 minutes, or 35 s: less is an error in
-writing, and soon the driver cannot tell it from an arm that does not move."""
+"""Least speed and acceleration of a joint move. Half a turn at them takes 50 minutes, or 35 s; lower values
+are writing errors, and the driver could not tell the arm from one that does not move."""
 
 
 class LimitsConfig(Section, frozen=True):
     speed_m_s: float = 0.25
-    """Speed of any modelled point of arm, tool or camera; code caps it at 0.25."""
+    """Largest speed of any modelled point of arm, tool or camera; at most 0.25."""
     joint_speed_rad_s: Positive = 0.6
     joint_acceleration_rad_s2: Positive = 1.0
     joint_step_rad: Positive = 3.2
@@ -163,16 +163,16 @@ class LimitsConfig(Section, frozen=True):
     joints_max_rad: Vector6 | None = None
     workspace_min_m: Vector3 | None = None
     workspace_max_m: Vector3 | None = None
-    """Box in `base` that flange and camera stay inside."""
+    """Corner of the box in `base` in which flange and camera must stay; None: no box."""
     planes: tuple[Plane, ...] = ()
     solids: tuple[Capsule, ...] = ()
-    """On the flange, in `flange`."""
+    """Solids on the flange, in `flange`."""
     clearance_m: Positive = 0.03
     board_clearance_m: Positive = 0.10
 
 
 class PointerConfig(Section, frozen=True):
-    """A tool whose tip a person brings onto a corner (`station touch-test`); in `flange`."""
+    """Pointer whose tip a person puts on a corner (`station touch-test`), in `flange`."""
 
     GONE: ClassVar = frozenset({"along", "radius_m"})
     tip_m: Vector3
@@ -190,28 +190,28 @@ class StillnessConfig(Section, frozen=True):
 class CaptureConfig(Section, frozen=True):
     lossless_png: bool = False
     time_bound_s: Positive = 0.02
-    """A pose whose time bound is worse is refused. The arm is at rest: at the stillness limit of 2 mrad/s
-    this is 0.04 mm at one metre."""
+    """Largest bound of the image time for which a pose is accepted. At the stillness limit of 2 mrad/s it is
+    0.04 mm at one metre."""
     free_space_bytes: Annotated[int, msgspec.Meta(ge=0)] = 2_000_000_000
     retries: Annotated[int, msgspec.Meta(ge=0)] = 2
     goal_m: Positive = 0.0005
-    """The session is good enough when the expected error of X (1 sigma of its translation) is below this."""
+    """Expected error of X (1σ of its translation) below which the session is complete enough."""
 
 
 class ValidityConfig(Section, frozen=True):
-    """Age at which an installed calibration is in doubt by itself."""
+    """Age from which an installed calibration is in doubt."""
 
     max_age_days: Positive | None = None
-    """Oldest that the last proof may be: a calibration, or a drift check that passed; None: no limit."""
+    """Largest age of the last proof (calibration or passed drift check); None: no limit."""
 
 
 class ApprovalConfig(Section, frozen=True):
-    """Users by their names; who may connect at all is the socket's group."""
+    """Users who may approve motion. Who may connect at all is decided by the socket's group."""
 
     persons: tuple[str, ...] = ()
-    """Who may approve motion at a terminal; empty: everybody who may connect."""
+    """Names of users who may approve motion at a terminal; empty: all who may connect."""
     services: tuple[str, ...] = ()
-    """Whose programs may approve a plan by its hash, with no terminal."""
+    """Names of users whose programs may approve a plan by its hash, without a terminal."""
 
 
 class StationConfig(Section, frozen=True):
@@ -233,10 +233,10 @@ class StationConfig(Section, frozen=True):
     validity: ValidityConfig = ValidityConfig()
     working_distance_m: float = 0.5
     pointer: PointerConfig | None = None
-    """None = the pendant's tool centre point."""
+    """Pointer for the touch test; None: the pendant's tool centre point."""
 
 
 PAPER_BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=7, rows=6, square_m=0.025)
-"""The paper's 8×7 squares of 25 mm."""
+"""The paper's chessboard: 8×7 squares of 25 mm."""
 BLOG_BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=9, rows=6, square_m=0.030)
-"""The blog's 10×7 squares of 30 mm."""
+"""The blog's chessboard: 10×7 squares of 30 mm."""

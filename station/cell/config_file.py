@@ -1,4 +1,4 @@
-"""Reads the station's configuration: every problem in one report, with line and remedy."""
+"""Reading of the station's configuration; all problems are reported at once, with line and remedy."""
 
 from __future__ import annotations
 
@@ -24,40 +24,40 @@ from station.cell.errors import ConfigError
 log = logging.getLogger(__name__)
 
 LARGEST_SQUARE_M, LARGEST_REACH_M = 0.5, 5.0
-"""Beyond these somebody wrote millimetres."""
+"""Largest plausible lengths, metres; larger ones were written in millimetres."""
 SMALLEST_SQUARE_M = 0.001
-"""Below this somebody wrote kilometres, or a factor too many."""
+"""Smallest plausible square, metres; a smaller one is a writing error."""
 METRES = "Give metres."
 _FIELD_OF_VIEW = (np.deg2rad(2.0), np.deg2rad(150.0))
-"""A lens outside of this sees no board: its focal length is in other units than pixels."""
+"""Plausible fields of view; outside them the focal length was not written in pixels."""
 _FOCAL_LENGTH = (
     "Give pixels: the lens's focal length in mm / the pixel's size in mm (8 mm / 0.0048 mm = 1667)."
 )
 _REFUSED = {
     "camera.time_offset": "frame times are not corrected any more; poses are taken at rest. Delete it."
 }
-"""Keys of earlier releases that the result hung on."""
+"""Removed keys that are refused, not ignored, because results depended on them."""
 _FACING = 0.3
-"""Cosine from which a printed side faces something."""
+"""Cosine above which the printed side counts as facing something."""
 
 
 @dataclass(frozen=True)
 class ConfigReport:
-    """Everything that can be said of a configuration file before anything is started."""
+    """Result of checking a configuration file."""
 
     content: bytes
     config: StationConfig | None
-    """None while `wrong` has something."""
+    """The configuration; None if `wrong` is not empty."""
     wrong: tuple[YamlProblem, ...]
-    """With these nothing is started."""
+    """Errors, with which nothing is started."""
     missing: tuple[YamlProblem, ...]
-    """Keys that planned capture with a real arm needs besides."""
+    """Missing keys that only a planned capture with a real arm needs."""
     ignored: tuple[YamlProblem, ...] = ()
-    """Keys of earlier releases."""
+    """Keys of earlier releases, which have no effect."""
 
 
 def load_config(path: Path) -> tuple[StationConfig, bytes]:
-    """(configuration, the file's bytes). Raises ConfigError (exit code 2) listing all problems."""
+    """Load a configuration; return it and the file's bytes. ConfigError (exit code 2) lists all problems."""
     report = examine_config(path)
     if report.config is None:
         raise config_error(path, report.wrong)
@@ -67,7 +67,7 @@ def load_config(path: Path) -> tuple[StationConfig, bytes]:
 
 
 def config_error(path: Path, problems: tuple[YamlProblem, ...]) -> ConfigError:
-    """All problems of the file in one error."""
+    """Make one error of all problems of a file."""
     count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
     text = "\n".join([f"{path}: {count}. Nothing was started.", *(f"  {problem}" for problem in problems)])
     return ConfigError(text, code="invalid-config", problems=len(problems))
@@ -107,14 +107,14 @@ def _section(problem: YamlProblem) -> str:
 
 
 def _line(lines: dict[str, int], where: str) -> int:
-    """The line of a key, or of what it stands in; 0 where the file has neither."""
+    """Find the line of a key, or of its section; 0 where the file has neither."""
     while where and where not in lines:
         where = re.sub(r"[.\[]?[^.\[]*$", "", where)
     return lines.get(where, 0)
 
 
 def _readable(plain: dict[str, object]) -> tuple[StationConfig, set[str]]:
-    """The configuration with stand-ins for sections that cannot be read, and the names of the others."""
+    """Parse what is valid: the configuration with defaults for invalid sections, and names of valid ones."""
     stand_ins: dict[str, object] = {
         "robot": {},
         "camera": {},
@@ -135,13 +135,13 @@ def _webcam_problems(camera: CameraConfig) -> Iterator[YamlProblem]:
     if camera.trigger == "hardware":
         yield YamlProblem(0, "camera.trigger", "a webcam has no trigger line", "Choose software.")
     if camera.device and not camera.device.isdecimal() and not camera.device.startswith("/dev/"):
-        # A film beside an arm that really moves would be a wrong calibration.
+        # A video file beside a real arm would give a wrong calibration.
         text = f"'{camera.device}' is no webcam of this computer"
         yield YamlProblem(0, "camera.device", text, "Give its number, or its link in /dev/v4l/by-id.")
 
 
 def _meaning_problems(config: StationConfig) -> Iterator[YamlProblem]:
-    """Finds what types cannot say: ranges, and things that must fit each other."""
+    """Find wrong ranges and contradictions between keys, which types cannot express."""
     limits, robot, camera = config.limits, config.robot, config.camera
     if robot.model not in MODELS:
         yield YamlProblem(0, "robot.model", f"'{robot.model}' is not known; one of {', '.join(MODELS)}")
@@ -199,7 +199,7 @@ def _square_problems(board: BoardSpec) -> Iterator[YamlProblem]:
 
 
 def _lens_problems(config: StationConfig) -> Iterator[YamlProblem]:
-    """A focal length in millimetres or metres, a centre outside the image."""
+    """Find a focal length that is not in pixels, and a centre outside the image."""
     model = config.camera.model
     if model is None or model.matrix is None:
         return
@@ -239,7 +239,7 @@ def _guess_problems(config: StationConfig) -> Iterator[YamlProblem]:
 
 
 def board_turned_away(config: StationConfig) -> YamlProblem | None:
-    """The board by its guess shows its printed side to a keep-out plane, or to the flange that holds it."""
+    """Find a board whose printed side, by `board_guess`, faces a keep-out plane or its own flange."""
     guess = config.board_guess
     if guess is None:
         return None
@@ -270,7 +270,7 @@ def _behind(plane: Plane, point: Array) -> float:
 
 
 def _reach_problems(config: StationConfig) -> Iterator[YamlProblem]:
-    """The board, or a camera beside the arm, is further away than the arm can look."""
+    """Find a board, or a fixed camera, that is out of the arm's reach."""
     in_hand = config.mount == "eye-in-hand"
     name = "board_guess" if in_hand else "camera_guess"
     guess: PoseGuess | None = getattr(config, name)

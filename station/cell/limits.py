@@ -1,7 +1,7 @@
-"""Limits before motion: whole paths are checked and their speeds capped before anything moves.
+"""Checks before motion: clearance and limits along whole paths, and the speed allowed on them.
 
-A joint move is straight in joint space with all joints in step, as the controller's moveJ runs it; speed
-and acceleration are those of the leading joint. The caps below are code: no configuration raises them.
+A joint move is straight in joint space with all joints in step, as the controller's moveJ does it. Speed and
+acceleration are those of the leading joint, the one that turns furthest.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from station.cell.plan import Plan, PlannedPose
 JOINT_SPEED_CAP_RAD_S = 1.05
 JOINT_ACCELERATION_CAP_RAD_S2 = 1.4
 _SPEED_RESERVE = 0.97
-"""Between samples a point may be a little faster than at them."""
+"""Factor on speeds, because between samples a point may be a little faster than at them."""
 _TURN_RAD = 0.05
-"""No joint turns further between two of them: surfaces are fast where centre lines hardly move."""
+"""Largest turn of a joint between two samples: surfaces may move although centre lines hardly do."""
 _PIECES = 48
-"""A move is first looked at in so many, to find how dense its samples must be."""
+"""Pieces into which a move is first divided to find the sampling that it needs."""
 _LONGEST_TURN_RAD = 4 * np.pi
-"""From one end of a joint's range to the other; whatever turns further is out of range."""
+"""Largest turn of a joint: from one end of its range to the other."""
 _LEAVING_SLACK_M = 0.001
 _FLANGE_TOLERANCE_M, _FLANGE_TOLERANCE_RAD = 0.002, 0.005
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One broken limit. `str()` is the sentence for people."""
+    """Violated limit. `str()` is the sentence for people."""
 
     pose: str
     limit: str
     text: str
     joint: str = ""
-    """The joint or body that breaks it."""
+    """Joint or body that violates the limit."""
     what: str = ""
-    """Clearance: which two things come too close."""
+    """For clearance: which two things come too close."""
 
     def __str__(self) -> str:
         return f"{self.pose}: {self.text}"
@@ -51,12 +51,12 @@ class Problem:
 
 @dataclass(frozen=True)
 class MoveCheck:
-    """One joint move, checked along its whole path."""
+    """Result of checking a joint move along its whole path."""
 
     name: str
     problems: tuple[Problem, ...]
     joint_speed_rad_s: float
-    """Speed of the leading joint: with it no modelled point exceeds the speed limit."""
+    """Speed of the leading joint with which no modelled point exceeds the speed limit."""
     joint_acceleration_rad_s2: float
     duration_s: float
     path_m: float
@@ -64,7 +64,7 @@ class MoveCheck:
     step_rad: float
     """Turn of the leading joint."""
     top_speed_m_s: float
-    """Speed of the fastest modelled point, with the trapezoid's true peak."""
+    """Speed of the fastest modelled point, at the peak that the move really reaches."""
     margin_m: float
     """Smallest distance to any limit along the path."""
 
@@ -73,7 +73,7 @@ class MoveCheck:
 class PlanCheck:
     moves: tuple[MoveCheck, ...]
     problems: tuple[Problem, ...]
-    """All of them: of the moves, and of the plan as such."""
+    """Violated limits of all moves, and of the plan itself."""
 
     @property
     def duration_s(self) -> float:
@@ -93,7 +93,7 @@ class PlanCheck:
 
 
 def trapezoid(step_rad: ArrayLike, speed_rad_s: ArrayLike, acceleration_rad_s2: float) -> tuple[Array, Array]:
-    """Duration (s) and peak speed (rad/s) of a move of the leading joint by `step_rad`, from rest to rest."""
+    """Compute duration (s) and peak speed (rad/s) of a turn by `step_rad` with a trapezoidal speed."""
     step, speed = np.abs(step_rad), np.asarray(speed_rad_s, dtype=float)
     peak = np.minimum(speed, np.sqrt(step * acceleration_rad_s2))
     cruise = np.maximum(step - peak**2 / acceleration_rad_s2, 0.0)
@@ -101,7 +101,7 @@ def trapezoid(step_rad: ArrayLike, speed_rad_s: ArrayLike, acceleration_rad_s2: 
 
 
 def joint_bounds(geometry: CellGeometry) -> tuple[Array, Array]:
-    """Lowest and highest joint angles (6,), rad: the arm's own and the configuration's."""
+    """Return the lowest and highest joint angles (6,), rad, by the arm and the configuration."""
     own, limits = geometry.model.joint_limit_rad, geometry.limits
     low = np.maximum(-own, limits.joints_min_rad or (-own,) * 6)
     high = np.minimum(own, limits.joints_max_rad or (own,) * 6)
@@ -109,16 +109,16 @@ def joint_bounds(geometry: CellGeometry) -> tuple[Array, Array]:
 
 
 def point_speed_m_s(geometry: CellGeometry, joints_rad: ArrayLike, joint_speeds_rad_s: ArrayLike) -> float:
-    """Speed of the fastest point on the surface of arm, tool or camera, now."""
+    """Compute the speed of the fastest surface point of arm, tool and camera, for joints (6,)."""
     q, dq = np.asarray(joints_rad, dtype=float), np.asarray(joint_speeds_rad_s, dtype=float)
     return float(surface_speeds(geometry, q[None], dq).max())
 
 
 def sample_path(geometry: CellGeometry, from_rad: Array, to_rad: Array, spacing_m: float) -> Array:
-    """Joints (m, 6) along the move, so dense that no modelled point moves more than `spacing_m` between."""
+    """Sample joints (m, 6) along a move so that no modelled point moves over `spacing_m` in between."""
     coarse = from_rad + np.linspace(0, 1, _PIECES + 1)[:, None] * (to_rad - from_rad)
     steps = np.linalg.norm(np.diff(moving_points(geometry, coarse), axis=0), axis=-1)
-    # An arc is longer than its chord, and speed changes along it: 10 % covers both in a piece this short.
+    # 10 % more, as arcs are longer than their chords and the speed changes within a piece.
     count = int(np.ceil(1.1 * _PIECES * steps.max() / spacing_m)) + 1
     turns = int(np.ceil(np.abs(to_rad - from_rad).max() / _TURN_RAD)) + 1
     return np.asarray(from_rad + np.linspace(0, 1, max(count, turns, 3))[:, None] * (to_rad - from_rad))
@@ -127,7 +127,7 @@ def sample_path(geometry: CellGeometry, from_rad: Array, to_rad: Array, spacing_
 def check_path(
     geometry: CellGeometry, from_joints_rad: ArrayLike, to_joints_rad: ArrayLike, name: str = "move"
 ) -> MoveCheck:
-    """Everything that can be wrong with one move, and the speed it may be driven at."""
+    """Check one move from joints (6,) to joints (6,), rad, and find its allowed speed."""
     start, target = (np.asarray(q, dtype=float) for q in (from_joints_rad, to_joints_rad))
     if start.shape != (6,) or target.shape != (6,) or not np.isfinite([start, target]).all():
         return _refused(name, [Problem(name, "joints", "six finite joint angles in radians are needed")])
@@ -159,12 +159,15 @@ def check_path(
 
 
 def _refused(name: str, problems: list[Problem]) -> MoveCheck:
-    """A move that is not worth sampling; speed zero."""
+    """Make the result of a move that is refused without sampling; speed 0."""
     return MoveCheck(name, tuple(problems), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -np.inf)
 
 
 def allowed_speed(geometry: CellGeometry, samples: Array) -> tuple[float, float, float, float]:
-    """Samples (m, 6) evenly along one move → leading joint's speed and acceleration, duration, top speed."""
+    """Compute leading joint's speed and acceleration, duration and top speed of a move.
+
+    samples: joints (m, 6) evenly along it.
+    """
     step_rad = float(np.abs(samples[-1] - samples[0]).max())
     turn = (samples[-1] - samples[0]) / max(step_rad, 1e-9)
     metres_per_rad = float(surface_speeds(geometry, samples, turn).max())
@@ -174,7 +177,10 @@ def allowed_speed(geometry: CellGeometry, samples: Array) -> tuple[float, float,
 
 
 def leading_speed(limits: LimitsConfig, metres_per_rad: ArrayLike) -> tuple[Array, float]:
-    """Speed (rad/s) and acceleration (rad/s²) of moves whose fastest point goes so far per rad (n,)."""
+    """Compute allowed speed (n,), rad/s, and acceleration, rad/s², of the leading joint.
+
+    metres_per_rad: (n,) way of the fastest point per turn of the leading joint.
+    """
     most_m_s = _SPEED_RESERVE * min(limits.speed_m_s, SPEED_CAP_M_S)
     by_points = most_m_s / np.maximum(metres_per_rad, 1e-9)
     speed = np.minimum(by_points, min(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S))
@@ -202,10 +208,10 @@ def _joint_problems(geometry: CellGeometry, start: Array, target: Array, name: s
 
 
 def leaving(gaps: Array) -> Array:
-    """Margins (..., samples, c) along paths, where an arm that already stands too close may move away.
+    """Adjust margins (..., samples, c) along paths so that an arm that stands too close may move away.
 
-    A margin that starts negative counts as zero for as long as it only grows, and grows fast enough to be
-    gone at the end of the path: sliding along a wall is no retreat.
+    A margin that starts negative counts as zero while it only grows, and grows fast enough to be positive at
+    the end of the path: sliding along a wall is not allowed.
     """
     growing = np.diff(gaps, axis=-2, prepend=gaps[..., :1, :]) > -1e-4
     left = 1.0 - np.linspace(0.0, 1.0, gaps.shape[-2])[:, None]
@@ -220,7 +226,7 @@ def _margin_problems(gaps: Array, contacts: Sequence[Contact], name: str) -> lis
     for contact in dict.fromkeys(contacts):
         alike = [
             column for column, other in enumerate(contacts) if other == contact
-        ]  # a plate is several rods
+        ]  # a plate consists of several capsules
         gap = gaps[:, alike].min(axis=1)
         at = int(np.argmin(gap))
         if gap[at] < 0:
@@ -233,7 +239,7 @@ def _margin_problems(gaps: Array, contacts: Sequence[Contact], name: str) -> lis
 
 
 def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeometry) -> PlanCheck:
-    """The whole plan from where the arm is now (None: from its first pose), move by move."""
+    """Check a plan move by move, from joints (6,) where the arm is; None: from its first pose."""
     problems = list(_plan_problems(plan, geometry))
     if not any(problem.limit == "speed" for problem in problems):
         geometry = with_plan_speeds(geometry, plan)
@@ -249,7 +255,7 @@ def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeo
 
 
 def with_plan_speeds(geometry: CellGeometry, plan: Plan) -> CellGeometry:
-    """The plan may ask for slower joints than the configuration, never for faster ones."""
+    """Return the geometry with a plan's speed limits where these are lower than the configured ones."""
     return slower(geometry, np.inf, plan.joint_speed_rad_s, plan.joint_acceleration_rad_s2)
 
 
@@ -259,7 +265,7 @@ def slower(
     joint_speed_rad_s: float = np.inf,
     joint_acceleration_rad_s2: float = np.inf,
 ) -> CellGeometry:
-    """The cell with speed limits that are no higher than these."""
+    """Return the geometry with speed limits that are at most these."""
     limits = geometry.limits
     lower = msgspec.structs.replace(
         limits,

@@ -1,4 +1,4 @@
-"""A plan is data: joint targets, what they are expected to show, and why each is there."""
+"""Plan: joint targets, the expected views, and the reason for each."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import msgspec
 from recordings.schema.messages import Matrix4, Mount, Vector6
 
 Criterion = Literal["A", "D", "arm", "all"]
-"""Smallest error of X; smallest ellipsoid of X; smallest error over the workspace with the arm's table;
-smallest ellipsoid of X, board, lens and table together."""
+"""Criterion of a plan. A: smallest error of X; D: smallest ellipsoid of X; arm: smallest error over the
+workspace with the arm's corrected table; all: smallest ellipsoid of X, board, lens and table together."""
 
 
 class ExpectedView(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """Expected look of the board from here, by the guess the plan was made with."""
+    """View of the board expected at a pose, by the initial camera and board poses of the planning."""
 
     distance_m: float
     tilt_rad: float
@@ -34,13 +34,13 @@ class PlannedPose(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknow
     view: ExpectedView | None = None
     why: str = ""
     predicted_sigma_m: float | None = None
-    """Expected sigma of X's translation after this pose."""
+    """Expected 1σ of X's translation after this pose."""
     guided: bool = False
-    """A hand brought the arm there."""
+    """True when a person brought the arm there by hand."""
 
 
 class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """25 poses, normally. Speeds are upper limits; code caps them further."""
+    """Poses of a session, normally 25. Speeds are upper limits, besides those of the configuration."""
 
     robot: str
     mount: Mount
@@ -51,11 +51,11 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     seed: int | None = None
     note: str = ""
     criterion: Criterion | None = None
-    """Criterion by which the planner chose all poses; None: a person taught, listed or changed some."""
+    """Criterion by which the planner chose the poses; None: a person taught, listed or changed some."""
     motion: Literal["stops", "sweep"] = "stops"
-    """sweep: of an earlier release; such a plan is read, and never driven."""
+    """sweep: of an earlier release; such a plan can be read, but not driven."""
 
 
 def plan_sha256(plan: Plan) -> str:
-    """Hash of everything that decides the motion, independent of file layout: an approval is bound to it."""
+    """Compute the hash, to which an approval is bound, of everything that decides the motion."""
     return hashlib.sha256(msgspec.json.encode(plan, order="deterministic")).hexdigest()

@@ -1,4 +1,4 @@
-"""The cell as configured: camera and board pose with their uncertainty, solids and obstacles."""
+"""Scene: configured camera and board pose with their uncertainty, solids and obstacles."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ from station.cell.plan import Plan, PlannedPose
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
 _DOUBT = 3.0
-"""Sigmas by which a body on a guess is thickened: nothing else keeps a wrong mount off the arm."""
+"""Sigmas of its pose by which a body with a rough pose is thickened for collision checks."""
 _MOST_DOUBT_M = 0.03
-"""A camera thicker than this could not stand beside any wrist: `station new` makes a guess better."""
+"""Largest thickening; a thicker camera would collide with the wrist in every posture."""
 _DRAWS = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A guess of the cell, good to the sigmas it carries."""
+    """Initial camera and board pose with 1σ, lens, board and geometry of a cell, as planning needs them."""
 
     mount: Mount
     camera: CameraModel
@@ -58,63 +58,63 @@ class Scene:
     """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand), (4, 4)"""
     geometry: CellGeometry
     x_sigma: tuple[float, float] = (0.0, 0.0)
-    """Per axis: metres, radians."""
+    """1σ of X per axis: metres, radians."""
     y_sigma: tuple[float, float] = (0.0, 0.0)
     working_distance_m: float = 0.5
 
     def camera_from_board(self, base_from_flange: Array) -> Array:
-        """(..., 4, 4) → (..., 4, 4)"""
+        """Compute camera_from_board (..., 4, 4) for flange poses (..., 4, 4)."""
         return board_in_camera(self.mount, base_from_flange, self.X, self.Y)
 
     def base_from_flange(self, camera_from_board: Array) -> Array:
-        """The flange pose that shows the board so."""
+        """Compute the flange poses (..., 4, 4) for views camera_from_board (..., 4, 4)."""
         return implied_flange(self.mount, self.X, self.Y, camera_from_board)
 
     def seen(self, base_from_flange: Array, points: Array) -> Array:
-        """Board points (k, 3) in `camera`, (n, k, 3)."""
+        """Transform board points (k, 3) to `camera` for n flange poses: (n, k, 3)."""
         return transform_points(self.camera_from_board(base_from_flange), points)
 
 
 def board_place(mount: Mount, base_from_flange: Array, X: Array, camera_from_board: Array) -> Array:
-    """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)."""
+    """Compute the board's constant pose: base_from_board (eye-in-hand) or flange_from_board."""
     if mount == "eye-in-hand":
         return np.asarray(base_from_flange @ X @ camera_from_board)
     return np.asarray(inverse(base_from_flange) @ X @ camera_from_board)
 
 
 def frustum(camera: CameraModel, base_from_camera: Array, far_m: float) -> Array:
-    """Optical centre and, around it, the image's corners at this distance, (5, 3) in `base`."""
+    """Compute optical centre and image corners at distance `far_m`, in order, (5, 3) in `base`."""
     w, h = camera.width, camera.height
     corners = np.array([(0, 0, 1), (w, 0, 1), (w, h, 1), (0, h, 1)]) @ np.linalg.inv(camera_matrix(camera)).T
     return transform_points(base_from_camera, np.vstack([np.zeros(3), far_m * corners]))
 
 
 def pose_at(model: RobotModel, name: str, joints_rad: ArrayLike, why: str = "") -> PlannedPose:
-    """A pose of a plan, with where the flange is expected; joints (6,)."""
+    """Make a plan's pose from joints (6,), with the expected flange pose."""
     joints = np.asarray(joints_rad, dtype=float)
     return PlannedPose(name, vector6(joints), matrix4(forward(model, joints)), why=why)
 
 
 def flange_poses(scene: Scene, plan: Plan) -> Array:
-    """(n, 4, 4) base_from_flange of the plan's joints."""
+    """Compute base_from_flange (n, 4, 4) of a plan's joints."""
     joints = np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6)
     return np.asarray(forward(scene.geometry.model, joints))
 
 
 def board_extent(board: BoardSpec) -> tuple[Array, Array]:
-    """Corners (2,) of the printed area in the board's plane, one square beyond the outermost points."""
+    """Return low and high corner (2,) of the printed area: one square beyond the outermost points."""
     points = board_points(board)[:, :2]
     return points.min(axis=0) - board.square_m, points.max(axis=0) + board.square_m
 
 
 def printed_corners(board: BoardSpec) -> Array:
-    """The same corners in order around it, (4, 3) in `board`."""
+    """Return the four corners of the printed area in order, (4, 3) in `board`."""
     (x0, y0), (x1, y1) = board_extent(board)
     return np.array([(x0, y0, 0.0), (x1, y0, 0.0), (x1, y1, 0.0), (x0, y1, 0.0)])
 
 
 def scene_of(config: StationConfig) -> Scene:
-    """The scene that the configuration describes. ConfigError names what is missing."""
+    """Make the scene of a configuration. ConfigError names what is missing."""
     camera, mount_guess, place_guess = config.camera.model, config.camera_guess, config.board_guess
     if camera is None or camera.matrix is None:
         raise ConfigError(
@@ -145,19 +145,19 @@ def scene_of(config: StationConfig) -> Scene:
 
 
 def guess_matrix(guess: PoseGuess) -> Array:
-    """(4, 4)"""
+    """Convert a configured pose to a matrix (4, 4)."""
     return pose_from_quaternion(guess.translation_m, guess.rotation_xyzw)
 
 
 def guess_from(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
-    """A transform (4, 4) as the configuration writes it."""
+    """Convert a transform (4, 4) to a configured pose."""
     quaternion = quaternion_from_matrix(matrix[:3, :3])
     x, y, z, w = (float(value) for value in quaternion)
     return PoseGuess(vector3(matrix[:3, 3]), (x, y, z, w), sigma_m, sigma_rad)
 
 
 def cell_geometry(config: StationConfig) -> CellGeometry:
-    """Geometry for checks before motion; uses the guesses where there are any, and their sigmas."""
+    """Make the geometry for checks before motion, with initial poses and their sigmas where given."""
     camera, board = config.camera_guess, config.board_guess
     return geometry_of(
         config,
@@ -169,7 +169,7 @@ def cell_geometry(config: StationConfig) -> CellGeometry:
 
 
 def arm_model(robot: RobotConfig) -> RobotModel:
-    """The configured arm, with its factory calibration where it is given. ConfigError: not known."""
+    """Return the configured arm, with its factory calibration if given. ConfigError: unknown model."""
     if (model := MODELS.get(robot.model)) is None:
         raise ConfigError(
             f"robot.model '{robot.model}' is unknown",
@@ -188,10 +188,10 @@ def geometry_of(
     camera_doubt_m: float = 0.0,
     board_doubt_m: float = 0.0,
 ) -> CellGeometry:
-    """Solids and obstacles of a cell, for a camera and a board that may be off by so much (one sigma).
+    """Make solids and obstacles of a cell, for camera and board poses with these 1σ (metres).
 
-    What is on the flange gets thicker by three sigmas, 30 mm at most; clearance to what stands in the cell
-    grows by two. Solids that the configuration draws on the flange are taken as they are.
+    A camera or board on the flange gets thicker by three sigmas, at most 30 mm; the clearance of one that is
+    fixed in the cell grows by two. Configured solids on the flange are taken as exact.
     """
     low, high = board_extent(config.board)
     limits = config.limits
@@ -226,7 +226,7 @@ def _thicker_m(sigma_m: float) -> float:
 
 
 def require_kept_clear(config: StationConfig) -> None:
-    """LimitError when what hangs on a guess may well be (1 sigma) where no check keeps clear of."""
+    """Raise LimitError when a camera or board pose is too uncertain for the collision checks."""
     name = "camera_guess" if config.mount == "eye-in-hand" else "board_guess"
     guess: PoseGuess | None = getattr(config, name)
     drawn = config.mount == "eye-in-hand" and config.limits.solids
@@ -243,32 +243,32 @@ def require_kept_clear(config: StationConfig) -> None:
 
 
 def covers_its_doubt(guess: PoseGuess) -> bool:
-    """Tell whether what hangs on the flange gets as much thicker as it may be off."""
+    """Tell whether the thickening covers three sigmas of a pose, without being cut at its largest value."""
     return _DOUBT * guess.sigma_m <= _MOST_DOUBT_M
 
 
 def camera_radius_m(sigma_m: float) -> float:
-    """Radius of a camera on the flange whose place is known to `sigma_m`."""
+    """Return the radius of the capsule of a camera on the flange whose position has this 1σ."""
     return _CAMERA_RADIUS_M + _thicker_m(sigma_m)
 
 
 def camera_ends(parent_from_camera: Array) -> Array:
-    """(..., 4, 4) → (..., 2, 3): the camera's body, from the optical centre back."""
+    """Compute the ends (..., 2, 3) of cameras' bodies behind their optical centres; poses (..., 4, 4)."""
     return transform_points(parent_from_camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -_CAMERA_BODY_M]]))
 
 
 def camera_body(name: str, parent_from_camera: Array, radius_m: float = _CAMERA_RADIUS_M) -> Capsule:
-    """A camera as it stands behind its optical centre."""
+    """Make the capsule of a camera, behind its optical centre."""
     ends = camera_ends(parent_from_camera)
     return Capsule(name, vector3(ends[0]), vector3(ends[1]), radius_m)
 
 
 def geometry_from(config: StationConfig, standing_rad: ArrayLike) -> CellGeometry:
-    """Geometry for checks of a motion that begins where the arm stands, joints (6,).
+    """Make the geometry for checks of a motion that begins at the arm's joints (6,).
 
-    A rough guess can put the camera where a part of the arm is. Then the guess is wrong, since the arm stands
-    there: the nearest mount by its sigmas that has room takes its place, as thick as the guessed one was. A
-    guess that is sharp enough for its thickness to cover its doubt is taken as it is.
+    A rough camera pose can put the camera into a part of the arm, which is impossible as the arm stands
+    there. Then the most likely pose without collision is used instead, with the same thickness. A pose that
+    is certain enough (`covers_its_doubt`) is used as it is.
     """
     guess, board = config.camera_guess, config.board_guess
     cell = cell_geometry(config)
@@ -282,18 +282,18 @@ def geometry_from(config: StationConfig, standing_rad: ArrayLike) -> CellGeometr
     ends = camera_ends(forward(cell.model, standing) @ mounts)
     room_m = gap_to_arm(cell, standing, ends[:, 0], ends[:, 1]) - camera_radius_m(guess.sigma_m)
     roomy = np.flatnonzero(room_m >= SPACING_M)
-    if room_m[0] >= SPACING_M / 2 or len(roomy) == 0:  # what the check of a path wants
+    if room_m[0] >= SPACING_M / 2 or len(roomy) == 0:  # the margin that the check of a path needs
         return cell
     Y, board_m = (None, 0.0) if board is None else (guess_matrix(board), board.sigma_m)
     return geometry_of(config, mounts[roomy[0]], Y, guess.sigma_m, board_m)
 
 
 def pose_vector(matrix: Array) -> Vector6:
-    """A pose (4, 4) as UR writes it: x, y, z [m] and a rotation vector [rad]."""
+    """Convert a pose (4, 4) to UR's form: x, y, z [m] and a rotation vector [rad]."""
     return vector6([*matrix[:3, 3], *rotation_log(matrix[:3, :3])])
 
 
 def flange_pose(state: RobotState, tcp_offset: Vector6) -> Array:
-    """base_from_flange (4, 4): the controller's own tool pose without the tool."""
+    """Compute base_from_flange (4, 4) from the controller's tool pose and its TCP offset."""
     base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
     return np.asarray(base_from_tcp @ inverse(pose_from_rotvec(tcp_offset[:3], tcp_offset[3:])))

@@ -1,4 +1,4 @@
-"""The sessions' folders on the disk, and what of a session outlives the daemon.
+"""Folders of sessions on the disk, and the state of a session that survives a restart.
 
 ROOT/sessions/20260131-101500-cell/   session.mcap, session-2.mcap … one file a segment
                                       session.json  poses and their state, written after every pose
@@ -35,32 +35,32 @@ class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
     plan: Plan
     poses: tuple[PoseStatus, ...]
     parts: int = 1
-    """Segments"""
+    """Number of segments"""
     elapsed_s: float = 0.0
-    """Time of all its runs together."""
+    """Total time of its runs."""
     check: bool = False
-    """A drift check of the installed calibration."""
+    """True: a drift check of the installed calibration."""
     sealed: bool = False
     recording: str = ""
 
 
 class SessionSummary(msgspec.Struct, frozen=True):
-    """A session on the disk, for a list of them."""
+    """Session on the disk, for lists."""
 
     name: str
     folder: str
     recording: str
-    """The file, or the folder where there are several; empty: nothing was recorded."""
+    """File of the recording, or folder of several; empty: nothing was recorded."""
     source: Source | Literal[""]
     views: int
     bytes: int
     sealed: bool
     calibration: str
-    """Path of the file that was made of it; empty: none."""
+    """Path of the calibration file made from it; empty: none."""
 
 
 def new_session_folder(root: Path, cell: str) -> Path:
-    """A new folder whose name sorts by time; two in one second get different ones. Raises StationError."""
+    """Make a new folder; names sort by time and are unique within a second. Raises StationError."""
     sessions = root / "sessions"
     stamp = time.strftime("%Y%m%d-%H%M%S")
     try:
@@ -88,7 +88,7 @@ def write_state(folder: Path, state: SessionState) -> None:
 
 
 def read_state(folder: Path) -> SessionState | None:
-    """None where it is missing or not ours."""
+    """Read a session's state; None where it is missing or invalid."""
     try:
         return msgspec.json.decode(read_file(folder / STATE_FILE, _LIMIT_BYTES), type=SessionState)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -96,7 +96,7 @@ def read_state(folder: Path) -> SessionState | None:
 
 
 def mark_active(root: Path, folder: Path) -> None:
-    sync_folder(folder.parent)  # the folder's own name, before anything points to it
+    sync_folder(folder.parent)  # make the folder durable before anything points to it
     write_atomically(root / _ACTIVE, folder.name.encode())
 
 
@@ -105,7 +105,7 @@ def clear_active(root: Path) -> None:
 
 
 def interrupted_session(root: Path) -> tuple[Path, SessionState] | None:
-    """The session that was running when the daemon last ended without sealing it."""
+    """Find the session that was running when the daemon ended without finishing it; None: none."""
     try:
         name = read_file(root / _ACTIVE, _LIMIT_BYTES).decode()
     except (OSError, UnicodeDecodeError):
@@ -118,7 +118,7 @@ def interrupted_session(root: Path) -> tuple[Path, SessionState] | None:
 
 
 def list_sessions(root: Path) -> list[SessionSummary]:
-    """The newest sessions first."""
+    """List the sessions below `root`, newest first."""
     try:
         folders = sorted((f for f in (root / "sessions").iterdir() if f.is_dir()), reverse=True)
     except OSError:

@@ -1,6 +1,6 @@
-"""Place of the daemon's sockets, and whose it must be. Loads nothing large: STOP from a shell needs it.
+"""Folder of the daemon's sockets, and checks of its owner. Imports little, as `station stop` needs it.
 
-In a folder that somebody else may write to, anyone can put a socket that answers in the daemon's place.
+Where other users may write to the folder, they could put a socket there that answers for the daemon.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 class UntrustedFolderError(Exception):
-    """Somebody else could have put the sockets there. No StationError: loading that takes STOP 12 ms."""
+    """Other users could have put the sockets there. Not a StationError, whose import delays STOP by 12 ms."""
 
 
 def default_socket() -> Path:
@@ -28,7 +28,7 @@ def default_socket() -> Path:
     if system.exists():
         return system
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    if runtime and _is_own(Path(runtime)):  # after `su` it is still the other user's
+    if runtime and _is_own(Path(runtime)):  # after `su` it may still be the other user's
         return Path(runtime) / "station-control.sock"
     state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
     return Path(state) / "calibration-station" / "run" / "control.sock"
@@ -42,17 +42,17 @@ def _is_own(folder: Path) -> bool:
 
 
 def stop_socket(control: Path) -> Path:
-    """Beside the control socket: every datagram that is sent there is STOP."""
+    """Return the path of the STOP socket, beside the control socket."""
     return control.with_suffix(".stop")
 
 
 def motion_page(control: Path) -> Path:
-    """Beside the control socket: the STOP and motion state (`station.protocol.stop_client`)."""
+    """Return the path of the file with STOP and motion state (`protocol.stop_client`)."""
     return control.with_suffix(".motion")
 
 
 def make_folder(folder: Path) -> None:
-    """Creates the daemon's folder for this user alone, or takes one that only its owner may write to.
+    """Create the sockets' folder for this user alone, or accept one that only its owner may write to.
 
     Raises StationError.
     """
@@ -75,13 +75,13 @@ def make_folder(folder: Path) -> None:
 
 
 def folder_owner(folder: Path) -> int:
-    """The user who alone, beside root, can put a socket there.
+    """Return the only user, besides root, who can put a socket into a folder.
 
-    This user, root, or an account for which root made the folder. Raises UntrustedFolderError when anybody
-    else could have made the folder, or can write to it or to what leads there.
+    This user, root, or an account for which root made the folder. Raises UntrustedFolderError when others
+    could have made the folder, or can write to it or to a folder above it.
     """
     try:
-        # Not `resolve`: a link on the way must be seen.
+        # Not `resolve`: symbolic links on the path must be checked, too.
         return _owner(Path(os.path.realpath(folder)), Path(os.path.abspath(folder)))  # noqa: PTH100
     except OSError as error:
         raise UntrustedFolderError(f"{folder}: {error.strerror}.") from None
@@ -110,7 +110,7 @@ def _require(good: bool, part: Path, owner: int) -> None:
 
 
 def _own_group_only(status: os.stat_result) -> bool:
-    """Many systems give each user a group of their own, and write permission to it."""
+    """Tell whether the folder's group is its owner's private one, to which many systems permit writing."""
     if status.st_mode & stat.S_IWOTH:
         return False
     import grp  # both rarely needed
@@ -126,13 +126,13 @@ def _own_group_only(status: os.stat_result) -> bool:
 
 
 def peer_of(link: socket.socket) -> tuple[int, int, int]:
-    """Process, user and group at the other end of a Unix socket, by the kernel's word."""
+    """Ask the kernel for process, user and group at the other end of a Unix socket."""
     pid, uid, gid = _CREDENTIALS.unpack(link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
     return pid, uid, gid
 
 
 def user_name(uid: int) -> str:
-    """'anna', or 'uid 1003' when nobody knows the name."""
+    """Return a user's name, or 'uid 1003' when it is unknown."""
     import pwd
 
     try:

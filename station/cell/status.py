@@ -1,4 +1,4 @@
-"""The daemon's status: one immutable snapshot; watchers get it whole, then its changed sections."""
+"""The daemon's status as an immutable snapshot, sent to watchers whole, then by changed sections."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     state: PoseState = "planned"
     reason: str = ""
     cause: str = ""
-    """The code of `reason`, for programs."""
+    """Code of `reason`, for programs."""
     why: str = ""
-    """Why the planner put it there."""
+    """Reason for the pose, by the planner."""
     attempt: int = 0
     corners: int | None = None
     predicted_sigma_mm: float | None = None
     estimated_sigma_mm: float | None = None
-    """Expected error after this pose by the images so far; `predicted_sigma_mm`: as planned."""
+    """Expected error after this pose, by the images so far (`predicted_sigma_mm`: when planned)."""
     coverage: float | None = None
     base_from_flange: Matrix4 | None = None
-    """Where the flange is expected to be."""
+    """Expected flange pose."""
     kept: bool = False
-    """To be taken again: the image it has counts until another takes its place."""
+    """To be captured again: the present image counts until it is replaced."""
 
     @property
     def counts(self) -> bool:
-        """The recording has an image of it that is used."""
+        """True when the recording has an image of this pose that is used."""
         return self.state == "done" or self.kept
 
 
@@ -66,21 +66,21 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     age_ms: float = 0.0
     """Age of the newest state."""
     safety: str = ""
-    """NORMAL, PROTECTIVE STOP, EMERGENCY STOP … in words"""
+    """Safety mode in words: NORMAL, PROTECTIVE STOP, EMERGENCY STOP …"""
     held: str = ""
-    """Cause that holds the arm (a stop, no power, brakes) and what to do at the pendant; empty: none."""
+    """Why the arm cannot move (a stop, no power, brakes) and the remedy at the pendant; empty: it can."""
     mode: str = ""
     remote: bool | None = None
     program: str = ""
-    """stopped, playing, paused"""
+    """State of the robot's program: stopped, playing, paused"""
     control: bool = False
-    """A control child lives."""
+    """True while the control process runs."""
     control_path: str = ""
     """Driver of the arm: ur_rtde, or script (the station's own)"""
     not_accepted: str = ""
-    """Why the stops of this real arm are not accepted (`station accept`); empty: they are."""
+    """Why the stops of a real arm are not accepted (`station accept`); empty: they are."""
     speed_m_s: float = 0.0
-    """Fastest modelled point, now."""
+    """Present speed of the fastest modelled point."""
     speed_limit_m_s: float = 0.25
     slider: float = 1.0
     joints_rad: Vector6 | None = None
@@ -97,7 +97,7 @@ class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     height: int = 0
     frames: int = 0
     dropped: int = 0
-    """Frames that were due and did not come whole"""
+    """Frames that did not come, or came incomplete"""
     fps: float = 0.0
     lost_packets: int = 0
     resent_packets: int = 0
@@ -106,7 +106,7 @@ class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The board in the newest preview or captured image."""
+    """Board detection in the newest preview or captured image."""
 
     found: bool = False
     reason: str = ""
@@ -114,12 +114,12 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     expected: int = 0
     sharpness: float = 0.0
     saturated: float = 0.0
-    """Share of pixels, 0…1"""
+    """Share of saturated pixels, 0…1"""
     coverage: float = 0.0
     tilt_rad: float | None = None
     distance_m: float | None = None
     advice: str = ""
-    """Fault of light or focus and what to set; empty: none."""
+    """What is wrong with light or focus, and what to set; empty: nothing."""
 
 
 class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -129,7 +129,7 @@ class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     drops: int = 0
     sync_ms: float = 0.0
     free_bytes: int | None = None
-    """On the sessions' disk; None: not known."""
+    """Free space on the sessions' disk; None: not known."""
     error: str = ""
 
 
@@ -143,7 +143,7 @@ class ClockStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     camera_bound_ms: float | None = None
     camera_drift_ppm: float | None = None
     camera_source: TimeSource | None = None
-    """Source of a frame's time; `camera_bound_ms` is that time's bound."""
+    """Source of frame times; `camera_bound_ms` is their bound."""
 
 
 class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -155,7 +155,7 @@ class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The running estimate after each pose; never the final one."""
+    """Running estimate after each pose, not the result of the session."""
 
     views: int = 0
     translation_mm: tuple[float, float, float] | None = None
@@ -180,29 +180,29 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     plan_sha256: str = ""
     poses: tuple[PoseStatus, ...] = ()
     current: int | None = None
-    """Number of the pose under way, or of the last one: its `index`, not its place in `poses`."""
+    """`index` (not position in `poses`) of the pose under way, or of the last one."""
     captured: int = 0
     elapsed_s: float = 0.0
     remaining_s: float | None = None
     recording: str = ""
-    """Path of the sealed recording, once there is one."""
+    """Path of the finished recording; empty: not finished yet."""
     calibration: str = ""
-    """Path of the calibration file that was made of it, once there is one."""
+    """Path of the calibration file made from it; empty: none yet."""
     approved_again: int = 0
-    """How often a simulated cell approved the rest of the session by itself, after news that came late."""
+    """How often a simulated cell approved the rest of the session itself, after late robot states."""
     check: bool = False
-    """A drift check: to be compared with what is installed, not to be solved."""
+    """True: a drift check, to be compared with the installed calibration, not to be solved."""
     source: Source = "real"
 
     @property
     def place(self) -> int | None:
-        """Place of `current` in `poses`; None: there is none, or it was dropped."""
+        """Position of `current` in `poses`; None: there is none, or the pose was removed."""
         return next((place for place, pose in enumerate(self.poses) if pose.index == self.current), None)
 
 
 class LeaseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     holder: str = ""
-    """'anna on tty1 (pid 4711)'; empty = free"""
+    """Client that has control, as 'anna on tty1 (pid 4711)'; empty: none"""
     client_id: int | None = None
     since_wall_ns: int = 0
 
@@ -216,21 +216,21 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     text: str
     pose_index: int | None = None
     code: str = ""
-    """Kind, for programs: kebab-case."""
+    """Kind of event, for programs, in kebab-case."""
     values: dict[str, Value] = {}
-    """Figures of it; each name ends in its unit"""
+    """Figures of the event; each name ends in its unit"""
 
 
 APPROVAL_LIFETIME_S = 120.0
-"""Time that an offered motion waits for a person."""
+"""Time for which an offered motion can be approved."""
 
 
 class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The motion a person approves before anything moves. `token` is for one use."""
+    """Motion for a person to approve before anything moves; `token` is valid once."""
 
     token: str
     purpose: str
-    """'run plan', 'retake pose 7', 'drift check of the installed calibration' …"""
+    """Purpose: 'run plan', 'retake pose 7', 'drift check of the installed calibration' …"""
     plan_sha256: str
     poses: int
     path_m: float
@@ -239,9 +239,9 @@ class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
     top_speed_m_s: float
     duration_s: float
     first_move: str
-    """'84 mm and 22° to pose 1'"""
+    """First move, as '84 mm and 22° to pose 1'"""
     changes: tuple[str, ...] = ()
-    """Changes of the plan that this approval brings, and their gain."""
+    """Changes of the plan that come with the approval, and their gain."""
     warnings: tuple[str, ...] = ()
     start_joints_rad: Vector6 | None = None
 
@@ -249,11 +249,11 @@ class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
 class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     state: StationState = StationState.DISCONNECTED
     reason: str = ""
-    """Why stopped, paused or at fault, and what to do: the sentence for the top bar."""
+    """Why the station is stopped, paused or at fault, and the remedy, for the screen's top bar."""
     cause: str = ""
     """The code of `reason`, for programs."""
     pending: str = ""
-    """Next after the pose under way: a pause or the end."""
+    """Request that waits for the end of the pose under way: to pause or to finish."""
     simulated: bool = False
     playback: bool = False
     cell: str = ""
@@ -269,15 +269,15 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     estimate: EstimateStatus = EstimateStatus()
     lease: LeaseStatus = LeaseStatus()
     go: MotionPreview | None = None
-    """A go that waits for a person's confirmation."""
+    """Motion that waits for a person's approval."""
     loop_lag_ms: float = 0.0
-    """Delay of the daemon's working loop, worst of the last second."""
+    """Largest delay of the daemon's event loop in the last second."""
     events: tuple[Event, ...] = ()
-    """The newest, at most 100."""
+    """Newest events, at most 100."""
 
 
 def changed_sections(old: StationStatus, new: StationStatus) -> dict[str, object]:
-    """Top-level fields that differ: what a watcher is sent after the first full status."""
+    """Return the top-level fields that differ, as sent to watchers after the first full status."""
     return {
         name: getattr(new, name)
         for name in StationStatus.__struct_fields__

@@ -1,6 +1,6 @@
-""" "At rest", measured: joint speed and scatter of the flange's pose over a window, image motion beside them.
+"""Detection of rest: joint speed and scatter of the flange pose over a time window, and image motion.
 
-Nobody sleeps for a fixed time: a pose is taken when the arm is still, or skipped with the reason why not.
+There are no fixed waiting times: a pose is captured once the arm is still, or fails with the reason.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ KEPT_SAMPLES = 4096
 
 
 class NotStillError(StationError):
-    """The arm did not settle in time; the message says what still moved, and by how much."""
+    """The arm did not settle in time; the message names what moved, and by how much."""
 
     code = "not-settled"
 
 
 class StillnessMonitor:
-    """Subscribe `add` to the robot; ask `measure` whenever needed. `window_s` of states is kept."""
+    """Monitor of the arm's rest. Subscribe `add` to the robot's states; call `measure` at any time."""
 
     def __init__(self, model: RobotModel, limits: StillnessConfig) -> None:
         self._model = model
@@ -47,7 +47,7 @@ class StillnessMonitor:
         """Host monotonic time of the newest sample in which a joint moved, or of the first one."""
 
     def add(self, state: RobotState) -> None:
-        """One sample, in order; quick, from any one thread."""
+        """Add a state, in order; quick. Call from one thread only."""
         states = self._states
         now_s = state.stamps.controller_s
         if states and now_s <= states[-1].stamps.controller_s:
@@ -59,7 +59,7 @@ class StillnessMonitor:
             states.popleft()
 
     def measure(self, image_motion_px: float | None = None) -> Stillness | None:
-        """Over the newest window; None while there are too few states or a hole among them.
+        """Measure over the newest window; None while there are too few states or a gap among them.
 
         Position scatter: largest distance of the flange from its mean place; rotation scatter: largest angle
         to the newest orientation; joint speed: the fastest joint in any sample.
@@ -83,7 +83,7 @@ class StillnessMonitor:
         )
 
     def unrest(self, found: Stillness) -> str:
-        """The parts that move, in words; empty: settled."""
+        """Name what still moves; empty: settled."""
         limits, speed_rad_s, joint = self._limits, found.max_joint_speed_rad_s, ""
         if speed_rad_s > limits.joint_speed_rad_s:
             speeds = np.abs([s.joint_speeds_rad_s for s in self._states.copy()]).max(axis=0)
@@ -102,7 +102,7 @@ class StillnessMonitor:
 
     @property
     def at_rest(self) -> bool:
-        """By the joints alone; asked often, so an arm in motion costs next to nothing."""
+        """Tell whether the arm rests, by its joints alone; cheap while the arm moves."""
         states = self._states.copy()
         if not states or max(map(abs, states[-1].joint_speeds_rad_s)) > self._limits.joint_speed_rad_s:
             return False
@@ -115,10 +115,10 @@ class StillnessMonitor:
         look: Callable[[int], float | None] = lambda since_ns: math.nan,
         now_s: Callable[[], float] = time.monotonic,
     ) -> Stillness:
-        """Returns as soon as everything is at rest. `alive`: the robot's `check`; None: its news are late.
+        """Wait until everything is at rest. `alive`: the robot's `check`; None: its states are late.
 
-        `look`: motion (px) in images exposed since this host time, when the joints came to rest; NaN where it
-        cannot be measured, None = not yet.
+        `look`: returns the motion (px) in images exposed since a host time, that of the joints' rest; NaN
+        where it cannot be measured, None: not yet.
         NotStillError after the configured time-out, with what still moved.
         """
         give_up_s = now_s() + self._limits.timeout_s
@@ -151,7 +151,7 @@ class StillnessMonitor:
             await asyncio.sleep(POLL_S)
 
     def require_rest(self, state: RobotState) -> None:
-        """NotStillError when the arm moved at that moment: rest before an image is no rest during it."""
+        """Raise NotStillError when the arm moved in this state, as it may move after having settled."""
         speeds, limit = np.abs(state.joint_speeds_rad_s), self._limits.joint_speed_rad_s
         joint = int(speeds.argmax())
         if speeds[joint] > limit:

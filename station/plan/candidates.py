@@ -1,4 +1,4 @@
-"""Hundreds of poses around the board that the camera could see it well from and the arm can stand in."""
+"""Candidate poses: views in which the board is seen well and that the arm can reach without collision."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ NOT_IN_PICTURE = "the whole board is not in the image"
 OUT_OF_REACH = "the arm's reach"
 ARM_IN_SIGHT = "the arm itself, between camera and board"
 _PATH_RESERVE_M = 0.01
-"""Poses stand this far from every limit, so that moves between neighbours have room."""
+"""Clearance of poses beyond every limit, so that moves between neighbours have room."""
 _HUBS = 6
 _NEARLY_ALL = 0.85
-"""Share of the branch from which on no other hub needs to be looked at."""
+"""Share of the branch that a group must hold for the search of a better hub to end."""
 _REACH_RAD = 2.6
-"""Members turn no joint further than this from the hub: no flips of the wrist, no wound-up cables."""
+"""Largest turn of a joint between hub and member of a group, to avoid wrist flips and wound-up cables."""
 
 
 @dataclass(frozen=True, eq=False)
 class CandidateSet:
-    """Candidates that passed everything, of all arm branches: a pose may appear once per branch."""
+    """Candidates that passed all checks; a pose may appear once per arm branch."""
 
     joints_rad: Array
     """(n, 6)"""
     base_from_flange: Array
     """(n, 4, 4)"""
     camera_from_board: Array
-    """(n, 4, 4) by the guess"""
+    """(n, 4, 4) by the initial camera and board pose"""
     branch: NDArray[np.intp]
-    """(n,) of `inverse_many`"""
+    """(n,) arm branch, as numbered by `inverse_many`"""
     margin_m: Array
-    """(n,)"""
+    """(n,) smallest distance to any limit, metres"""
     lost: Counter[str] = field(default_factory=Counter)
-    """Number of others that a limit forbids (a pose may break several)."""
+    """Limit → number of rejected poses that violate it (a pose may violate several)."""
     alone: Counter[str] = field(default_factory=Counter)
-    """Number of others that would be possible without this one limit."""
+    """Limit → number of rejected poses that violate only it."""
 
     def __len__(self) -> int:
         return len(self.joints_rad)
@@ -65,10 +65,10 @@ class CandidateSet:
 
 
 def camera_views(scene: Scene, view: ViewRange, count: int, rng: np.random.Generator) -> Array:
-    """Camera poses around the board, camera_from_board (count, 4, 4), spread over the range."""
+    """Draw views of the board, camera_from_board (count, 4, 4), spread over the range."""
     low, high = view.distance_m
     distance = rng.uniform(low, high, count)
-    # Equal area on the cap: uniform in the cosine.
+    # A uniform cosine gives directions that are uniform on the sphere.
     cosine = rng.uniform(np.cos(view.tilt_rad[1]), np.cos(view.tilt_rad[0]), count)
     tilt, around = np.arccos(cosine), rng.uniform(-np.pi, np.pi, count)
     roll = view.roll_centre_rad + rng.uniform(-view.roll_rad, view.roll_rad, count)
@@ -94,9 +94,9 @@ def find_candidates(
     near_joints_rad: Array | None,
     tries: int | None = None,
 ) -> CandidateSet:
-    """All arm branches of camera poses that pass view, reach, joints and clearance.
+    """Draw views and find the postures, of all arm branches, that pass all checks.
 
-    `tries` (None: `count`) camera poses are looked at; the first `count` of those that show the board go on.
+    `tries` (None: `count`) views are drawn; the first `count` that certainly show the board are used.
     """
     views = camera_views(scene, view, tries or count, rng)
     flange = scene.base_from_flange(views)
@@ -117,7 +117,7 @@ def find_candidates(
 def _checks(
     scene: Scene, view: ViewRange, joints: Array, base_from_flange: Array
 ) -> tuple[dict[str, NDArray[np.bool_]], Array]:
-    """Checks joints (n, 6): results by name, each (n,), and the smallest margin (n,)."""
+    """Check joints (n, 6): return results (n,) by name of the limit, and the smallest margins (n,)."""
     low, high = joint_bounds(scene.geometry)
     checks: dict[str, NDArray[np.bool_]] = {
         "the joint range": np.asarray(((joints >= low) & (joints <= high)).all(axis=1)),
@@ -135,7 +135,7 @@ def _checks(
 
 
 def _limit_of(contact: Contact) -> str:
-    """The name of a limit; bodies of the arm against each other are one."""
+    """Name the limit of a contact; all contacts of the arm with itself are one."""
     if contact.kind == "workspace":
         return "the workspace box"
     if contact.kind == "self":
@@ -146,7 +146,7 @@ def _limit_of(contact: Contact) -> str:
 def _all_branches(
     scene: Scene, flange: Array, near: Array | None
 ) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
-    """Inverse kinematics of all poses: row in `flange` (m,), joints (m, 6), and their branch (m,)."""
+    """Compute inverse kinematics: row in `flange` (m,), joints (m, 6), and arm branch (m,)."""
     low, high = joint_bounds(scene.geometry)
     rows, q, branches = inverse_many(scene.geometry.model, flange)
     for branch in np.unique(branches):
@@ -156,7 +156,7 @@ def _all_branches(
 
 
 def _gather(q: Array, near: Array | None, low: Array, high: Array) -> Array:
-    """Full turns so that a branch's joints (n, 6) lie together, near the start, within low…high (6,)."""
+    """Add full turns to joints (n, 6) so that they lie together, near the start, within low…high (6,)."""
     turn = 2 * np.pi
     mean = np.angle(np.exp(1j * q).mean(axis=0))
     mean += turn * np.round(((near if near is not None else (low + high) / 2) - mean) / turn)
@@ -168,9 +168,10 @@ def _gather(q: Array, near: Array | None, low: Array, high: Array) -> Array:
 def best_group(
     scene: Scene, found: CandidateSet, start: Array | None, wanted: int, plenty: int
 ) -> CandidateSet:
-    """A group of at most `wanted`: of the branch nearest to the start that has `plenty`, or else the largest.
+    """Choose at most `wanted` candidates of one arm branch with free direct moves to a common hub.
 
-    With a start, only groups count that it has a free direct move into. Empty when there is none.
+    The branch is the nearest to the start with at least `plenty` candidates, else the largest. With a start,
+    it must have a free direct move into the group. Empty when there is none.
     """
     branches = [found.take(np.flatnonzero(found.branch == n)) for n in np.unique(found.branch)]
     if start is None:
@@ -200,7 +201,7 @@ def _best_of_branch(scene: Scene, branch: CandidateSet, start: Array | None) -> 
 
 
 def _hubs(joints: Array, start: Array | None) -> Iterator[Array]:
-    """The start, the member nearest to the middle, then members far from these (farthest-point sampling)."""
+    """Yield hubs to try: the start, the member nearest to the middle, then members far from these."""
     if start is not None:
         yield start
     if len(joints) == 0:
@@ -214,7 +215,7 @@ def _hubs(joints: Array, start: Array | None) -> Iterator[Array]:
 
 
 def _moves(scene: Scene, hub: Array, members: Array, reach_rad: float = _REACH_RAD) -> Array:
-    """Durations (n,) of direct moves hub → members; infinite beyond the reach or where not free."""
+    """Compute durations (n,) of direct moves from hub to members; infinite where too far or not free."""
     near = np.abs(members - hub).max(axis=1) <= reach_rad
     times = np.full(len(members), np.inf)
     times[near] = move_times(scene.geometry, np.repeat(hub[None], int(near.sum()), axis=0), members[near])

@@ -1,4 +1,4 @@
-"""Choice of poses: exchange on the information matrix of the solver's own model."""
+"""Choice of poses by an exchange algorithm on the information matrices of the solver's model."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ from station.cell.scene import Scene
 WITH_TABLE = ("arm", "all")
 Aim = Literal["camera", "arm", "both"]
 CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm", "both": "all"}
-"""Aims of a plan, for people → criterion."""
+"""Aim of a plan, as users name it → criterion."""
 _LENS_SHARE = {"A": 0.02, "D": 0.2, "arm": 0.0, "all": 0.0}
-"""Weight of the lens, so that the image is covered."""
+"""Weight of the lens in each criterion, so that the views cover the image."""
 TABLE_MM = 0.3
-"""1σ of the errors of an arm's table that a plan expects, mm and mrad."""
+"""1σ of the errors of an arm's table that is assumed in planning, mm and mrad."""
 _ENOUGH_TO_RANK, _SHORTLIST = 8, 60
-"""With so many views known the first order ranks further ones well; so many of them are then looked at."""
+"""From so many known views on, further ones are ranked by their first-order effect; so many are then
+evaluated exactly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +44,11 @@ class Objective:
 
     criterion: Criterion
     lever_m: float
-    """A rotation error counts as the error it makes at this distance."""
+    """Distance at which rotation errors are converted to metres."""
     prior: Array
-    """(p, p) what is known beforehand."""
+    """(p, p) prior information."""
     lens: slice | None
-    """Places of a lens that is found from the same images; None where it is known."""
+    """Indices of the intrinsics if they are estimated from the same images; None where they are known."""
     workspace: Array | None = None
     """(p, p) K: the mean squared error of a point over the arm's workspace is trace(K C)."""
 
@@ -66,7 +67,7 @@ class Objective:
         return np.asarray(np.log(spread) + share * self._lens(covariance))
 
     def slope(self, information: Array) -> Array:
-        """(p, p) G, so that adding dM to the information changes the value by -trace(G dM), first order."""
+        """Compute G (p, p): adding dM to the information changes the value by -trace(G dM), first order."""
         C = covariance_of(information, self.prior)
         if self.criterion == "all":
             return C
@@ -96,7 +97,7 @@ def informations(
     joints_rad: Array | None = None,
     noise: MeasurementNoise = USUAL_NOISE,
 ) -> Array:
-    """(n, p, p) information of each pose by the scene's guess; with joints (n, 6) on the arm's table too."""
+    """Compute the information (n, p, p) of each pose; with joints (n, 6) also about the arm's table."""
     points, motion = board_points(scene.board), None
     if joints_rad is not None:
         motion = by_parameters(with_near_axes(scene.geometry.model), joints_rad) * RELATIVE_SIGMA
@@ -108,7 +109,10 @@ def informations(
 def objective_for(
     scene: Scene, criterion: Criterion, free_intrinsics: bool, joints_rad: Array | None = None
 ) -> Objective:
-    """`joints_rad` (n, 6): where the arm is planned for; needed for the criteria with its table."""
+    """Make the objective of a criterion.
+
+    `joints_rad`: (n, 6) postures that stand for the workspace, needed by the criteria with the arm's table.
+    """
     table_mm = TABLE_MM if criterion in WITH_TABLE else 0.0
     prior = prior_information(scene.camera, not free_intrinsics, BoardTolerance.of(scene.board), table_mm)
     lens = slice(12, 12 + len(intrinsics_names(scene.camera))) if free_intrinsics else None
@@ -131,10 +135,10 @@ def choose(
     progress: Callable[[float], None] = lambda done: None,
     known: Array | None = None,
 ) -> list[int]:
-    """Indices of `count` members of the pool (n, p, p): greedy, then exchanged until no swap helps.
+    """Choose `count` members of the pool (n, p, p), greedily, then by exchanges until none helps.
 
-    `keep` stay in; `known` (p, p) is there beside them. Deterministic for a given rng state; ties go to the
-    lower index.
+    `keep`: indices that stay chosen; `known`: (p, p) information of other views. Returns indices.
+    Deterministic for a given state of rng; ties go to the lower index.
     """
     chosen = list(keep)
     if not chosen and known is None:
@@ -160,7 +164,7 @@ def choose(
 
 
 def _best_addition(pool: Array, total: Array, taken: list[int], objective: Objective) -> tuple[int, float]:
-    """Find the further member that makes the sum best, and how good it is then."""
+    """Find the member whose addition gives the smallest objective; return its index and that value."""
     open_places = np.setdiff1d(np.arange(len(pool)), taken)
     if len(open_places) == 0:
         return taken[0], np.inf

@@ -30,14 +30,14 @@ _POSE = ["x", "y", "z", "qx", "qy", "qz", "qw"]
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # yaml has no types
-    """Without anchors: equal rows are written out, as the strict reader wants them."""
+    """YAML writer without anchors, which the strict reader does not accept."""
 
     def ignore_aliases(self, data: object) -> bool:
         return True
 
 
 def save_plan(plan: Plan, path: Path) -> None:
-    """Writes `plan.yaml` in one step. ConfigError with the remedy when the disk refuses."""
+    """Write a plan file atomically. ConfigError with the remedy when it cannot be written."""
     text = yaml.dump(
         msgspec.to_builtins(plan),
         Dumper=_Dumper,
@@ -54,12 +54,12 @@ def save_plan(plan: Plan, path: Path) -> None:
 
 
 def load_plan(path: Path) -> Plan:
-    """Reads and checks `plan.yaml`. ConfigError lists every problem that can be seen, with its line."""
+    """Read and check a plan file. ConfigError lists all problems with their lines."""
     return parse_plan(_read(path), str(path))
 
 
 def parse_plan(content: bytes, name: str = "plan") -> Plan:
-    """The same for what is already here (an attachment of a recording, an editor)."""
+    """Parse and check the content of a plan file, such as an attachment of a recording."""
     try:
         plan = strict_yaml.load(content, Plan)
     except strict_yaml.StrictYamlError as error:
@@ -93,7 +93,7 @@ def _read(path: Path) -> bytes:
 
 
 def _value_problems(plan: Plan) -> list[str]:
-    """Finds what types cannot say."""
+    """Find wrong values and contradictions that types cannot express."""
     problems = []
     if plan.motion != "stops":
         problems.append("motion: sweeps are gone. Make a plan of poses: `station plan`")
@@ -124,9 +124,9 @@ def _value_problems(plan: Plan) -> list[str]:
 
 
 def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
-    """The poses of a recording's images, guided by hand or driven to, as a plan, in their order.
+    """Make a plan of the poses at which a recording's images were taken, in their order.
 
-    ConfigError when they are of another arm or mount or without joints; RecordingError when it is not whole.
+    ConfigError for another arm or mounting, or without joints; RecordingError for an unfinished recording.
     """
     recording = open_recording(path)
     of = recording.info
@@ -150,7 +150,7 @@ def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
 
 
 def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[float] | None = None) -> Plan:
-    """A CSV list as a plan: header `[name,]j1_deg…j6_deg`, `[name,]j1_rad…` or `[name,]x,y,z,qx,qy,qz,qw`.
+    """Make a plan from CSV: header `[name,]j1_deg…j6_deg`, `[name,]j1_rad…` or `[name,]x,y,z,qx,qy,qz,qw`.
 
     Poses are base_from_flange in metres; each takes the arm branch nearest to the one before (the first:
     nearest to `near_joints_rad`, which is needed then). ConfigError names file, row and remedy.

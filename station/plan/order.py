@@ -1,4 +1,4 @@
-"""The order of the stops: short in time, every move free of collision."""
+"""Order of the poses: short in time, every move free of collision."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from station.cell.collision import SPACING_M, CellGeometry, margins, moving_poin
 from station.cell.limits import leading_speed, leaving, trapezoid
 
 _SAMPLES = (9, 33, 129)
-"""Along one move: few at first."""
+"""Numbers of samples along a move, tried in this order until the result is certain."""
 BLOCKED = np.inf
 _NEAR_STARTS, _OTHER_STARTS, _LONG_TOUR = 8, 4, 60
 
 
 def move_times(geometry: CellGeometry, joints_from: Array, joints_to: Array) -> Array:
-    """Durations (n,) in seconds of joint moves (n, 6) → (n, 6); BLOCKED where the path breaks a limit.
+    """Compute durations (n,), s, of joint moves (n, 6) → (n, 6); BLOCKED where the path violates a limit.
 
-    On the safe side: margins shrink by half of what modelled points travel between samples. Only moves that
+    Conservative: half of the motion of modelled points between samples is taken off the margins. Moves that
     few samples cannot decide are sampled more densely.
     """
     times = np.full(len(joints_from), BLOCKED)
@@ -40,7 +40,7 @@ def move_times(geometry: CellGeometry, joints_from: Array, joints_to: Array) -> 
 def _sampled(
     geometry: CellGeometry, joints_from: Array, joints_to: Array, samples: int
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Durations (n,) of moves; which are free for certain; which certainly break a limit."""
+    """Compute durations (n,) of moves, and masks of the certainly free and the certainly blocked ones."""
     n = len(joints_from)
     paths = joints_from[:, None] + np.linspace(0, 1, samples)[:, None] * (joints_to - joints_from)[:, None]
     flat = paths.reshape(-1, 6)
@@ -58,7 +58,7 @@ def _sampled(
 
 
 def time_matrix(geometry: CellGeometry, joints_rad: Array) -> Array:
-    """(n, n) move durations between all poses, symmetric, BLOCKED where a path breaks a limit."""
+    """Compute durations (n, n) of moves between all poses, symmetric, BLOCKED where not free."""
     n = len(joints_rad)
     i, j = np.triu_indices(n, 1)
     times = np.zeros((n, n))
@@ -67,10 +67,10 @@ def time_matrix(geometry: CellGeometry, joints_rad: Array) -> Array:
 
 
 def short_order(times: Array, first_leg: Array, seed: int) -> list[int]:
-    """A short open path through all n poses; `first_leg` (n,) is the time from the start to each.
+    """Find a short open path through all n poses; `first_leg` (n,): time from the start to each.
 
-    Nearest neighbour from every pose, then 2-opt and or-opt until nothing improves. BLOCKED moves are
-    avoided where that is possible; `path_time` tells.
+    Nearest neighbour from every pose, then 2-opt and or-opt until nothing improves. BLOCKED moves are avoided
+    where possible; `path_time` tells whether one is left.
     """
     n = len(times)
     cost = np.where(np.isfinite(times), times, 1e4)
@@ -95,7 +95,7 @@ def _nearest(cost: Array, start: int) -> list[int]:
 
 
 def _improve(tour: list[int], cost: Array, lead: Array, patterns: NDArray[np.intp]) -> list[int]:
-    """Takes the best of all neighbouring tours until none is shorter."""
+    """Improve a tour by the best rearrangement until none makes it shorter."""
     now = np.array(tour)
     best = path_time(tour, cost, lead)
     while True:
@@ -109,7 +109,7 @@ def _improve(tour: list[int], cost: Array, lead: Array, patterns: NDArray[np.int
 
 @lru_cache(maxsize=4)
 def _patterns(n: int) -> NDArray[np.intp]:
-    """Rearrangements (m, n) of places: every stretch reversed; for short tours every short piece moved."""
+    """List rearrangements (m, n): every stretch reversed; for short tours also every short piece moved."""
     places = list(range(n))
     found = [places[:i] + places[i : j + 1][::-1] + places[j + 1 :] for i in places for j in range(i + 1, n)]
     for size in (1, 2, 3) if n <= _LONG_TOUR else ():

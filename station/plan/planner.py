@@ -1,4 +1,4 @@
-"""Plan from a rough idea of the cell: candidates, one arm branch, the best 25, a short safe order."""
+"""Planner: candidates by the initial camera and board poses, one arm branch, the best set, a short order."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from station.plan.visibility import ViewRange, blind_share, expected_view, plann
 
 Progress = Callable[[str, float], None]
 POOL_SIZE = 1200
-"""Against 480, both errors are 4 to 6 % smaller (forecast on random cells)."""
+"""Size of the pool. Compared with 480, both predicted errors are 4 to 6 % smaller (random cells)."""
 _BLIND = 0.5
-"""A move without the board in the image counts as so much longer when the order is chosen."""
+"""Share by which a move without the board in the image counts as longer when the order is chosen."""
 _TRIES = 12
-"""Camera poses looked at per wanted member of the pool; most fall to the guess's uncertainty."""
+"""Views drawn per wanted member of the pool; most are rejected for the uncertainty of the initial poses."""
 _REMEDIES = {
     NOT_IN_PICTURE: "Measure camera_guess and board_guess better, use a smaller board or a wider lens.",
     "the joint range": "Widen limits.joints_min_rad and joints_max_rad, or turn the board.",
@@ -53,13 +53,13 @@ _REMEDIES = {
 _BACKWARDS = -0.3
 """Cosine between the flange's axis and the line of sight of a camera that looks back at the arm."""
 _KEYHOLE = 10
-"""Hidden views for each free one, from which on the free ones hang on the guess's last millimetres."""
+"""Ratio of views hidden by the arm to free ones above which the camera is taken to look back at the arm."""
 
 
 def explain_shortage(
     scene: Scene, wanted: int, group: CandidateSet, found: CandidateSet, start: Array | None
 ) -> LimitError:
-    """Say why there is no plan: `group` is what is usable, `found` all that passes pose by pose."""
+    """Make the error that says why there is no plan. `group`: usable candidates; `found`: all."""
     counts = {"possible": len(group), "wanted": wanted}
     if looks_back(scene, found):
         angle_deg = float(np.rad2deg(np.arccos(np.clip(scene.X[2, 2], -1.0, 1.0))))
@@ -107,7 +107,7 @@ def _remedy(limit: str) -> str:
 
 
 def looks_back(scene: Scene, found: CandidateSet) -> bool:
-    """Tell whether the guessed camera looks back at the arm, which hides the board from nearly everywhere."""
+    """Tell whether the configured camera looks back at the arm, which then hides the board in most views."""
     backwards = scene.mount == "eye-in-hand" and scene.X[2, 2] < _BACKWARDS
     return bool(backwards and found.alone[ARM_IN_SIGHT] > _KEYHOLE * len(found))
 
@@ -151,9 +151,9 @@ class PlanOptions:
     criterion: Criterion = "A"
     noise: MeasurementNoise = USUAL_NOISE
     free_intrinsics: bool = True
-    """The lens is calibrated from the same images."""
+    """True: the intrinsics are estimated from the same images."""
     view: ViewRange | None = None
-    """None = by the lens and the board's size."""
+    """Range of views; None: chosen by lens and board size."""
     pool: int = POOL_SIZE
 
 
@@ -167,11 +167,10 @@ def make_plan(
     lens_known: bool = False,
     progress: Progress = lambda text, done: None,
 ) -> Plan:
-    """A plan of `count` poses for the configured cell. Deterministic by seed; takes seconds.
+    """Make a plan of `count` poses for the configured cell. Deterministic by seed; takes seconds.
 
-    `lens_known`: the images need not tell the lens too, as when an installed calibration is checked.
-    ConfigError when the configuration lacks what planning needs; LimitError when there is no such plan,
-    saying which limit binds and what to change.
+    `lens_known`: intrinsics are not to be estimated, as in a drift check. ConfigError when the configuration
+    lacks what planning needs; LimitError, with the limiting constraint and the remedy, when there is no plan.
     """
     require_kept_clear(config)
     options = PlanOptions(count=count, seed=seed, criterion=criterion, free_intrinsics=not lens_known)
@@ -185,7 +184,7 @@ def plan_scene(
     progress: Progress = lambda text, done: None,
     captured: Array | None = None,
 ) -> Plan:
-    """The same, for a scene that is already known; `captured`: flange poses (n, 4, 4) that were taken."""
+    """Make a plan for a scene, as `make_plan`; `captured`: flange poses (n, 4, 4) of views already taken."""
     rng = np.random.default_rng(options.seed)
     start = None if start_joints_rad is None else np.asarray(start_joints_rad, dtype=float)
     progress("looking for poses", 0.0)
@@ -196,7 +195,7 @@ def plan_scene(
 
 
 def _relaxed(view: ViewRange, start_roll_rad: float | None) -> list[tuple[ViewRange, str]]:
-    """The wanted range, then ever less particular ones, each with what is to be said about it."""
+    """List the wanted range of views and ever wider ones, each with the note for the plan."""
     rolls = [0.0, np.pi / 2, -np.pi / 2, np.pi] if start_roll_rad is None else [start_roll_rad, 0.0]
     views = [(replace(view, roll_centre_rad=roll), "") for roll in rolls]
     doubtful = replace(views[0][0], doubt=2.0, off_centre=0.2)
@@ -212,7 +211,7 @@ def _relaxed(view: ViewRange, start_roll_rad: float | None) -> list[tuple[ViewRa
 
 
 def _start_roll(scene: Scene, start: Array | None) -> float | None:
-    """Roll of the board as seen from the start, rad; None where the start does not look at it."""
+    """Compute the board's roll in the view from the start, rad; None where it is not seen from there."""
     if start is None:
         return None
     flange = forward(scene.geometry.model, start)
@@ -224,7 +223,7 @@ def _start_roll(scene: Scene, start: Array | None) -> float | None:
 def candidate_pool(
     scene: Scene, options: PlanOptions, start: Array | None, rng: np.random.Generator
 ) -> tuple[CandidateSet, list[str]]:
-    """Candidates of the best branch. LimitError with the reason when the widest range has too few."""
+    """Find the candidates of the best branch, and notes. LimitError where the widest range has too few."""
     best: tuple[CandidateSet, CandidateSet, str] | None = None
     for view, note in _relaxed(options.view or view_range(scene), _start_roll(scene, start)):
         found = find_candidates(scene, view, 2 * options.pool, rng, start, _TRIES * options.pool)
@@ -249,7 +248,7 @@ def _choose_and_order(
     progress: Progress,
     captured: Array | None,
 ) -> Plan:
-    """The checked plan. Poses that no free path leads to leave the set, and the choice is made again."""
+    """Choose and order poses, and check the plan; repeat without poses that no free path leads to."""
     joints = pool.joints_rad if options.criterion in WITH_TABLE else None
     objective = objective_for(scene, options.criterion, options.free_intrinsics, joints)
     information = informations(scene, pool.base_from_flange, joints, options.noise)
@@ -257,7 +256,7 @@ def _choose_and_order(
     left = np.arange(len(pool))
     picked: list[int] = []
     while len(left) >= options.count:
-        # The first choice is polished; when poses without a free path leave, only their places are filled.
+        # After the first choice only the poses without a free path are replaced.
         kept = tuple(int(k) for k in np.flatnonzero(np.isin(left, picked)))
         chosen = choose(
             information[left],
@@ -285,7 +284,10 @@ def _choose_and_order(
 
 
 def _ordered(scene: Scene, joints: Array, start: Array | None, seed: int) -> tuple[list[int], list[int]]:
-    """A short order of joints (n, 6), in which moves that lose the board count as longer; unfree members."""
+    """Find a short order of joints (n, 6), preferring moves that keep the board in the image.
+
+    The second list holds the indices of poses without a free path.
+    """
     times = time_matrix(scene.geometry, joints)
     i, j = np.triu_indices(len(joints), 1)
     blind = np.zeros_like(times)
@@ -301,7 +303,7 @@ def _ordered(scene: Scene, joints: Array, start: Array | None, seed: int) -> tup
 
 
 def _failing(plan: Plan, start: Array | None, scene: Scene) -> list[int]:
-    """Places of poses whose move does not pass the dense check. LimitError when the plan as such is wrong."""
+    """List the poses whose move fails the dense check. LimitError when the plan itself violates a limit."""
     check = check_plan(plan, start, scene.geometry)
     failing = [place for place, move in enumerate(check.moves) if move.problems]
     if check.problems and not failing:

@@ -1,4 +1,4 @@
-"""Predicted error of X: from a plan alone, after each captured pose, and the best next pose."""
+"""Predicted error of X from a plan or after captured poses, and the most useful next pose."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ _TRIES = 12
 @dataclass(frozen=True)
 class Advice:
     sigma_m: float
-    """Expected 1σ of X now, translation."""
+    """Expected 1σ of X's translation after the captured poses."""
     enough: bool
     text: str
     next_pose: PlannedPose | None = None
-    """The pose that would help most, reachable from where the arm is; None when enough or when none helps."""
+    """Most useful pose that is reachable from where the arm is; None when enough or when none helps."""
     poses_missing: int | None = None
-    """So many more like it reach the goal; None = not with poses of this kind."""
+    """Number of further poses that reach the goal; None: not reachable."""
 
 
 _OPEN = 0.7
-"""A parameter whose 1σ stays above this share of what it was beforehand stays open."""
+"""Share of its prior 1σ above which a parameter counts as not determined."""
 
 
 @dataclass(frozen=True)
 class ArmForecast:
-    """Expected errors after a plan, with X and the arm's table estimated from it."""
+    """Errors expected after a plan if X and the arm's table are estimated from it."""
 
     with_table_m: float
-    """1σ of a point over the arm's workspace."""
+    """1σ of a point over the arm's workspace, with the corrected table."""
     if_measured_m: float
-    """The same with a board whose length is known to `MEASURED`."""
+    """The same if the board's length is known to `MEASURED`."""
     open: tuple[str, ...]
-    """Parameters of the table of which the plan tells little."""
+    """Parameters of the table that the plan does not determine."""
 
 
 def forecast_arm(scene: Scene, plan: Plan) -> ArmForecast:
-    """Forecast by the scene's guess and the usual noise, for errors of the table of the usual size."""
+    """Predict errors with the arm's table, for usual noise and usual errors of the table."""
     joints = np.array([pose.joints_rad for pose in plan.poses])
     gains = informations(scene, flange_poses(scene, plan), joints)
     total, expected = gains.sum(axis=0), []
@@ -72,9 +72,9 @@ def forecast_arm(scene: Scene, plan: Plan) -> ArmForecast:
 
 
 def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
-    """The plan, with the expected sigma after each pose if it says none; poses that cut the board.
+    """Add the expected sigma after each pose where it is missing, for usual noise.
 
-    By the scene's guess and the usual noise.
+    The second value names the poses in which the board is expected to be cut off.
     """
     flange = flange_poses(scene, plan)
     cut = tuple(pose.name for pose, seen in zip(plan.poses, _whole(scene, flange), strict=True) if not seen)
@@ -94,9 +94,9 @@ def forecast_views(
     free_intrinsics: bool = True,
     noise: MeasurementNoise = USUAL_NOISE,
 ) -> list[float]:
-    """Expected 1σ of X (m) after each of the views taken from these flange poses (n, 4, 4).
+    """Predict 1σ of X (m) after each of the views from these flange poses (n, 4, 4).
 
-    A view that by the guess does not show the whole board brings nothing.
+    A view that is not expected to show the whole board adds nothing.
     """
     objective = objective_for(scene, "A", free_intrinsics)
     gains = informations(scene, base_from_flange, noise=noise)
@@ -105,7 +105,7 @@ def forecast_views(
 
 
 def _whole(scene: Scene, base_from_flange: Array) -> NDArray[np.bool_]:
-    """(n,) whether every point of the board is in the image, by the guess."""
+    """Tell for each pose whether all points of the board are expected in the image, (n,)."""
     return visible(scene.camera, scene.seen(base_from_flange, board_points(scene.board)), 0.0)
 
 
@@ -116,7 +116,7 @@ def advise(
     joints_now_rad: Sequence[float],
     pool_size: int = 150,
 ) -> Advice:
-    """Are the captured flange poses (n, 4, 4) enough? If not: the next best pose, and how many more."""
+    """Tell whether the captured flange poses (n, 4, 4) are enough, else the next best pose and how many."""
     flange = np.asarray(captured, dtype=float).reshape(-1, 4, 4)
     objective = objective_for(scene, "A", free_intrinsics=True)
     known = informations(scene, flange).sum(axis=0)
@@ -146,7 +146,7 @@ def advise(
 
 
 def _best_free(scene: Scene, start: Array, joints_rad: Array, scores: Array) -> int | None:
-    """Row of the joints (n, 6) with the lowest score and a free path from `start` (6,); few are tried."""
+    """Find the row of joints (n, 6) of lowest score with a free path from `start` (6,); tries only a few."""
     for place in np.argsort(scores, kind="stable")[:_TRIES]:
         if not check_path(scene.geometry, start, joints_rad[place]).problems:
             return int(place)
@@ -154,7 +154,7 @@ def _best_free(scene: Scene, start: Array, joints_rad: Array, scores: Array) -> 
 
 
 def _missing(known: Array, gains: Array, goal_m: float, objective: Objective) -> int | None:
-    """Counts the greedily chosen further poses that reach the goal."""
+    """Count the further poses, chosen greedily, that reach the goal; None: too many."""
     total = known
     for count in range(1, _FURTHER_POSES + 1):
         total = total + gains[int(np.argmin(objective(total + gains)))]
@@ -164,8 +164,10 @@ def _missing(known: Array, gains: Array, goal_m: float, objective: Objective) ->
 
 
 def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:
-    """Say which pose would help most, how many are missing for `capture.goal_m`; empty when none is, or none
-    helps, or the guesses are missing."""
+    """Say which pose would help most and how many are missing for `capture.goal_m`.
+
+    Empty when none is missing, none helps, or the initial poses are missing.
+    """
     goal_m = config.capture.goal_m
     try:
         advice = advise(scene_of(config), base_from_flange, goal_m, joints_now_rad)

@@ -1,4 +1,4 @@
-"""A picture file of a plan: cameras and board in space, board points in the image, the expected error."""
+"""Drawing of a plan as a file: cameras and board in space, board points in the image, expected error."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _SHOWN_ARMS = 3
 
 
 def save_picture(scene: Scene, plan: Plan, path: Path) -> None:
-    """Writes the preview as PNG, SVG or PDF, by the name's ending. ConfigError when that cannot be."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # slow to import, seldom wanted
+    """Write the drawing as PNG, SVG or PDF, by the name's ending. ConfigError when it cannot be written."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # slow to import and rarely used
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 6.5), layout="constrained")
@@ -42,7 +42,7 @@ def save_picture(scene: Scene, plan: Plan, path: Path) -> None:
 
 
 def _placed(scene: Scene, plan: Plan) -> tuple[Array, Array, Array]:
-    """Cameras and boards, (n, 4, 4) or (1, 4, 4), and the path (n, 3) of what moves."""
+    """Compute poses of cameras and boards, (n, 4, 4) or (1, 4, 4), and the path (n, 3) of the moving one."""
     flange = flange_poses(scene, plan)
     in_hand = scene.mount == "eye-in-hand"
     cameras = flange @ scene.X if in_hand else scene.X[None]
@@ -78,13 +78,13 @@ def _draw_space(axes: Axes3D, scene: Scene, plan: Plan) -> None:
 
 
 def camera_frustum(scene: Scene, base_from_camera: Array) -> list[Array]:
-    """Edges of the image's pyramid, polylines (m, 3) in `base`."""
+    """Make the edges of the camera's viewing pyramid: polylines (m, 3) in `base`."""
     points = frustum(scene.camera, base_from_camera, _FRUSTUM_M)
     return [points[[1, 2, 3, 4, 1]], *(points[[0, corner]] for corner in range(1, 5))]
 
 
 def printed_outline(scene: Scene, base_from_board: Array) -> Array:
-    """The printed area's outline, closed, (5, 3) in `base`."""
+    """Make the closed outline (5, 3) of the printed area in `base`."""
     return transform_points(base_from_board, printed_corners(scene.board)[[0, 1, 2, 3, 0]])
 
 
@@ -100,7 +100,7 @@ def _draw_error(axes: Axes, plan: Plan) -> None:
     axes.set(xlabel="poses taken", title="expected error of the camera's position, mm (1σ)")
     if sigmas:
         axes.semilogy(range(1, len(sigmas) + 1), sigmas, "o-", ms=3)
-        # The first two views say nothing about X; their bars would hide the rest.
+        # The first two views do not determine X; their large values would flatten the rest.
         axes.set_ylim(0.7 * sigmas[-1], 1.5 * sigmas[min(2, len(sigmas) - 1)])
         axes.annotate(f"{sigmas[-1]:.2f} mm", (len(sigmas), 1.4 * sigmas[-1]), ha="right", va="bottom")
     axes.grid(True, which="both", alpha=0.3)

@@ -1,4 +1,4 @@
-"""Is the whole board in the image: through the lens, for a wrong guess, and past the arm."""
+"""Visibility of the board: wholly in the image despite uncertain initial poses, not hidden by the arm."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from station.cell.plan import ExpectedView, PlannedPose
 from station.cell.scene import Scene, printed_corners
 
 _ON_THE_WAY = 7
-"""Images looked at along a move."""
+"""Positions along a move at which visibility is checked."""
 
 
 @dataclass(frozen=True)
 class ViewRange:
-    """Range of places from which the board may be looked at."""
+    """Range of distance, tilt, roll and position of the board in wanted views."""
 
     distance_m: tuple[float, float] = (0.38, 0.60)
     tilt_rad: tuple[float, float] = (0.0, 0.70)
     roll_rad: float = 0.80
-    """Either way from `roll_centre_rad`."""
+    """Largest difference from `roll_centre_rad`."""
     roll_centre_rad: float = 0.0
     off_centre: float = 0.35
-    """Share of half the image that the board's centre may be away from the image's centre."""
+    """Largest distance of the board's centre from the image's centre, as share of half the image."""
     border_px: float = 12.0
     doubt: float = 3.5
-    """So many standard deviations of its pixels, as the guesses' sigmas make them, every corner of the board
-    keeps from the image's edge beyond `border_px`."""
+    """Distance of every board corner from the image's edge, beyond `border_px`, in standard deviations of its
+    pixel by the uncertainty of the initial poses."""
     smallest_singular: float = 0.03
 
 
 _NEAR_FILL, _FAR_FILL = 0.64, 0.40
-"""Share of the image's width or height that the board's outline fills, at the nearest and farthest."""
+"""Share of the image's width or height that the board fills at the shortest and longest distance."""
 _FOCUS = (0.6, 1.6)
-"""Images are sharp within these multiples of the working distance."""
+"""Range of distances with sharp images, as multiples of the working distance."""
 
 
 def view_range(scene: Scene) -> ViewRange:
-    """Distances at which the board fills the image well, as far as they lie near the working distance."""
+    """Choose distances at which the board fills the image well, near the working distance."""
     K = camera_matrix(scene.camera)
     points = board_points(scene.board)
     size_m = (points.max(axis=0) - points.min(axis=0))[:2] + scene.board.square_m
@@ -61,13 +61,13 @@ def view_range(scene: Scene) -> ViewRange:
 
 
 def visible(camera: CameraModel, points: Array, border_px: float) -> NDArray[np.bool_]:
-    """Points (n, k, 3) in `camera` → (n,) whether all lie inside the image, true lens included."""
+    """Tell for n views whether all points (n, k, 3) in `camera` lie in the image, with distortion: (n,)."""
     in_front = points[..., 2] > 0.02
     safe = np.where(in_front[..., None], points, [0.0, 0.0, 1.0])
     pixels = project(camera, safe).pixels
     size = np.array([camera.width, camera.height]) - 1
     inside = ((pixels >= border_px) & (pixels <= size - border_px)).all(axis=-1)
-    # Far off the axis a distortion polynomial folds points back into the image.
+    # Far from the axis a distortion polynomial may map points back into the image.
     radius = np.linalg.norm(safe[..., :2] / safe[..., 2:], axis=-1)
     return np.asarray((inside & in_front & (radius < lens_radius(camera))).all(axis=1))
 
@@ -79,7 +79,7 @@ def count_in_parts(camera: CameraModel, pixels: Array, rows: int, columns: int) 
 
 
 def lens_radius(camera: CameraModel) -> float:
-    """Largest normalised radius up to which the lens model grows, at most 1.3 times the image's corner."""
+    """Find the largest normalised radius up to which the lens model is monotonic (at most 1.3 × corner)."""
     K = camera_matrix(camera)
     corner = np.hypot(camera.width, camera.height) / (2 * min(K[0, 0], K[1, 1]))
     radii = np.linspace(0, 1.3 * corner, 200)
@@ -90,9 +90,9 @@ def lens_radius(camera: CameraModel) -> float:
 
 
 def seen_for_certain(scene: Scene, base_from_flange: Array, view: ViewRange) -> NDArray[np.bool_]:
-    """(n,) whether the whole board is in the image, and stays so when the guesses are wrong.
+    """Tell for n poses whether the whole board is in the image despite the uncertainty of the initial poses.
 
-    Every point of the outline keeps `border_px` and `doubt` standard deviations of its pixel from the edge.
+    Every point of the outline must be `border_px` plus `doubt` standard deviations away from the edge.
     """
     rim = outline(scene.board)
     good = visible(scene.camera, scene.seen(base_from_flange, rim), view.border_px)
@@ -105,10 +105,10 @@ def seen_for_certain(scene: Scene, base_from_flange: Array, view: ViewRange) -> 
 
 
 def uncertain_pixels(scene: Scene, base_from_flange: Array, points: Array) -> tuple[Array, Array]:
-    """Board points (k, 3) in n images: pixels and their standard deviations, (n, k, 2) each.
+    """Project board points (k, 3) into n images: pixels and their standard deviations, (n, k, 2) each.
 
-    First order. An error of the camera's place or of the board's moves a point alike in all directions; a
-    turn of the camera moves it about the camera, a turn of the board about the board's origin.
+    To first order. Position errors of camera and board are isotropic; an orientation error of the camera
+    moves a point about the camera, one of the board about the board's origin.
     """
     seen = scene.seen(base_from_flange, points)
     lever = seen - scene.seen(base_from_flange, np.zeros((1, 3)))
@@ -122,7 +122,7 @@ def uncertain_pixels(scene: Scene, base_from_flange: Array, points: Array) -> tu
 
 
 def blind_share(scene: Scene, joints_from: Array, joints_to: Array) -> Array:
-    """(n,) share of the path, 0…1, that joint moves (n, 6) → (n, 6) do not show the whole board."""
+    """Compute the share (n,), 0…1, of moves (n, 6) → (n, 6) during which the board is not wholly seen."""
     steps = np.linspace(0, 1, _ON_THE_WAY + 2)[1:-1]
     paths = joints_from[:, None] + steps[:, None] * (joints_to - joints_from)[:, None]
     flange = forward(scene.geometry.model, paths.reshape(-1, 6))
@@ -131,7 +131,7 @@ def blind_share(scene: Scene, joints_from: Array, joints_to: Array) -> Array:
 
 
 def outline(board: BoardSpec) -> Array:
-    """Points (8, 3) around the detectable ones, half a square wider: detectors need the rim."""
+    """Make an outline (8, 3) half a square outside the detectable points, as detectors need the margin."""
     points = board_points(board)
     low = points.min(axis=0) - board.square_m / 2
     high = points.max(axis=0) + board.square_m / 2
@@ -142,7 +142,7 @@ def outline(board: BoardSpec) -> Array:
 
 
 def sees_past_the_arm(scene: Scene, joints_rad: Array, base_from_flange: Array) -> NDArray[np.bool_]:
-    """(n,) whether no part of the arm stands in the lines of sight to the board's outline."""
+    """Tell for n postures whether the arm is clear of all lines of sight to the board's outline: (n,)."""
     starts, ends, radii = body_segments(scene.geometry, joints_rad)
     links = slice(2, len(ARM_BODIES))
     if scene.mount == "eye-in-hand":
@@ -156,7 +156,7 @@ def sees_past_the_arm(scene: Scene, joints_rad: Array, base_from_flange: Array) 
 
 
 def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
-    """Predicts how the board looks from a flange pose (4, 4), by the scene's guess."""
+    """Predict the view of the board from a flange pose (4, 4)."""
     camera_from_board = scene.camera_from_board(base_from_flange)
     points = board_points(scene.board)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -167,7 +167,7 @@ def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
     return ExpectedView(
         distance_m=float(np.linalg.norm(seen[0])),
         tilt_rad=float(np.arccos(np.clip(R[2, 2], -1, 1))),
-        # About the optical axis, after the tilt's shortest turn is taken off.
+        # Rotation about the optical axis that is left after the tilt, the shortest rotation, is removed.
         roll_rad=float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])),
         centre_px=(float(pixels[0, 0]), float(pixels[0, 1])),
         coverage=min(1.0, area / (scene.camera.width * scene.camera.height)),
@@ -175,7 +175,7 @@ def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
 
 
 def planned_pose(scene: Scene, number: int, joints_rad: Array, sigma_m: float | None) -> PlannedPose:
-    """A pose of the plan with its expected view and the reason in a few words."""
+    """Make a pose of a plan with its expected view and the reason in a few words."""
     base_from_flange = forward(scene.geometry.model, joints_rad)
     view = expected_view(scene, base_from_flange)
     return PlannedPose(

@@ -1,6 +1,6 @@
-"""The session, from an approval to a finished recording. Knows no socket and no screen.
+"""The session, from an approval to a finished recording, independent of sockets and screens.
 
-`Session` is all that others may use; its state is read at `Session.store` and `Session.context`.
+Other packages use `Session` only, and read its state from `Session.store` and `Session.context`.
 """
 
 from station.session.session import Session

@@ -1,4 +1,4 @@
-"""One stop of the arm: settle, image, robot pose of the same moment, disk. It counts only after the disk."""
+"""Capture at one pose: settle, image, robot pose at the same time, write. Counts once it is on the disk."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from station.session.recording import to_the_end
 
 SATURATED_LIMIT = 0.05
 GAPS_S = (0.0, 0.03)
-"""Between glimpses. Uneven, so that a ringing whose period fits one gap does not fit the other."""
+"""Pauses between the images for motion; unequal, so that no vibration has a period that fits both."""
 IMAGES = 3
 GLIMPSE_TRIES = 2
 WORKER_TIMEOUT_S = 5.0
@@ -35,15 +35,15 @@ log = logging.getLogger(__name__)
 
 
 class PoseFailedError(StationError):
-    """Pose that gave nothing usable; the session goes on."""
+    """Capture at a pose failed; the session goes on."""
 
     code = "pose-failed"
 
 
 async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
-    """Settles, takes the image, writes it; marks the pose done.
+    """Wait until the arm is settled, take the image, write it, and mark the pose done.
 
-    PoseFailedError and NotStillError when this pose gave nothing; RobotError and RecordingError end the run.
+    PoseFailedError and NotStillError when the pose failed; RobotError and RecordingError end the run.
     """
     _phase(context, index, StationState.SETTLING, "settling")
     async with ImageWatch(context, index) as watch:
@@ -80,15 +80,15 @@ def _phase(context: SessionContext, index: int, state: StationState, pose_state:
 
 
 async def take_image(context: SessionContext, index: int | None = None) -> Image:
-    """Take an image for a pose, or for none. PoseFailedError once the configured retries are used up."""
+    """Take an image, for pose `index` or none. PoseFailedError after the configured number of tries."""
     tries = 1 + context.cell.config.capture.retries
     camera = context.cell.camera
     for number in range(1, tries + 1):
         try:
-            if number == tries > 1:  # the last try, with a camera that was opened anew
+            if number == tries > 1:  # before the last try open the camera again
                 await camera.close()
                 await camera.open()
-            if number > 1:  # some cameras lose the first frame after a pause, and waiting for it was one
+            if number > 1:  # some cameras lose the first frame after a pause, such as the time-out just now
                 with contextlib.suppress(CameraError):
                     await camera.glimpse()
             return await camera.capture()
@@ -113,9 +113,9 @@ def show_frame(context: SessionContext, image: Image) -> None:
 
 
 async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState, float]:
-    """The arm, at rest, in the middle of an exposure, and the bound of that time, seconds.
+    """Return the state of the arm, at rest, at mid-exposure, and the bound of that time, seconds.
 
-    PoseFailedError and NotStillError when it is not known or the arm moved; RobotError.
+    PoseFailedError when the time is not known well enough, NotStillError when the arm moved, RobotError.
     """
     if image.time is None:
         raise PoseFailedError("The camera's driver gave an image without a time.", code="no-time")
@@ -147,7 +147,7 @@ async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState
 
 
 async def _write(context: SessionContext, index: int, image: Image, view: View) -> None:
-    """Disk and detection side by side; the view is written, and the pose counted, only with a board in it."""
+    """Write the image while the board is detected; write the view, and count the pose, only with a board."""
     recording, queue = context.require_recording(), context.require_queue()
     recording.image(image)
     sighting = await _sighting(context, image, index)
@@ -173,7 +173,7 @@ async def _write(context: SessionContext, index: int, image: Image, view: View) 
 
 
 async def _sighting(context: SessionContext, image: Image, index: int) -> BoardDetection | None:
-    """None when the worker could not say: the data are kept, the offline stage looks again."""
+    """Detect the board; None when the worker failed: the image is kept, and solving detects again."""
     try:
         return await context.look_at(image)
     except WorkerError as error:
@@ -182,7 +182,7 @@ async def _sighting(context: SessionContext, image: Image, index: int) -> BoardD
 
 
 def _unusable(sighting: BoardDetection) -> PoseFailedError | None:
-    """Say why an image does not count; None when it does."""
+    """Make the error where an image does not count; None when it does."""
     status = sighting.status
     if not status.found:
         return PoseFailedError(status.reason or "No board in the image.", code="no-board")
@@ -199,17 +199,17 @@ def _unusable(sighting: BoardDetection) -> PoseFailedError | None:
 
 
 class ImageWatch:
-    """Watches the image while the arm settles: three images, their motion, and again while it moves.
+    """Measures image motion between three images while the arm settles, again as long as something moves.
 
-    For the time of a `with` block; `look` is for `StillnessMonitor.settle`. A camera that cannot be looked
-    at (playback), or fails to, leaves the motion unmeasured.
+    Runs within a `with` block; `look` is for `StillnessMonitor.settle`. If the camera cannot take such images
+    (playback), or fails, the motion is not measured.
     """
 
     def __init__(self, context: SessionContext, index: int) -> None:
         self._context, self._index = context, index
         self._images: deque[tuple[int, Pixels]] = deque(maxlen=IMAGES)
         self._found: tuple[int, float] | None = None
-        """With the time before which none of its images began."""
+        """Time before which none of the three exposures began (host monotonic ns), and the motion, px."""
         self._blind = False
         self._again = asyncio.Event()
         self._glimpsing: asyncio.Task[Image | None] | None = None
@@ -217,12 +217,12 @@ class ImageWatch:
         model = context.cell.config.camera.model
         self._width = model.width if model is not None else 0
         view = context.require_queue().pose(index).view
-        # A fixed camera may see more of a resting background than of the board that swings before it.
+        # A fixed camera may see mostly background at rest, so look at the board, which may swing.
         fixed = context.cell.config.mount == "eye-to-hand" and model is not None
         self._box = board_box(view, model.width, model.height) if fixed and model is not None else None
 
     def look(self, since_ns: int) -> float | None:
-        """Motion (px) in images exposed after this host time; NaN: not to be measured, None: not yet."""
+        """Return the motion (px) in images exposed after a host time; NaN: not measurable, None: not yet."""
         if self._blind:
             return math.nan
         self._again.set()
@@ -235,12 +235,12 @@ class ImageWatch:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """The camera is free again when this returns: a request to it is never given up half-way."""
+        """End the measurement; a request to the camera that is under way is completed first."""
         assert self._task is not None
         self._task.cancel()
         ending = {self._task, *([self._glimpsing] if self._glimpsing else [])}
         await asyncio.wait(ending)
-        # Nobody waits for this look any more: its failure is the next image's to tell.
+        # Ignore errors of the last look: if they persist, the next image reports them.
         await asyncio.gather(*ending, return_exceptions=True)
 
     async def _run(self) -> None:
@@ -252,14 +252,14 @@ class ImageWatch:
                     await self._again.wait()
                 else:
                     await asyncio.sleep(GAPS_S[len(self._images) - 1])
-        except Exception as error:  # a defect, too, must not keep the pose waiting
+        except Exception as error:  # even a defect must not block the pose
             if not isinstance(error, StationError):
                 log.exception("the image motion could not be measured")
             self._context.store.problem(error, "warning", self._index, "image motion not measured: {}")
         self._blind = True
 
     async def _one_more(self) -> bool:
-        """False when this camera has none to show."""
+        """Take one more image; False when the camera cannot."""
         for left in reversed(range(GLIMPSE_TRIES)):
             asked_ns = time.monotonic_ns()
             self._glimpsing = asyncio.create_task(self._context.cell.camera.glimpse())

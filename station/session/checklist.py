@@ -1,4 +1,4 @@
-"""The preflight check: what a capture needs, and the remedy for what is missing. Read-only."""
+"""Preflight check: what a capture needs, with remedies for what is missing. Read-only."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NOT_ACCEPTED_REMEDY = "run `station accept`; until then: low speed slider, a han
 
 
 async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[Check]:
-    """List the checks in the order in which a person would go through them."""
+    """Make all checks, in the order in which a person would go through them. `troubles`: device → error."""
     return [
         *await _robot_checks(context, troubles),
         await _camera_check(context, troubles),
@@ -86,7 +86,7 @@ def _computer_check(context: SessionContext) -> Check:
 
 
 async def _from_outside(host: str) -> str:
-    """The answers of each port of a robot that gives no state, as the remedy."""
+    """Make the remedy for a robot without state: which of its ports answer."""
     if not host:
         return "give robot.host in the configuration"
     found = await probe(host)
@@ -119,7 +119,7 @@ async def _camera_check(context: SessionContext, troubles: dict[str, str]) -> Ch
 
 
 async def _wire_checks(context: SessionContext) -> list[Check]:
-    """GenICam cameras on this computer's wires, and what keeps one from being used; no other driver's."""
+    """Check GenICam cameras connected to this computer, and whether they can be used."""
     if context.cell.config.camera.driver != "aravis":
         return []
     network, usb = await asyncio.gather(ASKED.run(discover), ASKED.run(discover_usb))
@@ -130,7 +130,7 @@ async def _wire_checks(context: SessionContext) -> list[Check]:
 
 
 def _listed(name: str, none: str, cameras: list[tuple[str, str]]) -> Check:
-    """List each camera that was found, and what to do about it or ""."""
+    """Make a check of the cameras found, given as (description, remedy or "")."""
     problem = "; ".join(problem for _, problem in cameras if problem)
     text = "; ".join(line for line, _ in cameras)
     return Check(name, "warning" if problem else "ok" if text else "skipped", text or none, problem)
@@ -168,7 +168,7 @@ def _trigger_check(context: SessionContext, troubles: dict[str, str]) -> Check:
 
 
 def _calibration_check(context: SessionContext) -> Check:
-    """Check whether what is installed holds, and is of this robot and this camera."""
+    """Check that the installed calibration is valid and of this robot and camera."""
     cell = context.cell
     try:
         found = load_installed(
@@ -205,7 +205,7 @@ def _disk_check(context: SessionContext) -> Check:
 
 
 def _clock_check(context: SessionContext) -> Check:
-    """`ok` only when both are known, and together within the limit that poses are refused by."""
+    """Check the clocks: `ok` when both are known and their bounds together within the limit for poses."""
     robot, frames = context.cell.robot.clock(), context.cell.camera.timing
     if robot is None or frames is None:
         known = "controller" if robot is not None else "camera" if frames is not None else "neither"

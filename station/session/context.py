@@ -1,4 +1,4 @@
-"""The state that every part of a session works with, and the one status that watchers are told."""
+"""Shared state of a session's parts, and the status that is published to watchers."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ EVENT_TEXT_LIMIT = 400
 
 @dataclass
 class RunRequests:
-    """Wishes for the run under way."""
+    """Requests to the run under way."""
 
     pause_by: str = ""
-    """Who asked to pause after this pose; empty: nobody."""
+    """Client that asked to pause after this pose; empty: none."""
     finish: bool = False
     """Finish after this pose."""
     halt: bool = False
-    """STOP, a fault or lost control ends the run: it must not change the state any more."""
+    """STOP, a fault or lost control ended the run, which must not change the state any more."""
 
 
 @dataclass(eq=False)
 class SessionContext:
-    """State of a session. Touched by the event loop's thread only."""
+    """Shared state of a session. For the event loop's thread only, unless stated otherwise."""
 
     cell: Cell
     geometry: CellGeometry
@@ -63,24 +63,24 @@ class SessionContext:
     root: Path
     queue: PoseQueue | None = None
     recording: SessionRecording | None = None
-    """The session that is not finished yet."""
+    """Recording of the open session; None: no session is open."""
     seen: dict[int, CapturedView] = field(default_factory=dict)
-    """By pose number: views that count."""
+    """Pose number → view that counts."""
     requests: RunRequests = field(default_factory=RunRequests)
 
     @property
     def resting(self) -> StationState:
-        """Return the state between two motions: `paused` always has a session to continue."""
+        """State between motions: `paused` with an open session, else `idle`."""
         return StationState.IDLE if self.recording is None else StationState.PAUSED
 
     def loaded(self) -> PoseQueue:
-        """The plan's poses. RefusedError when there are none."""
+        """Return the loaded plan's poses. RefusedError when no plan is loaded."""
         if self.queue is None:
             raise RefusedError("No plan is loaded.", code="no-plan", remedy="Load or make one first.")
         return self.queue
 
     def require_queue(self) -> PoseQueue:
-        """Inside a run there always is one."""
+        """Return the loaded plan's poses; inside a run there always are."""
         assert self.queue is not None
         return self.queue
 
@@ -89,31 +89,31 @@ class SessionContext:
         return self.recording
 
     async def arm(self) -> RobotState:
-        """The arm's state, fresh and good; news that are late are waited for. Raises RobotError."""
+        """Wait for a current state of an arm that may be captured, and return it. Raises RobotError."""
         return await ready(self.cell.robot)
 
     @property
     def recorder(self) -> Recorder | None:
-        """The writer of the open file. From any thread."""
+        """Writer of the open file; None without one. From any thread."""
         recording = self.recording
         return recording.recorder if recording is not None else None
 
     def record_state(self, state: RobotState) -> None:
-        """Every sample of the arm, while a recording is open; from the reader's thread."""
+        """Record a state of the arm while a recording is open; called in the reader's thread."""
         if (recorder := self.recorder) is not None:
             recorder.robot_state(state)
 
     def record_event(self, event: Event) -> None:
-        """Keeps what people were told; a failing disk is reported elsewhere."""
+        """Record an event. Errors of the disk are ignored, as they are reported elsewhere."""
         if (recorder := self.recorder) is not None and recorder.error is None:
             stamps = Stamps(host_monotonic_ns=time.monotonic_ns(), host_wall_ns=event.wall_ns)
             with contextlib.suppress(RecordingError):
                 recorder.event(CaptureEvent(stamps, "station", event.pose_index, event.text, event.level))
 
     async def open_recording(self, queue: PoseQueue, check: bool = False) -> None:
-        """Opens the session's next file where none is open; begins a session where there is none.
+        """Open the session's next file if none is open; begin a session if there is none.
 
-        `check`: as a drift check. Raises RecordingError, StationError; all is as before then.
+        `check`: as a drift check. On RecordingError or StationError nothing has changed.
         """
         if self.recorder is not None:
             return
@@ -124,7 +124,7 @@ class SessionContext:
         recording = before
         if recording is None:
             recording = await DISK.run(SessionRecording, self.root, self.cell, check=check)
-        # Before it is open, and so it stays when STOP cuts in: what is there then must be closed.
+        # Set before opening, as STOP may interrupt it: a file opened by then must be closed.
         self.recording = recording
         try:
             await recording.open(queue, image)
@@ -133,7 +133,7 @@ class SessionContext:
             raise
 
     async def recover_segments(self, recording: SessionRecording) -> None:
-        """Makes whole what a crash left open, before another segment follows. Raises RecordingError."""
+        """Recover segments that a crash left open, before the next segment. Raises RecordingError."""
         await recording.released()
         async with recording.recovering:
             if await DISK.run(recording.unfinished_segments):
@@ -142,7 +142,7 @@ class SessionContext:
             await DISK.run(recording.count_segments)
 
     async def look_at(self, image: Image, lens: CameraModel | None = None) -> BoardDetection:
-        """The board in an image, by the configured lens where no other is given. Raises WorkerError."""
+        """Detect the board in an image; `lens`: None: the configured one. Raises WorkerError."""
         config = self.cell.config
         pixels = viewable(image.pixels, image.pixel_format)
         return await self.workers.call(
@@ -150,7 +150,7 @@ class SessionContext:
         )
 
     def forget_session(self, check: bool = False) -> None:
-        """Clears what is shown of the last session when the next begins; `check`: as a drift check."""
+        """Clear the last session from the status when a session begins; `check`: as a drift check."""
         self.seen.clear()
         self.store.update_session(
             name="",
@@ -164,7 +164,7 @@ class SessionContext:
         )
 
     def show_poses(self, current: int | None = None) -> None:
-        """Brings the status up to date with the queue and the recording."""
+        """Update the status from queue and recording. `current`: number of the pose under way."""
         queue, recording = self.queue, self.recording
         if queue is None:
             self.store.update(session=SessionStatus(source=self.cell.source))
@@ -181,29 +181,29 @@ class SessionContext:
 
 
 def displacement(context: SessionContext, before: Vector6, after: Vector6) -> str:
-    """'84 mm and 22°' of the flange."""
+    """Describe the flange's motion between two joints (6,), as '84 mm and 22°'."""
     delta = difference(*forward(context.geometry.model, [after, before]))
     distance_m, angle_rad = np.linalg.norm(delta[:3]), np.linalg.norm(delta[3:])
     return f"{1000 * distance_m:.0f} mm and {np.degrees(angle_rad):.0f}°"
 
 
 class StatusStore:
-    """Holds the newest immutable snapshot. Only the event loop's thread may call it."""
+    """Newest status, with callbacks for changes. For the event loop's thread only."""
 
     def __init__(self, status: StationStatus) -> None:
         self.status = status
         self.entered = 0
-        """States entered so far: one that was left and entered again is another."""
+        """Number of states entered so far; tells two visits of one state apart."""
         self._watchers: list[Callable[[], None]] = []
         self.recorded: Callable[[Event], None] = lambda event: None
-        """The recording keeps what people are told."""
+        """Called for every event, to record it."""
 
     @property
     def state(self) -> StationState:
         return self.status.state
 
     def watch(self, changed: Callable[[], None]) -> Callable[[], None]:
-        """`changed` is called after every change; returns what ends it, however often it is called."""
+        """Call `changed` after every change; return an idempotent function that ends it."""
         self._watchers.append(changed)
 
         def end() -> None:
@@ -219,14 +219,14 @@ class StatusStore:
             for watcher in list(self._watchers):
                 try:
                     watcher()
-                except Exception:  # who only looks on must not come between STOP and the arm
+                except Exception:  # an observer's error must not prevent STOP
                     log.exception("a watcher of the status failed")
 
     def update_session(self, **fields: object) -> None:
         self.update(session=msgspec.structs.replace(self.status.session, **fields))
 
     def enter(self, state: StationState, reason: str | CodedError = "", cause: str = "") -> None:
-        """`reason` for people, `cause` for programs. TransitionError for a step not in the table."""
+        """Enter a state; `reason` is for people, `cause` for programs. TransitionError: not allowed."""
         if state is not self.state:
             check_transition(self.state, state)
             self.entered += 1
@@ -237,7 +237,7 @@ class StatusStore:
     def event(
         self, code: str, text: str, level: Level = "info", pose_index: int | None = None, /, **values: Value
     ) -> None:
-        """Tells people, log and recording; `code` and `values` are for programs."""
+        """Publish an event to status, log and recording; `code` and `values` are for programs."""
         text = text if len(text) <= EVENT_TEXT_LIMIT else text[: EVENT_TEXT_LIMIT - 1] + "…"
         event = Event(time.time_ns(), level, text, pose_index, code, values)
         pose = f"pose {pose_index + 1}: " if pose_index is not None else ""
@@ -248,6 +248,6 @@ class StatusStore:
     def problem(
         self, error: Exception, level: Level = "warning", pose_index: int | None = None, said: str = "{}"
     ) -> None:
-        """Tells of an error; `said` puts its text into a sentence."""
+        """Publish an error as an event; `said`: sentence with {} for the error's text."""
         code, values = (error.code, error.values) if isinstance(error, CodedError) else ("internal", {})
         self.event(code, said.format(error), level, pose_index, **values)

@@ -1,4 +1,4 @@
-"""The running estimate: what the images so far tell of camera and board, and which pose would help most."""
+"""Running estimate: camera and board pose by the images so far, and the most useful next pose."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class Estimator:
-    """Keeps the running estimate fresh: one look in the worker after each pose, never two at once."""
+    """Task that updates the running estimate in the worker after each pose, one at a time."""
 
     def __init__(self, context: SessionContext) -> None:
         self._context = context
@@ -32,7 +32,7 @@ class Estimator:
         self._woken = asyncio.Event()
 
     def poke(self) -> None:
-        """Something changed; cheap."""
+        """Request an update; cheap."""
         if tuple(self._context.seen) != self._known:
             self._woken.set()
 
@@ -50,7 +50,7 @@ class Estimator:
                 continue
             try:
                 estimate = await self._estimate()
-            except Exception as error:  # this task looks on; it must outlive every image and every defect
+            except Exception as error:  # the capture does not depend on it, so it must not end
                 if not isinstance(error, WorkerError):
                     log.exception("the running estimate failed")
                 context.store.problem(error, said="no running estimate: {}")
@@ -60,11 +60,11 @@ class Estimator:
                 queue.note_estimate(self._known[-1], estimate.sigma_translation_mm)
                 context.store.update_session(poses=queue.statuses)
             if (recording := context.recording) is not None:
-                with contextlib.suppress(RecordingError):  # a full disk ends the run, not this look
+                with contextlib.suppress(RecordingError):  # a full disk is reported by the run
                     recording.show_frames(estimate.camera_pose, estimate.board_pose, stamps_now())
 
     async def _estimate(self) -> EstimateStatus:
-        """Estimate with advice on the next pose, where one more would help."""
+        """Estimate from the images so far, with advice on the next pose where one more would help."""
         context, config = self._context, self._context.cell.config
         seen = list(context.seen.values())
         known = context.cell.camera_model is not None
@@ -78,9 +78,9 @@ class Estimator:
 
 
 async def look_back(context: SessionContext) -> None:
-    """Reads what the images from before a restart show, for the estimate.
+    """Detect the board in the images from before a restart, for the running estimate.
 
-    Read from the recording, which is made whole first; nothing when it is known already.
+    They are read from the recording, recovered first. Does nothing when they are known already.
     """
     recording, queue = context.recording, context.queue
     if recording is None or recording.recorder is not None or context.seen or queue is None or not queue.done:

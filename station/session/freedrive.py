@@ -1,4 +1,4 @@
-"""Capture without control: the operator guides the arm by hand, the station only looks and records."""
+"""Capture in freedrive: the operator moves the arm by hand, the station only records."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ log = logging.getLogger(__name__)
 
 _GUIDE = "Guide the arm by hand. The station does not move it."
 NEW_PLACE_RAD = 0.1
-"""Auto-record: some joint must have turned by this much since the last image."""
+"""Turn of a joint since the last image from which an image is taken automatically."""
 WATCH_PERIOD_S = 0.1
 
 
 class FreedriveCapture:
-    """Nothing here moves the arm, so nothing here needs an approval."""
+    """Capture in freedrive. Never moves the arm, so it needs no approval."""
 
     def __init__(self, context: SessionContext) -> None:
         self._context = context
@@ -39,13 +39,13 @@ class FreedriveCapture:
         context.store.watch(self._note_guiding)
 
     def _note_guiding(self) -> None:
-        """Between the images of freedrive, and while one is taken, a person moves the arm."""
+        """Tell the robot driver whether a person may move the arm, for its limits on late states."""
         state = self._context.store.state
         if state not in (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING):
             self._context.cell.robot.guided = state is StationState.FREE_DRIVE
 
     async def begin(self, auto: bool) -> None:
-        """Opens the recording if none is open. `auto`: an image whenever the arm rests anew."""
+        """Begin freedrive; open a recording if none is open. `auto`: take an image at each new rest."""
         if self.taking:
             raise _taking()
         self._end_watch()
@@ -54,7 +54,7 @@ class FreedriveCapture:
         if (refusal := Freedrive.refusal(store.state)) is not None:
             raise refusal  # STOP came in between
         context.requests.halt = False
-        # At once, and taking: while the disk works nobody is offered a motion, and no image is begun.
+        # Enter the state at once: while the file is opened no motion is offered and no image begun.
         store.enter(StationState.FREE_DRIVE, "The recording is being opened.")
         async with self._taking:
             try:
@@ -92,11 +92,11 @@ class FreedriveCapture:
 
     @property
     def taking(self) -> bool:
-        """An image is under way."""
+        """True while an image is being taken."""
         return self._taking.locked()
 
     async def last_picture(self) -> None:
-        """Returns when the image under way is taken; no further one is begun by itself."""
+        """Wait for the image under way; no further automatic one begins."""
         async with self._taking:
             self._end_watch()
 
@@ -106,7 +106,7 @@ class FreedriveCapture:
             self._watcher = None
 
     async def record(self) -> int:
-        """One image here and now; its pose number. RefusedError when one is being taken already."""
+        """Take an image now; return its pose number. RefusedError while one is being taken."""
         if self._taking.locked():
             raise _taking()
         async with self._taking:
@@ -123,7 +123,7 @@ class FreedriveCapture:
         self._last_place = joints
         try:
             await take_pose(context, index, attempt)
-        except (PoseFailedError, NotStillError, StaleStateError) as error:  # late news: nothing of ours moves
+        except (PoseFailedError, NotStillError, StaleStateError) as error:  # late states: no move to stop
             queue.mark(index, "failed", error)
             store.problem(error, "warning", index)
         except RecordingError as error:
@@ -133,7 +133,7 @@ class FreedriveCapture:
             self._failed(error, index)
             return index
         except Exception as error:
-            if not context.requests.halt:  # else STOP came in between: its state stays
+            if not context.requests.halt:  # after STOP its state stays
                 log.exception("an image failed")
             self._failed(internal_error(error), index)
         if not context.requests.halt and store.state is not StationState.FAULT:
@@ -151,7 +151,7 @@ class FreedriveCapture:
             self._context.store.problem(error, "error", index)
 
     async def _watch(self) -> None:
-        """Watch for as long as freedrive lasts."""
+        """Take images automatically until freedrive ends."""
         while self._context.store.state not in (StationState.PAUSED, StationState.IDLE):
             await asyncio.sleep(WATCH_PERIOD_S)
             if self._context.store.state is not StationState.FREE_DRIVE:
@@ -160,7 +160,7 @@ class FreedriveCapture:
                 if self._at_rest_elsewhere():
                     await self.record()
             except StaleStateError:
-                continue  # a hiccup of the news; an image waits for better ones
+                continue  # states are late; an image waits for current ones
             except StationError as error:
                 self._context.store.problem(error)
 

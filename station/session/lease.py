@@ -1,4 +1,4 @@
-"""Control, and the one-use approval to move. Both end the moment anything is in doubt."""
+"""Control by one client, and the one-use approval of a motion. Both end on any doubt."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from station.protocol.verbs import Purpose
 from station.session.queue import OfferedPoses
 
 START_TOLERANCE_RAD = 0.005
-"""The arm must stand where it stood when the person was asked."""
+"""Largest joint difference between where the arm stood when the motion was offered and at its start."""
 
 
 class LeaseManager:
-    """At most one client has control."""
+    """Manager of control, which at most one client has."""
 
     def __init__(self) -> None:
         self.lease = LeaseStatus()
 
     def take(self, client_id: int, who: str, wall_ns: int) -> LeaseStatus:
-        """Taking it again is fine. RefusedError names who has it."""
+        """Give control to a client, which may already have it. RefusedError names another that has it."""
         if self.lease.client_id is None:
             self.lease = LeaseStatus(holder=who, client_id=client_id, since_wall_ns=wall_ns)
         self.require(client_id)
         return self.lease
 
     def release(self, client_id: int) -> bool:
-        """True when this client had it."""
+        """Release control; True when this client had it."""
         if self.lease.client_id != client_id:
             return False
         self.lease = LeaseStatus()
@@ -54,21 +54,21 @@ class LeaseManager:
 
 @dataclass(frozen=True)
 class MotionApproval:
-    """A permission to move, as it was asked for."""
+    """Motion offered for approval: what it covers, from where, and for which client."""
 
     summary: MotionPreview
     client_id: int
     poses: tuple[int, ...] = ()
-    """Pose numbers it covers, in order; more may not be driven to with it."""
+    """Pose numbers that it covers, in order; no others may be driven to."""
     purpose: Purpose | None = None
     """None: a stop test."""
     begins: OfferedPoses | None = None
-    """Poses of the session that begins with this approval."""
+    """Poses of the session that begins with this approval; None: none begins."""
     beside: Drive | None = None
-    """Drives a checked motion instead of poses of the plan; nothing is recorded then."""
+    """Function that drives a checked motion other than the plan's poses, without recording."""
     expires_s: float = 0.0
     again: bool = False
-    """Nobody is there to be asked: poses that do not settle are tried once more at the end."""
+    """True: poses that do not settle are tried once more at the end, as no person can be asked."""
     approval: str = ""
     """Who approved it, and how."""
 
@@ -79,25 +79,25 @@ class MotionApproval:
 
     @property
     def said(self) -> str:
-        """A line for log and recording."""
+        """Text on the approval for log and recording."""
         return f"{self.approval}: {self.summary.purpose}, plan {self.summary.plan_sha256[:12]}"
 
 
 Drive = Callable[[MotionApproval], Coroutine[object, object, None]]
-"""Carries out a motion that was approved."""
+"""Function that carries out an approved motion."""
 
 
 class ApprovalManager:
-    """At most one approval waits for a person; redeeming or voiding destroys it."""
+    """Manager of the one offered motion that may be approved, once, or voided."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self.waiting: MotionApproval | None = None
         self.voids = 0
-        """Counts voided ones: a check that was under way meanwhile offers none."""
+        """Number of times approvals were voided: a preflight check that began before may not offer one."""
 
     def offer(self, asked: MotionApproval) -> None:
-        """Let this one wait for a person, for two minutes. An older one is void."""
+        """Offer a motion for `APPROVAL_LIFETIME_S`; an older offer is void."""
         self.waiting = replace(asked, expires_s=self._clock() + APPROVAL_LIFETIME_S)
 
     def void(self) -> None:
@@ -112,7 +112,7 @@ class ApprovalManager:
         joints_rad: Sequence[float],
         again: bool = False,
     ) -> MotionApproval:
-        """The approval, once. RefusedError says what changed since the person was asked; it is void then."""
+        """Return the approval, once. RefusedError when anything changed since the offer, then void."""
         asked, self.waiting = self.waiting, None
         if asked is None or not secrets.compare_digest(asked.summary.token.encode(), token.encode()):
             raise _void("approval-used", "Approval used or revoked.")
@@ -122,14 +122,14 @@ class ApprovalManager:
         if asked.client_id != client_id:
             raise _void("approval-of-another", "Approval was asked for by another client.")
         before = asked.begins.before_sha256 if asked.begins else asked.summary.plan_sha256
-        if asked.beside is None and before != plan_sha256:  # what is beside carries its own
+        if asked.beside is None and before != plan_sha256:  # other motions do not depend on the plan
             raise _void("plan-changed", "The plan changed since the approval was asked for.")
         require_start(joints_rad, asked.start_joints_rad, "since the approval was asked for")
         return replace(asked, again=again)
 
 
 def require_start(joints_rad: Sequence[float], start_rad: Sequence[float], when: str) -> None:
-    """RefusedError when the arm does not stand where it stood."""
+    """Raise RefusedError when joints (6,) differ from `start_rad` by more than `START_TOLERANCE_RAD`."""
     moved_rad = float(np.abs(np.subtract(joints_rad, start_rad)).max())
     if moved_rad > START_TOLERANCE_RAD:
         text = f"The arm moved by {np.rad2deg(moved_rad):.1f}° {when}."

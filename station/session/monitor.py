@@ -1,4 +1,4 @@
-"""Devices for the screen: opened, opened again, what they say ten times a second, and their images."""
+"""Device status ten times a second, opening and reopening of devices, and preview images."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ PREVIEW_PERIOD_S = 0.2
 SIDES = (16, 1024)
 _OBSERVE_S = 5.0
 WALL_STEP_S = 0.5
-"""Less is a clock that is being disciplined, or a moment between two readings on a busy computer."""
+"""Smallest step of the wall clock that is reported; less may be slewing, or delay between readings."""
 
 
 class Monitor:
@@ -65,12 +65,12 @@ class Monitor:
         self._controller: tuple[float, float] | None = None
         self._states_seen = 0
         self._frames = (0.0, 0)
-        """When, and how many until then"""
+        """Time and count of states at the last measurement of the rate"""
         self._wall_ahead_ns = _wall_ahead_ns()
         context.cell.robot.subscribe(self._count)
 
     def _count(self, state: RobotState) -> None:
-        """Count from the reader's thread: one addition."""
+        """Count a state; called in the reader's thread, so kept minimal."""
         self._states_seen += 1
 
     def refresh(self, lag_ms: float) -> None:
@@ -78,7 +78,7 @@ class Monitor:
         self._watch_files()
         store, notice = self._context.store, self._context.cell.robot.notice
         if store.state is StationState.MOVING:
-            store.update(reason=notice)  # 'speed slider at 5 %': no fault, but a person wants to know
+            store.update(reason=notice)  # such as 'speed slider at 5 %'
         store.update(
             robot=self._robot(),
             camera=self._camera(),
@@ -90,14 +90,14 @@ class Monitor:
         )
 
     def _pending(self) -> str:
-        """A wish that waits for the end of the pose under way: who asked sees that it was heard."""
+        """Name the request (pause, finish) that waits for the end of the pose under way."""
         context = self._context
         if context.store.state not in RUNNING:
             return ""
         return FINISHES if context.requests.finish else PAUSES if context.requests.pause_by else ""
 
     def _watch_wall_clock(self) -> None:
-        """Nothing is placed by it, but a person who compares times with another computer wants to know."""
+        """Report when the wall clock was set: no data depend on it, but times are compared by people."""
         ahead_ns = _wall_ahead_ns()
         step_s, self._wall_ahead_ns = (ahead_ns - self._wall_ahead_ns) / 1e9, ahead_ns
         if abs(step_s) >= WALL_STEP_S:
@@ -140,7 +140,7 @@ class Monitor:
         )
 
     def _rate_hz(self) -> float:
-        """Over the last round trip of at least a second."""
+        """Compute the rate of states over the last period of at least a second."""
         now_s = time.monotonic()
         if self._controller is None or now_s - self._controller[0] >= 1.0:
             last = self._controller
@@ -186,7 +186,7 @@ class Monitor:
         )
 
     def _watch_files(self) -> None:
-        """In a thread, which a disk may hold as long as it likes: the heartbeat waits for no file."""
+        """Read files in a thread, as a hanging disk must not delay the heartbeat."""
         if self._reading is not None:
             if not self._reading.done():
                 return
@@ -217,14 +217,14 @@ def _wall_ahead_ns() -> int:
 
 @dataclass(frozen=True)
 class _Files:
-    """What the disk tells of a cell that nobody asks: other programs write it."""
+    """Facts of files that other programs write: free space, acceptance, calibration."""
 
     free_bytes: int | None = None
     not_accepted: str = ""
     session: str = ""
     """Folder of the finished session that is shown."""
     calibration: str = ""
-    """Made of it by a process of its own; empty: not yet."""
+    """Calibration file made from it by another process; empty: none yet."""
 
 
 def _read_files(context: SessionContext, folder: str) -> _Files:
@@ -251,15 +251,15 @@ def _clock_facts(fit: ClockFit | None) -> tuple[float | None, float | None, floa
 
 
 class DeviceConnector:
-    """Opens the devices and opens them again: read-only, in the background, for the daemon's life."""
+    """Background task that opens all devices (read-only), with retries, and closes them at the end."""
 
     def __init__(self, context: SessionContext) -> None:
         self._context = context
         self.troubles: dict[str, str] = {}
-        """Device → why it is not there."""
+        """Device → error of its last opening."""
 
     async def run(self) -> None:
-        """Everything at once: none waits for another."""
+        """Open all devices in parallel."""
         await asyncio.gather(
             self._start_worker(),
             self._until_open("robot", self._open_robot),
@@ -318,7 +318,7 @@ class DeviceConnector:
         self._context.store.event("device-found", f"{device} {identity} found", device=device)
 
     async def close(self) -> None:
-        """The robot's side does not wait for a camera whose driver hangs."""
+        """Close all devices in parallel, so that a hanging camera does not delay the robot's."""
         cell = self._context.cell
 
         async def close_robot() -> None:
@@ -336,7 +336,7 @@ class DeviceConnector:
 
 
 class Previewer:
-    """Small images, never recorded, asked for once per `PREVIEW_PERIOD_S` however many screens watch."""
+    """Preview images, never recorded, at most one per `PREVIEW_PERIOD_S` for all screens together."""
 
     def __init__(self, context: SessionContext) -> None:
         self._context = context
@@ -347,7 +347,7 @@ class Previewer:
         self._count = 0
 
     async def preview(self, width: int, height: int) -> PreviewImage:
-        """A JPEG that fits into width × height, px; empty without an image."""
+        """Return a JPEG that fits into width × height, px; empty without an image."""
         async with self._taking:
             if time.monotonic() - self._taken_s >= PREVIEW_PERIOD_S:
                 await self._take()
@@ -366,7 +366,7 @@ class Previewer:
         """
         check_board(tag)
         context, robot = self._context, self._context.cell.robot
-        async with self._taking:  # one at a time: a session that begins waits for one image at most
+        async with self._taking:  # one at a time, so that a new session waits for one image at most
             _require_between_sessions(context)
             await context.arm()
             if not context.stillness.at_rest:
@@ -397,7 +397,7 @@ class Previewer:
         context = self._context
         self._taken_s = time.monotonic()
         if context.store.state is StationState.CAPTURING or context.workers.waiting:
-            return  # the capture has the camera, or the worker is needed for more than the screen
+            return  # camera or worker are needed by the capture
         try:
             image = await context.cell.camera.preview()
         except CameraError:

@@ -1,4 +1,4 @@
-"""The poses of a session and what became of each. Pose numbers never change; the order may."""
+"""Poses of a session with their states. A pose number never changes; the order may."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ NOT_AGAIN = "not captured again: its image counts"
 
 @dataclass(frozen=True, eq=False)
 class OfferedPoses:
-    """Poses that wait for a person's approval."""
+    """Poses offered for approval."""
 
     purpose: Purpose
     queue: PoseQueue
     poses: tuple[int, ...]
-    """Those that the approval covers, in order."""
+    """Pose numbers that the approval covers, in order."""
     before_sha256: str
-    """Hash of the poses that are shown until then."""
+    """Hash of the poses shown until the approval."""
 
 
 class PoseQueue:
-    """Poses in driving order. `index` is a pose's number in the session, counted from 0, for ever."""
+    """Poses in driving order. `index` is a pose's permanent number in the session, counted from 0."""
 
     def __init__(self, plan: Plan, restored: Sequence[PoseStatus] = ()) -> None:
-        """`restored`: after a restart, one for each pose of the plan, in its order."""
+        """`restored`: states after a restart, one for each pose of the plan, in its order."""
         self._plan = plan
         known = [_after_restart(status) for status in restored]
         if len(known) != len(plan.poses):
@@ -44,16 +44,16 @@ class PoseQueue:
         self._poses = {status.index: pose for status, pose in zip(known, plan.poses, strict=True)}
         self._status = {status.index: status for status in known}
         self.next_index = max(self._poses, default=-1) + 1
-        """The number that a further pose will have."""
+        """Number that the next added pose gets."""
 
     @property
     def plan(self) -> Plan:
-        """Return the plan with every change that was made since it was loaded."""
+        """Plan with all changes since it was loaded."""
         return msgspec.structs.replace(self._plan, poses=tuple(self._poses.values()))
 
     @property
     def sha256(self) -> str:
-        """Hash of the plan and its order: an approval is bound to it."""
+        """Hash of the plan, order included, to which an approval is bound."""
         return plan_sha256(self.plan)
 
     @property
@@ -62,12 +62,12 @@ class PoseQueue:
 
     @property
     def open(self) -> tuple[int, ...]:
-        """Poses still to be driven to, in order."""
+        """Numbers of the poses still to be captured, in order."""
         return tuple(i for i in self._poses if self._status[i].state == "planned")
 
     @property
     def done(self) -> int:
-        """Poses whose image counts, those that are to be taken again included."""
+        """Number of poses whose image counts, those to be retaken included."""
         return sum(status.counts for status in self._status.values())
 
     @property
@@ -78,7 +78,7 @@ class PoseQueue:
         return self._poses[index]
 
     def status(self, index: int) -> PoseStatus:
-        """RefusedError for a number that does not exist."""
+        """Return a pose's status. RefusedError for a number that does not exist."""
         if index not in self._status:
             text = f"There is no pose {index + 1}; the plan has {len(self._poses)}."
             raise RefusedError(text, code="no-such-pose", pose=index, poses=len(self._poses))
@@ -96,7 +96,7 @@ class PoseQueue:
         )
 
     def note(self, index: int, *, corners: int | None = None, coverage: float | None = None) -> None:
-        """Notes what the image showed."""
+        """Note corners and coverage of the image at a pose."""
         self._status[index] = msgspec.structs.replace(self.status(index), corners=corners, coverage=coverage)
 
     def note_estimate(self, index: int, sigma_mm: float | None) -> None:
@@ -105,9 +105,9 @@ class PoseQueue:
             self._status[index] = msgspec.structs.replace(self._status[index], estimated_sigma_mm=sigma_mm)
 
     def anew(self, guided: bool = True) -> PoseQueue:
-        """A copy for another session: what is skipped stays left out, all else is planned once more.
+        """Copy the queue for a new session: skipped poses stay skipped, all others are planned again.
 
-        `guided`: with the places that a hand brought the arm to.
+        `guided`: include poses to which a person moved the arm by hand.
         """
         kept = {i: pose for i, pose in self._poses.items() if guided or not pose.guided}
         left_out = {i for i in kept if self._status[i].state == "skipped"}
@@ -118,20 +118,20 @@ class PoseQueue:
         return again
 
     def start_attempt(self, index: int) -> int:
-        """The number of this attempt, from 1; later ones supersede earlier ones in the recording."""
+        """Begin an attempt; return its number, from 1. In the recording the last attempt counts."""
         attempt = self.status(index).attempt + 1
         self._status[index] = msgspec.structs.replace(self._status[index], attempt=attempt)
         return attempt
 
     def retake(self, index: int) -> None:
-        """Plans it once more, where it stands in the order."""
+        """Plan a pose again, at its position in the order."""
         status = self.status(index)
         if status.state in BUSY:
             raise _refused("pose-busy", index, "is being taken right now")
         self.mark(index, "planned", TAKE_AGAIN + (STILL_COUNTS if status.counts else ""))
 
     def skip(self, index: int) -> None:
-        """Leaves it out; of one that has an image only the retake, for the recording keeps the image."""
+        """Skip a pose; if it has an image, only its retake is skipped, as the image stays recorded."""
         status = self.status(index)
         state = status.state
         if status.kept and state not in BUSY:
@@ -143,21 +143,21 @@ class PoseQueue:
         self.mark(index, "skipped", "skipped by the operator")
 
     def reorder(self, order: Sequence[int]) -> None:
-        """`order`: every pose number once."""
+        """Change the order; `order`: every pose number once."""
         if sorted(order) != sorted(self._poses):
             text = f"An order names each of the {len(self._poses)} poses exactly once."
             raise RefusedError(text, code="wrong-order")
         before = self.statuses
         self._poses = {i: self._poses[i] for i in order}
         for place, (index, was) in enumerate(zip(order, before, strict=True)):
-            # An error is expected after all poses so far: it holds where these are the same as before.
+            # Predicted errors stay valid where the set of poses up to there is unchanged.
             same = {old.index for old in before[: place + 1]} == set(order[: place + 1])
             sigma_mm = was.predicted_sigma_mm if same else None
             self._status[index] = msgspec.structs.replace(self._status[index], predicted_sigma_mm=sigma_mm)
         self._changed()
 
     def add(self, pose: PlannedPose) -> int:
-        """At the end; returns its number."""
+        """Add a pose at the end; return its number."""
         if any(pose.name == other.name for other in self._poses.values()):
             raise RefusedError(f"There is already a pose named '{pose.name}'.", code="pose-name")
         if len(self._poses) >= POSE_LIMIT:
@@ -169,7 +169,7 @@ class PoseQueue:
         return index
 
     def drop(self, index: int) -> None:
-        """Forgets a pose that was never taken."""
+        """Remove a pose that was never tried."""
         status = self.status(index)
         if status.state in BUSY:
             raise _refused("pose-busy", index, "is being taken right now")
@@ -181,7 +181,7 @@ class PoseQueue:
         self._changed()
 
     def _changed(self) -> None:
-        """Note that a person changed the plan: no other takes its place unasked."""
+        """Note that a person changed the plan, so that it is not replaced without asking."""
         self._plan = msgspec.structs.replace(self._plan, criterion=None)
 
 
@@ -202,6 +202,6 @@ def _fresh(index: int, pose: PlannedPose) -> PoseStatus:
 
 
 def _after_restart(old: PoseStatus) -> PoseStatus:
-    """Keeps what was on the disk; all else is planned again."""
+    """Restore a pose's status: captured ones stay done, all others are planned again."""
     kept = old.state if old.state in ("done", "skipped", "failed") else "planned"
     return msgspec.structs.replace(old, state=kept)

@@ -1,4 +1,4 @@
-"""The recording of a running session: its folder, its open file, and the state that survives a crash."""
+"""Recording of an open session: folder, open file, and the saved state that survives a crash."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ R = TypeVar("R")
 
 @cache
 def software() -> dict[str, str]:
-    """Versions of what takes part in a capture."""
+    """List the versions of the software that takes part in a capture."""
     found = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -72,7 +72,7 @@ def software() -> dict[str, str]:
 
 
 async def to_the_end(work: Coroutine[object, object, R]) -> R:
-    """Finishes `work` even when cancelled. STOP halts the arm, never the disk."""
+    """Finish `work` even when cancelled, as STOP must not interrupt writing."""
     writing = asyncio.ensure_future(work)
     try:
         return await asyncio.shield(writing)
@@ -90,7 +90,7 @@ def stamps_now() -> Stamps:
 
 
 class SessionRecording:
-    """Open from an approval to its end. Images are numbered here, without gaps or repeats."""
+    """Recording of a session. Numbers its images without gaps or repeats."""
 
     def __init__(
         self,
@@ -101,9 +101,10 @@ class SessionRecording:
         elapsed_s: float = 0.0,
         check: bool = False,
     ) -> None:
-        """`folder`, `segments`, `elapsed_s`: of an interrupted session; its next one follows. StationError.
+        """Begin a recording, or continue an interrupted one. Raises StationError.
 
-        `check`: it is a drift check, also after a restart.
+        `folder`, `segments`, `elapsed_s`: of the interrupted session; a new segment follows. `check`: it is a
+        drift check.
         """
         self._root, self._cell, self._check = root, cell, check
         self.segment = segments + 1
@@ -117,25 +118,25 @@ class SessionRecording:
 
     @property
     def elapsed_s(self) -> float:
-        """Time of all its runs together, the present one included; pauses do not count."""
+        """Total time of its runs, the present one included, without pauses."""
         return self._before_s + (time.monotonic() - self._run_since_s if self._run_since_s else 0.0)
 
     def count_time(self, running: bool) -> None:
-        """A run begins, or it has ended."""
+        """Start or stop counting time, as a run begins or has ended."""
         self._before_s, self._run_since_s = self.elapsed_s, time.monotonic() if running else 0.0
 
     def unfinished_segments(self) -> bool:
-        """Files that a crash left open."""
+        """Tell whether a crash left segments unfinished."""
         return any(self.folder.glob(f"*.mcap{PART_SUFFIX}"))
 
     def count_segments(self) -> None:
-        """The next segment follows those that are whole, and those that are empty or lost. RecordingError."""
+        """Count the segments on the disk, empty or lost ones too, for the next number. RecordingError."""
         files = len([*self.folder.glob("*.mcap"), *self.folder.glob(f"*.mcap*{EMPTY_SUFFIX}")])
         manifest = read_manifest(self.folder)
         self.segment = 1 + max([files, *(manifest.parts if manifest else [])])
 
     def whole(self) -> Path:
-        """The one file, or the folder where there are several."""
+        """Path of the recording: the file, or the folder if there are several segments."""
         files = list(self.folder.glob("*.mcap"))
         return files[0] if len(files) == 1 else self.folder
 
@@ -144,11 +145,11 @@ class SessionRecording:
         return self.folder.name
 
     async def open(self, queue: PoseQueue, first_image: Image | None = None) -> None:
-        """Creates the file with everything needed to re-solve it. Raises RecordingError."""
+        """Create the next segment with all that is needed to solve it. Raises RecordingError."""
         try:
             settings = await self._cell.camera.settings()
         except CameraError as error:
-            settings = {"error": str(error)}  # its images will say the same
+            settings = {"error": str(error)}  # taking images will report the same error
         await to_the_end(DISK.run(self._open, queue.plan, queue.sha256, first_image, settings))
         await self.save_state(queue)
 
@@ -199,7 +200,7 @@ class SessionRecording:
     def show_frames(
         self, camera: Matrix4 | None, board: Matrix4 | None, stamps: Stamps | None = None
     ) -> None:
-        """Write where camera and board are, as known from `stamps` on, for viewers."""
+        """Write poses of camera and board, valid from `stamps` on, for viewers such as Foxglove."""
         in_hand = self._cell.config.mount == "eye-in-hand"
         camera_parent, board_parent = ("flange", "base") if in_hand else ("base", "flange")
         for matrix, parent, child in ((camera, camera_parent, "camera"), (board, board_parent, "board")):
@@ -207,7 +208,7 @@ class SessionRecording:
                 self.recorder.frame(parent, child, matrix, stamps)
 
     def _session_camera(self, image: Image | None) -> CameraModel:
-        """Known intrinsics, or at least the size of the images."""
+        """Return the known intrinsics, or a model with only the size of the images."""
         if (known := self._cell.camera_model) is not None:
             return known
         if image is not None:
@@ -217,21 +218,21 @@ class SessionRecording:
         return CameraModel(width=rough.width if rough else 0, height=rough.height if rough else 0)
 
     def number(self, image: Image) -> Image:
-        """The same image with its number in this session, and pixels that no camera overwrites."""
+        """Copy an image and give it the next number of the session."""
         pixels = np.array(image.pixels, copy=True)
         numbered = msgspec.structs.replace(image, sequence=self._sequence, pixels=pixels)
         self._sequence += 1
         return numbered
 
     def image(self, image: Image) -> None:
-        """Hands it to the writer. Raises RecordingError when the disk cannot keep up or has failed."""
+        """Queue an image for writing. RecordingError when the disk cannot keep up or has failed."""
         recorder = self.require_open()
         if not recorder.image(image):
             text = "The disk cannot keep up: an image was dropped."
             raise recorder.error or RecordingError(text, code="disk-too-slow")
 
     async def sync(self) -> None:
-        """Returns when all of the above is on the disk (fdatasync). Raises RecordingError."""
+        """Wait until everything queued is on the disk (fdatasync). Raises RecordingError."""
         try:
             async with asyncio.timeout(SYNC_TIMEOUT_S):
                 await asyncio.shield(asyncio.wrap_future(self.require_open().sync()))
@@ -244,13 +245,13 @@ class SessionRecording:
             ) from error
 
     def require_space(self) -> None:
-        """Before a pose starts. RecordingError with how much to free."""
+        """Check the free space before a pose. RecordingError tells how much to free."""
         require_free_space(self.folder, self._cell.config.capture.free_space_bytes)
 
     async def save_state(self, queue: PoseQueue, recording: Path | None = None) -> None:
-        """Saves what a restarted daemon needs; `recording`: set once it is finished. Raises RecordingError.
+        """Save what a restarted daemon needs; `recording`: path once it is finished. Raises RecordingError.
 
-        In a thread: a disk may take long over an fsync, and the arm's heartbeat does not wait.
+        Writes in a thread, as a slow fsync must not delay the arm's heartbeat.
         """
         state = SessionState(
             name=self.name,
@@ -264,7 +265,7 @@ class SessionRecording:
             recording=str(recording or ""),
         )
         async with self._saving:
-            await to_the_end(DISK.run(self._write_state, state))  # the next one is newer
+            await to_the_end(DISK.run(self._write_state, state))  # complete it, so that states stay in order
 
     def _write_state(self, state: SessionState) -> None:
         try:
@@ -278,8 +279,8 @@ class SessionRecording:
             raise RecordingError(text, code="disk-write") from error
 
     async def seal(self, queue: PoseQueue) -> Path:
-        """Finishes the file; returns the recording: the file, or the folder of several."""
-        # Shielded: a cancelled waiter must not cancel what the writer's thread is doing.
+        """Finish the file; return the path of the recording: the file, or the folder of several."""
+        # Shielded: cancelling this call must not cancel the writer's thread.
         await asyncio.shield(asyncio.wrap_future(self.require_open().finish()))
         self.recorder = None
         whole = await DISK.run(self.whole)
@@ -287,9 +288,9 @@ class SessionRecording:
         return whole
 
     def abandon(self) -> None:
-        """After a write error: the `.part` file stays as it is, for `recordings recover`.
+        """Close after a write error; the `.part` file stays for `recordings recover`.
 
-        In a thread: closing waits for the disk, and STOP must not wait for a disk that hangs.
+        Closes in a thread, as STOP must not wait for a disk that hangs.
         """
         if self.recorder is not None:
             self._closing = threading.Thread(target=self.recorder.close, name="recorder close", daemon=True)
@@ -297,27 +298,27 @@ class SessionRecording:
             self.recorder = None
 
     async def released(self) -> None:
-        """Returns when nobody writes to an abandoned file any more."""
+        """Wait until abandoned files are closed."""
         if self._closing is not None:
             await DISK.run(self._closing.join)
             self._closing = None
 
     def require_open(self) -> Recorder:
-        """RecordingError when it is not open."""
+        """Return the writer of the open file. RecordingError when none is open."""
         if self.recorder is None:
             raise RecordingError(f"The recording in {self.folder} is not open.", code="not-open")
         return self.recorder
 
 
 class Logbook(logging.Handler):
-    """The log of `station`, also inside the recording. Events for people get there by themselves."""
+    """Log handler that writes the log of `station` to the recording; events are recorded elsewhere."""
 
     def __init__(self, recorder: Callable[[], Recorder | None]) -> None:
         super().__init__(logging.INFO)
         self._recorder = recorder
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Record a log line from any thread; never raises, a log must not harm what it describes."""
+        """Record a log line; callable from any thread, never raises."""
         recorder = self._recorder()
         if recorder is None or record.name == "station.events":
             return

@@ -1,4 +1,4 @@
-"""Carries out one approval: pose after pose, until all are done or one fails."""
+"""Run: carries out one approval, pose after pose."""
 
 from __future__ import annotations
 
@@ -37,26 +37,26 @@ from station.session.threads import DISK, MOTION
 log = logging.getLogger(__name__)
 
 ARRIVED_RAD = 1e-4
-"""Nearer to its target than this the arm need not move."""
+"""Distance to the target within which no move is made."""
 FAILURES_IN_A_ROW = 3
 APPROVED_AGAIN = 3
-"""So often a simulated cell goes on by itself under one approval of a person."""
+"""Times that a simulated cell goes on by itself under one approval of a person."""
 
 
 class Run:
-    """The owner calls `drive` as a task; cancelling it ends it where it is, after the disk has its data."""
+    """Execution of one approval. Run `drive` as a task; when cancelled it ends after writing its data."""
 
     def __init__(
         self, context: SessionContext, go: MotionApproval, geometry: CellGeometry | None = None
     ) -> None:
-        """`geometry`: what a motion beside the plan was checked in; None: the cell, from where it stands."""
+        """`geometry`: that by which the motion was checked; None: the cell's, from the approved start."""
         self._context = context
         self._go = go
         self._geometry = geometry or self._cell_geometry()
         self._approved_again = 0
         self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
-        """Poses where something still moved."""
+        """Numbers of poses that did not settle."""
         self._tried_again = False
 
     def _cell_geometry(self) -> CellGeometry:
@@ -64,19 +64,19 @@ class Run:
         return with_plan_speeds(geometry, self._context.require_queue().plan)
 
     async def drive(self) -> None:
-        """Drive from checking to paused, stopped, fault or idle; raises only when cancelled."""
+        """Carry out the approval, ending in paused, stopped, fault or idle; raises only when cancelled."""
         while (late := await self._drive_once()) is not None:
             if not await self._approve_again(late):
                 self._halt(StationState.FAULT, late)
                 return
 
     async def _drive_once(self) -> StationError | None:
-        """What came late, where nothing real moves and the rest of the poses may be approved again."""
+        """Carry out the approval once; return the error of a delay after which it may go on, else None."""
         try:
             if await self._begin():
                 await self._poses()
         except SafetyStopError as error:
-            self._halt(StationState.STOPPED, error)  # the controller itself holds the arm
+            self._halt(StationState.STOPPED, error)  # the controller itself stopped the arm
         except (RobotError, TriggerError) as error:
             await self._context.cell.robot.stop(str(error))
             if self._may_go_on(error):
@@ -86,7 +86,7 @@ class Run:
             await self._context.cell.robot.stop("the disk failed")
             disk_failed(self._context, error)
         except Exception as error:
-            # A defect of this program: the arm must stand, and the state must say so.
+            # A defect of this program: stop the arm and report it.
             log.exception("the run failed")
             defect = internal_error(error)
             await self._context.cell.robot.stop(str(defect))
@@ -96,8 +96,11 @@ class Run:
         return None
 
     def _may_go_on(self, error: StationError | RecordingError) -> bool:
-        """Only after lateness whose cause is known, in a cell whose simulator this program started, and not
-        where a person or the controller wants the arm to stand."""
+        """Tell whether the run may go on by itself after an error.
+
+        Only after a delay of known cause, in a cell whose simulator this program started, and unless a person
+        or the controller stopped the arm.
+        """
         late = error.code in set(Delay) and self._approved_again < APPROVED_AGAIN
         return late and self._context.cell.simulated and self._go.beside is None and not self._halted
 
@@ -106,7 +109,7 @@ class Run:
         return self._context.requests.halt
 
     async def _approve_again(self, late: StationError) -> bool:
-        """An approval of this simulated cell's own for the poses that are left; False: there can be none."""
+        """Approve the remaining poses in a simulated cell; False: not possible."""
         context, queue = self._context, self._context.require_queue()
         store, count = context.store, context.store.status.session.approved_again + 1
         unmark_busy(context)
@@ -130,7 +133,7 @@ class Run:
         return True
 
     def _halt(self, state: StationState, error: StationError) -> None:
-        """The run's own end for a reason; nothing when STOP or lost control already ended it."""
+        """End the run for an error; does nothing when STOP or lost control already ended it."""
         context = self._context
         if self._halted:
             return
@@ -139,11 +142,11 @@ class Run:
         unmark_busy(context)
 
     async def _begin(self) -> bool:
-        """Opens control and the recording. False when refused: the state is as before the approval."""
+        """Start control and open the recording. False when refused: the state is as before the approval."""
         context, resting = self._context, self._context.resting
         try:
             if context.recording is not None:
-                # Nothing moves by poses that a restart would not find again.
+                # Save the poses before anything moves, so that a restart finds them.
                 await context.recording.save_state(context.require_queue())
             await context.cell.robot.start_control()
             here = (await fresh(context.cell.robot)).joints_rad  # starting control takes a second or two
@@ -168,7 +171,7 @@ class Run:
         await context.open_recording(context.require_queue(), context.store.status.session.check)
         context.show_poses()
         recording = context.require_recording()
-        context.record_event(Event(time.time_ns(), "info", self._go.said, code="approved"))  # said before
+        context.record_event(Event(time.time_ns(), "info", self._go.said, code="approved"))
         text = f"recording to {recording.folder}, segment {recording.segment}"
         context.store.event("recording", text, segment=recording.segment)
 
@@ -195,15 +198,15 @@ class Run:
             await DISK.run(context.require_recording().require_space)
             await self._pose(index)
             taken += 1
-            # By this run's average; elapsed: the session's runs before this one included.
+            # By the average of this run, while elapsed time includes the session's earlier runs.
             remaining_s = round((time.monotonic() - started_s) / taken * len(todo), 1)
             elapsed_s = round(context.require_recording().elapsed_s, 1)
             context.store.update_session(elapsed_s=elapsed_s, remaining_s=remaining_s)
 
     def _once_more(self) -> list[int]:
-        """Poses that did not settle, once, under the same approval, where nobody can be asked.
+        """Return the unsettled poses for a second try, once, if the approval allows it (`again`).
 
-        The same places that it covers; every path is checked anew from where the arm stands.
+        The approval covers these poses; every path is checked again from where the arm stands.
         """
         queue = self._context.require_queue()
         found = [index for index in self._unsettled if queue.status(index).state == "failed"]
@@ -236,7 +239,7 @@ class Run:
             context.show_poses(index)
 
     async def _move_to(self, index: int) -> None:
-        """Move from where the arm really is. LimitError when that path is not free."""
+        """Move to a pose from where the arm is. LimitError when the path is not free."""
         context = self._context
         queue = context.require_queue()
         here, target = (await context.arm()).joints_rad, queue.pose(index).joints_rad
@@ -248,23 +251,23 @@ class Run:
         await self._drive(here, target, f"pose {index + 1}")
 
     async def _drive(self, here: Vector6, target: Vector6, name: str) -> None:
-        """LimitError when the path from `here`, where the arm stands, is not free."""
-        # In a thread: neither the heartbeat nor STOP waits for it.
+        """Check the path from `here`, where the arm stands, and move. LimitError when it is not free."""
+        # In a thread, so that heartbeat and STOP need not wait.
         check = await MOTION.run(check_path, self._geometry, here, target, name)
         if check.problems:
             raise LimitError("; ".join(map(str, check.problems)), code="path")
         now = (await self._context.arm()).joints_rad
         moved_rad = float(np.abs(np.subtract(now, here)).max())
-        if moved_rad > JOGGED_RAD:  # less than that is settling
+        if moved_rad > JOGGED_RAD:  # less may be settling
             text = f"The arm moved by {np.rad2deg(moved_rad):.1f}° while its path was checked."
             raise LimitError(text, code="arm-moved", moved_rad=moved_rad, limit_rad=JOGGED_RAD)
         await self._context.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 
     async def _rest(self) -> None:
-        """Enter the state in which the session stands when its approval is used up."""
+        """Enter the state after the last pose of the approval: finished, or paused with the reason."""
         context = self._context
         queue = context.require_queue()
-        await context.cell.robot.end_control()  # before finishing: heartbeats end with the run
+        await context.cell.robot.end_control()  # before finishing, as heartbeats end with the run
         if context.requests.halt:
             return
         if context.requests.finish or (not queue.open and not queue.failed):
@@ -277,7 +280,7 @@ class Run:
         context.show_poses()
 
     def _why_paused(self) -> tuple[str, str]:
-        """Code and sentence."""
+        """Say why the session is paused: code and sentence."""
         queue, pausing = self._context.require_queue(), self._context.requests.pause_by
         if pausing:
             return "paused", f"Paused by {pausing}. Approve again to continue."
@@ -297,17 +300,17 @@ class Run:
 
 
 def _numbers(indices: Sequence[int]) -> str:
-    """'pose 4', 'poses 4, 7', as people count."""
+    """Name poses with numbers from 1: 'pose 4', 'poses 4, 7'."""
     return f"pose{'s' * (len(indices) > 1)} " + ", ".join(str(index + 1) for index in indices)
 
 
 def internal_error(error: Exception) -> StationError:
-    """A defect of this program, as a person reads it."""
+    """Make the error that reports a defect of this program."""
     return StationError(f"Internal error ({error!r}).", code="internal", remedy="See the daemon's log.")
 
 
 async def seal(context: SessionContext) -> None:
-    """Finishes the recording, an interrupted one too: sealing → idle. Raises RecordingError, StationError."""
+    """Finish the recording, also an interrupted one: sealing → idle. Raises RecordingError, StationError."""
     context.store.enter(StationState.SEALING)
     context.show_poses()
     context.requests = RunRequests(halt=context.requests.halt)
@@ -315,7 +318,7 @@ async def seal(context: SessionContext) -> None:
 
 
 async def _seal(context: SessionContext) -> None:
-    """A STOP meanwhile stays latched; was it acknowledged, nothing is left paused."""
+    """Finish the recording; a STOP meanwhile stays latched, or if acknowledged the state becomes idle."""
     recording, queue = context.require_recording(), context.require_queue()
     if recording.recorder is None:  # nothing was added since the crash
         await context.recover_segments(recording)
@@ -324,7 +327,7 @@ async def _seal(context: SessionContext) -> None:
         path = await recording.seal(queue)
     context.recording = None
     context.store.update_session(recording=str(path), remaining_s=0.0)
-    # What matters first: a narrow screen cuts the end.
+    # The most important first, as a narrow screen cuts the end.
     poses = len(queue.statuses)
     text = f"finished with {queue.done} of {poses} poses: {path}"
     if again := context.store.status.session.approved_again:
@@ -335,7 +338,7 @@ async def _seal(context: SessionContext) -> None:
 
 
 def disk_failed(context: SessionContext, error: RecordingError) -> None:
-    """Leaves the `.part` file for recovery; told in every state, and a STOP meanwhile stays latched."""
+    """Report a disk error; the `.part` file stays for recovery, and a STOP meanwhile stays latched."""
     if context.recording is not None:
         context.recording.abandon()
     text = f"Recording: {str(error).rstrip('.')}. What was saved before is safe."
@@ -349,7 +352,7 @@ def disk_failed(context: SessionContext, error: RecordingError) -> None:
 
 
 def unmark_busy(context: SessionContext) -> None:
-    """Plans again what a halt kept from the disk."""
+    """Plan poses again whose capture a halt interrupted."""
     queue = context.queue
     if queue is None:
         return
@@ -360,7 +363,7 @@ def unmark_busy(context: SessionContext) -> None:
 
 
 async def close_or_seal(context: SessionContext) -> None:
-    """Finishes what rests. A failing disk leaves a fault and the `.part` file."""
+    """Finish the recording; on a disk error enter fault and leave the `.part` file."""
     recording = context.require_recording()
     try:
         await seal(context)

@@ -1,6 +1,6 @@
-"""The session's state machine: what a person may command, and what becomes of it.
+"""The session's state machine: commands of clients and their effects.
 
-One at a time: every command here runs in the event loop; `stop` and a lost lease cut in at once.
+All commands run in the event loop; `stop` and the loss of control interrupt the others at once.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ log = logging.getLogger(__name__)
 R = TypeVar("R")
 END_RUN_S = 10.0
 END_RUN_AT_CLOSE_S, CLOSE_DEVICES_S = 1.0, 1.8
-"""At the daemon's end, which waits no longer for what hangs."""
+"""Longest waits at the daemon's end for a run and for devices."""
 STOP_WAIT_S = 1.0
-"""The answer to STOP waits no longer for what still goes to the disk: the arm stands."""
+"""Longest time that the answer to STOP, sent after the arm was stopped, waits for data being written."""
 PLAN_TIMEOUT_S = 180.0
 
 
 class Session:
-    """Knows devices through `cell`, and nothing of sockets and screens."""
+    """Session of a cell, below the folder `root`; independent of sockets and screens."""
 
     def __init__(self, cell: Cell, root: Path) -> None:
         config, playback = cell.config, cell.source == "playback"
@@ -88,7 +88,7 @@ class Session:
         self._logbook = Logbook(lambda: self.context.recorder)
 
     async def start(self) -> None:
-        """Connects, read-only, and keeps trying. Nothing moves. A session that a crash cut is found again."""
+        """Connect devices (read-only, with retries) and restore a session that a crash interrupted."""
         self.context.root.mkdir(parents=True, exist_ok=True)
         logging.getLogger("station").addHandler(self._logbook)
         found = await DISK.run(interrupted_session, self.context.root)
@@ -100,7 +100,7 @@ class Session:
         self._tasks = [asyncio.create_task(loop) for loop in loops]
 
     async def close(self) -> None:
-        """End in this order: the arm stands, the recording is finished, devices and worker end."""
+        """Stop the arm, finish the recording, then close devices and worker."""
         context = self.context
         self.approvals.void()
         if self.store.state in RUNNING:
@@ -125,14 +125,14 @@ class Session:
     # -- stopping, by anyone and anything ----------------------------------------------------------------
 
     async def stop(self, who: str) -> None:
-        """Now, from anyone, in any state; latched until acknowledged."""
+        """Stop the arm now, from any client, in any state; latched until acknowledged."""
         if self.store.state is StationState.STOPPED:
             await self.context.cell.robot.stop(f"STOP by {who}")
             return
         await self._halt(StationState.STOPPED, f"STOP by {who}. Look at the cell, then acknowledge.", "stop")
 
     async def lease_lost(self, client_id: int, how: str = "The connection of {} was lost.") -> None:
-        """Nobody commands any more: decelerate at once; continue only with a new approval."""
+        """Stop the arm as the client in control is gone; going on needs a new approval."""
         holder = self.leases.lease.holder
         if not self.leases.release(client_id):
             return
@@ -143,7 +143,7 @@ class Session:
             await self._halt(self.context.resting, reason, "control-lost")
 
     async def _halt(self, state: StationState, reason: str, cause: str) -> None:
-        """Voids the approval, stops the arm both ways, ends the run: one that writes once the disk has it."""
+        """Void the approval, stop the arm by both paths, end the run (after its data are written)."""
         context, run = self.context, self._run
         self._void()
         context.requests = RunRequests(halt=True)
@@ -157,7 +157,7 @@ class Session:
         unmark_busy(context)
 
     async def acknowledge(self, who: str) -> None:
-        """A person looked. What still holds the arm is told at the next approval."""
+        """Leave `stopped` or `fault` after a person looked at the cell."""
         self._require_state(verbs.Acknowledge)
         try:
             await fresh(self.context.cell.robot)
@@ -171,7 +171,7 @@ class Session:
     # -- from a question to a motion ---------------------------------------------------------------------
 
     async def prepare(self, client_id: int, purpose: Purpose, index: int | None = None) -> MotionPreview:
-        """Checks the whole path from where the arm is and offers a one-use approval for it."""
+        """Check the whole path from where the arm is and offer it for approval, once."""
         offer = await self._begin_offer(verbs.Prepare, client_id)
         await look_back(self.context)
         begun = begun_anew(self.context, purpose)
@@ -181,7 +181,7 @@ class Session:
         return summary
 
     async def prepare_stop_test(self, client_id: int, request: verbs.StopTest) -> StopTestOffer:
-        """Offers a one-use approval for a short move that is ended in one way."""
+        """Offer a short move, to be ended in one way, for approval, once."""
         offer = await self._begin_offer(verbs.StopTest, client_id)
         drive, found = await prepare_stop_test(self.context, request)
         offer(MotionApproval(found.go, client_id, beside=drive))
@@ -190,11 +190,11 @@ class Session:
     async def _begin_offer(
         self, verb: type[Verb[object]], client_id: int
     ) -> Callable[[MotionApproval], None]:
-        """Return what offers the checked motion; that raises RefusedError when anything changed meanwhile."""
+        """Return a function that offers the checked motion, or RefusedError if anything changed meanwhile."""
         self.permit(verb, client_id)
         if verb is not verbs.Prepare:
             self._require_no_session()
-        await self._run_ended()  # it is finished and shown; its control process may take a moment more
+        await self._run_ended()  # its control process may still be ending
         self._void()
         return partial(self._offer, self.approvals.voids)
 
@@ -205,13 +205,13 @@ class Session:
                 "Conditions changed during the preflight check.", code="changed", remedy="Retry."
             )
         self.approvals.offer(asked)
-        # To every watcher, without the token that is for the one who asked.
+        # Watchers get it without the token, which is for the client that asked.
         self.store.update(go=msgspec.structs.replace(asked.summary, token=""))
 
     async def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
-        """A person approves exactly that summary. RefusedError when anything changed.
+        """Start the offered motion, which a person approved. RefusedError when anything changed.
 
-        `approval`: who gave it and how, for log and recording. `again`: see MotionApproval.
+        `approval`: who approved and how, for log and recording. `again`: see MotionApproval.
         """
         context = self.context
         self.permit(verbs.Go, client_id)
@@ -239,13 +239,13 @@ class Session:
         self._run = asyncio.create_task(drive)
 
     def pause(self, who: str) -> None:
-        """After this pose. Anyone may: it only ever makes the arm do less."""
+        """Pause after this pose. Any client may, as it never causes motion."""
         self._require_state(verbs.Pause)
         self.context.requests.pause_by = who
         self.store.event("pause-wanted", f"{who} asks to pause after this pose", who=who)
 
     async def finish(self, client_id: int) -> None:
-        """Finishes what is there; a pose under way is taken first."""
+        """Finish the recording, after the pose under way."""
         self.permit(verbs.Finish, client_id)
         self._void()
         if self.store.state in RUNNING and not self.freedrive.taking:
@@ -256,13 +256,13 @@ class Session:
             raise RefusedError("Nothing is recorded yet.", code="nothing-recorded")
         await asyncio.gather(self._run_ended(), self.freedrive.last_picture())
         self._require_state(verbs.Finish)
-        self._run = closing = asyncio.create_task(close_or_seal(self.context))  # nothing new begins beside it
+        self._run = closing = asyncio.create_task(close_or_seal(self.context))  # as `_run`, it bars new runs
         await asyncio.wait({closing})
         if not closing.cancelled():
             closing.result()
 
     async def _run_ended(self, wait_s: float = END_RUN_S) -> None:
-        """RefusedError when it does not: nothing new begins beside it."""
+        """Wait for the end of the last run; RefusedError when it does not end in time."""
         if self._run is not None and not self._run.done():
             await asyncio.wait({self._run}, timeout=wait_s)
         self._require_run_ended()
@@ -279,7 +279,7 @@ class Session:
         return lease
 
     async def release_lease(self, client_id: int) -> None:
-        """Releasing control during a run is losing it: the arm decelerates."""
+        """Release control; during a run the arm decelerates as when control is lost."""
         await self.lease_lost(client_id, "{} released control.")
 
     def load_plan(self, client_id: int, plan: Plan) -> None:
@@ -290,7 +290,7 @@ class Session:
     async def make_plan(
         self, client_id: int, poses: int, seed: int, lens_known: bool = False, aim: Aim = "camera"
     ) -> None:
-        """Made in the worker. ConfigError and LimitError say what is missing or in the way."""
+        """Make a plan in the worker and load it. ConfigError and LimitError say what prevents it."""
         self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
         try:
@@ -323,9 +323,9 @@ class Session:
         self.store.event("plan-loaded", f"plan of {count} poses loaded", poses=count)
 
     async def edit(self, verb: type[Verb[object]], client_id: int, change: Callable[[PoseQueue], R]) -> R:
-        """Retake, skip, reorder, add, drop: voids a waiting approval.
+        """Change the poses (retake, skip, reorder, add, drop), voiding an offered motion.
 
-        RecordingError: it is done, but not on the disk.
+        RecordingError: the change is made, but could not be saved.
         """
         self.permit(verb, client_id)
         context = self.context
@@ -355,7 +355,7 @@ class Session:
         return await self.freedrive.record()
 
     def permit(self, verb: type[Verb[object]], client_id: int) -> None:
-        """RefusedError unless the table of verbs allows it to this client now."""
+        """Raise RefusedError unless a verb is allowed to this client in the present state."""
         if verb.control:
             self.leases.require(client_id)
         self._require_state(verb)
@@ -379,7 +379,7 @@ def _still_ending(what: str) -> RefusedError:
 
 
 def show_interrupted(context: SessionContext, folder: Path, state: SessionState) -> None:
-    """Brings its poses back and stands in `stopped` until a person looked. Nothing moves."""
+    """Restore an interrupted session's poses, in state `stopped` until acknowledged. Nothing moves."""
     if state.source != context.cell.source:
         context.store.event(
             "interrupted-elsewhere",

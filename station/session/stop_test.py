@@ -1,6 +1,6 @@
-"""A move of the acceptance test: short, slow, checked, approved by itself, ended in one way in its middle.
+"""Move of the acceptance test: short, slow, checked, separately approved, stopped in its middle in one way.
 
-Nothing is recorded here: who judges the stop reads the arm by a connection of its own.
+Nothing is recorded here: the stop is judged from another connection to the arm (`operate.acceptance`).
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ LONGEST_TURN_RAD = 0.4
 _PROBE_RAD = 0.05
 FROZEN_S = 1.0
 _MIDDLE = 0.5
-"""Share of the turn after which the stop is given."""
+"""Share of the turn after which the stop is triggered."""
 _LOOK_S = 0.002
 _SLIDER_FULL = 0.99
 MOVE_S = 3.0
-"""Duration of the whole move, as far as its path is free."""
+"""Wanted duration of the whole move; shorter where its path is not free."""
 _WORDS = {
     StopWay.CONTROL: "is stopped by the control process alone",
     StopWay.DASHBOARD: "is stopped by the dashboard alone",
@@ -48,7 +48,10 @@ _WORDS = {
 
 
 async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) -> tuple[Drive, StopTestOffer]:
-    """RefusedError, LimitError and RobotError say what is in the way. Nothing moves."""
+    """Check a move for the stop test; return its execution and the offer. Nothing moves yet.
+
+    RefusedError, LimitError and RobotError say what prevents it.
+    """
     state = await context.arm()
     if (fraction := state.target_speed_fraction) < _SLIDER_FULL:
         raise RefusedError(
@@ -79,7 +82,7 @@ async def prepare_stop_test(context: SessionContext, request: verbs.StopTest) ->
 def _free_move(
     context: SessionContext, request: verbs.StopTest, start: Vector6
 ) -> tuple[Vector6, PlanCheck, CellGeometry, Plan]:
-    """The first of some turns whose path is free: the longest first, in the wanted direction first."""
+    """Find the first turn with a free path; longer turns, and the wanted direction, are tried first."""
     geometry = geometry_from(context.cell.config, start)
     geometry = slower(geometry, request.speed_m_s, joint_acceleration_rad_s2=ACCELERATION_RAD_S2)
     refused: PlanCheck | None = None
@@ -107,7 +110,7 @@ def _free_move(
 
 
 def _turns(geometry: CellGeometry, request: verbs.StopTest, start: Vector6) -> Iterator[float]:
-    """Turns (rad) of the joint that last as long as asked for, then shorter ones."""
+    """Yield turns (rad) of the joint: those of the wanted duration, then shorter ones."""
     sign = 1.0 if request.forward else -1.0
     near = vector6(np.array(start) + sign * _PROBE_RAD * np.eye(6)[request.joint])
     speed = check_path(geometry, start, near).joint_speed_rad_s
@@ -118,7 +121,7 @@ def _turns(geometry: CellGeometry, request: verbs.StopTest, start: Vector6) -> I
 
 
 class StopTestRun(Run):
-    """Carries out one approved stop test: one move, no image, nothing recorded."""
+    """Execution of an approved stop test: one move, no image, nothing recorded."""
 
     def __init__(
         self,
@@ -154,19 +157,19 @@ class StopTestRun(Run):
             context.store.enter(StationState.IDLE, said, STOP_TESTED)
 
     async def _give_stop(self, driving: asyncio.Task[None]) -> None:
-        """Give the stop in mid-move, timed to the microsecond. RobotError where a way is not there."""
+        """Trigger the stop in mid-move and note its exact time. RobotError where the way is missing."""
         robot, way = self._context.cell.robot, self._way
         start, target = (np.array(q) for q in (self._go.start_joints_rad, self._target_rad))
         while not driving.done():
-            with contextlib.suppress(StaleStateError):  # the move itself says when that is too old
+            with contextlib.suppress(StaleStateError):  # the move itself reports states that are too old
                 if np.abs(robot.latest().joints_rad - start).max() >= _MIDDLE * np.abs(target - start).max():
                     break
             await asyncio.sleep(_LOOK_S)
         else:
-            return  # it ended by itself, and says why
+            return  # the move ended before, and reports why
         moment_ns = time.monotonic_ns()
         if way is StopWay.FROZEN:
-            time.sleep(FROZEN_S)  # on purpose: heartbeat, STOP and screen all hang on this loop
+            time.sleep(FROZEN_S)  # blocks the event loop on purpose, and with it heartbeat and STOP
         else:
             robot.stop_one_way(way)
         self._context.store.event(STOP_GIVEN, f"stop given: {way.value}", moment_ns=moment_ns)

@@ -1,4 +1,4 @@
-"""The preview a person approves before anything moves: checked, from where the arm stands now."""
+"""Preview of a motion for approval: the checked path from where the arm stands, in figures."""
 
 from __future__ import annotations
 
@@ -23,13 +23,16 @@ from station.session.queue import OfferedPoses, PoseQueue
 from station.session.threads import DISK
 
 POSE_OVERHEAD_S = 0.8
-"""Settle, expose, look, write: what a stop takes beside the move."""
+"""Time per pose besides the move: settling, exposure, detection, writing."""
 _PROBLEMS_SHOWN = 12
 _SLOW_SLIDER = 0.99
 
 
 def begun_anew(context: SessionContext, purpose: Purpose) -> OfferedPoses | None:
-    """The loaded plan for a session that begins with this approval; until then the last one stays shown."""
+    """Offer the loaded plan for a new session; None: the approval begins none.
+
+    Until the approval the last session stays shown.
+    """
     queue = context.queue
     if purpose is not Purpose.RUN or context.recording is not None or queue is None:
         return None
@@ -38,7 +41,7 @@ def begun_anew(context: SessionContext, purpose: Purpose) -> OfferedPoses | None
 
 
 def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None) -> OfferedPoses:
-    """The session's poses that an approval for this purpose covers. RefusedError when there are none."""
+    """List the poses that an approval for this purpose would cover. RefusedError when there are none."""
     queue = context.loaded()
     if purpose in (Purpose.RETAKE, Purpose.RESUME) and context.recording is None:
         raise RefusedError("No session is open.", code="no-session", remedy="Run the plan to begin one.")
@@ -62,7 +65,7 @@ def _open(queue: PoseQueue) -> tuple[int, ...]:
 
 
 async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple[str, ...]) -> MotionPreview:
-    """Checks the whole path in the worker. LimitError: it is not free; RobotError: what the arm lacks."""
+    """Check the whole path in the worker and make the preview. LimitError: not free; RobotError."""
     if offered.queue.plan.motion != "stops":
         raise RefusedError(
             "This plan is a sweep, and sweeps are gone.",
@@ -96,7 +99,7 @@ async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple
 def motion_preview(
     check: PlanCheck, start_joints_rad: Vector6, *, overhead_s: float = 0.0, **said: Any
 ) -> MotionPreview:
-    """The figures of a checked path with the words said of it, and a new token."""
+    """Make a preview from a checked path, further fields, and a new token."""
     return MotionPreview(
         token=secrets.token_urlsafe(16),
         path_m=round(check.path_m, 3),
@@ -109,7 +112,7 @@ def motion_preview(
 
 
 async def _refused(context: SessionContext, plan: Plan, check: PlanCheck, start: Vector6) -> LimitError:
-    """The plan is not free; where only the way to its first pose is not, it was made from another posture."""
+    """Make the error for a plan that is not free, special if only the path to its first pose is not."""
     refused = LimitError(_problem_text(check), code="plan", problems=len(check.problems))
     if not plan.poses or len(check.problems) > len(check.moves[0].problems):
         return refused

@@ -1,7 +1,7 @@
-"""The working loop: heartbeat to the arm, watch over the resting arm, status. Nothing in it may wait.
+"""Supervisor: heartbeat to the arm, monitoring of the resting arm, status. Nothing in it may block.
 
-The arm's watchdog and systemd's hang on this one loop: when it stalls, the arm stops and the daemon is
-restarted. That is why the heartbeat comes from nowhere else.
+The arm's watchdog and systemd's depend on this loop alone: when it stalls, the arm stops and the daemon is
+restarted. So the heartbeat must not be sent from elsewhere.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ class SessionSupervisor:
     def __init__(
         self, context: SessionContext, jogged: Callable[[str], None], lost: Callable[[], None]
     ) -> None:
-        """`jogged`: the resting arm was moved, in words. `lost`: the resting robot was silent too long."""
+        """`jogged`: called with how far the resting arm was moved; `lost`: when its states are too late."""
         self._context = context
         self._monitor = Monitor(context)
         self._jogged, self._lost = jogged, lost
         self.first: Callable[[], None] = lambda: None
-        """Before anything else in every round."""
+        """Called first in every round."""
         self.ticked: Callable[[], None] = lambda: None
-        """After every round."""
+        """Called after every round."""
         self._failure = ""
         self._rest: tuple[int, Vector6] | None = None
-        """Which pause it is, of `store.entered`, and the joints at rest in it."""
+        """Number of the present pause (`store.entered`), and the joints (6,) at rest in it."""
         self._silent = False
-        """The robot's news are later than its rest or motion allows."""
+        """True while the robot's states are later than allowed."""
         self._late_since_s = 0.0
-        """Since when they are late (host monotonic); 0: they are not."""
+        """Since when states are late (host monotonic); 0: they are not."""
         self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
         """Delay of each round."""
 
@@ -73,7 +73,7 @@ class SessionSupervisor:
         self.ticked()
 
     def _look(self) -> None:
-        """Refreshes the status. What fails here must not end the heartbeat; a person is told."""
+        """Refresh the status. An error is reported and does not end the heartbeat."""
         try:
             self._watch_link()
             self._watch_rest()
@@ -85,12 +85,12 @@ class SessionSupervisor:
                 self._context.store.problem(error, "error", said="what the screen shows is not fresh: {!r}")
 
     def lag_ms(self) -> float:
-        """Worst of the last second."""
+        """Return the largest delay of the last second, ms."""
         recent = list(self.lags_s)[-50:]
         return 1000 * max(recent, default=0.0)
 
     def _watch_link(self) -> None:
-        """idle ⇄ disconnected; a running session notices a lost robot by itself."""
+        """Switch between idle and disconnected; during a run the run itself detects a lost robot."""
         store, robot = self._context.store, self._context.cell.robot
         try:
             if robot.news() is None:
@@ -113,7 +113,7 @@ class SessionSupervisor:
             store.event("robot-connected", "robot connected")
 
     def _tell_delay(self, since_s: float) -> None:
-        """Names what made news late that were waited for; what stopped an arm was told then."""
+        """Report what made states of a resting arm late."""
         store, now_s = self._context.store, time.monotonic()
         late = self._context.cell.robot.delay(self.lag_ms() / 1000, since_s - TOLD_S)
         began_ns = time.time_ns() - round(1e9 * (now_s - since_s))
@@ -122,7 +122,7 @@ class SessionSupervisor:
             store.problem(late)
 
     def _watch_rest(self) -> None:
-        """Tells when somebody moves the arm while the session rests; any approval is void then."""
+        """Detect when the arm is moved while the session is paused, which voids an offered motion."""
         context = self._context
         if context.store.state is not StationState.PAUSED:
             return
@@ -132,7 +132,7 @@ class SessionSupervisor:
             return
         pause, joints = context.store.entered, state.joints_rad
         if self._rest is None or self._rest[0] != pause:
-            if max(map(abs, state.joint_speeds_rad_s)) < RESTING_RAD_S:  # not while a halt still brakes
+            if max(map(abs, state.joint_speeds_rad_s)) < RESTING_RAD_S:  # not while the arm still brakes
                 self._rest = pause, joints
             return
         if np.abs(np.subtract(joints, self._rest[1])).max() > JOGGED_RAD:

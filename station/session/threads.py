@@ -1,4 +1,4 @@
-"""Threads of the daemon for each kind of work: what hangs in one holds up neither another nor the loop."""
+"""Separate threads for each kind of blocking work, so that none delays another kind or the event loop."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ R = TypeVar("R")
 
 
 class WorkThreads:
-    """A few threads for one kind of work, which may hang for ever: on a dead file server, for instance."""
+    """A few threads for one kind of work that may hang for ever, as on a dead file server."""
 
     def __init__(self, name: str, threads: int, waiting: int = 100) -> None:
-        """`waiting`: so much may wait for a free thread."""
+        """`waiting`: largest number of calls that may wait for a free thread."""
         self._pool = ThreadPoolExecutor(threads, f"station {name}")
         self._places = BoundedSemaphore(threads + waiting)
 
     async def run(self, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-        """The result of `work`, or its exception. RefusedError where too much waits already."""
+        """Run `work` in a thread; return its result. RefusedError where too many calls are waiting."""
         if not self._places.acquire(blocking=False):
             raise RefusedError(
                 "Too many requests wait for this computer's disk or network.",
@@ -36,12 +36,12 @@ class WorkThreads:
 
 
 MOTION = WorkThreads("motion", 2)
-"""Checks of a path that is approved or about to be."""
+"""Checks of paths"""
 DISK = WorkThreads("disk", 3)
-"""The session's own files."""
+"""Files of the session"""
 ASKED = WorkThreads("asked", 4, 8)
-"""What a person asked to see: files and devices, however many and slow."""
+"""Requests of clients for files and devices"""
 WATCH = WorkThreads("watch", 1)
-"""What the status tells of files."""
+"""Files of which the status tells"""
 NAMES = WorkThreads("names", 2)
-"""Names of users, which may come from the network."""
+"""Names of users, which may come from a directory server"""

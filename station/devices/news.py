@@ -107,9 +107,11 @@ def largest_gap(
 
 
 def longest_silence_s(kicks_s: Iterable[float], since_s: float, until_s: float) -> float:
-    """Find the longest time (s) without a reset of the watchdog within a span; 0: there was no reset."""
-    inside = [kick_s for kick_s in kicks_s if since_s < kick_s < until_s]
-    return max((b - a for a, b in pairwise([*inside, until_s])), default=0.0)
+    """Find the longest time (s) without a reset of the watchdog that began in a span, or lasted to its end;
+    0: there was no reset."""
+    before = [kick_s for kick_s in kicks_s if kick_s < until_s]
+    counted = [kick_s for kick_s in before if kick_s > since_s] or before[-1:]
+    return max((b - a for a, b in pairwise([*counted, until_s])), default=0.0)
 
 
 def is_loopback(host: str) -> bool:

@@ -98,6 +98,8 @@ class UrRobot(UrLink):
         self._stop_reason = self._link_loss = ""
         self._ended_by: RobotError | None = None
         """Error that ended control between two moves."""
+        self._explaining = False
+        """True while that error's cause is being looked for."""
         self._one_way_s: float | None = None
         """When the stop test triggered its single stop (host monotonic); None before and after it."""
         self._played_s = 0.0
@@ -189,6 +191,8 @@ class UrRobot(UrLink):
         speed, acceleration and joint range are enforced.
         """
         check_goal(joints_rad, speed_rad_s, acceleration_rad_s2, self.model.joint_limit_rad)
+        while self._explaining:
+            await asyncio.sleep(POLL_S)
         child = self._child
         if child is None or not self.control:
             raise self._ended_by or RobotError(
@@ -441,9 +445,13 @@ class UrRobot(UrLink):
             if state is not None and (trouble := self._program_trouble(state)) is not None:
                 raise trouble
         except RobotError as error:
-            cause = self._explain(error, child)
-            await self.stop(str(cause))
-            cause = await self._look_again(cause, child)
+            self._explaining = True
+            try:
+                cause = self._explain(error, child)
+                await self.stop(str(cause))
+                cause = await self._look_again(cause, child)
+            finally:
+                self._explaining = False
             assert isinstance(cause, RobotError)
             self._ended_by = cause
             raise cause from None

@@ -23,6 +23,7 @@ DRIVER = """
 import asyncio, sys
 from pathlib import Path
 from station.cell.config import RobotConfig
+from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
 
 async def main(host, folder, control):
@@ -37,7 +38,10 @@ async def main(host, folder, control):
     goal = list(robot.newest().state.joints_rad)
     goal[0] += 1.5
     print(robot.control_pid, flush=True)
-    await robot.move(goal, 0.5, 1.0)
+    try:
+        await robot.move(goal, 0.5, 1.0)
+    except RobotError as error:
+        print(error.code, flush=True)
 
 asyncio.run(main(sys.argv[1], Path(sys.argv[2]), sys.argv[3]))
 """
@@ -63,6 +67,9 @@ async def test_driving_process(
             type("O", (), {"noticed_s": 0.0, "stopped_s": stopped_s, "error": RobotError("none left")})
         )
         await c.stays_at_rest()
+        if kill == signal.SIGSTOP:
+            driver.send_signal(signal.SIGCONT)
+            assert (await asyncio.to_thread(driver.stdout.readline)).strip() == "computer-late"
         driver.kill()
         driver.wait()
     await until(lambda: not Path(f"/proc/{child_pid}").exists() or _is_zombie(child_pid))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -186,6 +188,20 @@ async def test_control_process(strike: Strike, kill: signal.Signals, code: str) 
     await c.stays_at_rest()
     with pytest.raises(ProcessLookupError):
         os.kill(killed[0], 0)
+
+
+async def test_a_control_process_held_up_between_two_moves_is_named_by_the_next(
+    cell: Callable[..., Awaitable[Any]],
+) -> None:
+    c = await cell()
+    control_pid, here = c.robot.control_pid, c.joints_rad()
+    os.kill(control_pid, signal.SIGSTOP)
+    await asyncio.sleep(0.4)
+    with suppress(ProcessLookupError):  # the station may have ended it
+        os.kill(control_pid, signal.SIGCONT)
+    with raises("computer-late"):
+        while True:
+            await c.robot.move(here, 0.5, 1.0)
 
 
 async def test_a_session_loop_that_stalls_stops_the_arm(strike: Strike) -> None:

@@ -110,6 +110,7 @@ def test_a_silence_is_the_watchdogs_business_only_before_the_program_ended() -> 
     kicks_s = [0.0, 0.3, 0.35, 0.4, 0.9]
     assert longest_silence_s(kicks_s, 0.1, 0.42) == pytest.approx(0.05)
     assert longest_silence_s(kicks_s, 0.1, 0.65) == pytest.approx(0.25)
+    assert longest_silence_s(kicks_s, 0.45, 0.85) == pytest.approx(0.45)
     assert longest_silence_s([], 0.1, 0.65) == 0.0
 
 

@@ -1,5 +1,5 @@
-"""Flows that a person drives: capture, drift check, touch test, acceptance of an arm, a new cell.
+"""Procedures with a person: capture, drift check, touch test, acceptance of an arm, a new cell.
 
-They know the daemon's protocol alone. What differs between shell and screen is who is asked: a callable or a
-small protocol that each of them brings.
+They depend on the daemon's protocol only. Shell and screen each pass in a callable or small object by which
+the person is asked.
 """

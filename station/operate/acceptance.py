@@ -1,7 +1,7 @@
-"""The acceptance test of an arm: one approved move for each way to stop, judged by the controller's samples.
+"""Acceptance test of an arm: one approved move for each way to stop, judged by the controller's states.
 
-It ends with the first figure beyond its limit, and clears nothing: after a protective stop a person stands at
-the pendant. A stop that could not be measured says nothing of the arm, and is told as that.
+It ends with the first figure beyond its limit. It clears no stop: after a protective stop a person must do so
+at the pendant. A stop that could not be measured is reported as not measured, not as failed.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from station.protocol.states import RUNNING
 from station.protocol.verbs import StopTest
 
 AFTER_S = WATCHED_S + 1.0
-"""The arm is watched for so long after the move's end."""
+"""Time for which states are recorded after the move's end."""
 PREPARE_S = 60.0
 END_S = 40.0
 TRIES = 3
-"""Moves for one way, until one is measured."""
+"""Most moves for one way to stop, until its stop is measured."""
 
 
 class StateRecorder(Protocol):
-    """Every sample of the arm, by a connection that is not the daemon's."""
+    """Recorder of the arm's states by a connection that is not the daemon's."""
 
     async def begin(self) -> None: ...
 
@@ -40,13 +40,13 @@ class StateRecorder(Protocol):
 
 
 class PersonAtArm(Protocol):
-    """The person at the arm, by a shell or by the screen."""
+    """Questions to the person at the arm, by shell or screen."""
 
     async def holds_emergency_stop(self) -> bool:
-        """The person confirms that the emergency stop is in their hand."""
+        """Ask the person to confirm that they hold the emergency stop."""
 
     async def approves(self, preview: MotionPreview) -> bool:
-        """One move."""
+        """Ask the person to approve one move."""
 
     def judged(self, result: StopResult) -> None:
         """Tell how one move ended."""
@@ -54,7 +54,7 @@ class PersonAtArm(Protocol):
 
 @dataclass
 class AcceptanceTest:
-    """The test under way, and all that it found. Part of the `ways` accepts nothing."""
+    """The test and its results. A test of only some `ways` never accepts the arm."""
 
     link: Link
     person: PersonAtArm
@@ -80,7 +80,7 @@ class AcceptanceTest:
         return self.outcome()
 
     def outcome(self) -> Acceptance:
-        """All that was found until now. RefusedError when nothing was."""
+        """Return the results so far. RefusedError when there are none."""
         if self.subject is None:
             raise RefusedError("Nothing moved: no move was approved.", code="not-approved")
         passed = {result.way for result in self.results if result.passed}
@@ -90,7 +90,7 @@ class AcceptanceTest:
         return Acceptance(self.subject, accepted, speed_m_s, time.time_ns(), who, tuple(self.results))
 
     async def _tested(self, way: StopWay) -> bool:
-        """False: it failed, or was not approved. What was not measured is asked for again, a few times."""
+        """Test one way, repeating moves that were not measured; False: failed, or not approved."""
         for tries in range(TRIES):
             result = await self._move(way, tries)
             if result is None:
@@ -103,7 +103,7 @@ class AcceptanceTest:
         return True
 
     async def _move(self, way: StopWay, tries: int) -> StopResult | None:
-        """None: it was not approved."""
+        """Make one move and judge it; None: it was not approved."""
         request = StopTest(way, self.speed_m_s, self.joint, self._forward)
         offer = await self.link.call(request, timeout_s=PREPARE_S)
         self._forward = not self._forward
@@ -134,7 +134,7 @@ class AcceptanceTest:
         return StopResult(way, offer.go.top_speed_m_s, figures, tries, not_measured)
 
     async def _ended(self, begun_ns: int) -> int | None:
-        """When the stop was given (host monotonic), by the station's account; None: the move ended before."""
+        """Wait for the move's end; return when the stop was triggered (host monotonic ns), None: never."""
         moment_ns: int | None = None
         try:
             async with asyncio.timeout(END_S):

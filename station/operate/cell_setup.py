@@ -1,4 +1,4 @@
-"""A cell that is being set up: its draft, the devices that answer, and what they show now."""
+"""Setup of a new cell: the draft, the devices found, and their present images and states."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _LOOKED_FOR = (CellStep.BOARD, CellStep.VIEWS, CellStep.LIMITS)
 
 
 class CellSetup:
-    """Only reads: no method here can move the arm but `stop`, which ends its program."""
+    """State of the setup. Only reads from the arm, except `stop`, which ends its program."""
 
     def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
         """`root` keeps the draft; `output` is the configuration to write."""
@@ -45,18 +45,18 @@ class CellSetup:
         self.camera: CameraReader | None = None
         self.cameras: tuple[CameraChoice, ...] = ()
         self.mount: Mount = self.draft.mount or "eye-in-hand"
-        """The drawing that is marked."""
+        """Mounting that is selected."""
         self.state: RobotState | None = None
-        """Newest of the arm; None: it does not answer."""
+        """Newest state of the arm; None: it does not answer."""
         self._moved_s = time.monotonic()
         self.seen: tuple[float, Detection] | None = None
-        """When the newest image was begun, and the board in it."""
+        """Time at which the newest image was requested, and the board in it."""
         self.trouble = ""
-        """Fault of the newest image; empty: none."""
+        """What is wrong with the newest image; empty: nothing."""
 
     @property
     def found(self) -> FoundCell | None:
-        """Camera and board by the views so far."""
+        """Camera and board pose by the views so far; None: not determined."""
         return find_cell(self.draft)
 
     @property
@@ -71,7 +71,7 @@ class CellSetup:
         return flange_pose(self.state, self.arm.identity.tcp_offset)
 
     def keep(self, draft: Draft) -> None:
-        """Raises StationError where the disk does not take it; it holds until the end all the same."""
+        """Set and save the draft. StationError when it cannot be saved; it is then kept in memory."""
         self.draft = draft
         try:
             drafts.save_draft(self.root, draft)
@@ -99,7 +99,7 @@ class CellSetup:
         )
 
     async def look_for_cameras(self) -> bool:
-        """Tell whether others answer than before; one that is alone is opened: its picture says more."""
+        """Search for cameras; True when the list changed. A single one is opened at once."""
         found = await self._hardware.cameras()
         changed, self.cameras = found != self.cameras, found
         if len(found) == 1:
@@ -124,7 +124,7 @@ class CellSetup:
         )
 
     async def expose(self, factor: float) -> None:
-        """Raises CameraError."""
+        """Change the exposure by a factor. Raises CameraError."""
         if self.camera is not None:
             await self.camera.expose(float(np.clip(factor * self.camera.exposure_us, *EXPOSURE_US)))
             self.change(exposure_us=self.camera.exposure_us)
@@ -148,7 +148,7 @@ class CellSetup:
         return found
 
     def new_view(self) -> bool:
-        """The newest image shows the board from where a view helps, and the arm rested before it."""
+        """True when the newest image shows the board from a useful new pose, with the arm at rest."""
         return not self._not_takable() and what_is_missing(self.draft, self.flange).new
 
     def _not_takable(self) -> str:
@@ -170,7 +170,7 @@ class CellSetup:
         self.change(views=self.draft.views[:-1], limits_seen=False, written="")
 
     def set_mount(self) -> None:
-        """Keep the drawing that is marked."""
+        """Save the selected mounting."""
         if self.draft.mount != self.mount:
             self.change(mount=self.mount, limits_seen=False, written="")
 
@@ -197,14 +197,14 @@ class CellSetup:
                 await device.close()
 
     def arm_words(self) -> str:
-        """The joints, or why they are not known."""
+        """Describe the joints, or why they are not known."""
         if self.state is not None:
             return f"joints {', '.join(f'{math.degrees(q):.1f}' for q in self.state.joints_rad)}°"
         return "" if self.arm is None else self.arm.trouble()
 
 
 async def _exposed(camera: CameraReader) -> Image:
-    """Image of the camera, its exposure brought to a middle grey in a few tries. Raises CameraError."""
+    """Take an image, adjusting the exposure to `GREY_WANTED` in a few tries. Raises CameraError."""
     image = None
     for _ in range(4):
         image = await camera.glimpse()

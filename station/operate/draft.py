@@ -1,4 +1,4 @@
-"""The draft of a new cell: what a person and the devices have told so far, kept after every step."""
+"""Draft of a new cell: answers and measurements so far, saved after every step."""
 
 from __future__ import annotations
 
@@ -78,10 +78,10 @@ class CameraReader(Protocol):
 
 
 class Hardware(Protocol):
-    """Devices that a shell brings for this flow: it alone knows them."""
+    """Access to devices, implemented by the command line, so that this package needs no drivers."""
 
     async def arm(self, host: str) -> ArmReader:
-        """Connect for reading only. Raises RobotError with the pendant's own menu words."""
+        """Connect for reading only. Raises RobotError that names the pendant's menu items."""
 
     async def cameras(self) -> tuple[CameraChoice, ...]:
         """Cameras that answer now. Raises CameraError."""
@@ -91,7 +91,7 @@ class Hardware(Protocol):
 
 
 class GuidedView(msgspec.Struct, frozen=True):
-    """View from where a hand brought the arm."""
+    """View from a pose to which a person moved the arm by hand."""
 
     joints_rad: Vector6
     base_from_flange: Matrix4
@@ -113,13 +113,13 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
     board: BoardSpec | None = None
     views: tuple[GuidedView, ...] = ()
     table_m: float | None = None
-    """Height of the table in `base`; None: by the board."""
+    """Height of the table in `base`; None: derived from the board."""
     limits_seen: bool = False
     written: str = ""
-    """The configuration's path, once it is written."""
+    """Path of the written configuration; empty: not written yet."""
 
     def without_views(self, **changes: object) -> Draft:
-        """Return the draft with changes that make the views taken so far worthless."""
+        """Return the draft with changes, and without the views, which they invalidate."""
         return msgspec.structs.replace(self, views=(), limits_seen=False, written="", **changes)
 
 

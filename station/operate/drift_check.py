@@ -1,4 +1,4 @@
-"""The drift check: capture a few poses in place of the loaded plan, then judge what is installed by them."""
+"""Drift check: capture a few poses in place of the loaded plan and test the installed calibration by them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from station.operate.motion import PREPARE_S, Approve, Link, prepared_motion
 from station.protocol.verbs import GetPlan, LoadPlan, MakePlan, Purpose
 
 POSES = 8
-"""Detect a shift of 0.5 mm in 96 of 100 cases at mid noise, five in 88 (benchmarks/README.md)."""
+"""Default number of poses. Eight detect a shift of 0.5 mm in 96 % of cases at mid noise, five in 88 %
+(benchmarks/README.md)."""
 SEED = 0
 
 
@@ -41,13 +42,13 @@ async def start_drift_check(
 
 
 def _never_run(status: StationStatus) -> bool:
-    """Tell whether a plan is loaded and none of its poses was ever tried: somebody may still want it."""
+    """Tell whether a plan is loaded of which no pose was ever tried, so that it should be kept."""
     poses = status.session.poses
     return bool(poses) and not any(pose.attempt for pose in poses)
 
 
 async def recorded(link: Link, plan_sha256: str) -> SessionStatus | None:
-    """The session of the plan that was just started, once its recording is finished; after pauses, too.
+    """Wait until the recording of the plan's session is finished, also after pauses; return the session.
 
     None when another plan takes its place, or when the daemon ends.
     """

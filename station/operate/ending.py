@@ -1,4 +1,4 @@
-"""The end of every flow: install it, retake something, or look for a cause. For the shell and the screen."""
+"""Recommended next step after each procedure: install, retake, or look for a cause."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from station.cell.status import SessionStatus
 
 
 class Way(StrEnum):
-    """Next step after a flow."""
+    """Next step after a procedure."""
 
     SOLVE = "solve"
     INSTALL = "install"
@@ -24,7 +24,7 @@ class Way(StrEnum):
 
 @dataclass(frozen=True)
 class Ending:
-    """A way on, and its reason in a sentence."""
+    """Recommended next step, with its reason."""
 
     way: Way
     text: str
@@ -34,7 +34,7 @@ class Ending:
 
 
 def after_capture(session: SessionStatus) -> Ending:
-    """A recording that is finished, or a session that rests."""
+    """Recommend a step after a finished or paused session."""
     failed = [str(pose.index + 1) for pose in session.poses if pose.state == "failed"]
     if failed:
         causes = {pose.reason for pose in session.poses if pose.state == "failed" and pose.reason}
@@ -46,7 +46,7 @@ def after_capture(session: SessionStatus) -> Ending:
 
 
 def after_solve(calibration: Calibration, objections: Sequence[str] = ()) -> Ending:
-    """A calibration file; `objections`: what else installing would ask a reason for."""
+    """Recommend a step after solving; `objections`: further points for which installing asks a reason."""
     quality, rejected = calibration.quality, calibration.views.rejected
     if quality.failed:
         gate = quality.failed[0]
@@ -62,7 +62,7 @@ def after_solve(calibration: Calibration, objections: Sequence[str] = ()) -> End
 
 
 def after_touches(touches: Sequence[Touch]) -> Ending:
-    """Corners that a hand found."""
+    """Recommend a step after a touch test."""
     off = [touch for touch in touches if not agrees(touch)]
     if not off:
         return Ending(Way.INSTALL, f"the tip met {len(touches)} corners as predicted")
@@ -75,7 +75,7 @@ def after_touches(touches: Sequence[Touch]) -> Ending:
 
 
 def after_drift_check(entry: CheckEntry, trend: str = "") -> Ending:
-    """A drift check of the installed calibration; `trend`: what the checks before it show."""
+    """Recommend a step after a drift check; `trend`: trend of the checks before, empty: none."""
     if trend:
         return Ending(Way.LOOK_FOR, trend)
     if entry.passed:

@@ -1,4 +1,4 @@
-"""Views that a hand guides the arm to: which are missing, and where camera and board are by them."""
+"""Views to which a person moves the arm by hand: which are missing, and the cell estimated from them."""
 
 from __future__ import annotations
 
@@ -27,43 +27,43 @@ from station.cell.scene import board_place, flange_pose
 from station.operate.draft import Draft, GuidedView
 
 FEWEST_GUIDED, MOST_GUIDED = 4, 6
-"""Views that are guided by hand."""
+"""Fewest and most views that are asked for."""
 TURN_RAD = math.radians(20.0)
-"""Turn of the flange that makes a view a new one."""
+"""Rotation of the flange from all other views from which a view counts as new."""
 _OTHER_AXIS = math.sin(math.radians(25.0))
-"""Smallest share of the turns across the main axis: then they are about more than one axis."""
+"""Smallest share of rotation across the main axis for rotations about more than one axis."""
 STILL_RAD_S, STILL_S = 0.003, 0.4
 GOOD_M, GOOD_RAD = 0.010, math.radians(2.0)
-"""1σ of the camera's pose that is enough to plan from."""
+"""1σ of the camera's pose below which the views are enough for planning."""
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 0.003, 0.01
-"""A guess is never said to be better: the true arm differs from its nominal table."""
+"""Smallest 1σ that is stated, because the true arm differs from its nominal table."""
 _MOVED_M = 0.006
-"""The board stands further apart between the views than any arm's table explains."""
+"""Spread of the board's position over the views above which it, or the camera, was moved."""
 _WRONG_SCALE = 0.03
-"""Share by which the squares may differ from what is stated before a person is told."""
+"""Relative deviation of the squares from their stated size above which a warning is given."""
 _SCALE_SIGMA, _TRAVEL_M = 0.5, 0.001
 """Prior 1σ of the scale; 1σ of the arm's travel against the camera's."""
 _LIT = 0.15
-"""Brightest part of an image without a board, of full scale, that could be read."""
+"""Level of the brightest part, of full scale, below which an image without a board is too dark."""
 _OTHER_MOUNT = 3.0
-"""The other mounting fits so many times better: the answer was wrong."""
+"""Ratio of the fits from which the other mounting is taken to be the right one."""
 
 
 def image_trouble(image: Image, found: Detection) -> tuple[str, str]:
-    """Say what is wrong with an image, for a program and for a person; both empty: the board is seen well."""
+    """Say what is wrong with an image: code and sentence; both empty: nothing."""
     advice = assess(image.pixels, found.pixels if found.found else None, image.exposure_us, image.gain_db)
     if found.cause and found.cause != "not-found":
         return found.cause, found.reason
     told = dict(advice.warnings)
     if not found.found and advice.white > _LIT:
-        told.pop("under-exposed", None)  # the board's paper is the brightest thing, and it is not there
+        told.pop("under-exposed", None)  # meaningless without the board's white paper in the image
         told.pop("low-contrast", None)
     cause = next(iter(told), "")
     return (cause, told[cause]) if cause else (found.cause, found.reason)
 
 
 def guided_view(state: RobotState, tcp_offset: Vector6, found: Detection) -> GuidedView:
-    """The view of an arm at rest."""
+    """Make a view from the state of an arm at rest and a detection."""
     return GuidedView(
         state.joints_rad,
         matrix4(flange_pose(state, tcp_offset)),
@@ -81,7 +81,7 @@ class Missing:
     turn_rad: float = 0.0
     """Turn of the flange from the nearest view so far, to `TURN_RAD`."""
     new: bool = False
-    """The arm stands where a view helps."""
+    """True when the arm stands where a view is useful."""
 
 
 _WANTED = (
@@ -95,7 +95,7 @@ _WANTED = (
 
 
 def what_is_missing(draft: Draft, joints_flange: Array | None) -> Missing:
-    """Sentence and figures for where the arm stands now, base_from_flange (4, 4); None: not known."""
+    """Say which view is missing; joints_flange: present base_from_flange (4, 4), None: not known."""
     if enough(draft):
         return Missing("")
     if len(draft.views) >= MOST_GUIDED:
@@ -116,7 +116,7 @@ def what_is_missing(draft: Draft, joints_flange: Array | None) -> Missing:
 
 
 def _turns(views: Sequence[GuidedView]) -> list[Array]:
-    """Rotation vectors of the flange from the first view to each other one."""
+    """Compute rotation vectors (3,) of the flange from the first view to each other."""
     first = np.array(views[0].base_from_flange)[:3, :3]
     return [rotation_log(first.T @ np.array(view.base_from_flange)[:3, :3]) for view in views[1:]]
 
@@ -131,7 +131,7 @@ def _across(turns: list[Array]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class FoundCell:
-    """Camera and board as the views show them."""
+    """Camera, board and mounting estimated from the views."""
 
     camera: CameraModel
     X: Array
@@ -141,11 +141,11 @@ class FoundCell:
     sigma_m: float
     sigma_rad: float
     spread_m: float
-    """Root mean square of how far the board stands apart between the views."""
+    """Rms distance of the board's positions, by single views, from their mean."""
     scale: float
-    """Size of the squares by the arm's travel over the stated size."""
+    """Size of the squares, measured by the arm's motion, over the stated size."""
     other_fits: bool
-    """The other mounting explains the views far better."""
+    """True when the other mounting explains the views far better."""
 
     @property
     def good(self) -> bool:
@@ -153,7 +153,7 @@ class FoundCell:
 
     @property
     def cause(self) -> Literal["", "other-mounting", "square-size", "moved"]:
-        """Code of what cannot be right; empty: it can."""
+        """Code of what is probably wrong; empty: nothing."""
         if self.other_fits:
             return "other-mounting"
         if abs(self.scale - 1) > _WRONG_SCALE:
@@ -162,7 +162,7 @@ class FoundCell:
 
     @property
     def warning(self) -> str:
-        """Say why this cannot be right, and what to do; empty: it can."""
+        """Say what is probably wrong, and the remedy; empty: nothing."""
         if self.cause == "other-mounting":
             return "These views fit the other drawing (step 3): the camera is mounted the other way."
         if self.cause == "square-size":
@@ -179,13 +179,13 @@ class FoundCell:
 
 
 def find_cell(draft: Draft) -> FoundCell | None:
-    """Mounting, board and a rough lens from the views, in a tenth of a second; None: they say too little."""
+    """Estimate camera and board pose and a rough lens, in about 0.1 s; None: the views are not enough."""
     if draft.mount is None or draft.board is None or len(draft.views) < 3:
         return None
     return _find(draft.mount, draft.board, draft.views, CameraModel(draft.width, draft.height))
 
 
-@lru_cache(maxsize=2)  # it is asked for with every picture
+@lru_cache(maxsize=2)  # it is called with every image
 def _find(
     mount: Mount, board: BoardSpec, guided: tuple[GuidedView, ...], blank: CameraModel
 ) -> FoundCell | None:
@@ -212,7 +212,7 @@ def _found(mount: Mount, board: BoardSpec, seen: list[CapturedView], blank: Came
     other_views, other_X, _ = solve_quickly(other, camera, True, board, seen)
     other_m = _spread_m(other, other_views, other_X)
     sigma_m, sigma_rad = quick_sigma(views, board, X, Y, True)
-    # Repeatability of the arm and a lens from few views: what the views disagree by is not less than known.
+    # Few views give a rough lens, so state at least the disagreement between the views.
     sigma_m = float(np.hypot(sigma_m, spread_m))
     return FoundCell(
         camera=_rounded(camera),
@@ -233,16 +233,16 @@ def _rounded(camera: CameraModel) -> CameraModel:
 
 
 def _spread_m(mount: Mount, views: ViewSet, X: Array) -> float:
-    """Root mean square distance of the board's places, one a view, from their middle."""
+    """Compute the rms distance of the board's positions, by single views, from their mean."""
     places = board_place(mount, views.base_from_flange, X, views.camera_from_board)[:, :3, 3]
     return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _scale(views: ViewSet, X: Array) -> float:
-    """Factor on the board's size for which camera and arm travel alike; 1 where the views cannot tell.
+    """Estimate the factor on the board's size at which camera and arm move by equal distances.
 
     AX = XB by translations (Shiu & Ahmad 1989) with t_B times an unknown factor: linear in it and in t_X.
-    Views that only turn about one point say nothing of it, so it begins as 1 ± `_SCALE_SIGMA`.
+    Views that only rotate about one point do not determine it, hence the prior 1 ± `_SCALE_SIGMA`.
     """
     flange = views.base_from_flange
     gripper = flange if views.mount == "eye-in-hand" else inverse(flange)
@@ -264,7 +264,7 @@ def _scale(views: ViewSet, X: Array) -> float:
 
 
 def enough(draft: Draft) -> bool:
-    """Tell whether the views so far are enough to plan from."""
+    """Tell whether the views so far are enough for planning."""
     if len(draft.views) < FEWEST_GUIDED or _across(_turns(draft.views)) < _OTHER_AXIS:
         return False
     found = find_cell(draft)

@@ -20,39 +20,39 @@ from station.protocol.verbs import PLANNED_ELSEWHERE, Finish, GetPlan, Go, MakeP
 R = TypeVar("R")
 Watcher = Callable[[StationStatus], None]
 Approve = Callable[[MotionPreview], Awaitable[bool]]
-"""Show a person what would move; True: they approve exactly this motion."""
+"""Function that shows a person a motion; True: they approve exactly this one."""
 PlansHere = Callable[[StationError], Awaitable[bool]]
-"""Show a person why the plan is refused; True: they want it made again from where the arm stands."""
+"""Function that shows why a plan is refused; True: make it again from where the arm stands."""
 REPLACEABLE: Criterion = "A"
-"""Poses that `MakePlan` would choose too; what a person taught, listed or asked for is never replaced."""
+"""Criterion of plans that may be replaced by a new one; taught or listed poses never are."""
 HASH_DIGITS = 12
-"""Digits of a plan's hash that are shown; fewer approve nothing."""
+"""Digits of a plan's hash that are shown, and the fewest accepted for an approval."""
 CONNECT_WAIT_S = 30.0
 PREPARE_S = 200.0
-"""Poses may be planned for it: seconds on a quick computer, minutes on a busy one."""
+"""Time-out of a preflight check, which may plan poses: up to minutes on a busy computer."""
 _RESTING = (StationState.PAUSED, StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED)
 
 
 class Link(Protocol):
-    """The daemon as a flow sees it: `station.protocol.client.Client`, or the screen's desk."""
+    """Connection to the daemon: `protocol.client.Client`, or the screen's."""
 
     @property
     def root(self) -> Path | None:
-        """Below which the daemon keeps sessions and what is installed."""
+        """Folder in which the daemon keeps sessions and installed calibrations."""
 
     @property
     def camera(self) -> str:
         """Name of the daemon's camera."""
 
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
-        """The verb's result. RefusedError with the daemon's code; StationError when it is gone."""
+        """Carry out a verb; return its result. RefusedError with the daemon's code; StationError: gone."""
 
     def statuses(self) -> AsyncIterator[StationStatus]:
-        """The full status, never older than the last call, and at every change; ends with the daemon."""
+        """Yield the status, never older than the last call, and every change; ends with the daemon."""
 
 
 async def status_now(socket: Path) -> StationStatus:
-    """The status as it is now, by a connection of its own, where none waits in a queue."""
+    """Return the present status by a new connection, on which none can be queued."""
     async with await Client.connect(socket) as client:
         async for status in client.statuses():
             return status
@@ -60,7 +60,7 @@ async def status_now(socket: Path) -> StationStatus:
 
 
 async def wait_until_idle(link: Link, *, camera: bool = True) -> StationStatus:
-    """The status once robot and camera are there. RefusedError names what does not come."""
+    """Wait until robot and camera are connected; return the status. RefusedError names what is missing."""
     status, told = StationStatus(), False
     with contextlib.suppress(TimeoutError):
         async with timeout(CONNECT_WAIT_S):
@@ -87,9 +87,9 @@ async def prepared_motion(
     headless: bool = False,
     plans_here: PlansHere | None = None,
 ) -> bool:
-    """Check the whole path, then as `approved_motion`. `changes`: what else an approval changes.
+    """Check the whole path, then go on as `approved_motion`. `changes`: other effects of the approval.
 
-    `plans_here`: who is asked whether to plan again where the plan was made from another posture.
+    `plans_here`: asks whether to plan again if the plan was made from another posture.
     """
     try:
         preview = await link.call(Prepare(purpose), timeout_s=PREPARE_S)
@@ -108,9 +108,9 @@ async def prepared_motion(
 async def approved_motion(
     link: Link, preview: MotionPreview, approve: Approve, headless: bool = False
 ) -> bool:
-    """Start the motion that a person approves. False: they do not, and nothing moves.
+    """Ask a person to approve a motion and start it. False: not approved, nothing moves.
 
-    `headless`: nobody will be asked on the way; poses that do not settle are tried once more.
+    `headless`: no person will be asked later; poses that do not settle are tried once more.
     """
     if not await approve(preview):
         return False
@@ -119,7 +119,7 @@ async def approved_motion(
 
 
 def motion_facts(preview: MotionPreview) -> list[tuple[str, str]]:
-    """Names and facts of a motion that a person approves."""
+    """List names and values of a motion's figures, for the person who approves it."""
     turn_deg = math.degrees(preview.largest_step_rad)
     return [
         ("What", f"{preview.purpose}, {preview.poses} pose{'s' * (preview.poses != 1)}"),
@@ -143,7 +143,7 @@ async def carry_out(
     headless: bool = False,
     plans_here: PlansHere | None = None,
 ) -> StationStatus:
-    """One session from its approval until it rests. RefusedError when the daemon or the person says no."""
+    """Run a session from its approval until it is finished or paused. RefusedError when refused."""
     if not await prepared_motion(link, purpose, approve, headless=headless, plans_here=plans_here):
         raise not_approved()
     return await watched(link, watch, finish_with_loss)
@@ -154,7 +154,7 @@ def not_approved() -> RefusedError:
 
 
 async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> StationStatus:
-    """Watch a session until it rests; `finish_with_loss`: finish it although poses failed."""
+    """Watch a session until it ends or pauses; `finish_with_loss`: finish it although poses failed."""
     status = await _until_rest(link, watch)
     if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
         await link.call(Finish())

@@ -1,7 +1,7 @@
-"""A new cell: from an address and a camera to a configuration, by a few views that a person guides by hand.
+"""Configuration of a new cell from an address, a camera and a few views to which the arm is moved by hand.
 
-Only reading: nothing here can move the arm, and no program is started on its controller. What was found is
-kept after every step, so that a person may leave and take it up again.
+Nothing here can move the arm or start a program on its controller. Results are saved after every step, so
+that the person can interrupt and continue later.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from station.operate.draft import STEPS, CellStep, Draft
 from station.operate.guided_views import FEWEST_GUIDED, FoundCell, enough, find_cell
 
 _ROOM_M = 0.35
-"""Room around the guided views that the workspace leaves, either way."""
+"""Margin of the workspace box around the guided views and the board, metres."""
 _BELOW_BOARD_M = 0.01
 _COUNTED = {
     BoardKind.CHESSBOARD: "columns and rows of inner corners",
@@ -42,11 +42,11 @@ _COUNTED = {
     BoardKind.ASYMMETRIC_CIRCLES: "columns and rows of circles",
     BoardKind.APRIL_GRID: "columns and rows of tags",
 }
-"""Boards that the wizard offers; a single tag shows too little of the lens."""
+"""Boards that the wizard offers, and what their columns and rows count; a single tag is not enough."""
 
 
 def next_step(draft: Draft) -> CellStep:
-    """The first step that is not done."""
+    """Return the first step that is not done."""
     if draft.robot is None:
         return CellStep.ROBOT
     if draft.camera is None:
@@ -81,10 +81,10 @@ def summary(draft: Draft, step: CellStep) -> str:
 
 
 def read_board(text: str) -> BoardSpec:
-    """A board as a person types it: '8x5 30' is a chessboard of 8 × 5 inner corners, squares of 30 mm.
+    """Parse a typed board: '8x5 30' is a chessboard of 8 × 5 inner corners, squares of 30 mm.
 
-    Others by their kind first, marker (charuco) or gap (april-grid) and dictionary last where they are not
-    the usual ones: 'charuco 8x6 30 22 DICT_5X5_100'. Raises ConfigError, BoardError.
+    Other kinds are named first; marker size (charuco) or gap (april-grid) and dictionary come last, unless
+    the defaults: 'charuco 8x6 30 22 DICT_5X5_100'. Raises ConfigError, BoardError.
     """
     words = re.sub(r"(?<=\d) *mm|,", " ", text.replace("×", "x")).split()
     try:
@@ -115,7 +115,7 @@ def board_words(board: BoardSpec) -> str:
 
 
 def limits_of(draft: Draft, found: FoundCell) -> LimitsConfig:
-    """Table and workspace from where the arm was guided and where the board is."""
+    """Derive table and workspace limits from the guided views and the board's pose."""
     flanges = np.array([view.base_from_flange for view in draft.views])
     places = [flanges[:, :3, 3]]
     if draft.mount == "eye-in-hand":
@@ -146,7 +146,7 @@ def _rounded3(values: Array) -> Vector3:
 
 
 def made_config(draft: Draft) -> StationConfig:
-    """The configuration of the draft. RefusedError names the step that is missing."""
+    """Make the configuration from the draft. RefusedError names the step that is missing."""
     found = find_cell(draft)
     if draft.robot is None or draft.camera is None or draft.board is None or draft.mount is None or not found:
         step = next_step(draft)
@@ -172,7 +172,7 @@ def made_config(draft: Draft) -> StationConfig:
 
 
 def _seen_at(found: FoundCell, draft: Draft) -> Array:
-    """The board's middle in `camera` at the first view, m."""
+    """Compute the board's centre (3,) in `camera` at the first view, m."""
     assert draft.board is not None
     flange = np.array(draft.views[0].base_from_flange)
     in_hand = draft.mount == "eye-in-hand"
@@ -189,7 +189,7 @@ def _guess(T: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
 
 
 def config_text(config: StationConfig) -> str:
-    """The configuration as YAML with comments, as a person would want to read and edit it."""
+    """Write the configuration as YAML with comments, for people to read and edit."""
 
     def flow(value: object) -> str:
         return msgspec.json.encode(value).decode().replace('"', "").replace(",", ", ").replace(":", ": ")
@@ -242,9 +242,9 @@ def config_text(config: StationConfig) -> str:
 
 
 def write_config(draft: Draft, path: Path) -> StationConfig:
-    """Write the file, read it back as the daemon does, and check that a plan can be asked for.
+    """Write the file, read it back as the daemon does, and check that planning has all it needs.
 
-    A file that is there is kept beside it as `.before`. Raises ConfigError, RefusedError, OSError.
+    An existing file is kept as `.before`. Raises ConfigError, RefusedError, OSError.
     """
     config = made_config(draft)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
-"""The judge of the acceptance test: the samples of one stopped move → its figures against limits.
+"""Evaluation of a stop in the acceptance test: from the states of one move to figures with limits.
 
-A pure function of what the controller told. Times are the controller's own; the moment of the stop, in host
-time, is placed in them by the quickest sample of the trace (RTDE's delay is never negative).
+Pure functions of the controller's states. Times are on the controller's clock; the time of the stop is
+converted from host time by the state that arrived with the least delay.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from station.cell.acceptance import Figure, StopWay
 RESTING_RAD_S = 0.01
 """An arm slower than this rests: joint speeds of a resting UR read up to some mrad/s."""
 REST_S = 0.1
-"""For so long, before it counts as rest."""
+"""Time for which the arm must be slower than `RESTING_RAD_S` to count as at rest."""
 SLOWER = 0.9
-"""Share of its speed below which the arm obeys."""
+"""Share of the speed below which the arm counts as having reacted to the stop."""
 WINDOW_S = 0.02
-"""Decelerations are means over this time: single differences at 500 Hz are noise."""
+"""Time over which decelerations are averaged, as single differences at 500 Hz are noise."""
 BRAKING_RAD_S2 = 2.0
 WATCHED_S = 1.0
-"""For so long it is watched at rest."""
+"""Time for which the resting arm is observed after the stop."""
 CONTROLLER_S = 0.05
 RUNNING, SAFE_MODES, SAFE_BITS = 7, (1, 2), 0b11
 """RTDE guide: robot_mode 7 running, safety_mode 1 normal, 2 reduced, safety_status_bits 0 and 1 the same."""
@@ -38,19 +38,19 @@ REACTION_S: dict[StopWay, tuple[float, str]] = {
     StopWay.KILLED: (0.2 + CONTROLLER_S, "0.2 s watchdog, whatever else stops it, and 0.05 s"),
     StopWay.FROZEN: (0.3 + CONTROLLER_S, _WATCHDOG_RULE),
 }
-"""Longest time until the arm is slower, and why."""
+"""Longest time until the arm reacts, and the reason for this limit."""
 _BRAKES = "brakes with at least 2 rad/s², half of what the station asks for"
 ABRUPT = 8.0, "twice the 4 rad/s² that the station asks for"
 REPEATS_RAD = 0.001, "ten times a UR's repeatability (0.1 mm at 1.3 m)"
 BACK_RAD = 0.002, "twenty times a UR's repeatability"
 GAP_S = 0.04
-"""Five cycles of a CB3: with less news than that a stop is not measured."""
+"""Longest gap between states with which a stop counts as measured: five cycles of a CB3."""
 FEWEST_SAMPLES = 50
 
 
 @dataclass(frozen=True)
 class StopMove:
-    """The move that was approved, and what was to end it."""
+    """Approved move, and the way in which it was stopped."""
 
     way: StopWay
     joint: int
@@ -60,11 +60,11 @@ class StopMove:
     speed_rad_s: float
     """Planned speed of that joint."""
     moment_ns: int | None
-    """Time of the stop (host monotonic); None: it was not given."""
+    """Time of the stop (host monotonic); None: it was not triggered."""
 
 
 class Trace:
-    """Samples of one move as arrays; n of them, at least one."""
+    """States of one move as arrays of n ≥ 1 samples."""
 
     def __init__(self, states: Sequence[RobotState], move: StopMove) -> None:
         self.move = move
@@ -79,7 +79,7 @@ class Trace:
 
     @property
     def fastest(self) -> Array:
-        """(n,) rad/s of the fastest joint."""
+        """Speed (n,) of the fastest joint, rad/s."""
         return np.asarray(np.abs(self.speeds).max(axis=1, initial=0.0))
 
     @property
@@ -91,9 +91,9 @@ class Trace:
 
 
 def judge(states: Sequence[RobotState], move: StopMove) -> tuple[tuple[Figure, ...], str]:
-    """All figures of this move, or why it was not measured.
+    """Compute all figures of a move, or say why it was not measured.
 
-    What a gap in the samples cannot feign fails all the same: safety that holds the arm, and too much speed.
+    A safety stop and too high a speed fail even if the states have gaps, as gaps cannot cause them.
     """
     if len(states) < FEWEST_SAMPLES:
         return (), f"{len(states)} samples of the arm came (≥ {FEWEST_SAMPLES})"
@@ -112,7 +112,7 @@ def judge(states: Sequence[RobotState], move: StopMove) -> tuple[tuple[Figure, .
 
 
 def _not_measured(trace: Trace, moment: int, rest: int | None) -> str:
-    """Why this move says nothing of the stop; empty: it does."""
+    """Say why the stop of this move was not measured; empty: it was."""
     move = trace.move
     if trace.gap_s > GAP_S:
         return f"no news of the arm for {trace.gap_s:.3f} s (≤ {GAP_S:g}): computer or network is busy"
@@ -129,7 +129,7 @@ def _speed_at(trace: Trace, moment: int) -> float:
 
 
 def _held(state: RobotState) -> bool:
-    """Any of the fields that can tell it: a controller may tell in one only."""
+    """Tell whether safety holds the arm, by any of the fields that may show it."""
     unsafe = state.safety_mode not in SAFE_MODES or bool(state.safety_status_bits & ~SAFE_BITS)
     return unsafe or state.robot_mode != RUNNING
 
@@ -154,7 +154,7 @@ def _stop(trace: Trace, moment: int, rest: int | None) -> list[Figure]:
 
 
 def rest_index(time_s: Array, fastest: Array, start: int) -> int | None:
-    """The first sample from which on the arm rests for `REST_S`; None: it does not."""
+    """Find the first sample from which the arm rests for `REST_S`; None: there is none."""
     moving = np.flatnonzero(fastest[start:] >= RESTING_RAD_S) + start
     ends = np.concatenate([[start], moving + 1])
     following = np.concatenate([moving, [len(fastest)]])
@@ -165,7 +165,7 @@ def rest_index(time_s: Array, fastest: Array, start: int) -> int | None:
 
 
 def _deceleration(trace: Trace, moment: int) -> float:
-    """Largest mean loss of speed of the fastest joint over `WINDOW_S` after the stop, rad/s²."""
+    """Compute the largest deceleration of the fastest joint, over `WINDOW_S`, after the stop, rad/s²."""
     time_s, fastest = trace.time_s[moment:], trace.fastest[moment:]
     later = np.searchsorted(time_s, time_s + WINDOW_S - 1e-6)
     found = later < len(time_s)
@@ -176,7 +176,7 @@ def _deceleration(trace: Trace, moment: int) -> float:
 
 
 def _after_rest(trace: Trace, rest: int) -> list[Figure]:
-    """Judge that it neither swings back nor drifts nor goes on, for as long as it is watched."""
+    """Judge whether the arm swings back, drifts or moves on after its rest."""
     settled = min(int(np.searchsorted(trace.time_s, trace.time_s[rest] + REST_S)), len(trace.time_s) - 1)
     drift = float(np.abs(trace.joints[settled:] - trace.joints[settled]).max())
     gone = trace.direction * trace.joints[:, trace.move.joint]

@@ -1,6 +1,6 @@
-"""The touch test: a person brings a tip onto corners of the board, and the arm's position tells each offset.
+"""Touch test: a person puts a tip on corners of the board; the arm's position gives each offset.
 
-Nothing moves by it: the arm is guided in freedrive, or jogged on the pendant.
+The station moves nothing: the arm is moved in freedrive or jogged on the pendant.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from station.protocol.verbs import Configuration, Observe
 
 LOOK_S = 30.0
 _TOUCHING_M, _BESIDE_M = 0.01, 0.05
-"""A tip is on the board, and at a corner, within these."""
+"""Largest distance of the tip from the board, and from the corner, for a touch."""
 _SHORTEST_M, _LONGEST_M = 0.01, 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:
-    """The board by the calibration under test and one image."""
+    """Board pose by the calibration under test and one image."""
 
     calibration: Calibration
     view: BoardView
@@ -110,7 +110,7 @@ def read_touch(
 
 
 def pointer_tip(board: SeenBoard, length_m: float | None) -> tuple[Vector3, str]:
-    """The tip in `flange`, and words for it: as asked for, as configured, or the pendant's tool."""
+    """Return the tip in `flange` and its description: by `length_m`, configuration, or the pendant's TCP."""
     if length_m is not None:
         if not _SHORTEST_M <= length_m <= _LONGEST_M:
             text = f"A pointer is 10 to 1000 mm long, not {1000 * length_m:g} mm."
@@ -130,7 +130,7 @@ def pointer_tip(board: SeenBoard, length_m: float | None) -> tuple[Vector3, str]
 
 
 def _offset_mm(corner: int, corner_m: Array, touching_m: Array) -> Array:
-    """(2,) what the tip would miss the true corner by, sent there by the calibration."""
+    """Compute the offset (2,), mm, of the tip from the true corner if the calibration sent it there."""
     height_m = abs(float(touching_m[2]))
     if height_m > _TOUCHING_M:
         raise RefusedError(
@@ -153,14 +153,14 @@ def _offset_mm(corner: int, corner_m: Array, touching_m: Array) -> Array:
 
 
 def _mm(metres: Array) -> tuple[float, float]:
-    """x and y."""
+    """Convert x and y to mm."""
     return round(1000 * float(metres[0]), 3), round(1000 * float(metres[1]), 3)
 
 
 def note_touches(
     root: Path | None, file: Path | None, touches: list[Touch], camera: str = MAIN_CAMERA
 ) -> str:
-    """Keep what was found in the file and in the installed calibration of the same solve; what next, too.
+    """Save touch tests in the file and in the installed calibration of the same solve; describe the result.
 
     `file`: None: the installed one of `camera` alone. Raises CalibrationError, OSError.
     """

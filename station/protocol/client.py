@@ -27,13 +27,13 @@ R = TypeVar("R")
 CONNECT_S = 5.0
 ANSWER_S = 30.0
 _ANSWER_LIMIT_BYTES = 8 * 1024 * 1024
-"""The daemon is trusted more than its clients are: a preview is larger than any request."""
+"""Largest answer accepted, more than a request, as a preview image is larger."""
 
 
 _SUSPECT = re.compile(
     rb"\\(u00[01]|[bfr])|\x7f|\xc2[\x80-\x9f]|\xe2(\x80[\x8e\x8f\xaa-\xae]|\x81[\xa6-\xa9])"
 )
-"""Control characters for a terminal, as JSON writes them; lines without them are taken as they are."""
+"""Pattern of control characters that could affect a terminal, as encoded in JSON."""
 
 
 class DaemonGoneError(StationError):
@@ -43,13 +43,13 @@ class DaemonGoneError(StationError):
 
 
 class NoAnswerError(StationError):
-    """The daemon holds the connection and says nothing: it hangs, or its computer is far too busy."""
+    """The daemon does not answer although connected: it hangs, or its computer is overloaded."""
 
     code = "no-answer"
 
 
 def who_am_i() -> str:
-    """Return 'anna on tty1', which others read as who has control."""
+    """Return user and terminal, as 'anna on tty1', by which others see who has control."""
     try:
         terminal = " on " + os.ttyname(0).removeprefix("/dev/")
     except OSError:
@@ -73,7 +73,7 @@ class _Incoming(msgspec.Struct):
 
 
 class Client:
-    """A connection. Losing it loses control: the daemon then decelerates the arm and pauses."""
+    """Connection to the daemon. If it is lost, so is control: the daemon stops the arm and pauses."""
 
     def __init__(self, path: Path, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._path, self._reader, self._writer = path, reader, writer
@@ -83,16 +83,16 @@ class Client:
         self._fresh = asyncio.Event()
         self._gone = False
         self.root = Path()
-        """Below which the daemon keeps sessions and what is installed."""
+        """Folder in which the daemon keeps sessions and installed calibrations."""
         self.camera = MAIN_CAMERA
         self.max_age_days: float | None = None
         self._one_at_a_time = asyncio.Lock()
-        """Pieces of two long requests must not mix."""
+        """Lock that keeps the pieces of two long requests apart."""
         self._task = asyncio.create_task(self._read(), name="client-read")
 
     @classmethod
     async def connect(cls, path: Path, who: str = "") -> Client:
-        """Raises DaemonGoneError with the remedy when nobody serves there."""
+        """Connect to a daemon. DaemonGoneError with the remedy when none serves the socket."""
         try:
             async with asyncio.timeout(CONNECT_S):
                 reader, writer = await asyncio.open_unix_connection(str(path), limit=_ANSWER_LIMIT_BYTES)
@@ -121,15 +121,15 @@ class Client:
         return client
 
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
-        """The verb's result. Raises RefusedError with the daemon's code, DaemonGoneError, NoAnswerError."""
+        """Carry out a verb; return its result. Raises RefusedError, DaemonGoneError, NoAnswerError."""
         answer = await self.request(verb.verb(), timeout_s=timeout_s, **msgspec.to_builtins(verb))
         result: R = msgspec.convert(answer, verb.result())
         return result
 
     async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: object) -> object:
-        """Calls a verb by its name; the result as plain data."""
+        """Carry out a verb by its name; return its result as plain data."""
         if verb == "stop":
-            send_stop(self._path)  # nobody can hold this up; the request brings the answer
+            send_stop(self._path)  # by STOP's own socket, which cannot be delayed; then ask for the answer
         if self._gone:
             raise DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
         request = Request(self._next_id, verb, args)
@@ -177,9 +177,9 @@ class Client:
             return await self.request("whole", timeout_s=timeout_s)
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
-        """The status now and after every change (slow readers see the newest only).
+        """Yield the status now and after every change (a slow reader gets only the newest).
 
-        Never one from before the last answer: the daemon tells the changes first.
+        Never older than the last answer, before which the daemon sends the changes.
         """
         await self.request("watch")
         if self._plain_status is not None:
@@ -212,7 +212,7 @@ class Client:
                     message = msgspec.convert(plain_data(msgspec.to_builtins(message)), _Incoming)
                 self._take(message)
         except (OSError, ValueError, msgspec.DecodeError):
-            pass  # A daemon that speaks nonsense is as good as gone.
+            pass  # treat invalid messages as a lost connection
         finally:
             self._gone = True
             for answer in self._waiting.values():
@@ -233,7 +233,7 @@ class Client:
         self._fresh.set()
 
     def _gone_error(self) -> DaemonGoneError:
-        """Make the error of a daemon that was lost while asked: it may have done what it was asked for."""
+        """Make the error for a daemon lost during a request, which may or may not have been carried out."""
         return DaemonGoneError(
             f"The station daemon at {self._path} is gone and did not answer: whether it heard this is not "
             "known.",
@@ -243,7 +243,7 @@ class Client:
 
 
 def ask(path: Path, verb: Verb[R]) -> R:
-    """One question from a plain program, no event loop needed. Raises as `Client.call` does."""
+    """Carry out one verb without an event loop. Raises as `Client.call` does."""
 
     async def once() -> R:
         async with await Client.connect(path) as client:

@@ -18,11 +18,11 @@ from station.cell.status import StationStatus
 
 LINE_LIMIT_BYTES = 64 * 1024
 REQUEST_LIMIT_BYTES = 2 * 1024 * 1024
-"""For a request in pieces: a plan of some thousand poses. A connection costs no more memory than that."""
+"""Largest request in pieces, enough for a plan of some thousand poses; bounds memory per connection."""
 PIECE_BYTES = 32 * 1024
 CLIENT_LIMIT = 64
 USER_CLIENT_LIMIT = 16
-"""One user cannot take the others' places."""
+"""Most clients of one user, so that places are left for others."""
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -36,7 +36,7 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     ok: bool
     result: object = None
     error: str = ""
-    """A sentence for a person; for programs: `problem`."""
+    """Error as a sentence for people; for programs see `problem`."""
     problem: ErrorData | None = None
 
     @classmethod
@@ -45,7 +45,7 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Notice(msgspec.Struct, frozen=True, omit_defaults=True):
-    """An unasked-for line to a watcher; exactly one field is set."""
+    """Message to a watcher without a request; exactly one field is set."""
 
     status: StationStatus | None = None
     changes: dict[str, object] | None = None

@@ -1,4 +1,4 @@
-"""The one table of what state may follow what; in which a verb is allowed stands in `protocol.verbs`.
+"""Table of allowed state transitions; the states in which a verb is allowed are in `protocol.verbs`.
 
     disconnected ──> idle ──go──> checking ──> moving ──> settling ──> capturing ──> writing
                       ^  ^                       ^            pose by pose            │
@@ -33,12 +33,12 @@ TRANSITIONS: dict[S, frozenset[S]] = {
 }
 
 RUNNING = frozenset({S.CHECKING, S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING})
-"""An approved motion is under way: the control child may live, heartbeats flow."""
+"""States during an approved motion, in which the control process may run and heartbeats are sent."""
 RESTING = frozenset({S.IDLE, S.PAUSED})
 
 
 class TransitionError(Exception):
-    """A step that the table does not know: a defect of the program, never of a person."""
+    """Transition that the table does not allow: a defect of the program."""
 
 
 def check_transition(old: S, new: S) -> None:

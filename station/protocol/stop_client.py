@@ -1,9 +1,9 @@
-"""`station stop` without the command line's libraries: one datagram, then a look at what became of it.
+"""`station stop`, without slow imports: sends a datagram, then checks its effect.
 
-STOP is sent wherever something listens; that it worked is claimed only when the genuine daemon says so: on
+STOP is sent to whatever listens on the socket. It is reported as done only if the genuine daemon says so on
 the motion page, a small file beside the socket that only the daemon's user can have made. It tells how many
-STOPs were carried out, and whether the arm rests. Answers would go through a queue that somebody else can
-fill; a file is read by any number of readers, and nobody can hold it up.
+STOPs were carried out, and whether the arm rests. A file is used because other users could delay answers by
+filling a queue.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from station.cell.socket_folder import (
 _MAGIC = b"STATION1"
 _LAYOUT = struct.Struct("<8sIIQ")
 HEARD_S = 0.8
-"""A person at the emergency stop waits no longer for an answer."""
+"""Longest wait for a confirmation, as the person may need the emergency stop."""
 REST_S = 3.0
 _LOOK_S = 0.005
 
 
 class Motion(IntEnum):
     UNKNOWN = 0
-    """No fresh state from the robot"""
+    """No current state from the robot"""
     MOVES = 1
     RESTS = 2
 
@@ -48,7 +48,7 @@ class Page(NamedTuple):
     pid: int
     motion: Motion
     stops: int
-    """STOPs that were carried out in the daemon's life."""
+    """Number of STOPs carried out since the daemon's start."""
 
 
 def packed(page: Page) -> bytes:
@@ -56,11 +56,11 @@ def packed(page: Page) -> bytes:
 
 
 def create_page(path: Path, page: Page) -> int:
-    """The descriptor of a new file, readable by the group. Raises OSError."""
+    """Create the motion page, readable by the group; return its descriptor. Raises OSError."""
     path.unlink(missing_ok=True)
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     descriptor = os.open(path, flags, 0o640)
-    os.fchmod(descriptor, 0o640)  # whatever the umask
+    os.fchmod(descriptor, 0o640)  # independent of the umask
     write_page(descriptor, page)
     return descriptor
 
@@ -71,7 +71,7 @@ def write_page(descriptor: int, page: Page) -> None:
 
 
 def open_page(path: Path, owners: set[int]) -> int:
-    """A descriptor to read from. Raises PermissionError where the file is not one of `owners`', OSError."""
+    """Open the motion page for reading. PermissionError where its owner is not in `owners`, OSError."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     status = os.fstat(descriptor)
     if not stat.S_ISREG(status.st_mode) or status.st_uid not in owners:
@@ -81,7 +81,7 @@ def open_page(path: Path, owners: set[int]) -> int:
 
 
 def read_page(descriptor: int | None) -> Page | None:
-    """None when there is none, or it is not (yet) a whole one."""
+    """Read the motion page; None when there is none, or it is incomplete."""
     if descriptor is None:
         return None
     raw = os.pread(descriptor, _LAYOUT.size, 0)
@@ -106,7 +106,7 @@ class Outcome(Enum):
 
 
 def main(arguments: Sequence[str]) -> int | None:
-    """The exit code: 0 only when the arm rests. None for arguments that are the full command line's."""
+    """Run `station stop`; return the exit code, 0 only when the arm rests. None: not for this program."""
     match list(arguments):
         case []:
             control = default_socket()
@@ -126,7 +126,7 @@ def stop_and_tell(control: Path) -> int:
 
 
 def send_stop(control: Path) -> bool:
-    """Puts one STOP into the daemon's queue without waiting for what comes of it; False: not queued."""
+    """Send STOP without waiting for its effect; False: it could not be sent."""
     try:
         with _link(control) as link:
             link.send(b"STOP")
@@ -136,7 +136,7 @@ def send_stop(control: Path) -> bool:
 
 
 def stop(control: Path) -> tuple[Outcome, str]:
-    """Sends STOP, and looks whether the genuine daemon heard it and the arm rests; why it is UNTRUSTED."""
+    """Send STOP and check that the genuine daemon carried it out; return the outcome, and why UNTRUSTED."""
     try:
         owners = {folder_owner(control.parent), ROOT}
     except UntrustedFolderError as error:
@@ -164,7 +164,7 @@ def _stop(control: Path, page: int | None) -> Outcome:
     before = read_page(page)
     try:
         with _link(control) as link, contextlib.suppress(BlockingIOError):
-            # A full queue is full of STOPs: the daemon stops the arm all the same.
+            # A full queue holds nothing but STOPs, so the daemon stops the arm anyway.
             link.send(b"STOP")
     except (FileNotFoundError, ConnectionRefusedError):
         return Outcome.NO_DAEMON

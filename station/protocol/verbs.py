@@ -1,4 +1,4 @@
-"""The one table of what a client may ask of the daemon: each class here is a verb.
+"""Table of the daemon's verbs: each class is a request that a client may send.
 
 Its fields are the arguments, its type parameter the result, its docstring the line of help; `states` says in
 which states it is allowed, `control` whether only the client that has control may ask. Dispatch, client,
@@ -36,9 +36,9 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
     states: ClassVar[frozenset[S]] = _ANY
     control: ClassVar[bool] = True
     spoken: ClassVar[str] = ""
-    """Its name for people, where that is not the verb's."""
+    """Name for people; empty: the verb's name."""
     wire: ClassVar[str] = ""
-    """Its name on the wire, where that is not the class's (`LoadPlan`: load_plan)."""
+    """Name in messages; empty: derived from the class's (`LoadPlan`: load_plan)."""
 
     @classmethod
     def verb(cls) -> str:
@@ -46,7 +46,7 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def result(cls) -> Any:
-        """The type of its result."""
+        """Type of the verb's result."""
         return get_args(cls.__orig_bases__[0])[0]  # type: ignore[attr-defined]
 
     @classmethod
@@ -55,7 +55,7 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def refusal(cls, state: S) -> RefusedError | None:
-        """Say why it is not possible in this state; None where it is."""
+        """Make the error where the verb is not allowed in a state; None where it is."""
         if state in cls.states:
             return None
         why, remedy = _NOT_NOW.get(state, (f"the session is {state.value}", "Pause or stop it first."))
@@ -83,23 +83,23 @@ _NOT_NOW: dict[S, tuple[str, str]] = {
 
 
 class Done(msgspec.Struct, frozen=True):
-    """Reply of a verb that has nothing to tell."""
+    """Empty result."""
 
 
 class Welcome(msgspec.Struct, frozen=True):
     version: str
     pid: int
     root: str
-    """Folder of the sessions and of what is installed."""
+    """Folder of sessions and installed calibrations."""
     camera: str = MAIN_CAMERA
-    """Name of the daemon's camera: under it its calibrations are installed."""
+    """Name of the daemon's camera, under which its calibrations are installed."""
     max_age_days: float | None = None
-    """Oldest proof of a calibration, by the cell's own rule; None: none."""
+    """Largest age of the last proof of a calibration in this cell; None: no limit."""
 
 
 class LoadedPlan(msgspec.Struct, frozen=True, omit_defaults=True):
     plan: Plan | None = None
-    """None: there is none."""
+    """The loaded plan; None: there is none."""
     sha256: str = ""
 
 
@@ -114,16 +114,16 @@ class PoseNumber(msgspec.Struct, frozen=True):
 
 class PreviewImage(msgspec.Struct, frozen=True, omit_defaults=True):
     jpeg_base64: str = ""
-    """Empty: the camera shows nothing."""
+    """JPEG in base64; empty: there is no image."""
     width: int = 0
     height: int = 0
     corners: tuple[tuple[float, float], ...] = ()
-    """The board's, as shares of the image's sides."""
+    """The board's corners, as shares of the image's sides."""
     sequence: int = 0
 
 
 class Observation(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The tag in an image, and the arm at mid-exposure."""
+    """Detection of a tag in an image, and the arm's pose at mid-exposure."""
 
     mount: Mount
     source: Source
@@ -131,7 +131,7 @@ class Observation(msgspec.Struct, frozen=True, omit_defaults=True):
     camera_serial: str
     wall_ns: int
     rested_s: float
-    """Time that the arm had rested by then."""
+    """Time for which the arm had rested by then."""
     base_from_flange: Matrix4
     joints_rad: Vector6
     width: int
@@ -153,11 +153,11 @@ class Check(msgspec.Struct, frozen=True):
 
 
 PLANNED_ELSEWHERE = "planned-elsewhere"
-"""Code of a refused plan: all that is not free is the way from where the arm stands to its first pose."""
+"""Error code of a plan of which only the path from the arm's posture to the first pose is not free."""
 
 
 class Purpose(StrEnum):
-    """The aim of a motion that is prepared."""
+    """Purpose of a motion that is to be approved."""
 
     RUN = "run"
     DRIFT_CHECK = "check"
@@ -179,7 +179,7 @@ class Watch(Verb[Done], frozen=True):
 
 
 class Lease(Verb[status.LeaseStatus], frozen=True):
-    """Take or release control; `lost`: nobody is at the screen that has it."""
+    """Take or release control; `lost`: the person left the screen that has it."""
 
     control = False
     action: Literal["take", "release", "lost"] = "take"
@@ -222,7 +222,7 @@ class MakePlan(Verb[PlanFacts], frozen=True):
     seed: int = 0
     lens_known: bool = False
     aim: Literal["camera", "arm", "both"] = "camera"
-    """Aim of the poses: where the camera is, the arm's table too, or all there is."""
+    """What the poses should determine: the camera pose, the arm's table, or both and the lens."""
 
 
 class Prepare(Verb[MotionPreview], frozen=True):
@@ -245,7 +245,7 @@ class StopTest(Verb[StopTestOffer], frozen=True):
     """Speed of the fastest modelled point."""
     joint: Annotated[int, msgspec.Meta(ge=0, le=5)] = 0
     forward: bool = True
-    """The direction that is tried first."""
+    """Direction that is tried first."""
 
 
 class Go(Verb[Done], frozen=True):
@@ -255,7 +255,7 @@ class Go(Verb[Done], frozen=True):
     token: str
     plan_sha256: str = ""
     headless: bool = False
-    """Nobody will be asked: poses that do not come to rest are tried once more."""
+    """No person will be asked later: poses that do not settle are tried once more."""
 
 
 class Pause(Verb[Done], frozen=True):

@@ -1,7 +1,7 @@
-"""The print on a board: albedo as a function of the place on it.
+"""Print of a board: albedo as a function of position.
 
-The place (0, 0) and the directions are those of the board's points: x to the right, y down, z into the
-board. Markers are laid out by OpenCV's own board classes, so that its detectors see what they expect.
+Origin and axes are those of the board's points: x to the right, y down, z into the board. Markers are laid
+out by OpenCV's own board classes, as its detectors expect.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 Floats = NDArray[np.float32]
 Ink = Callable[[Floats, Floats], NDArray[np.bool_]]
-"""Places (any equal shapes), metres → where it is black."""
+"""Function of positions x, y (arrays of one shape), metres → mask of black ones."""
 Markers = Sequence[tuple[float, float, float, NDArray[np.bool_]]]
 """x, y of the corner and side, metres; black cells (n, n), border included"""
 
@@ -30,14 +30,14 @@ APRIL_GRID_BORDER_BITS = 1
 
 @dataclass(frozen=True, eq=False)
 class BoardPrint:
-    """A piecewise constant print on a white sheet."""
+    """Piecewise constant print on a white sheet."""
 
     sheet_m: tuple[float, float, float, float]
     """x0, y0, x1, y1 of the white sheet"""
     black: Ink
 
     def albedo(self, x_m: Floats, y_m: Floats, around: float) -> Floats:
-        """Reflectance at places (any equal shapes); `around` beyond the sheet."""
+        """Compute the albedo at positions (arrays of one shape), metres; `around`: that beyond the sheet."""
         x0, y0, x1, y1 = self.sheet_m
         value = np.where(self.black(x_m, y_m), np.float32(BLACK), np.float32(WHITE))
         on_sheet = (x_m >= x0) & (x_m <= x1) & (y_m >= y0) & (y_m <= y1)
@@ -45,7 +45,7 @@ class BoardPrint:
 
 
 def _squares(columns: int, rows: int, square_m: float, first_white: bool = False) -> Ink:
-    """Chequered squares; the first (top left) one begins a square before the frame, and is black."""
+    """Make a chequered pattern; the top left square is black and begins one square before the origin."""
 
     def black(x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
         i = np.floor((x_m + np.float32(square_m)) * np.float32(1 / square_m))
@@ -59,7 +59,7 @@ def _squares(columns: int, rows: int, square_m: float, first_white: bool = False
 
 
 def _dots(centres_m: NDArray[np.float32], radius_m: float) -> Ink:
-    """centres_m: (n, 2)."""
+    """Make black dots around centres (n, 2), metres."""
 
     def black(x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
         inked = np.zeros(x_m.shape, dtype=bool)
@@ -71,7 +71,7 @@ def _dots(centres_m: NDArray[np.float32], radius_m: float) -> Ink:
 
 
 def _markers(markers: Markers, beneath: Ink | None = None) -> Ink:
-    """Square markers over what lies beneath."""
+    """Make square markers on top of another pattern."""
 
     def black(x_m: Floats, y_m: Floats) -> NDArray[np.bool_]:
         inked = np.zeros(x_m.shape, dtype=bool) if beneath is None else beneath(x_m, y_m)
@@ -88,7 +88,7 @@ def _markers(markers: Markers, beneath: Ink | None = None) -> Ink:
 
 @lru_cache(maxsize=8)
 def board_print(board: BoardSpec) -> BoardPrint:
-    """The print of a board with a white margin of at least half a square around it."""
+    """Make the print of a board with a white margin of at least half a square."""
     columns, rows, s = board.columns, board.rows, board.square_m
     if board.kind is BoardKind.CHESSBOARD:
         sheet = (-1.5 * s, -1.5 * s, (columns + 0.5) * s, (rows + 0.5) * s)
@@ -128,7 +128,7 @@ def _marker(
 
 
 def _charuco_markers(board: BoardSpec) -> Markers:
-    """OpenCV counts from the outer corner of the first square, the board's frame from the first inner one."""
+    """Place ChArUco markers; OpenCV's origin is the outer corner, the board's the first inner corner."""
     dictionary = _dictionary(board, "DICT_4X4_250")
     marker_m = board.marker_m or 0.75 * board.square_m
     layout = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, marker_m, dictionary)
@@ -146,9 +146,9 @@ def _single_tag(board: BoardSpec) -> BoardPrint:
 
 
 def _april_grid(board: BoardSpec) -> BoardPrint:
-    """Tags of side `square_m`, `marker_m` apart, numbered as Kalibr does: row by row from the bottom left.
+    """Make tags of side `square_m`, `marker_m` apart, numbered as by Kalibr: by rows from the bottom left.
 
-    Small black squares where the gaps cross, as on Kalibr's print.
+    As on Kalibr's print, small black squares are where the gaps cross.
     """
     side, gap = board.square_m, board.marker_m or 0.3 * board.square_m
     dictionary = _dictionary(board, APRIL_DICTIONARY)

@@ -1,4 +1,4 @@
-"""A camera of a simulated cell: renders, in a process of its own, what the arm's true pose shows."""
+"""Camera of a simulated cell, whose images are rendered in another process from the arm's true pose."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _REOPEN = "Open it again."
 
 
 class RenderedCamera:
-    """`station.devices.base.Camera` of a simulated cell. `controller_host`: whose arm it looks at."""
+    """Rendered camera behind `devices.base.Camera`. `controller_host`: the simulated arm's address."""
 
     def __init__(
         self,
@@ -69,12 +69,12 @@ class RenderedCamera:
         return self.counter.counts()
 
     def pulse(self) -> None:
-        """An edge on the trigger line; from any thread. Nobody sees it while the camera is not open."""
+        """Deliver an edge on the trigger line; from any thread. Ignored while the camera is not open."""
         if self._loop is not None and self._process is not None:
             self._loop.call_soon_threadsafe(self._write, {"cmd": "trigger"})
 
     async def open(self) -> CameraIdentity:
-        """Starts the process and reads its clock a few times."""
+        """Start the process and read its clock a few times."""
         self._loop = asyncio.get_running_loop()
         self._process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "station.simulation.camera_process"),
@@ -92,9 +92,9 @@ class RenderedCamera:
             "gain_db": self._gain_db,
         }
         try:
-            async with self._asking:  # whoever asks for an image meanwhile finds the clock read
+            async with self._asking:  # so that images are taken only after the clock was read
                 await self._ask_locked(setup, START_TIMEOUT_S)
-                self._clock.restart()  # not before: without a reading it counts as one that cannot be read
+                self._clock.restart()  # not before: a clock without readings counts as unreadable
                 for _ in range(_CLOCK_READINGS):
                     await self._read_clock()
         except BaseException:
@@ -103,7 +103,7 @@ class RenderedCamera:
         return self.identity
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        """One trigger, one frame; a frame that was there before the trigger is an error, not the answer."""
+        """Trigger once and return that frame; a frame from before the trigger is an error."""
         async with self._asking:
             await self._read_clock()
             if surplus := self._frames.qsize():
@@ -138,7 +138,7 @@ class RenderedCamera:
         }
 
     async def glimpse(self) -> Image | None:
-        """At half the size, rendered anew."""
+        """Render a new image at half the size."""
         picture = await self._ask({"cmd": "preview"}, _ANSWER_S)
         assert isinstance(picture, Image)
         return picture
@@ -150,7 +150,7 @@ class RenderedCamera:
             return None
 
     async def inject(self, fault: str, value: object = None) -> None:
-        """Arms a fault of `camera_faults`; 'unplugged' ends the process."""
+        """Inject a fault of `CameraFaults`; 'unplugged' ends the process."""
         if fault == "unplugged":
             self._write({"cmd": "fault", "name": fault})
             return
@@ -193,7 +193,7 @@ class RenderedCamera:
 
     async def _ask_locked(self, request: Json, timeout_s: float) -> Image | Json:
         while not self._answers.empty():
-            self._answers.get_nowait()  # an answer that came after its deadline
+            self._answers.get_nowait()  # discard answers that came too late
         self._write(request)
         try:
             answer = await asyncio.wait_for(self._answers.get(), timeout_s)
@@ -210,7 +210,7 @@ class RenderedCamera:
         self._process.stdin.write(json.dumps(request).encode() + b"\n")
 
     async def _read(self, process: asyncio.subprocess.Process) -> None:
-        """Sorts what the process sends until it ends; then everyone who waits is told."""
+        """Distribute the process's messages until it ends; then fail all waiting calls."""
         assert process.stdout is not None
         try:
             while line := await process.stdout.readline():

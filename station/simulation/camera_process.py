@@ -1,4 +1,4 @@
-"""The rendered camera's own process: takes triggers on standard input, gives frames on standard output.
+"""Process of the rendered camera: triggers on standard input, frames on standard output.
 
 It behaves like a device: its own clock, frame ids that wrap, exposure that takes time, and faults on
 demand. Frames are JSON lines with `bytes`, followed by that many bytes of pixels. It ends with its input.
@@ -26,19 +26,19 @@ from station.simulation.renderer import Light, render, scaled
 
 TRIGGER_LATENCY_NS = 150_000
 READOUT_NS = 13_300_000
-"""One frame at 75 fps"""
+"""Readout time of a frame at 75 fps"""
 FIRST_FRAME_ID = 65_520
-"""So that every session sees the ids start over."""
+"""First frame id, so high that every session meets the overflow at 65535."""
 PREVIEW_SCALE = 0.5
 
 
 Message = tuple[Json, NDArray[np.uint8] | None]
 ADDING = ("missed-trigger", "lost-frame", "double-frame", "clock-step")
-"""Faults that come to those there are; without a value, one more."""
+"""Faults whose value is added to the present one; the default is 1."""
 
 
 class Ringing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The camera's bracket nods about the image's x axis, dying away from its injection on."""
+    """Damped oscillation of the camera's bracket about the image's x axis, from its injection on."""
 
     amplitude_rad: float
     frequency_hz: float = 7.0
@@ -52,29 +52,29 @@ class Ringing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CameraFaults(msgspec.Struct):
-    """Faults by their names. Counts are used up by triggers, the others last until set again."""
+    """Faults by their names. Counts are used up by triggers, other values last until set again."""
 
     missed_trigger: int = 0
     lost_frame: int = 0
     double_frame: int = 0
     clock_step: int = 0
-    """ns"""
+    """Step of the camera's clock, ns"""
     stamp_error: int = 0
     """Added to the frames' stamps, not to the clock that is read; ns"""
     illumination: float = 1.0
     """Factor on the light"""
     exposure: float | None = None
-    """The camera's exposure changed by itself; µs"""
+    """Exposure that the camera uses instead of the one set, µs"""
     board: BoardSpec | None = None
-    """Another board lies there"""
+    """Board that lies there instead of the right one"""
     cover: float = 0.0
-    """Share of the image, from the left, over which something dark lies"""
+    """Share of the image, from the left, that something dark covers"""
     ringing: Ringing | None = None
     knock: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Shift of the camera, in its own frame; m"""
 
     def inject(self, name: str, value: Any = None) -> None:
-        """ValueError for an unknown name."""
+        """Inject a fault. ValueError for an unknown name."""
         field = name.replace("-", "_")
         if field not in self.__struct_fields__:
             known = ", ".join((*self.__struct_fields__, "unplugged")).replace("_", "-")
@@ -110,19 +110,19 @@ class CameraProcess:
         self._place: Array = np.array(truth.board_place)
 
     def warm_up(self) -> None:
-        """Both lens tables are made before the first trigger: they take half a second."""
+        """Make both lens tables, which takes half a second, before the first trigger."""
         behind = np.eye(4)
         behind[2, 3] = -1.0
         for model in (self.truth.camera, scaled(self.truth.camera, PREVIEW_SCALE)):
             render(model, self.truth.board, behind)
 
     def device_ns(self, host_monotonic_ns: int) -> int:
-        """The camera's own clock."""
+        """Convert a host time to the camera's clock."""
         drift_ns = round(host_monotonic_ns * self.truth.camera_clock_drift_ppm * 1e-6)
         return host_monotonic_ns + drift_ns + self.truth.camera_clock_offset_ns + self.faults.clock_step
 
     def answer(self, request: Json) -> list[Message]:
-        """Messages to send back, each with its pixels or None. Raises RobotError without a controller."""
+        """Answer a request: messages, each with its pixels or None. RobotError without a controller."""
         match request["cmd"]:
             case "trigger":
                 return self._trigger()
@@ -164,7 +164,7 @@ class CameraProcess:
         return header, picture
 
     def picture(self, start_ns: int, camera: CameraModel) -> NDArray[np.uint8]:
-        """Exposed from the host time `start_ns` on; returns after the exposure."""
+        """Render an image exposed from host time `start_ns`; return after the end of exposure."""
         exposure_us = self.faults.exposure or self.exposure_us
         middle_ns = start_ns + round(exposure_us * 500)
         camera_from_board = self.faults.bracket(middle_ns) @ self.camera_from_board(
@@ -188,7 +188,7 @@ class CameraProcess:
         return inverse(self._mount) @ base_from_flange @ self._place
 
     def _flange_at(self, host_monotonic_ns: int) -> Array:
-        """Ask where the flange truly is then: the controller's admin port waits for times to come."""
+        """Ask the controller's admin port for the true flange pose at a time, which may be in the future."""
         try:
             if self._admin is None:
                 self._admin = AdminClient(self._host)
@@ -204,7 +204,7 @@ def _sleep_until(host_monotonic_ns: int) -> None:
 
 
 def serve(lines: BinaryIO, out: BinaryIO) -> None:
-    """The first line describes the camera, each further one is a request; returns at the end of input."""
+    """Serve requests until the end of input; the first line describes the camera."""
     setup = json.loads(lines.readline())
     truth = msgspec.convert(setup["truth"], CellTruth)
     camera = CameraProcess(truth, setup["controller_host"], setup["exposure_us"], setup["gain_db"])

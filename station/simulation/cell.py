@@ -1,7 +1,7 @@
-"""The one owner of the truth: everything a simulated cell really is. Files of it are JSON.
+"""Truth of a simulated cell: its real geometry, lens and noise, stored as JSON.
 
-Controller, camera and trigger are separate processes that each read the same truth; the result is
-compared with it at the end, and nothing in between may look at it.
+Controller, camera and trigger are separate processes that read the same truth. A result may be compared with
+it at the end, but nothing that leads to the result may read it.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ class CellTruth(msgspec.Struct, frozen=True, omit_defaults=True):
     robot_model: str
     board: BoardSpec
     camera: CameraModel
-    """True lens."""
+    """True intrinsics."""
     camera_mount: Matrix4
-    """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand): the answer."""
+    """True X: flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand)."""
     board_place: Matrix4
     """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)."""
     start_joints_rad: Vector6
     robot_sigma_m: float = 0.00005
-    """Repeatability: the flange misses by this much per axis, drawn anew at every stop."""
+    """Repeatability: 1σ of the flange's position per axis, drawn at every stop."""
     robot_sigma_rad: float = 8.7e-5
     dh_delta_a_m: Vector6 = (0.0,) * 6
-    """The true arm differs from the controller's table by these (systematic error)."""
+    """Systematic error: true minus the controller's a, per joint."""
     dh_delta_d_m: Vector6 = (0.0,) * 6
     dh_delta_alpha_rad: Vector6 = (0.0,) * 6
     dh_delta_theta_rad: Vector6 = (0.0,) * 6
     factory_a_m: Vector6 = (0.0,) * 6
-    """The controller's table, its factory calibration, differs from the published one by these."""
+    """Factory calibration: the controller's minus the published a, per joint."""
     factory_d_m: Vector6 = (0.0,) * 6
     factory_alpha_rad: Vector6 = (0.0,) * 6
     factory_theta_rad: Vector6 = (0.0,) * 6
     states_factory: bool = True
-    """Port 30001 states that table; else the published one."""
+    """True: port 30001 states the factory-calibrated table; False: the published one."""
     pixel_noise: float = 2.0
-    """Grey levels, 1σ, at gain 0 dB."""
+    """Noise of a pixel, 1σ, grey levels, at gain 0 dB."""
     blur_px: float = 0.7
     """Sigma of the lens's blur."""
     illumination: float = 1.0
@@ -65,7 +65,7 @@ def write_truth(truth: CellTruth, path: Path) -> None:
 
 
 def read_truth(path: Path) -> CellTruth:
-    """Raises ConfigError where it is missing or no truth."""
+    """Read a truth file. ConfigError where it is missing or invalid."""
     try:
         return msgspec.json.decode(read_file(path, _LIMIT_BYTES), type=CellTruth)
     except (OSError, msgspec.DecodeError) as error:

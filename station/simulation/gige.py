@@ -1,4 +1,4 @@
-"""A GigE Vision camera in a process of its own: Aravis's fake camera, fed with rendered images.
+"""Simulated GigE Vision camera as a process: Aravis's fake camera with rendered images.
 
 Its features are those of `genicam.xml`. It speaks the real control and stream protocols over loopback: run it
 only in a network namespace that has nothing but `lo`, for discovery broadcasts. Faults are JSON lines on
@@ -39,15 +39,15 @@ ADDRESSES = {
     node.attrib["Name"].removesuffix("Register"): int(node.findtext("Address", "", _GENICAM), 16)
     for node in _ROOT.iterfind("*[Address]", _GENICAM)
 }
-"""Of each feature's register."""
+"""Feature → address of its register."""
 PIXEL_FORMATS = {
     entry.attrib["Name"]: int(entry.findtext("Value", "", _GENICAM))
     for entry in _ROOT.iterfind("Enumeration[@Name='PixelFormat']/EnumEntry", _GENICAM)
 }
 OWN_MEMORY = 0xA000
-"""Registers from here on mean nothing to Aravis."""
+"""First register that Aravis does not use itself."""
 FAKE_TRIGGER_SOURCE, FAKE_TRIGGER_SOFTWARE = 0x304, 1
-"""The only source Aravis's fake camera reacts to: pulses on a line are written to TriggerSoftware, too."""
+"""The only trigger source of Aravis's fake camera; pulses on a line are written to TriggerSoftware, too."""
 GAIN_STEPS_PER_DB = 10
 _LATCH_POLL_S = 0.001
 _FILL = ctypes.CFUNCTYPE(
@@ -58,7 +58,7 @@ Source = Callable[[int, int, float, float], tuple[NDArray[np.uint8], int]]
 
 
 class GigeCamera:
-    """The fake camera of libaravis behind ctypes. CameraError when the library or the address is missing."""
+    """Fake camera of libaravis, through ctypes. CameraError when library or address are not available."""
 
     def __init__(self, source: Source, width: int, height: int, address: str, serial: str) -> None:
         self._source = source
@@ -91,7 +91,7 @@ class GigeCamera:
         )
 
     def watch_latch(self, device_ns: Callable[[], int]) -> None:
-        """Answers GevTimestampControlLatch, in a thread that lives as long as the process."""
+        """Serve GevTimestampControlLatch in a thread until the end of the process."""
 
         def watch() -> None:
             while True:
@@ -126,7 +126,7 @@ class GigeCamera:
         names = {value: name for name, value in PIXEL_FORMATS.items()}
         width, height = self.register("Width"), self.register("Height")
         grey, device_ns = self._source(width, height, float(exposure_us), gain / GAIN_STEPS_PER_DB)
-        # The size it reports is not set yet; the buffer holds width × height pixels of this format.
+        # The buffer's reported size is not set yet; it holds width × height pixels of this format.
         target = self._lib.arv_buffer_get_data(buffer, ctypes.byref(ctypes.c_size_t()))
         if names[pixel_format] == "Mono8":
             ctypes.memmove(target, grey.ctypes.data, grey.nbytes)
@@ -137,7 +137,7 @@ class GigeCamera:
 
 
 def _require_free(address: str) -> None:
-    """Aravis says that it runs even where it could not listen."""
+    """Raise CameraError where the address is in use, which Aravis does not report."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((address, CONTROL_PORT))
@@ -173,7 +173,7 @@ def _library() -> Any:
 
 
 def rendered_source(camera: CameraProcess) -> Source:
-    """Images of the simulated cell at the moment they are asked for."""
+    """Make a source of images of the simulated cell at the time of the call."""
     last = [np.full((camera.truth.camera.height, camera.truth.camera.width), 20, np.uint8)]
 
     def source(width: int, height: int, exposure_us: float, gain_db: float) -> tuple[NDArray[np.uint8], int]:
@@ -181,7 +181,7 @@ def rendered_source(camera: CameraProcess) -> Source:
         start_ns = time.monotonic_ns()
         try:
             last[0] = camera.picture(start_ns, camera.truth.camera)
-        except RobotError as error:  # a picture must go out all the same: the last one again
+        except RobotError as error:  # an image must be sent anyway: repeat the last one
             print(error, file=sys.stderr, flush=True)
         return np.ascontiguousarray(last[0][:height, :width]), camera.device_ns(start_ns)
 
@@ -194,7 +194,7 @@ def main(
     address: Annotated[str, typer.Option(help="Loopback address of the camera.")] = "127.0.0.1",
     serial: Annotated[str, typer.Option(help="As the camera reports it.")] = "SIM00000",
 ) -> None:
-    """Serves until standard input ends; prints one JSON line when it listens."""
+    """Serve until standard input ends; print one JSON line when listening."""
     cell = make_cell() if truth is None else read_truth(truth)
     rendered = CameraProcess(cell, controller_host, cell.exposure_us, cell.gain_db)
     rendered.warm_up()
@@ -204,7 +204,7 @@ def main(
 def serve(
     source: Source, rendered: CameraProcess, address: str, serial: str, inject: Callable[[str, Any], None]
 ) -> None:
-    """`rendered`: whose size and clock the camera has. `inject`: carries out what is no fault of GigE."""
+    """Serve the camera. `rendered` gives size and clock; `inject` handles faults other than of GigE."""
     cv2.setNumThreads(1)
     model = rendered.truth.camera
     try:

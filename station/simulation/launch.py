@@ -1,4 +1,4 @@
-"""Simulated devices as child processes: the controller, on a free loopback address, and the GigE camera."""
+"""Start of simulated devices as child processes: controller, on a free loopback address, and GigE camera."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from station.cell.process import give_own_priority
 from station.simulation.netns import is_isolated
 
 Json = dict[str, Any]
-"""One line of what parent and child tell each other."""
+"""Message between parent and child: a JSON object in one line."""
 ADMIN_PORT = 29990
 ATTEMPTS = 5
 ADDRESS_TAKEN = 1
@@ -30,7 +30,7 @@ GIGE_TIMEOUT_S = 30.0
 
 
 class AdminClient:
-    """One connection to a controller's admin port; blocking, with a timeout on every call, for one thread."""
+    """Connection to a simulated controller's admin port; blocking with time-outs, for one thread."""
 
     def __init__(self, host: str, timeout_s: float = 5.0) -> None:
         """Raises RobotError when nothing listens there."""
@@ -43,7 +43,7 @@ class AdminClient:
         self._lines = self._socket.makefile("rb")
 
     def ask(self, cmd: str, **arguments: object) -> Json:
-        """The answer's fields. Raises RobotError when the command is refused or the simulation is gone."""
+        """Send a command; return the answer's fields. RobotError when refused, or the simulation is gone."""
         try:
             self._socket.sendall(json.dumps({"cmd": cmd, **arguments}).encode() + b"\n")
             line = self._lines.readline()
@@ -69,7 +69,7 @@ class AdminClient:
 
 
 class ChildProcess:
-    """A running child. It ends with `stop`, with the `with` block, and when this process dies."""
+    """Child process that ends by `stop`, at the end of its `with` block, or when this process dies."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
@@ -79,7 +79,7 @@ class ChildProcess:
         return self.process.poll() is None
 
     def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> None:
-        """Ends the child, by force if it does not listen. Idempotent."""
+        """End the child, by force if it does not react. Idempotent."""
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
                 pipe.close()  # it ends with its input
@@ -117,11 +117,11 @@ def start_controller(
     options: tuple[str, ...] = (),
     module: str = "station.simulation.controller",
 ) -> SimulatedController:
-    """Starts the child and waits until all its ports listen; blocking, call it outside an event loop.
+    """Start a controller and wait until all its ports listen; blocking, so call it outside an event loop.
 
-    host None: a random free 127.x.y.z. log: where its standard error goes. options: further arguments of
-    the command line. module: another program with the same one. Raises RobotError with the child's last
-    words.
+    host: None: a random free 127.x.y.z. log: file for its standard error. options: further arguments of the
+    command line. module: another program with the same command line. Raises RobotError with the child's last
+    output.
     """
     command = [sys.executable, "-m", module, "--model", model, "--die-with-parent"]
     command += ["--time-scale", str(time_scale), *options]
@@ -140,7 +140,7 @@ def start_controller(
 
 
 def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subprocess.Popen[bytes], str]:
-    """The child, and why it is not ready and has been ended ("" = it is)."""
+    """Start a child; return it, and why it was not ready and was ended ("": it is ready)."""
     kept = None if log is None else open_regular(log, os.O_RDWR | os.O_APPEND | os.O_CREAT)
     with tempfile.TemporaryFile() if kept is None else os.fdopen(kept, "a+b") as stderr:
         said_before = stderr.seek(0, os.SEEK_END)
@@ -155,7 +155,7 @@ def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subp
         if ready:
             return child, ""
         try:
-            child.wait(END_TIMEOUT_S)  # it may be ending by itself
+            child.wait(END_TIMEOUT_S)  # it may be ending already
         except subprocess.TimeoutExpired:
             child.kill()
         child.communicate()
@@ -166,7 +166,7 @@ def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subp
 
 class SimulatedGige(ChildProcess):
     def inject(self, fault: str, value: object = None) -> None:
-        """A fault of `CameraFaults`, or `packet-loss` with a share of packets; then it is in force."""
+        """Inject a fault of `CameraFaults`, or `packet-loss` (share of packets); return when in effect."""
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.write(json.dumps({"name": fault, "value": value}).encode() + b"\n")
         self.process.stdin.flush()
@@ -182,7 +182,7 @@ def start_gige(
     module: str = "station.simulation.gige",
     log: Path | None = None,
 ) -> SimulatedGige:
-    """Starts the camera on 127.0.0.1 and waits until it listens; blocking, call it outside an event loop.
+    """Start the camera on 127.0.0.1 and wait until it listens; blocking, so call it outside an event loop.
 
     module: another program with the same command line. log: where its standard error goes.
 

@@ -1,4 +1,4 @@
-"""A whole simulated cell for the daemon: truth, controller child, real driver, rendered camera."""
+"""Complete simulated cell for the daemon: truth, controller process, real driver, rendered camera."""
 
 from __future__ import annotations
 
@@ -28,21 +28,24 @@ class SimulationOptions:
     noise: NoiseLevel = "low"
     mount: Mount = "eye-in-hand"
     time_scale: float = 1.0
-    """Above 1 only in tests: real time is what is demonstrated."""
+    """Speed of simulated time; above 1 in tests only."""
     gige: bool = False
-    """The camera over GigE Vision, in a network namespace with only `lo`."""
+    """Simulate the camera over GigE Vision, in a network namespace with only `lo`."""
     hardware_trigger: bool = False
-    """A trigger box on a pseudo terminal fires the camera."""
+    """Trigger the camera by a simulated box on a pseudo terminal."""
     control: ControlPath | None = None
-    """Driver of the arm; None = what is installed."""
+    """Driver of the arm; None: ur_rtde if installed, else script."""
     robot: str = "UR10"
-    """Another arm at the same place; its own start shows the board for seed 0."""
+    """Model of the arm; the start posture of each model shows the board for seed 0."""
     free_space_bytes: int = 200_000_000
-    """A demonstration must run on a small disk."""
+    """Free disk space below which no pose is captured; small, so that demonstrations run anywhere."""
 
 
 def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
-    """Starts the controller; blocking (a second). `folder` takes the truth and logs. Raises StationError."""
+    """Make the cell and start its controller; blocking (a second). Raises StationError.
+
+    `folder`: for truth and logs.
+    """
     from station.devices.ur import UrRobot
     from station.simulation.scenes import cell_config
 
@@ -108,7 +111,7 @@ def _camera(
     trigger: Trigger | None,
     ends: ExitStack,
 ) -> tuple[Camera, Callable[[], None]]:
-    """The camera, and what an edge on its trigger line does."""
+    """Make the camera, and the function that an edge on its trigger line calls."""
     if not options.gige:
         from station.simulation.camera import RenderedCamera
 

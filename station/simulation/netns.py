@@ -1,4 +1,4 @@
-"""A network with nothing but loopback, for the GigE simulator: discovery broadcasts reach nobody.
+"""Network namespace with only loopback, so that the GigE simulator's broadcasts reach no real network.
 
 ``python -m station.simulation.netns COMMAND …`` runs a command inside such a namespace.
 """
@@ -23,12 +23,12 @@ def is_isolated() -> bool:
 
 
 def isolated_command(command: list[str]) -> list[str]:
-    """The same command inside a namespace of its own. StationError where `unshare` is missing."""
+    """Make the command that runs `command` in a new namespace. StationError where `unshare` is missing."""
     unshare = shutil.which("unshare")
     if unshare is None:
         remedy = "Run apt install util-linux."
         raise StationError("the GigE simulator needs 'unshare'", code="no-unshare", remedy=remedy)
-    # Without root a user namespace gives the right to make a network namespace.
+    # Without root, a user namespace permits making a network namespace.
     rights = [] if os.geteuid() == 0 else ["--map-root-user"]
     return [unshare, *rights, "--net", sys.executable, "-m", "station.simulation.netns", *command]
 

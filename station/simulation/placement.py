@@ -1,6 +1,6 @@
-"""Places of camera, board and arm of a simulated cell, so that the arm can show the board in many ways.
+"""Placement of camera, board and arm of a simulated cell such that many different views are possible.
 
-A place counts when enough of the planner's own candidate poses are reachable and free from there.
+A placement is accepted when enough of the planner's candidate poses are reachable without collision.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from station.plan.visibility import view_range
 
 ROBOT = "UR10"
 TABLE = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-"""The arm stands on it."""
+"""Table on which the arm stands."""
 _ATTEMPTS = 400
 _TRIED_VIEWS = 60
 _NEEDED_SHARE = 0.4
-"""Share of the tried views that the start's own arm branch reaches."""
+"""Smallest accepted share of views that are reachable in the arm branch of the start."""
 _START_MARGIN_M = 0.015
 _START_SINGULARITY = 0.08
 
@@ -44,7 +44,7 @@ def board_centre(board: BoardSpec) -> Array:
 
 
 def seen_from(board: BoardSpec, distance_m: float, rotation: Array | None = None) -> Array:
-    """camera_from_board with the board's middle on the optical axis."""
+    """Make camera_from_board with the board's centre on the optical axis."""
     R = np.eye(3) if rotation is None else rotation
     return pose(R, np.array([0.0, 0.0, distance_m]) - R @ board_centre(board))
 
@@ -57,7 +57,7 @@ def cell_description(
     board_guess: PoseGuess,
     host: str = "",
 ) -> StationConfig:
-    """The configuration of a simulated cell: UR10 on a table, rendered camera."""
+    """Make the configuration of a simulated cell: UR10 on a table, rendered camera."""
     return StationConfig(
         name="simulated",
         mount=mount,
@@ -73,7 +73,7 @@ def cell_description(
 def place_moving_camera(
     board: BoardSpec, camera: CameraModel, camera_turn: Array, rng: np.random.Generator
 ) -> Placement:
-    """Eye-in-hand: a mount turned by `camera_turn` (3, 3), looking down at a board on table or stand."""
+    """Place an eye-in-hand camera, rotated by `camera_turn` (3, 3), above a board on table or stand."""
     for _ in range(_ATTEMPTS):
         around, beside_m, ahead_m = (
             rng.uniform(-np.pi, np.pi),
@@ -94,7 +94,7 @@ def place_moving_camera(
 
 
 def place_fixed_camera(board: BoardSpec, camera: CameraModel, rng: np.random.Generator) -> Placement:
-    """Eye-to-hand: a camera beside the cell, the board on the flange facing away from the arm."""
+    """Place an eye-to-hand camera beside the cell, and a board on the flange facing away from the arm."""
     outwards = rotation_exp([np.pi, 0.0, 0.0])
     for _ in range(_ATTEMPTS):
         turn = outwards @ rotation_exp([*rng.uniform(-0.1, 0.1, 2), rng.uniform(-np.pi, np.pi)])
@@ -115,7 +115,7 @@ def place_fixed_camera(board: BoardSpec, camera: CameraModel, rng: np.random.Gen
 
 
 def _camera_looking_down(rng: np.random.Generator) -> Array:
-    """base_from_camera over the table, its axis at most 50° from straight down, any roll."""
+    """Draw base_from_camera above the table, at most 50° from looking straight down, with any roll."""
     lean, around = np.deg2rad(rng.uniform(0, 50)), rng.uniform(-np.pi, np.pi)
     axis = np.array([np.cos(around), np.sin(around), 0.0]) * (np.pi - lean)
     turn = rotation_exp(axis) @ rotation_exp([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
@@ -123,13 +123,13 @@ def _camera_looking_down(rng: np.random.Generator) -> Array:
 
 
 def _shell_point(rng: np.random.Generator) -> Array:
-    """A point within the arm's comfortable reach, in `base`."""
+    """Draw a point that the arm reaches without stretching, in `base`."""
     radius, around = rng.uniform(0.45, 0.85), rng.uniform(-np.pi, np.pi)
     return np.array([radius * np.cos(around), radius * np.sin(around), rng.uniform(0.45, 0.9)])
 
 
 def _exact_scene(mount: Mount, camera: CameraModel, board: BoardSpec, X: Array, Y: Array) -> Scene:
-    # 20 mm of doubt about what stands in the cell: room for the guesses that the configuration hands out.
+    # 1σ of 20 mm for what is fixed in the cell leaves room for the rough poses of the configuration.
     camera_sigma_m, board_sigma_m = (0.0, 0.02) if mount == "eye-in-hand" else (0.02, 0.0)
     guesses = guess_from(X, camera_sigma_m, 0.0), guess_from(Y, board_sigma_m, 0.0)
     return scene_of(cell_description(mount, camera, board, *guesses))

@@ -1,7 +1,7 @@
-"""A rehearsal: the user's own configuration with a simulated arm and a rendered camera in place of devices.
+"""Rehearsal: the user's own configuration with a simulated arm and a rendered camera.
 
-The guesses are taken for what they say they are: the simulated cell is drawn within their sigmas. No address
-of the configuration is ever used.
+The true poses of the simulated cell are drawn within the sigmas of the configured initial poses. No address
+in the configuration is ever used.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from station.simulation.cell import CellTruth
 from station.simulation.launch_cell import start_cell
 
 FOLDER = "rehearsal"
-"""Below the state folder: nothing of a rehearsal lies beside what is real."""
+"""Subfolder of the state folder, which keeps rehearsals apart from real data."""
 ATTACHMENT = "rehearsal.json"
 REPEATABILITY_M, REPEATABILITY_RAD = 1e-4, 1.7e-4
-"""1σ per axis: an arm as UR states it (± 0.1 mm)."""
+"""Repeatability of the simulated arm, 1σ per axis, as stated by UR (± 0.1 mm)."""
 _WITHIN = 1.5
-"""Sigmas of a guess that the simulated cell is at most away from it."""
+"""Largest distance of the simulated from the configured poses, in sigmas."""
 _FOCAL_SHARE, _K1 = 0.02, -0.05
-"""Deviations of a lens that is roughly known: focal length either way, radial distortion."""
+"""Deviation of a roughly known lens: relative focal length (either sign), radial distortion."""
 _NORMAL_EXPOSURE_US = 10_000.0
 
 
@@ -64,9 +64,9 @@ def rehearsed_cell(config: StationConfig, path: str, folder: Path, seed: int = 0
 
 
 def without_devices(config: StationConfig, host: str) -> StationConfig:
-    """The configuration with the controller at `host` and no other device of it.
+    """Replace the devices of a configuration by the simulated controller at `host` and camera.
 
-    Limits, board, guesses, approval and goals stay. The factory's kinematic corrections are of the real arm.
+    Limits, board, initial poses, approval and goals stay. Factory corrections of the real arm are removed.
     """
     robot = msgspec.structs.replace(config.robot, host=host, serial="", kinematics=None)
     camera = msgspec.structs.replace(
@@ -76,10 +76,10 @@ def without_devices(config: StationConfig, host: str) -> StationConfig:
 
 
 def truth_within(config: StationConfig, seed: int) -> CellTruth:
-    """Draw a cell that the configuration describes rightly, its arm where the camera sees the board."""
+    """Draw a true cell that agrees with the configuration; its arm starts where the board is seen."""
     require_kept_clear(config)
     scene = scene_of(config)
-    assert config.camera_guess is not None and config.board_guess is not None  # scene_of wants both
+    assert config.camera_guess is not None and config.board_guess is not None  # checked by scene_of
     rng = np.random.default_rng([22, seed])
     group, _ = candidate_pool(scene, PlanOptions(seed=seed), None, rng)
     middle = np.abs(group.joints_rad - np.median(group.joints_rad, axis=0)).max(axis=1).argmin()
@@ -96,7 +96,7 @@ def truth_within(config: StationConfig, seed: int) -> CellTruth:
         start_joints_rad=vector6(group.joints_rad[middle]),
         robot_sigma_m=REPEATABILITY_M,
         robot_sigma_rad=REPEATABILITY_RAD,
-        # Exposure and gain are taken to be right for the cell's light.
+        # Choose the light for which the configured exposure and gain are right.
         illumination=_NORMAL_EXPOSURE_US / camera.exposure_us * 10 ** (-camera.gain_db / 20),
         exposure_us=camera.exposure_us,
         gain_db=camera.gain_db,
@@ -109,7 +109,7 @@ def _within(guess: PoseGuess, rng: np.random.Generator) -> np.ndarray:
 
 
 def _lens_within(camera: CameraModel, rough: bool, rng: np.random.Generator) -> CameraModel:
-    """The lens as it is stated; one that is rough differs a little."""
+    """Return the configured lens, slightly changed if it is only roughly known."""
     if not rough:
         return camera
     K = np.array(camera.matrix)

@@ -1,7 +1,7 @@
-"""Images of a board as a camera with a known lens would take them.
+"""Renderer of images of a board for a camera with a known lens.
 
-Every pixel is followed back through the lens to the board: no textures are warped, so corners lie where
-`cv2.projectPoints` puts them. Pixels that hold an edge are the mean of sub-pixel samples.
+The ray of every pixel is traced through the lens to the board. No texture is warped, so corners are exactly
+where `cv2.projectPoints` puts them. Pixels with an edge are averages of sub-pixel samples.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from station.simulation.board_print import BoardPrint, Floats, board_print
 
 TABLE_ALBEDO = 0.30
 FULL_SCALE_US = 10_000.0
-"""At this exposure, gain 0 dB and illumination 1, albedo 1 in the image's centre gives WHITE_LEVEL."""
+"""Exposure at which albedo 1 in the image's centre gives WHITE_LEVEL, at gain 0 dB and illumination 1."""
 WHITE_LEVEL = 235.0
 BLACK_LEVEL = 3.0
 VIGNETTING = 0.18
-"""Light lost in the image's far corners."""
+"""Share of light lost in the image's corners."""
 _SAMPLES, _STRIDE = 13, 5
-"""Sub-pixel samples of a pixel with an edge: a Fibonacci lattice, each in a row and a column of its own. An
-edge along the rows of a square grid passes all samples of a row at once: 0.06 px in a corner with 4×4."""
+"""Sub-pixel samples of a pixel with an edge, on a Fibonacci lattice, so that no two share a row or column.
+On a square grid an edge along a row would pass all its samples at once: an error of 0.06 px with 4×4."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """All that decides the grey levels."""
+    """Exposure, gain, illumination, noise and blur of an image."""
 
     exposure_us: float = FULL_SCALE_US
     gain_db: float = 0.0
     illumination: float = 1.0
     pixel_noise: float = 2.0
-    """Grey levels, 1 sigma, at 0 dB"""
+    """Noise of a pixel, 1σ, grey levels, at 0 dB"""
     blur_px: float = 0.7
     """Sigma of the lens's blur"""
 
 
 @dataclass(frozen=True, eq=False)
 class _LensTable:
-    """The ray (x, y, 1) of each pixel centre, its change per pixel, and the vignetting."""
+    """Ray (x, y, 1) of each pixel centre, its derivatives per pixel, and the vignetting."""
 
     x: Floats
     y: Floats
@@ -59,7 +59,7 @@ def render(
     light: Light | None = None,
     rng: np.random.Generator | None = None,
 ) -> NDArray[np.uint8]:
-    """(height, width) mono8 image; `camera_from_board` (4, 4) at mid-exposure.
+    """Render a mono8 image (height, width); `camera_from_board` (4, 4) at mid-exposure.
 
     Without `rng` the image is free of noise. ValueError for a transform that is not rigid or a camera
     without a matrix.
@@ -91,7 +91,7 @@ def render(
 
 
 def scaled(camera: CameraModel, factor: float) -> CameraModel:
-    """The same lens with `factor` times the pixels; pixel (0, 0) stays the centre of the first pixel."""
+    """Scale a lens to `factor` times the pixels; pixel (0, 0) stays the centre of the first pixel."""
     if camera.matrix is None:
         raise ValueError("the camera has no matrix")
     (fx, skew, cx), (_, fy, cy), _ = camera.matrix
@@ -125,7 +125,7 @@ def _lens(camera: CameraModel) -> _LensTable:
 def _window(
     camera: CameraModel, board: BoardSpec, camera_from_board: Array, margin_px: int
 ) -> tuple[slice, slice] | None:
-    """Rows and columns that may show the sheet; None where it is out of the image."""
+    """Find rows and columns that may show the sheet; None where it is outside the image."""
     x0, y0, x1, y1 = board_print(board).sheet_m
     corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
     along = np.linspace(0.0, 1.0, 9)[:, None, None]
@@ -140,7 +140,7 @@ def _window(
     pixels, _ = cv2.projectPoints(
         points, rotation, camera_from_board[:3, 3], np.array(camera.matrix), np.array(camera.distortion)
     )
-    # A point far outside the image may be folded back by the distortion polynomial: look everywhere then.
+    # The distortion polynomial may map points far outside back into the image: then use the whole image.
     if np.abs(in_camera[:, :2] / in_camera[:, 2:]).max() > 1.0:
         return whole
     low = np.floor(pixels.reshape(-1, 2).min(axis=0)).astype(int) - margin_px
@@ -155,9 +155,9 @@ def _window(
 def _reflectance(
     lens: _LensTable, window: tuple[slice, slice], camera_from_board: Array, printed: BoardPrint
 ) -> Floats:
-    """Mean reflectance over each pixel of the window."""
+    """Compute the mean albedo over each pixel of the window."""
     plane_from_ray = np.asarray(np.linalg.inv(camera_from_board[:3, [0, 1, 3]]), dtype=float)
-    front = camera_from_board[:3, 2] @ camera_from_board[:3, 3] > 0  # z of the board points away from the eye
+    front = camera_from_board[:3, 2] @ camera_from_board[:3, 3] > 0  # the board's z points away
     x, y = lens.x[window], lens.y[window]
     if not front:
         return np.full(x.shape, TABLE_ALBEDO, dtype=np.float32)
@@ -177,7 +177,7 @@ def _reflectance(
 
 
 def _slopes(field: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Change per pixel to the right and per pixel down."""
+    """Compute the derivatives of a field per pixel to the right and per pixel down."""
     height, width = field.shape
     left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, width - 1)
     up, down = np.maximum(rows - 1, 0), np.minimum(rows + 1, height - 1)
@@ -187,7 +187,7 @@ def _slopes(field: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp]) ->
 
 
 def _sample(plane_from_ray: Array, x: Floats, y: Floats, printed: BoardPrint) -> Floats:
-    """Reflectance where the rays (x, y, 1) meet the board's plane; the table where they miss."""
+    """Compute the albedo where rays (x, y, 1) meet the board's plane; the table's where they miss it."""
     h = plane_from_ray.astype(np.float32)
     inverse_depth = h[2, 0] * x + h[2, 1] * y + h[2, 2]
     ahead = inverse_depth > 1e-3

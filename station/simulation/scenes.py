@@ -1,7 +1,7 @@
-"""Cells to simulate: the paper's and the blog's, and by seed any number of others.
+"""Simulated cells: those of the paper and the blog, and random ones by seed.
 
-Seed 0 is the scene as published. Other seeds draw the camera's mount anywhere on SO(3), the board's
-place, the lens and the noise; the board stays where 25 varied poses can look at it.
+Seed 0 is the cell as published. Other seeds draw the camera's orientation (anywhere on SO(3)), the board's
+pose, lens and noise, such that 25 different poses can see the board.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ PAPER_X = (
     (0.0032, 1.0000, -0.0068, -0.0603),
     (0.0026, 0.0068, 1.0000, 0.0870),
 )
-"""Eq. 23 of the paper, flange_from_camera; rounded there, so its rotation is made orthonormal here."""
+"""flange_from_camera of eq. 23 of the paper; it is rounded, so its rotation is orthonormalised here."""
 _START_DEG = (0.0, -94.0, -90.0, -86.0, 90.0, 0.0)
-"""The flange points straight down, half a metre over the table."""
+"""Start joints: the flange points straight down, half a metre above the table."""
 _GUESS_M, _GUESS_RAD = 0.004, 0.02
-"""Error of the guesses, 1 sigma per axis"""
+"""1σ per axis of the errors of the configured initial poses"""
 
 
 class _PublishedScene(NamedTuple):
@@ -68,7 +68,7 @@ _FAR_M = 0.6
 def make_cell(
     scene: SceneName = "paper", seed: int = 0, noise: NoiseLevel = "low", mount: Mount = "eye-in-hand"
 ) -> CellTruth:
-    """The truth of a cell; the same arguments give the same cell. ConfigError for an unknown name."""
+    """Make the truth of a cell; equal arguments give the same cell. ConfigError for an unknown name."""
     scenes = {"paper": _paper_scene, "blog": _blog_scene, "paper-binned": _paper_binned_scene}
     if scene not in scenes or noise not in _NOISE or mount not in ("eye-in-hand", "eye-to-hand"):
         raise ConfigError(
@@ -108,13 +108,13 @@ def _paper_scene() -> _PublishedScene:
 
 
 def _paper_binned_scene() -> _PublishedScene:
-    """The paper's scene with 2 × 2 pixels read as one: small recordings."""
+    """Make the paper's scene with 2 × 2 binning, for small recordings."""
     paper = _paper_scene()
     return paper._replace(camera=scaled(paper.camera, 0.5))
 
 
 def _blog_scene() -> _PublishedScene:
-    """X is the blog's `Hand-Eye` frame, RPY(0, −15, 0)° at (0.1, 0, 0) m on the flange.
+    """Make the blog's scene: X is its `Hand-Eye` frame, RPY(0, −15, 0)° at (0.1, 0, 0) m on the flange.
 
     RobWork's camera looks along −z of `Hand-Eye-Sim`, which is `Hand-Eye` rolled by 180°. The blog's own
     answer is `Hand-Eye` itself, so that its z is the optical axis; `camera` is taken as that frame.
@@ -146,7 +146,7 @@ def _place(
 
 
 def _other_lens(camera: CameraModel, rng: np.random.Generator) -> CameraModel:
-    """Another copy of the lens: focal length, centre and distortion a little different."""
+    """Draw a lens with slightly different focal length, centre and distortion."""
     assert camera.matrix is not None
     focal = camera.matrix[0][0] * rng.uniform(0.97, 1.03)
     cx, cy = camera.matrix[0][2] + rng.normal(0, 6), camera.matrix[1][2] + rng.normal(0, 6)
@@ -167,7 +167,7 @@ def _with_noise(truth: CellTruth, level: _CellNoise, rng: np.random.Generator) -
     factory = np.zeros((4, 6))
     if level.factory_mm:
         factory = 1e-3 * level.factory_mm * np.random.default_rng([1945, truth.seed]).normal(size=(4, 6))
-        # Axes that are nearly parallel have their common normal far off: so makers state them.
+        # The common normal of nearly parallel axes may be far off, as in real factory calibrations.
         factory[1, 1:4] += _FAR_M * np.array([1.0, -0.4, -0.6])
         factory[[0, 2], 5] = 0.0
     tables: dict[str, Vector6] = {}
@@ -187,7 +187,7 @@ def _with_noise(truth: CellTruth, level: _CellNoise, rng: np.random.Generator) -
 
 
 def cell_config(truth: CellTruth, host: str = "") -> StationConfig:
-    """Configuration of an operator with a tape measure: guesses of mount, board and lens, all a bit off.
+    """Make a configuration as by an operator with a tape measure: rough camera pose, board pose and lens.
 
     `host`: the simulated controller. The same truth gives the same configuration.
     """

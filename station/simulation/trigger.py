@@ -1,4 +1,4 @@
-"""A trigger box at the other end of a pty, with the faults that real ones show."""
+"""Simulated trigger box on a pseudo terminal, with the faults of real ones."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ _SERIAL = "SIM1"
 
 
 class SimulatedTriggerBox:
-    """Serves from a thread; `port` is the path to open. `on_pulse` is the trigger line's other end.
+    """Trigger box served by a thread. `port` is the path to open; `on_pulse` is called for every pulse.
 
-    Faults are attributes: set them, and they hold until set back.
+    Faults are attributes that last until set back.
     """
 
     def __init__(self, on_pulse: Callable[[], None] = lambda: None) -> None:
         self.on_pulse = on_pulse
         self.product = PRODUCT
-        """Another one = some other device sits on this port"""
+        """Product name; another one simulates another device on this port"""
         self.count = 0
         self.light_permille = 0
         self.silent = False
         self.garbage = b""
-        """Sent before every answer"""
+        """Bytes sent before every answer"""
         self.cut_answers = 0
-        """So many answers end in the middle, without a newline"""
+        """Number of next answers that are cut in the middle, without a newline"""
         self._boot_id = "00000001"
         self._start_s = time.monotonic()
         self._lines = LineReader()
@@ -43,13 +43,13 @@ class SimulatedTriggerBox:
         self._thread.start()
 
     def reset(self) -> None:
-        """Power failed for a moment: count and light are zero, the boot id is another."""
+        """Simulate a short power failure: count and light are 0, the boot id changes."""
         self._boot_id = f"{int(self._boot_id, 16) + 1:08x}"
         self.count = self.light_permille = 0
         self._start_s = time.monotonic()
 
     def unplug(self) -> None:
-        """The port vanishes. Idempotent."""
+        """Remove the port. Idempotent."""
         if self._thread.is_alive():
             os.write(self._stop_write, b"x")
             self._thread.join()

@@ -15,8 +15,8 @@ from scipy import optimize, special
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
 from calibrate.handeye.arm import ArmPostures
+from calibrate.handeye.axxb.global_start import GlobalResult
 from calibrate.handeye.axxb.pairs import Pairs
-from calibrate.handeye.axxb.robust import GlobalResult
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corners import corner_distance, corner_residuals
 from calibrate.handeye.linear import GAIN, ROBOT_PRIOR_COUNT, STUDENT, WIDE, Fit, Linear, Scales, first_scales

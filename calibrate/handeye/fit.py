@@ -10,8 +10,8 @@ from scipy import special
 from calibrate.errors import PosesDisagreeError
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.arm import RELATIVE_SIGMA, arm_postures, by_parameters, flex_motion
+from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
-from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.estimate import (
     MAX_STEPS,
@@ -24,7 +24,7 @@ from calibrate.handeye.estimate import (
 )
 from calibrate.handeye.linear import Linear, LinearSolution, inverse_of
 from calibrate.handeye.metrics import require_motion
-from calibrate.handeye.poses import BoardPoses, agreed_start
+from calibrate.handeye.pose_fit import BoardPoses, agreed_start
 from calibrate.handeye.priors import Priors
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, Observations, Places, ViewSet, observe_views

@@ -1,7 +1,7 @@
 """Alternative interpretations ("readings") of a recording in which robot poses and images disagree.
 
 Poses in another convention, images that belong to their neighbours' poses, squares of another size,
-something moved half-way: each is fitted like the recording as it stands (`poses`), and the evidence tells
+something moved half-way: each is fitted like the recording as it stands (`pose_fit`), and the evidence tells
 which one explains all views. This comes before any single view is called wrong.
 """
 
@@ -22,7 +22,7 @@ from calibrate.geometry import (
     rotation_exp,
     rotation_log,
 )
-from calibrate.handeye.poses import BoardPoses, Moved, PoseFit, PoseViews, fit_poses
+from calibrate.handeye.pose_fit import BoardPoses, Moved, PoseFit, PoseViews, fit_poses
 from calibrate.handeye.solution import Explanation, Reading
 from calibrate.views import ViewSet
 

@@ -40,7 +40,7 @@ from calibrate.handeye.metrics import (
     require_solvable,
     score_holdout,
 )
-from calibrate.handeye.poses import pose_views
+from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.readings import explain_recording, explain_text
 from calibrate.handeye.solution import (

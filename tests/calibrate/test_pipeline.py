@@ -15,7 +15,7 @@ from benchmarks.imperfect_cells import table_errors
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.files.calibration import encode_calibration
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
-from calibrate.handeye.poses import pose_views
+from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.job import JobOptions, SolvedRecording

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import difference
+from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.pairs import all_pairs
-from calibrate.handeye.axxb.robust import solve_global
 from calibrate.handeye.metrics import distance_in_sigmas
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solve import SolveOptions, solve_views

@@ -3,9 +3,9 @@ import pytest
 
 from calibrate.errors import DegenerateMotionError
 from calibrate.geometry import perturb, pose, random_rotation, rotation_angle, rotation_exp
+from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.objective import pair_covariance
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
-from calibrate.handeye.axxb.robust import solve_global
 from calibrate.handeye.metrics import (
     axis_spread,
     board_spread,

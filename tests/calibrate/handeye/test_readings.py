@@ -15,7 +15,7 @@ from calibrate.geometry import (
     rotation_exp,
     rotation_log,
 )
-from calibrate.handeye.poses import pose_views
+from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import SolveOptions, solve_views

@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from calibrate.geometry import perturb, pose, random_rotation, rotation_exp
 from calibrate.handeye.axxb.certificate import TOLERANCE, _constraints, certify
+from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import all_pairs
-from calibrate.handeye.axxb.robust import solve_global
 from tests.calibrate.cells import exact_motions
 
 

@@ -11,9 +11,9 @@ from calibrate.handeye.axxb.evolution import (
     _partners,
     evolve,
 )
+from calibrate.handeye.axxb.global_start import _rotations
 from calibrate.handeye.axxb.pairs import consecutive_pairs
 from calibrate.handeye.axxb.paper import BOX, SETTINGS, solve_paper
-from calibrate.handeye.axxb.robust import _rotations
 from tests.calibrate.cells import LOW, make_cell
 
 ROOT = Path(__file__).parents[4]

@@ -18,7 +18,7 @@ import pytest
 from calibrate.cli import main as calibrate
 from calibrate.files.loader import load_installed
 from calibrate.files.versions import installed_versions, read_log
-from calibrate.quality.checks import read_checks
+from calibrate.quality.drift_history import read_checks
 from recordings.cli import main as recordings
 from recordings.errors import CodedError
 from recordings.importers.bags import open_bag

@@ -21,7 +21,6 @@ from calibrate.files.install import note_check
 from calibrate.files.validity import Validity, ValidityReason, validity_text
 from calibrate.job import JobOptions
 from calibrate.pipeline import prepare_views
-from calibrate.quality.checks import CheckEntry, Trend, append_check, earlier_results, find_trend, read_checks
 from calibrate.quality.drift import (
     FEWEST_VIEWS,
     POWER,
@@ -30,6 +29,14 @@ from calibrate.quality.drift import (
     OtherCellError,
     check_drift,
     require_same_cell,
+)
+from calibrate.quality.drift_history import (
+    CheckEntry,
+    Trend,
+    append_check,
+    earlier_results,
+    find_trend,
+    read_checks,
 )
 from recordings.files import MAIN_CAMERA, state_root
 from recordings.reader import open_recording

@@ -16,7 +16,7 @@ from calibrate.errors import CalibrationFileError, UsageError
 from calibrate.files.calibration import read_calibration, write_output
 from calibrate.files.folders import cameras, current_validity, current_version, readable_folder
 from calibrate.files.validity import ValidityState, parse_time
-from calibrate.quality.checks import read_checks
+from calibrate.quality.drift_history import read_checks
 
 _HELP = {
     "version": "Number of the installed version.",

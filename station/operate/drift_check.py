@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from calibrate.files.install import installed_calibration
-from calibrate.quality.checks import find_trend, read_checks
+from calibrate.quality.drift_history import find_trend, read_checks
 from station.cell.status import SessionStatus, StationState, StationStatus
 from station.operate.ending import Ending, after_drift_check
 from station.operate.motion import PREPARE_S, Approve, Link, prepared_motion

@@ -8,7 +8,7 @@ from enum import StrEnum
 
 from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch, agrees, touch_sigmas
-from calibrate.quality.checks import CheckEntry
+from calibrate.quality.drift_history import CheckEntry
 from station.cell.status import SessionStatus
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from textual.content import Content
 
-from calibrate.quality.checks import FEWEST_FOR_TREND, CheckEntry, find_trend
+from calibrate.quality.drift_history import FEWEST_FOR_TREND, CheckEntry, find_trend
 from station.operate.ending import Way, after_drift_check
 from station.tui.widgets.canvas import Series, curve
 from station.tui.words import Mark, dim, facts, many, mark

@@ -18,7 +18,7 @@ from calibrate.files.touch import agrees
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
 from calibrate.files.versions import LogEntry, read_log, same_solve
-from calibrate.quality.checks import CheckEntry, read_checks
+from calibrate.quality.drift_history import CheckEntry, read_checks
 from recordings.files import MAIN_CAMERA
 from station.cell.session_folder import SessionSummary
 

@@ -11,7 +11,7 @@ from textual.pilot import Pilot
 
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
-from calibrate.quality.checks import CheckEntry, append_check
+from calibrate.quality.drift_history import CheckEntry, append_check
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus

@@ -19,8 +19,8 @@ from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, forward
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_at
-from calibrate.quality.checks import CheckEntry, append_check, earlier_results, find_trend, read_checks
 from calibrate.quality.drift import POWER, DriftCheck, Noise, check_drift, judge_shift, pnp_covariance, powers
+from calibrate.quality.drift_history import CheckEntry, append_check, earlier_results, find_trend, read_checks
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
 from tests.calibrate.calling import raises_code

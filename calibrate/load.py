@@ -31,7 +31,7 @@ from recordings.schema.messages import (
     View,
 )
 
-FEWEST_VIEWS = 4
+FEWEST_FOR_SOLVE = 4
 Progress = Callable[[int, int, str], None]
 """done, of, name of the picture"""
 
@@ -57,7 +57,7 @@ def load_views(
     camera: CameraModel | None = None,
     progress: Progress | None = None,
     threads: int | None = None,
-    fewest: int = FEWEST_VIEWS,
+    fewest: int = FEWEST_FOR_SOLVE,
 ) -> LoadedViews:
     """Find the board in every image of the recording.
 
@@ -176,7 +176,9 @@ def arm_of_ros(content: bytes, robot: str) -> RobotModel:
     return table_of_axes(MODELS[robot], frames[1:, :3, 2], frames[1:, :3, 3], frames[6])
 
 
-def without_views(loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_VIEWS) -> LoadedViews:
+def without_views(
+    loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_FOR_SOLVE
+) -> LoadedViews:
     """Exclude the poses of these numbers (from 1), which a person chose; they are listed as rejected.
 
     A pose whose picture shows no board is left out already. Raises BadViewsError for a number that no pose

@@ -22,7 +22,7 @@ from calibrate.files.validity import Validity, ValidityReason, validity_text
 from calibrate.job import JobOptions
 from calibrate.pipeline import prepare_views
 from calibrate.quality.drift import (
-    FEWEST_VIEWS,
+    FEWEST_FOR_DRIFT_CHECK,
     POWER,
     CellIdentity,
     DriftCheck,
@@ -76,7 +76,7 @@ def drift_check(
     calibration, _ = named_or_installed(calibration_file, root, camera)
     options = JobOptions(camera=calibration.intrinsics.model, threads=threads)
     with detection_progress() as progress:
-        prepared = prepare_views(recording, options, progress, fewest=FEWEST_VIEWS)
+        prepared = prepare_views(recording, options, progress, fewest=FEWEST_FOR_DRIFT_CHECK)
     info = prepared.recording.info
     try:
         require_same_cell(str(recording), calibration, CellIdentity.of(info))

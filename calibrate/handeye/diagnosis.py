@@ -136,7 +136,7 @@ def _chance(residual: Array, covariance: Array) -> float:
 
 
 FOLDS = 5
-FEWEST_VIEWS = 6
+FEWEST_FOR_FOLDS = 6
 _STEPS = 3
 """Linearisations for each fold; few suffice, as it starts from the estimate of all views."""
 _CALLED_TOO_SMALL = 1e-4
@@ -146,7 +146,7 @@ _CALLED_TOO_SMALL = 1e-4
 def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
     """Predict each view from the other folds; None with too few views, or where a fold determines nothing."""
     full = np.flatnonzero(fit.estimate.chances[:, 0] > FULL)
-    if len(full) < FEWEST_VIEWS:
+    if len(full) < FEWEST_FOR_FOLDS:
         return None
     order = np.random.default_rng(seed).permutation(full)
     missed = np.zeros((len(fit.views), 6))

@@ -25,7 +25,7 @@ from recordings.schema.messages import CameraModel
 
 LensModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 
-FEWEST_VIEWS = 3
+FEWEST_FOR_INTRINSICS = 3
 _FISHEYE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-9)
 
 
@@ -45,12 +45,12 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
 
     Raises TooFewViewsError below three views, BadViewsError when no lens explains the corners.
     """
-    if len(views) < FEWEST_VIEWS:
+    if len(views) < FEWEST_FOR_INTRINSICS:
         raise TooFewViewsError(
-            f"{len(views)} views cannot tell the intrinsics (minimum {FEWEST_VIEWS}).",
+            f"{len(views)} views cannot tell the intrinsics (minimum {FEWEST_FOR_INTRINSICS}).",
             remedy="Give the camera's matrix and distortion, or record more views with different tilts.",
             views=len(views),
-            minimum=FEWEST_VIEWS,
+            minimum=FEWEST_FOR_INTRINSICS,
         )
     dropped: dict[int, str] = {}
     used = views
@@ -66,7 +66,7 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
             ) from None
         median_px = float(np.median(view_rms_px))
         good = np.flatnonzero(view_rms_px <= max(4 * median_px, 0.5)).tolist()
-        if len(good) == len(used) or len(good) < FEWEST_VIEWS:
+        if len(good) == len(used) or len(good) < FEWEST_FOR_INTRINSICS:
             break
         for k in set(range(len(used))) - set(good):
             fits = f"its corners fit the lens to {view_rms_px[k]:.2f} px, the median is {median_px:.2f} px"

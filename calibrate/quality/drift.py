@@ -25,7 +25,7 @@ from calibrate.projection import project_at
 from calibrate.views import ViewSet, board_in_camera, extent_of, observe_views, require_no_copies
 from recordings.schema.messages import CameraModel, Mount, SessionInfo, Source
 
-FEWEST_VIEWS = 3
+FEWEST_FOR_DRIFT_CHECK = 3
 FALSE_ALARM = 0.05
 POWER = 0.95
 """Probability of detecting `SHIFT_M` and `TURN_RAD` that a check should have."""
@@ -136,12 +136,12 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
     Gauss-Newton over δX and the board's pose P. The residual r of a view is the difference between the board
     pose seen and that implied by X and P; its covariance is that of PnP plus that of the robot's pose.
     """
-    if len(views) < FEWEST_VIEWS:
+    if len(views) < FEWEST_FOR_DRIFT_CHECK:
         raise TooFewViewsError(
-            f"{len(views)} views are too few for a drift check (≥ {FEWEST_VIEWS}).",
+            f"{len(views)} views are too few for a drift check (≥ {FEWEST_FOR_DRIFT_CHECK}).",
             remedy="Capture more: station drift-check.",
             views=len(views),
-            needed=FEWEST_VIEWS,
+            needed=FEWEST_FOR_DRIFT_CHECK,
         )
     flanges, seen = views.base_from_flange, views.camera_from_board
     pnp = np.array(

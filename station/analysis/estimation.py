@@ -30,7 +30,7 @@ from station.cell.config import StationConfig, matrix4
 from station.cell.status import EstimateStatus
 from station.plan.visibility import count_in_parts
 
-FEWEST_VIEWS = 4
+FEWEST_FOR_ESTIMATE = 4
 FEWEST_FOR_LENS = 6
 COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
 
@@ -48,7 +48,7 @@ def running_estimate(
         image_coverage=image_coverage(camera, [view.pixels for view in seen]),
         image_views=tuple(tuple(int(n) for n in row) for row in np.greater(shown, 0).sum(axis=0)),
     )
-    if len(seen) < FEWEST_VIEWS:
+    if len(seen) < FEWEST_FOR_ESTIMATE:
         return msgspec.structs.replace(blank, advice="too few views yet")
     try:
         views, X, Y = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)

@@ -128,7 +128,7 @@ def _closed_form_translation(D: Array, right: Array) -> Array:
     )
 
 
-_FEWEST_VIEWS = 10
+_FEWEST_FOR_SANDWICH = 10
 """With fewer views their scores do not span six directions: pairs then count as independent."""
 
 
@@ -141,7 +141,7 @@ def pair_covariance(objective: QuadraticObjective, pairs: Pairs, X: Array) -> Ar
     H_inverse = np.linalg.pinv(objective.curvature(X), hermitian=True)
     views, first = np.unique(np.concatenate([pairs.first, pairs.second]), return_inverse=True)
     n = len(views)
-    if n < _FEWEST_VIEWS:
+    if n < _FEWEST_FOR_SANDWICH:
         variance = max(objective.value(X), 0.0) / max(6 * len(pairs) - 6, 1)
         return np.asarray(variance * H_inverse * n / 2)
     scores = np.zeros((n, 6))

@@ -31,7 +31,7 @@ from recordings.schema.messages import (
     View,
 )
 
-FEWEST_FOR_SOLVE = 4
+FEWEST_TO_SOLVE = 4
 Progress = Callable[[int, int, str], None]
 """done, of, name of the picture"""
 
@@ -57,7 +57,7 @@ def load_views(
     camera: CameraModel | None = None,
     progress: Progress | None = None,
     threads: int | None = None,
-    fewest: int = FEWEST_FOR_SOLVE,
+    fewest: int = FEWEST_TO_SOLVE,
 ) -> LoadedViews:
     """Find the board in every image of the recording.
 
@@ -177,7 +177,7 @@ def arm_of_ros(content: bytes, robot: str) -> RobotModel:
 
 
 def without_views(
-    loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_FOR_SOLVE
+    loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_TO_SOLVE
 ) -> LoadedViews:
     """Exclude the poses of these numbers (from 1), which a person chose; they are listed as rejected.
 

@@ -23,7 +23,7 @@ from calibrate.job import JobOptions, PreparedViews, SolvedRecording
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
-from calibrate.load import FEWEST_FOR_SOLVE, Progress, load_views, without_views
+from calibrate.load import FEWEST_TO_SOLVE, Progress, load_views, without_views
 from calibrate.projection import intrinsics_names
 from calibrate.quality.gates import GateInputs, judge
 from calibrate.views import ViewSet
@@ -62,7 +62,7 @@ def prepare_views(
     path: Path,
     options: JobOptions | None = None,
     progress: Progress | None = None,
-    fewest: int = FEWEST_FOR_SOLVE,
+    fewest: int = FEWEST_TO_SOLVE,
 ) -> PreparedViews:
     """Open, find the boards, the lens where it is not known, and the board poses.
 

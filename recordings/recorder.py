@@ -234,9 +234,10 @@ class Recorder:
             self._finished.set_result(self._writer.finish())
 
     def _next(self) -> list[_Item]:
-        """The oldest items: states up to the first thing that is none, which may be large or waited for.
+        """Take the oldest items: states up to and including the first other item.
 
-        Empty when there are none for a flush period, or when there will be no more.
+        Another item may be large, or a caller may wait for it, so it is written before more are taken. Empty
+        when none came for a flush period, or when there will be no more.
         """
         items: list[_Item] = []
         with self._lock:

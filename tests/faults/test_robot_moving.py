@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
+from station.devices.news import Delay
 from station.devices.ur_child import ControlChild
 from tests.codes import raises
 from tests.patience import until
@@ -199,9 +200,10 @@ async def test_a_control_process_held_up_between_two_moves_is_named_by_the_next(
     await asyncio.sleep(0.4)
     with suppress(ProcessLookupError):  # the station may have ended it
         os.kill(control_pid, signal.SIGCONT)
-    with raises("computer-late"):
+    with pytest.raises(RobotError) as told:
         while True:
             await c.robot.move(here, 0.5, 1.0)
+    assert told.value.code in set(Delay)  # on a busy computer the controller may be late, too
 
 
 async def test_a_session_loop_that_stalls_stops_the_arm(strike: Strike) -> None:

@@ -103,7 +103,7 @@ def _real_cell(config: Path, root: Path) -> Cell:
 
 
 async def serve_cell(
-    cell: Cell, root: Path, socket: Path, end_with_stdin: bool, real_time: RealTimeThreads
+    cell: Cell, root: Path, socket: Path, end_with_stdin: bool, real_time: RealTimeThreads | None = None
 ) -> None:
     """Ends the process, too: a thread in a driver or on a disk that hangs is not waited for."""
     from station.daemon import Daemon

@@ -64,6 +64,8 @@ class FreedriveCapture:
                     store.enter(context.resting)
                 raise
         if (refusal := Record.refusal(store.state)) is not None:
+            if store.state is StationState.IDLE:  # acknowledged before there was a recording to pause
+                store.enter(context.resting)
             raise refusal  # STOP, or the end of freedrive, came in between
         store.enter(StationState.FREE_DRIVE, _GUIDE)
         context.show_poses()

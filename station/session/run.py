@@ -102,7 +102,7 @@ class Run:
         or the controller stopped the arm.
         """
         late = error.code in set(Delay) and self._approved_again < APPROVED_AGAIN
-        return late and self._context.cell.simulated and self._go.beside is None and not self._halted
+        return late and self._context.cell.own_simulator and self._go.beside is None and not self._halted
 
     @property
     def _halted(self) -> bool:

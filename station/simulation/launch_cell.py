@@ -85,6 +85,7 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
         trigger=trigger,
         attachments=attachments,
         ended=started.close,
+        own_simulator=True,
     )
 
 

@@ -60,6 +60,7 @@ def rehearsed_cell(config: StationConfig, path: str, folder: Path, seed: int = 0
         config_path=path,
         attachments=attachments | {ATTACHMENT: json.dumps(about).encode()},
         ended=ends.close,
+        own_simulator=True,
     )
 
 

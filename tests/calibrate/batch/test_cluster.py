@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -91,7 +92,7 @@ def test_a_killed_worker_loses_nothing_and_the_bits_are_the_pools(
                 os.kill(pids[1], signal.SIGKILL)
             opened.update(listening_inodes(os.getpid()) - before)
 
-        wait_until((tmp_path / "scheduler.json").exists)
+        wait_until(lambda: _is_written(tmp_path / "scheduler.json"))
         workers = cluster_workers(Cluster.from_file(tmp_path / "scheduler.json"))
         spread = run_batch(recordings, tmp_path / "dask", progress=kill_one, workers=workers)
     assert [result.error for result in spread] == [""] * 4
@@ -185,3 +186,11 @@ def test_nothing_left_to_solve_needs_no_cluster(recordings: list[Path], tmp_path
     run_batch(recordings[:1], tmp_path / "out", workers=in_this_process)
     nobody = cluster_workers(Cluster("tcp://127.0.0.1:9")) if shutil.which("dask") else in_this_process
     assert run_batch(recordings[:1], tmp_path / "out", workers=nobody)[0].solved
+
+
+def _is_written(path: Path) -> bool:
+    """Its program is not in the middle of it."""
+    try:
+        return bool(json.loads(path.read_text()))
+    except (FileNotFoundError, json.JSONDecodeError):
+        return False

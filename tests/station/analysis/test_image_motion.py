@@ -164,7 +164,7 @@ async def test_a_ringing_bracket_is_waited_for(
     object.__setattr__(context.cell, "camera", rendered)
     await rendered.inject("ringing", {"amplitude_rad": 0.01, "frequency_hz": 6.3})
     async with ImageWatch(context, 0) as watch:
-        settling = asyncio.ensure_future(context.stillness.settle(lambda: None, watch.look))
+        settling = asyncio.ensure_future(context.stillness.settle(lambda: True, watch.look))
         look = None
         while look is None:
             await asyncio.sleep(0.02)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from typing import Any
 
 import pytest
 
@@ -16,6 +17,7 @@ from station.protocol.verbs import Drop, Purpose
 from station.session import freedrive
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
+from station.session.threads import DISK
 from tests.codes import raises
 from tests.patience import until
 from tests.station.session_rig import POSES, Rig, sealed
@@ -185,3 +187,23 @@ async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
     if not fails:
         await rig.session.finish(1)  # in idle it was refused, and so was every plan
         assert rig.state is S.IDLE
+
+
+async def test_stop_that_is_acknowledged_before_the_recording_is_there_leaves_a_way_on(
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig, disk, run = bare_rig, asyncio.Event(), DISK.run
+
+    async def slow(*work: Any, **named: Any) -> Any:
+        await disk.wait()
+        return await run(*work, **named)
+
+    monkeypatch.setattr(DISK, "run", slow)
+    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
+    await rig.until(S.FREE_DRIVE)
+    await rig.session.stop("bert")
+    await rig.session.acknowledge("anna")
+    disk.set()
+    with pytest.raises(RefusedError):
+        await beginning
+    assert rig.state is S.PAUSED and rig.session.context.recording is not None

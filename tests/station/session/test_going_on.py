@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -16,7 +17,13 @@ LATE = [StaleStateError("busy", code=delay) for delay in Delay]
 
 
 async def end_of_run(rig: Rig, errors: list[RobotError]) -> Rig:
-    """A run whose first moves end so, at its rest."""
+    """A run whose first moves end so, at its rest; of a cell whose simulator the station started."""
+    context = rig.session.context
+    context.cell = replace(context.cell, own_simulator=context.cell.simulated)
+    return await end_of_any_run(rig, errors)
+
+
+async def end_of_any_run(rig: Rig, errors: list[RobotError]) -> Rig:
     move, left = rig.arm.move, list(errors)
 
     async def fails_first(*request: Any) -> None:
@@ -64,9 +71,10 @@ async def test_nothing_but_lateness_is_gone_on_after(rig: Rig, error: RobotError
     assert rig.state is state and rig.arm.log.count("move") == 1
 
 
-@pytest.mark.parametrize("source", ["real", "playback"])
+@pytest.mark.parametrize("source", ["real", "playback", "simulated"])
 async def test_any_other_cell_waits_for_a_person(new_rig: NewRig, source: str) -> None:
-    rig = await end_of_run(await new_rig(source=source), LATE[:1])
+    """A simulated one, too, whose simulator is somebody else's."""
+    rig = await end_of_any_run(await new_rig(source=source), LATE[:1])
     assert rig.state is S.FAULT and rig.cause == Delay.COMPUTER and rig.arm.log.count("move") == 1
 
 
@@ -80,6 +88,8 @@ async def test_stop_and_a_lost_client_end_it_while_it_approves_again(
     summary = await rig.session.prepare(1, "run")  # type: ignore[arg-type]
     monkeypatch.setattr("station.session.run.summarise", ended_meanwhile)
     monkeypatch.setattr(rig.arm, "move", _late)
+    context = rig.session.context
+    context.cell = replace(context.cell, own_simulator=True)
     await rig.session.go(1, summary.token)
     await rig.until(S.STOPPED, S.PAUSED)
     assert rig.state is (S.STOPPED if how == "stop" else S.PAUSED)

@@ -6,6 +6,7 @@ record. What the channels mean is gathered from everything that is whole, before
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import zlib
@@ -171,14 +172,23 @@ class _Walk:
 
     def _next_good(self, position: int) -> int:
         """The next place where a whole chunk, attachment or metadata record starts, or the file's end."""
-        for start in range(position, self._size, _BLOCK_BYTES):
+        start = self._next_data(position)
+        while start < self._size:
             block, at = self._read(start, _BLOCK_BYTES + _PATTERN_BYTES - 1), -1
             while (match := _LIKE_A_RECORD.search(block, at + 1)) is not None:
                 at = match.start()
                 with suppress(BadRecordError):
                     _proven(*self._content(start + at))
                     return start + at
+            start = self._next_data(start + _BLOCK_BYTES)
         return self._size
+
+    def _next_data(self, position: int) -> int:
+        """Skip what was never written: a sparse file of many gigabytes may hold next to nothing."""
+        try:
+            return os.lseek(self._descriptor, position, os.SEEK_DATA)
+        except OSError as error:  # EINVAL: this file system cannot tell
+            return self._size if error.errno == errno.ENXIO else position
 
     def _declarations_from_summary(self) -> None:
         """A finished file repeats its channels at the end: they help when the chunk that had them is lost."""

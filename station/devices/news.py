@@ -35,6 +35,17 @@ class Delay(StrEnum):
     NETWORK = "network-late"
 
 
+_TOLD = {
+    Delay.COMPUTER: ("this computer was busy", "End other programs on it"),
+    Delay.CONTROLLER: ("the robot's controller sent nothing", "Look at the pendant"),
+    Delay.NETWORK: (
+        "the network carried nothing from the robot",
+        "Check cable, switch and what else uses this network",
+    ),
+}
+"""What happened, and what to do."""
+
+
 class Evidence(NamedTuple):
     """Measurements of the time before an arm was stopped, from which the cause of a delay is derived."""
 
@@ -65,30 +76,12 @@ class Evidence(NamedTuple):
 
     def error(self, effect: str = ": the arm was stopped") -> StaleStateError | None:
         """Make the error for people; None without a delay. `effect`: what followed from it."""
-        pause_ms, gap_ms = 1000 * self.pause_s, 1000 * self.gap_s
-        match self.delay:
-            case Delay.COMPUTER:
-                return StaleStateError(
-                    f"this computer was busy for {pause_ms:.0f} ms{effect}",
-                    code=Delay.COMPUTER,
-                    remedy=f"End other programs on it, {APPROVE_AGAIN}.",
-                    late_ms=pause_ms,
-                )
-            case Delay.CONTROLLER:
-                return StaleStateError(
-                    f"the robot's controller sent nothing for {gap_ms:.0f} ms{effect}",
-                    code=Delay.CONTROLLER,
-                    remedy=f"Look at the pendant, {APPROVE_AGAIN}.",
-                    late_ms=gap_ms,
-                )
-            case Delay.NETWORK:
-                return StaleStateError(
-                    f"the network carried nothing from the robot for {gap_ms:.0f} ms{effect}",
-                    code=Delay.NETWORK,
-                    remedy=f"Check cable, switch and what else uses this network, {APPROVE_AGAIN}.",
-                    late_ms=gap_ms,
-                )
-        return None
+        if (delay := self.delay) is None:
+            return None
+        late_ms = 1000 * (self.pause_s if delay is Delay.COMPUTER else self.gap_s)
+        what, remedy = _TOLD[delay]
+        text, remedy = f"{what} for {late_ms:.0f} ms{effect}", f"{remedy}, {APPROVE_AGAIN}."
+        return StaleStateError(text, code=delay, remedy=remedy, late_ms=late_ms)
 
 
 def largest_gap(

@@ -70,6 +70,7 @@ class UrLink:
         self._payload: Payload | None = None
         """The payload at connect."""
         self._trouble: RobotError | None = None
+        self._trouble_since_s = 0.0
         self._supervisor: asyncio.Task[None] | None = None
 
     @property
@@ -322,6 +323,9 @@ class UrLink:
             raise stop
         self.check_tool(self.newest())
         if self._trouble is not None:
+            recent = time.monotonic() - self._trouble_since_s <= RESTING_S
+            if self._trouble.code == DashboardError.code and recent and not self.in_motion:
+                return None  # what held up the news held up the dashboard, too
             raise self._trouble
         return state
 
@@ -358,6 +362,8 @@ class UrLink:
                 failures, self._trouble = 0, None
             except StationError as error:
                 failures += 1
+                if self._trouble is None:
+                    self._trouble_since_s = time.monotonic()
                 self._trouble = RobotError(error.text, code=error.code, remedy=error.remedy, **error.values)
             except Exception:
                 failures += 1

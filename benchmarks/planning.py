@@ -31,10 +31,10 @@ from benchmarks.scene import MID
 from benchmarks.trials import trials
 from calibrate.geometry import Array, difference, perturb
 from calibrate.handeye.cell_state import CellState
-from calibrate.handeye.corners import bent_points
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.information import MeasurementNoise
 from calibrate.handeye.priors import LensPrior, Priors
+from calibrate.handeye.reprojection import bent_points
 from calibrate.kinematics import forward
 from calibrate.projection import project
 from calibrate.results import SHAPE

@@ -13,7 +13,7 @@ from vision_calibration import models as rs
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose_from_quaternion, quaternion_from_matrix
 from calibrate.handeye.axxb.peer_methods import HAND_EYE, ROBOT_WORLD, opencv_hand_eye, opencv_robot_world
-from calibrate.handeye.corners import bent_points
+from calibrate.handeye.reprojection import bent_points
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import calibrate_intrinsics

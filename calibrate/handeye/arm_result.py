@@ -11,7 +11,7 @@ from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb
 from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA, ArmPostures, corrected_model
 from calibrate.handeye.cell_state import Layout
-from calibrate.handeye.corners import boards_by_corners
+from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.estimate import CellFit
 from calibrate.handeye.solution import MEASURED, Solution, TableRefusal, TableResult, Verification
 from calibrate.handeye.workspace import MIDDLE, SPREAD, Workspace, sample_workspace
@@ -94,7 +94,7 @@ def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") ->
     views, shape = views.select(far), solution.board
     observed = observe_views(views)
     numbers = np.zeros(len(SHAPE)) if shape is None else shape.numbers
-    C = boards_by_corners(observed, solution.camera, views.camera_from_board, numbers)
+    C = fit_corners(observed, solution.camera, views.camera_from_board, shape=numbers, robust=True).C
     joints = np.array([view.joints_rad for view in views], dtype=float)
     middle = np.array([*observed.extent[0], 0.0, 1.0])
     missed = []

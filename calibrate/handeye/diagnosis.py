@@ -11,8 +11,9 @@ from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, skew
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.estimate import FULL, CellFit, estimate
-from calibrate.handeye.linear import Linear, inverse_of
+from calibrate.handeye.linear import Linear
 from calibrate.handeye.solution import CrossValidation, Finding
+from calibrate.handeye.uncertainty import inverse_of
 from calibrate.projection import intrinsics_vector
 from calibrate.results import RejectedView
 from calibrate.views import Places, implied_flange

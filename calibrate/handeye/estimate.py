@@ -18,9 +18,12 @@ from calibrate.handeye.arm import ArmPostures
 from calibrate.handeye.axxb.global_start import GlobalResult
 from calibrate.handeye.axxb.pairs import Pairs
 from calibrate.handeye.cell_state import CellState
-from calibrate.handeye.corners import corner_distance, corner_residuals
-from calibrate.handeye.linear import GAIN, ROBOT_PRIOR_COUNT, STUDENT, WIDE, Fit, Linear, Scales, first_scales
+from calibrate.handeye.corner_modes import STUDENT
+from calibrate.handeye.linear import Fit, Linear
+from calibrate.handeye.mixture import weights_of
+from calibrate.handeye.noise_scales import ROBOT_PRIOR_COUNT, WIDE, Scales
 from calibrate.handeye.priors import Priors
+from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.views import Observations, ViewSet
 
 MAX_STEPS = 15
@@ -73,7 +76,7 @@ class Estimate:
     @property
     def weight(self) -> Array:
         """Weight (n,) of each view: 1 counts fully, 0 not at all."""
-        return np.asarray(self.chances[:, :3] @ GAIN**-2.0)
+        return weights_of(self.chances)
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -122,7 +125,7 @@ def estimate(
     converged, steps = False, 0
     fit: Fit = "all" if fit_scales else "nothing"
     linear = Linear.at(observed, state, weights)
-    scales = scales or first_scales(linear, wide)
+    scales = scales or linear.first_scales(wide)
     try:
         while steps < max_steps and not converged:
             steps += 1

@@ -22,10 +22,11 @@ from calibrate.handeye.estimate import (
     estimate,
     is_settled,
 )
-from calibrate.handeye.linear import Linear, LinearSolution, inverse_of
+from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.pose_fit import BoardPoses, agreed_start
 from calibrate.handeye.priors import Priors
+from calibrate.handeye.uncertainty import inverse_of
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, Observations, Places, ViewSet, observe_views
 

@@ -82,7 +82,7 @@ def view_information(
     information = J_t @ W @ linear.J
     if linear.modes is not None:
         shared = linear.modes.shared
-        information[:, shared, shared] += linear.modes.information / noise.pixel_px**2
+        information[:, shared, shared] += linear.modes.free.information / noise.pixel_px**2
     return np.asarray(information)
 
 

@@ -26,9 +26,7 @@ from calibrate.handeye.axxb.peer_methods import (
     zhi_linear,
 )
 from calibrate.handeye.cell_state import CellState
-from calibrate.handeye.corners import corner_residuals, linearise_corners
 from calibrate.handeye.estimate import estimate
-from calibrate.handeye.linear import Scales
 from calibrate.handeye.metrics import (
     HeldOut,
     board_spread,
@@ -40,7 +38,9 @@ from calibrate.handeye.metrics import (
     placed_boards,
     require_solvable,
 )
+from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
+from calibrate.handeye.reprojection import corner_residuals, linearise_corners
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_robust_profile
 from calibrate.projection import intrinsics_vector

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from calibrate.geometry import Array, difference, inverse, perturb, pose, project_to_rotation, rotation_log
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.cell_state import Quadratic, flange_derivatives
-from calibrate.handeye.corners import linearise_corners
-from calibrate.handeye.linear import CornerModes, Linear, LinearSolution, Scales, first_scales
+from calibrate.handeye.corner_modes import CornerModes
+from calibrate.handeye.linear import Linear, LinearSolution
+from calibrate.handeye.noise_scales import Scales
+from calibrate.handeye.reprojection import linearise_corners
 from calibrate.projection import intrinsics_vector
 from calibrate.views import Places, ViewSet, implied_flange, observe_views
 from recordings.schema.messages import Mount
@@ -204,8 +206,8 @@ def pose_views(views: ViewSet, focal_sigma: float, size_sigma: float) -> PoseVie
         )
     blocks = linearise_corners(observed, views.camera, C, observed.present, with_lens=True)
     H = np.asarray(np.linalg.inv(blocks.LL), dtype=float)
-    focal = -(H @ blocks.LG[..., :2]) @ intrinsics_vector(views.camera)[:2]
     modes = CornerModes.of(blocks, H, slice(0))
+    focal = -modes.free.by_shared[..., :2] @ intrinsics_vector(views.camera)[:2]
     boards = BoardPoses(C, np.stack([size, focal]), np.array([size_sigma, focal_sigma]))
     return PoseViews(views.mount, observed.flange, boards, modes.typical_px**2 * H)
 
@@ -236,7 +238,7 @@ def fit_poses(views: PoseViews, seed: int = 0) -> PoseFit:
     scales: Scales | None = None
     for _ in range(_STEPS):
         linear = _linearise(views, X, Y, factors)
-        scales = scales or first_scales(linear)
+        scales = scales or linear.first_scales()
         solved = linear.solve(_prior(views.boards, len(X) + len(Y), factors), scales, "robot")
         scales, step = solved.scales, solved.step
         at_Y, at_factors = 6 * len(X), 6 * (len(X) + len(Y))

@@ -16,7 +16,7 @@ from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
 from calibrate.handeye.cell_state import Layout
-from calibrate.handeye.corners import boards_by_corners, corner_distance, corner_residuals
+from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.diagnosis import (
     cross_validate,
     error_shares,
@@ -43,6 +43,7 @@ from calibrate.handeye.metrics import (
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.readings import explain_recording, explain_text
+from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.handeye.solution import (
     ArmTable,
     Explanation,
@@ -227,7 +228,8 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
         return None
     H = mount_poses(fit.views.base_from_flange, fit.views.mount)[last]
     state = partial.state
-    C = boards_by_corners(fit.observed.part(last), state.camera, whole.board_poses[last], state.shape)
+    seen, C = fit.observed.part(last), whole.board_poses[last]
+    C = fit_corners(seen, state.camera, C, shape=state.shape, robust=True).C
     pairs = all_pairs(H, C)
     indices = [fit.views.views[i].index for i in last]
     note = f"fit on {len(first)} views, all {len(pairs)} pairs inside the other {HELD_OUT} scored"

@@ -15,11 +15,11 @@ import msgspec
 import numpy as np
 
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import Array, perturb
-from calibrate.handeye.corners import CornerBlocks, corner_residuals, linearise_corners
+from calibrate.geometry import Array
+from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.priors import LensPrior
 from calibrate.lens.pnp import planar_tilts
-from calibrate.projection import camera_matrix, intrinsics_vector, with_intrinsics_vector
+from calibrate.projection import camera_matrix
 from calibrate.views import ViewSet, observe_views
 from recordings.schema.messages import CameraModel
 
@@ -115,43 +115,14 @@ def _first_fisheye(views: ViewSet) -> CameraModel:
     return CameraModel(*size, matrix, tuple(float(v) for v in np.asarray(D).ravel()), "equidistant")
 
 
-_STEPS = 60
-_SETTLED = 1e-9
-"""Relative gain after which the next step, by far smaller, is not worth taking: a thousandth of a sigma."""
-_DAMPING, _LARGEST_DAMPING = 1e-9, 1e9
-"""The first and least one; and where it ends."""
-_CORNER_PX = 0.3
-"""1σ of a corner against which the prior is weighed."""
-
-
 def fit_lens(views: ViewSet, start: CameraModel) -> tuple[CameraModel, Array]:
     """Fit from an initial lens: the lens, and the rms distance of each view's corners from it (n,), px.
 
     Raises BadViewsError or cv2.error where the corners allow no fit.
     """
-    observed = observe_views(views)
-    prior = LensPrior.unknown(start)
-    camera, C = start, np.array([planar_tilts(view, start)[0] for view in views])
-    blocks = linearise_corners(observed, camera, C, observed.present, with_lens=True)
-    cost = _cost(blocks, prior, camera)
-    damping = _DAMPING
-    for _ in range(_STEPS):
-        trial = _moved(blocks, prior, camera, C, damping)
-        ahead, ahead_cost = None, np.inf
-        if trial is not None:
-            ahead = linearise_corners(observed, *trial, observed.present, with_lens=True)
-            ahead_cost = _cost(ahead, prior, trial[0])
-        if trial is None or ahead is None or not ahead_cost <= cost:
-            damping *= 30
-            if damping > _LARGEST_DAMPING:
-                break
-            continue
-        (camera, C), blocks, before, cost = trial, ahead, cost, ahead_cost
-        damping = max(damping / 10, _DAMPING)
-        if before - cost <= _SETTLED * before:
-            break
-    square = (corner_residuals(observed, camera, C) ** 2).sum(axis=(1, 2))
-    return camera, np.sqrt(square / observed.present.sum(axis=1))
+    C = np.array([planar_tilts(view, start)[0] for view in views])
+    found = fit_corners(observe_views(views), start, C, LensPrior.unknown(start))
+    return found.camera, found.rms_px
 
 
 def initial_camera(views: ViewSet) -> CameraModel:
@@ -164,36 +135,3 @@ def initial_camera(views: ViewSet) -> CameraModel:
     focal = np.clip(focal, 0.1 * max(size), 100 * max(size))
     matrix = ((float(focal[0]), 0.0, (size[0] - 1) / 2), (0.0, float(focal[1]), (size[1] - 1) / 2))
     return CameraModel(*size, (*matrix, (0.0, 0.0, 1.0)), (0.0,) * 5)
-
-
-def _prior_terms(prior: LensPrior, camera: CameraModel) -> tuple[Array, Array]:
-    """Distance (p,) from the prior's mean, and its precision (p,) for corners of 1 px."""
-    return intrinsics_vector(camera) - prior.mean, _CORNER_PX**2 * prior.sigma**-2.0
-
-
-def _cost(blocks: CornerBlocks, prior: LensPrior, camera: CameraModel) -> float:
-    miss, precision = _prior_terms(prior, camera)
-    return float(blocks.rr.sum()) + float((precision * miss**2).sum())
-
-
-def _moved(
-    blocks: CornerBlocks, prior: LensPrior, camera: CameraModel, C: Array, damping: float
-) -> tuple[CameraModel, Array] | None:
-    """After a damped step, the board poses eliminated; None where there is no such camera."""
-    miss, precision = _prior_terms(prior, camera)
-    LL, GG = blocks.LL.copy(), blocks.GG.sum(axis=0)
-    for block in (LL, GG):
-        np.einsum("...ii->...i", block)[:] *= 1 + damping
-    try:
-        H = np.asarray(np.linalg.inv(LL), dtype=float)
-        HLG = H @ blocks.LG
-        information = GG - np.einsum("nia,nib->ab", blocks.LG, HLG) + np.diag(precision)
-        right = blocks.Gr.sum(axis=0) - np.einsum("nia,ni->a", HLG, blocks.Lr) - precision * miss
-        step = np.linalg.solve(information, right)
-    except np.linalg.LinAlgError:
-        return None
-    by_view = np.einsum("nij,nj->ni", H, blocks.Lr) - HLG @ step
-    vector = intrinsics_vector(camera) + step
-    if not (vector[:2] > 0).all() or not np.isfinite(by_view).all():
-        return None
-    return with_intrinsics_vector(camera, vector), perturb(C, by_view)

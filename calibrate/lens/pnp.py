@@ -14,18 +14,11 @@ from numpy.typing import NDArray
 
 from calibrate.boards.model import board_from_turned, looks_same_turns
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, rotation_log, transform_points
-from calibrate.handeye.corners import corner_residuals, linearise_corners
+from calibrate.geometry import Array, inverse, pose, rotation_exp, rotation_log, transform_points
+from calibrate.handeye.corner_fit import fit_corners
 from calibrate.projection import camera_matrix, project_at, undistort
-from calibrate.views import BoardView, Observations, ViewSet, observe_views
+from calibrate.views import BoardView, ViewSet, observe_views
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
-
-_STEPS = 20
-_SETTLED = 1e-6
-"""Relative gain after which the next step, by far smaller, is not worth taking: a hundredth of a sigma."""
-_JUDGED_AFTER = 4
-"""Steps after which a tilt that is far from credible is not followed any further: it has no minimum there."""
-_DAMPING, _LARGEST_DAMPING = 1e-6, 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +74,10 @@ def _planar_poses(views: ViewSet) -> list[list[Array]]:
     """T. Collins, A. Bartoli: "Infinitesimal plane-based pose estimation" (2014), then least squares."""
     starts = [planar_tilts(view, views.camera) for view in views]
     owner = np.repeat(np.arange(len(views)), [len(each) for each in starts])
-    poses, rms_px = _least_squares(views, owner, np.concatenate(starts))
+    found = fit_corners(observe_views(views).part(owner), views.camera, np.concatenate(starts))
+    poses, rms_px = found.C, found.rms_px
     in_front = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(rms_px) & (poses[:, 2, 3] > 0)
-    found = []
+    candidates = []
     for i, view in enumerate(views):
         own = np.flatnonzero(in_front & (owner == i))
         if not len(own):
@@ -95,8 +89,8 @@ def _planar_poses(views: ViewSet) -> list[list[Array]]:
             )
         own = own[np.argsort(rms_px[own], kind="stable")]
         limit_px = _credible_px(rms_px[own[0]])
-        found.append([poses[k] for k in own if rms_px[k] <= limit_px])
-    return found
+        candidates.append([poses[k] for k in own if rms_px[k] <= limit_px])
+    return candidates
 
 
 def _credible_px(best_px: Array) -> Array:
@@ -121,46 +115,6 @@ def planar_tilts(view: BoardView, camera: CameraModel) -> Array:
     return pose(
         rotation_exp(np.reshape(turns, (-1, 3))[:count]), np.reshape(shifts, (-1, 3))[:count]
     ).reshape(-1, 4, 4)
-
-
-def _least_squares(views: ViewSet, owner: NDArray[np.intp], poses: Array) -> tuple[Array, Array]:
-    """Poses (m, 4, 4) of views `owner` (m,), each by itself to its own minimum; and rms distances (m,), px.
-
-    Levenberg-Marquardt on all of them at once.
-    """
-    everything = observe_views(views)
-    poses, damping = poses.copy(), np.full(len(poses), _DAMPING)
-    square = _squares(everything, views.camera, owner, poses)
-    going = np.flatnonzero(np.isfinite(square))
-    count = everything.present[owner].sum(axis=1)
-    for step in range(_STEPS):
-        if step == _JUDGED_AFTER:
-            best = np.full(len(views), np.inf)
-            np.fmin.at(best, owner, square)
-            limit = 2 * _credible_px(np.sqrt(best[owner] / count))
-            going = going[np.sqrt(square / count)[going] <= limit[going]]
-        if not len(going):
-            break
-        observed = everything.part(owner[going])
-        blocks = linearise_corners(observed, views.camera, poses[going], observed.present)
-        V = blocks.LL
-        np.einsum("nii->ni", V)[:] *= 1 + damping[going, None]
-        V += 1e-9 * np.eye(6)
-        trial = perturb(poses[going], np.linalg.solve(V, blocks.Lr[..., None])[..., 0])
-        ahead = _squares(everything, views.camera, owner[going], trial)
-        before = square[going]
-        better = ahead <= before
-        poses[going[better]], square[going[better]] = trial[better], ahead[better]
-        damping[going] = np.where(better, np.maximum(damping[going] / 10, _DAMPING), damping[going] * 30)
-        settled = better & (before - ahead <= _SETTLED * before)
-        going = going[~settled & (damping[going] < _LARGEST_DAMPING)]
-    return poses, np.sqrt(square / count)
-
-
-def _squares(everything: Observations, camera: CameraModel, owner: NDArray[np.intp], poses: Array) -> Array:
-    """(m,) sums of squared distances, px²."""
-    misses = corner_residuals(everything.part(owner), camera, poses)
-    return np.asarray((misses**2).sum(axis=(1, 2)))
 
 
 def view_rms_px(view: BoardView, camera: CameraModel, camera_from_board: Array) -> float:

@@ -15,7 +15,7 @@ from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, inverse, perturb, transform_points
-from calibrate.handeye.corners import bent_points
+from calibrate.handeye.reprojection import bent_points
 from calibrate.lens.pnp import Candidate, candidate_poses
 from calibrate.quality.drift import Noise, pnp_covariance, with_found_shape
 from calibrate.views import BoardView, ViewSet, observe_views

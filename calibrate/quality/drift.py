@@ -20,7 +20,8 @@ from calibrate.errors import BadViewsError, TooFewViewsError, UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, perturb
 from calibrate.handeye.axxb.pairs import mount_poses
-from calibrate.handeye.corners import bent_points, boards_by_corners
+from calibrate.handeye.corner_fit import fit_corners
+from calibrate.handeye.reprojection import bent_points
 from calibrate.projection import project_at
 from calibrate.views import ViewSet, board_in_camera, extent_of, observe_views, require_no_copies
 from recordings.schema.messages import CameraModel, Mount, SessionInfo, Source
@@ -121,7 +122,7 @@ def with_found_shape(views: ViewSet, calibration: Calibration) -> ViewSet:
     if found is None:
         return views
     observed = replace(observe_views(views), extent=extent_of(board_points(calibration.board)))
-    C = boards_by_corners(observed, views.camera, views.camera_from_board, found.numbers)
+    C = fit_corners(observed, views.camera, views.camera_from_board, shape=found.numbers, robust=True).C
     points = bent_points(observed, found.numbers)
     shaped = [
         replace(view, board_points=points[i, : len(view.pixels)], camera_from_board=C[i])

@@ -27,7 +27,7 @@ from calibrate.files.formatting import (
 )
 from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.geometry import Array, difference
-from calibrate.handeye.corners import bent_points
+from calibrate.handeye.reprojection import bent_points
 from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_at

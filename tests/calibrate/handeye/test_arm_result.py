@@ -15,9 +15,9 @@ from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb, pose, random_rotation
 from calibrate.handeye.arm import HELD, PARAMETERS, by_parameters, corrected_model
 from calibrate.handeye.arm_result import verify_elsewhere
-from calibrate.handeye.linear import inverse_of
 from calibrate.handeye.solution import Solution, TableResult
 from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.handeye.uncertainty import inverse_of
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import MODELS, forward, with_near_axes
 from calibrate.views import BoardView, ViewSet

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.handeye import arm, estimate, fit, linear, priors, readings
+from calibrate.handeye import arm, corner_modes, estimate, fit, mixture, noise_scales, priors, readings
 from calibrate.handeye.axxb import certificate, paper
 from calibrate.handeye.axxb.pairs import MAX_PAIRS
 from calibrate.quality import drift
@@ -28,10 +28,10 @@ PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
         (certificate.TOLERANCE, 1e-6, "certified at ≤ 1e-6"),
         (len(certificate._constraints()), 20, "With the 20 independent equations"),
         (MAX_PAIRS, 20_000, "thinned above 20 000"),
-        (linear.STUDENT, 8.0, "corner weight = (8 + 2) / (8 + r²/σ²)"),
-        (linear.GAIN, [1, 3, 10], "g = 1, 3, 10"),
-        ([linear.GARBAGE_M, linear.GARBAGE_RAD], [0.3, 1.0], "garbage: 0.3 m, 1 rad"),
-        (linear.ROBOT_PRIOR_COUNT, 1.0, "ν = 3 Σ p_i1 − 6 + 1"),
+        (corner_modes.STUDENT, 8.0, "corner weight = (8 + 2) / (8 + r²/σ²)"),
+        (mixture.GAIN, [1, 3, 10], "g = 1, 3, 10"),
+        ([mixture.GARBAGE_M, mixture.GARBAGE_RAD], [0.3, 1.0], "garbage: 0.3 m, 1 rad"),
+        (noise_scales.ROBOT_PRIOR_COUNT, 1.0, "ν = 3 Σ p_i1 − 6 + 1"),
         (priors.BoardTolerance().square, 0.003, "`square_tolerance` (0.3 %)"),
         (priors.BoardTolerance().flatness_m, 0.001, "`flatness_m` (1 mm)"),
         (priors._KNOWN_SHARE, 0.002, "0.2 % of focal length and width"),

@@ -7,9 +7,10 @@ import pytest
 
 from calibrate.geometry import perturb
 from calibrate.handeye.cell_state import CellState, Layout, flange_residuals
-from calibrate.handeye.corners import corner_residuals
-from calibrate.handeye.linear import Linear, Scales, first_scales
+from calibrate.handeye.linear import Linear
+from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
+from calibrate.handeye.reprojection import corner_residuals
 from calibrate.views import observe_views
 from tests.calibrate.cells import LENSES, MID, CellNoise, changed, make_cell, real_cell
 
@@ -122,7 +123,7 @@ def test_noise_scales_come_out_as_they_went_in():
         state = CellState(cell.X, cell.Y, cell.views.camera_from_board, cell.camera, np.zeros(5), np.zeros(0))
         linear = Linear.at(observed, state, observed.present)
         prior = Priors(LensPrior.given(cell.camera, np.full(9, 1e-6)), BoardTolerance(1e-7, 1e-8))
-        scales = first_scales(linear)
+        scales = linear.first_scales()
         for _ in range(3):
             scales = linear.solve(prior.linearise(state, 0.0), scales).scales
         found.append([scales.tau_px, scales.sigma_px, *scales.robot])
@@ -140,7 +141,7 @@ def test_an_unclear_view_costs_information_but_never_more_than_it_tells():
         state = CellState(cell.X, cell.Y, cell.views.camera_from_board, cell.camera, np.zeros(5), np.zeros(0))
         linear = Linear.at(seen, state, seen.present)
         prior = Priors(LensPrior.given(cell.camera), BoardTolerance()).linearise(state, 0.0)
-        solved = linear.solve(prior, first_scales(linear))
+        solved = linear.solve(prior, linear.first_scales())
         lost = linear.lost(solved)
         assert np.linalg.eigvalsh(lost).min() > -1e-6 * np.abs(lost).max()
         assert (np.diag(linear.covariance(solved)) >= np.diag(np.linalg.inv(solved.precision)) * 0.999).all()

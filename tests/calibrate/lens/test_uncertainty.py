@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.scene import CellNoise, make_cell, zhang
 from calibrate.geometry import Array, rotation_exp
-from calibrate.handeye.corners import linearise_corners
+from calibrate.handeye.reprojection import linearise_corners
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.projection import camera_matrix, project_pixels, undistort
 from calibrate.views import observe_views

@@ -1,4 +1,4 @@
-"""Corner residuals (observed minus modelled pixels) and their normal equations, one block for each view."""
+"""Reprojection residuals (observed minus modelled pixels) and their normal equations, a block for each view."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, perturb, skew
+from calibrate.geometry import Array, skew
 from calibrate.projection import intrinsics_names, project, project_pixels
 from calibrate.results import SHAPE
 from calibrate.views import Observations
@@ -14,7 +14,6 @@ from recordings.schema.messages import CameraModel
 
 _CHUNK_POINTS = 40_000
 """Most corners linearised at once, so that thousands of views fit into memory."""
-_STEPS, _LIMIT_SIGMA = 10, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +34,31 @@ class CornerBlocks:
     """(n,) weighted sums of squares, px²."""
     rows: Array
     """(n,) twice the weighted number of corners."""
+
+    def without_boards(self, H: Array) -> Eliminated:
+        """Eliminate the board poses; H (n, 6, 6): LL⁻¹, or the inverse of a damped LL."""
+        to_optimum, by_shared = (H @ self.Lr[..., None])[..., 0], H @ self.LG
+        GL = np.swapaxes(self.LG, 1, 2)
+        right = self.Gr - (GL @ to_optimum[..., None])[..., 0]
+        return Eliminated(to_optimum, by_shared, self.GG - GL @ by_shared, right)
+
+
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """Normal equations of the shared columns, each view's board pose at its optimum for them (Schur)."""
+
+    to_optimum: Array
+    """(n, 6) step of each board pose to its own corners' optimum."""
+    by_shared: Array
+    """(n, 6, g) negative derivative of that optimum by the shared unknowns."""
+    information: Array
+    """(n, g, g)"""
+    right: Array
+    """(n, g)"""
+
+    def board_step(self, shared: Array) -> Array:
+        """Compute the step (n, 6) of the board poses that belongs to a step (g,) of the shared unknowns."""
+        return np.asarray(self.to_optimum - self.by_shared @ shared)
 
 
 def bent_points(observed: Observations, shape: Array) -> Array:
@@ -124,26 +148,6 @@ def linearise_corners(
             blocks.GG[part] = G_t @ G
             blocks.Gr[part] = (G_t @ r[..., None])[..., 0]
     return blocks
-
-
-def boards_by_corners(observed: Observations, camera: CameraModel, C: Array, shape: Array) -> Array:
-    """Fit board poses (n, 4, 4) to each view's own corners, starting at C, outliers down-weighted."""
-    if not observed.has_pixels:
-        return C
-    for _ in range(_STEPS):
-        distance = np.nan_to_num(corner_distance(corner_residuals(observed, camera, C, shape)), nan=1e6)
-        typical = np.nanmedian(np.where(observed.present > 0, distance, np.nan), axis=1, keepdims=True)
-        limit = _LIMIT_SIGMA * np.maximum(typical, 0.01)
-        weights = (
-            np.where(distance > limit, (limit / np.maximum(distance, limit)) ** 2, 1.0) * observed.present
-        )
-        blocks = linearise_corners(observed, camera, C, weights, shape=shape)
-        delta = np.linalg.solve(blocks.LL + 1e-9 * np.eye(6), blocks.Lr[..., None])[..., 0]
-        length = np.linalg.norm(delta, axis=1, keepdims=True)
-        C = perturb(C, delta * np.minimum(1.0, 0.2 / np.maximum(length, 1e-12)))
-        if length.max() < 1e-9:
-            break
-    return C
 
 
 def _by_shape(observed: Observations) -> Array:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate.geometry import perturb
-from calibrate.handeye.corners import bent_points, corner_residuals, linearise_corners
+from calibrate.handeye.reprojection import bent_points, corner_residuals, linearise_corners
 from calibrate.projection import intrinsics_vector, with_intrinsics_vector
 from calibrate.views import observe_views
 from tests.calibrate.cells import LENSES, changed, printed, real_cell
@@ -72,7 +72,7 @@ def test_many_views_are_linearised_in_parts_to_the_same_bits(monkeypatch):
     camera = LENSES["plumb_bob"]
     observed, C = observed_cell(0, camera)
     whole = linearise_corners(observed, camera, C, observed.present, True, np.zeros(5))
-    monkeypatch.setattr("calibrate.handeye.corners._CHUNK_POINTS", 1)
+    monkeypatch.setattr("calibrate.handeye.reprojection._CHUNK_POINTS", 1)
     parts = linearise_corners(observed, camera, C, observed.present, True, np.zeros(5))
     assert all(np.array_equal(value, getattr(parts, name)) for name, value in vars(whole).items())
 

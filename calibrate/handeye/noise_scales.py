@@ -1,0 +1,79 @@
+"""Scales of the noise, fitted by restricted maximum likelihood between two solutions of the unknowns.
+
+Each update is a fixed point of the likelihood's derivative: a variance is multiplied by the squares that the
+residuals have over those that their covariance predicts, the part that the fit absorbed taken off. A weak
+prior stands beside each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calibrate.geometry import Array
+from calibrate.handeye.mixture import GAIN, SHARE_COUNTS, class_variances
+
+WIDE = 3.0
+ROBOT_PRIOR_COUNT = 1.0
+"""Weight of the prior of the robot's noise, in squares of one component."""
+_ROBOT_PRIOR = np.array([1e-4, np.radians(0.02)])
+MODE_COUNT = 4.0
+"""Weight, in residuals, of the prior that τ is about λ or larger."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """Scales (1σ) of the noise of robot and corners, and the shares of the noise classes."""
+
+    robot: Array
+    """(2,) metres and radians per axis, of a view of the first class."""
+    tau_px: float
+    lambda_px: float
+    sigma_px: float
+    shares: Array
+    """(K,) prior probability of each class."""
+    table: Array = field(default_factory=lambda: np.zeros(0))
+    """(q,) prior 1σ of each systematic error, mm and mrad."""
+
+    @property
+    def classes(self) -> Array:
+        """Variances (K, 6) of the robot's noise in each class."""
+        return class_variances(self.robot)
+
+
+def first_scales(residual: Array, corner_px: float, wide: float = WIDE) -> Scales:
+    """Take initial noise scales from the medians of the robot residuals (n, 6), times `wide`.
+
+    Above 1, `wide` starts with a wide noise, so that no view begins as an outlier.
+    """
+    parts = residual.reshape(-1, 2, 3).swapaxes(0, 1).reshape(2, -1)
+    robot = np.maximum(wide * 1.48 * np.median(np.abs(parts), axis=1), 1e-5)
+    return Scales(robot, corner_px, corner_px, corner_px, SHARE_COUNTS / SHARE_COUNTS.sum())
+
+
+def update_robot(scales: Scales, chances: Array, z: Array, P: Array) -> Scales:
+    """Update the robot's two scales and the shares of the classes.
+
+    chances: (n, K) of the classes; z: (n, K, 6) S_k⁻¹ m; P: (n, K, 6, 6) S_k⁻¹ less what the fit absorbs.
+    """
+    square, ordinary = scales.robot**2, chances[:, :-1] * GAIN**2
+    found = np.einsum("nk,nki->i", ordinary, z[:, :-1] ** 2)
+    predicted = np.einsum("nk,nkii->i", ordinary, P[:, :-1].clip(0.0))
+    up = found.reshape(2, 3).sum(axis=1) + ROBOT_PRIOR_COUNT * _ROBOT_PRIOR**2 / square**2
+    down = predicted.reshape(2, 3).sum(axis=1) + ROBOT_PRIOR_COUNT / square
+    total = chances.sum(axis=0) + SHARE_COUNTS
+    robot = np.sqrt(square * up / np.maximum(down, 1e-300))
+    return replace(scales, robot=robot, shares=total / total.sum())
+
+
+def update_corners(
+    scales: Scales, chances: Array, z: Array, P: Array, B: Array, sigma2: float, lambda2: float
+) -> Scales:
+    """Update τ, and take over σ² and λ² (px²). B: (n, 6, 6) covariance of m by corners of 1 px."""
+    tau2 = scales.tau_px**2
+    found = np.einsum("nk,nki,nij,nkj->", chances, z, B, z)
+    predicted = np.einsum("nk,nkij,nji->", chances, P, B)
+    tau2 *= float((found + MODE_COUNT * lambda2 / tau2**2) / (predicted + MODE_COUNT / tau2))
+    tau, lambda_, sigma = np.sqrt([max(tau2, lambda2), lambda2, sigma2]).tolist()
+    return replace(scales, tau_px=tau, lambda_px=lambda_, sigma_px=sigma)

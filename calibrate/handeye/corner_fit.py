@@ -52,6 +52,8 @@ def fit_corners(
     stays there.
     """
     n, C = len(observed), C.copy()
+    if not observed.has_pixels:
+        return CornerFit(camera, C, np.zeros(n))
     damping, going = np.full(n, _DAMPING), np.arange(n)
 
     def cost(weights: Array, residual: Array, camera: CameraModel) -> Array:
@@ -92,7 +94,7 @@ def fit_corners(
         if not len(going):
             break
     square = np.square(corner_residuals(observed, camera, C, shape)).sum(axis=(1, 2))
-    return CornerFit(camera, C, np.sqrt(square / np.maximum(observed.present.sum(axis=1), 1)))
+    return CornerFit(camera, C, np.sqrt(square / observed.present.sum(axis=1)))
 
 
 def _without_far(observed: Observations, residual: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Reprojection residuals (observed minus modelled pixels) and their normal equations, a block for each view."""
+"""Reprojection residuals (observed minus modelled pixels) and their normal equations, one block a view."""
 
 from __future__ import annotations
 

@@ -31,7 +31,8 @@ def inverse_of(N: Array) -> Array:
 def information_lost(chances: Array, z: Array, W: Array) -> Array:
     """Compute the information (n, 6, 6) about a view's residual that its unknown class costs.
 
-    T. Louis (1982). z: (n, K, 6) S_k⁻¹ residual; W: (n, 6, 6) `expected` information. A view cannot lose more than it gives.
+    z: (n, K, 6) S_k⁻¹ residual; W: (n, 6, 6) `expected` information. A view cannot lose more than it gives.
+    T. Louis (1982).
     """
     mean = np.einsum("nk,nki->ni", chances, z)
     spread = np.einsum("nk,nki,nkj->nij", chances, z, z) - mean[:, :, None] * mean[:, None, :]

@@ -11,7 +11,6 @@ from pathlib import Path
 import msgspec
 
 from recordings.files import read_file, write_atomically
-from station.cell.status import MotionPreview
 
 _LIMIT_BYTES = 1024 * 1024
 ACCEPTANCE_NAME = "acceptance.json"
@@ -67,17 +66,17 @@ class ArmSubject(msgspec.Struct, frozen=True):
         return ""
 
 
-class StopTestOffer(msgspec.Struct, frozen=True):
-    """A move of the acceptance test that waits for its approval."""
+class StopTestMove(msgspec.Struct, frozen=True):
+    """A move of the acceptance test: one joint turns, and is stopped half way."""
 
-    go: MotionPreview
+    way: StopWay
     subject: ArmSubject
     joint: int
     """Number of the joint that moves, from 0."""
     target_rad: float
     """Goal of that joint."""
     speed_rad_s: float
-    """Speed of that joint."""
+    """Planned speed of that joint."""
 
 
 class Figure(msgspec.Struct, frozen=True):

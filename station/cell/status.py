@@ -9,6 +9,7 @@ import msgspec
 
 from recordings.errors import Value
 from recordings.schema.messages import Matrix4, Mount, Source, TimeSource, Vector6
+from station.cell.acceptance import StopTestMove
 
 
 class StationState(StrEnum):
@@ -244,6 +245,8 @@ class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
     """Changes of the plan that come with the approval, and their gain."""
     warnings: tuple[str, ...] = ()
     start_joints_rad: Vector6 | None = None
+    stop_test: StopTestMove | None = None
+    """Move of the acceptance test; None: a motion that captures images."""
 
 
 class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -17,15 +17,14 @@ from recordings.schema.messages import RobotState
 from station.cell.acceptance import STOP_GIVEN, Acceptance, ArmSubject, StopResult, StopWay
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview
-from station.operate.motion import Link, approved_motion
-from station.operate.stop_judge import WATCHED_S, StopMove, judge
+from station.operate.motion import Link, prepared_motion
+from station.operate.stop_judge import WATCHED_S, judge
 from station.protocol.client import DaemonGoneError
 from station.protocol.states import RUNNING
-from station.protocol.verbs import StopTest
+from station.protocol.verbs import Prepare, Purpose, StopTest
 
 AFTER_S = WATCHED_S + 1.0
 """Time for which states are recorded after the move's end."""
-PREPARE_S = 60.0
 END_S = 40.0
 TRIES = 3
 """Most moves for one way to stop, until its stop is measured."""
@@ -104,34 +103,41 @@ class AcceptanceTest:
 
     async def _move(self, way: StopWay, tries: int) -> StopResult | None:
         """Make one move and judge it; None: it was not approved."""
-        request = StopTest(way, self.speed_m_s, self.joint, self._forward)
-        offer = await self.link.call(request, timeout_s=PREPARE_S)
+        test = StopTest(way, self.speed_m_s, self.joint, self._forward)
         self._forward = not self._forward
-        if self.subject is not None and (changed := self.subject.difference(offer.subject)):
-            raise RefusedError(
-                f"{changed[0].upper()}{changed[1:]} changed during the test.",
-                code="subject-changed",
-                remedy="Begin again.",
-            )
-        self.subject = offer.subject
+        offered: list[MotionPreview] = []
 
         async def approves(preview: MotionPreview) -> bool:
+            offered.append(preview)
+            self._require_same_arm(preview)
             approved = await self.person.approves(preview)
             if approved:
                 await self.recorder.begin()
             return approved
 
-        if not await approved_motion(self.link, offer.go, approves):
+        if not await prepared_motion(self.link, Prepare(Purpose.STOP_TEST, stop_test=test), approves):
             return None
+        preview, move = offered[0], offered[0].stop_test
+        assert move is not None
         try:
             moment_ns = await self._ended(time.time_ns())
             await asyncio.sleep(AFTER_S)
         finally:
             states = await self.recorder.end()
-        figures, not_measured = judge(
-            states, StopMove(way, offer.joint, offer.target_rad, offer.speed_rad_s, moment_ns)
-        )
-        return StopResult(way, offer.go.top_speed_m_s, figures, tries, not_measured)
+        figures, not_measured = judge(states, move, moment_ns)
+        return StopResult(way, preview.top_speed_m_s, figures, tries, not_measured)
+
+    def _require_same_arm(self, preview: MotionPreview) -> None:
+        """Note the arm of the first move; RefusedError when another one, or changed, is offered later."""
+        assert preview.stop_test is not None
+        subject = preview.stop_test.subject
+        if self.subject is not None and (changed := self.subject.difference(subject)):
+            raise RefusedError(
+                f"{changed[0].upper()}{changed[1:]} changed during the test.",
+                code="subject-changed",
+                remedy="Begin again.",
+            )
+        self.subject = subject
 
     async def _ended(self, begun_ns: int) -> int | None:
         """Wait for the move's end; return when the stop was triggered (host monotonic ns), None: never."""

@@ -9,7 +9,7 @@ from calibrate.quality.drift_history import find_trend, read_checks
 from station.cell.status import SessionStatus, StationState, StationStatus
 from station.operate.ending import Ending, after_drift_check
 from station.operate.motion import PREPARE_S, Approve, Link, prepared_motion
-from station.protocol.verbs import GetPlan, LoadPlan, MakePlan, Purpose
+from station.protocol.verbs import GetPlan, LoadPlan, MakePlan, Prepare, Purpose
 
 POSES = 8
 """Default number of poses. Eight detect a shift of 0.5 mm in 96 % of cases at mid noise, five in 88 %
@@ -33,7 +33,7 @@ async def start_drift_check(
     started = False
     try:
         started = await prepared_motion(
-            link, Purpose.DRIFT_CHECK, approve, changes=changes, headless=headless
+            link, Prepare(Purpose.DRIFT_CHECK), approve, changes=changes, headless=headless
         )
     finally:
         if before is not None and not started:

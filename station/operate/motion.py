@@ -80,19 +80,21 @@ async def wait_until_idle(link: Link, *, camera: bool = True) -> StationStatus:
 
 async def prepared_motion(
     link: Link,
-    purpose: Purpose,
+    wanted: Prepare,
     approve: Approve,
     *,
     changes: tuple[str, ...] = (),
     headless: bool = False,
     plans_here: PlansHere | None = None,
 ) -> bool:
-    """Check the whole path, then go on as `approved_motion`. `changes`: other effects of the approval.
+    """Check the whole path, ask a person to approve the motion, and start it. False: not approved.
 
-    `plans_here`: asks whether to plan again if the plan was made from another posture.
+    `changes`: other effects of the approval. `headless`: no person will be asked later; poses that do not
+    settle are tried once more. `plans_here`: asks whether to plan again if the plan was made from another
+    posture.
     """
     try:
-        preview = await link.call(Prepare(purpose), timeout_s=PREPARE_S)
+        preview = await link.call(wanted, timeout_s=PREPARE_S)
     except StationError as refusal:
         if refusal.code != PLANNED_ELSEWHERE or plans_here is None:
             raise
@@ -100,18 +102,8 @@ async def prepared_motion(
         if plan is None or plan.criterion != REPLACEABLE or not await plans_here(refusal):
             raise
         await link.call(MakePlan(max(4, len(plan.poses)), plan.seed or 0), timeout_s=PREPARE_S)
-        preview = await link.call(Prepare(purpose), timeout_s=PREPARE_S)
+        preview = await link.call(wanted, timeout_s=PREPARE_S)
     preview = msgspec.structs.replace(preview, changes=(*changes, *preview.changes))
-    return await approved_motion(link, preview, approve, headless)
-
-
-async def approved_motion(
-    link: Link, preview: MotionPreview, approve: Approve, headless: bool = False
-) -> bool:
-    """Ask a person to approve a motion and start it. False: not approved, nothing moves.
-
-    `headless`: no person will be asked later; poses that do not settle are tried once more.
-    """
     if not await approve(preview):
         return False
     await link.call(Go(preview.token, preview.plan_sha256, headless))
@@ -144,7 +136,7 @@ async def carry_out(
     plans_here: PlansHere | None = None,
 ) -> StationStatus:
     """Run a session from its approval until it is finished or paused. RefusedError when refused."""
-    if not await prepared_motion(link, purpose, approve, headless=headless, plans_here=plans_here):
+    if not await prepared_motion(link, Prepare(purpose), approve, headless=headless, plans_here=plans_here):
         raise not_approved()
     return await watched(link, watch, finish_with_loss)
 

@@ -7,13 +7,12 @@ converted from host time by the state that arrived with the least delay.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from calibrate.geometry import Array
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import Figure, StopWay
+from station.cell.acceptance import Figure, StopTestMove, StopWay
 
 RESTING_RAD_S = 0.01
 """An arm slower than this rests: joint speeds of a resting UR read up to some mrad/s."""
@@ -48,26 +47,11 @@ GAP_S = 0.04
 FEWEST_SAMPLES = 50
 
 
-@dataclass(frozen=True)
-class StopMove:
-    """Approved move, and the way in which it was stopped."""
-
-    way: StopWay
-    joint: int
-    """Number of the joint that moves, from 0."""
-    target_rad: float
-    """Goal of that joint."""
-    speed_rad_s: float
-    """Planned speed of that joint."""
-    moment_ns: int | None
-    """Time of the stop (host monotonic); None: it was not triggered."""
-
-
 class Trace:
     """States of one move as arrays of n ≥ 1 samples."""
 
-    def __init__(self, states: Sequence[RobotState], move: StopMove) -> None:
-        self.move = move
+    def __init__(self, states: Sequence[RobotState], move: StopTestMove, moment_ns: int | None) -> None:
+        self.move, self.moment_ns = move, moment_ns
         self.time_s = np.array([s.stamps.controller_s for s in states])
         host_s = np.array([s.stamps.host_monotonic_ns for s in states]) / 1e9
         self.ahead_s = float(np.min(host_s - self.time_s))
@@ -85,19 +69,23 @@ class Trace:
     @property
     def moment_s(self) -> float:
         """Time of the stop on the controller's clock."""
-        if self.move.moment_ns is None:
+        if self.moment_ns is None:
             return float(self.time_s[-1])
-        return self.move.moment_ns / 1e9 - self.ahead_s
+        return self.moment_ns / 1e9 - self.ahead_s
 
 
-def judge(states: Sequence[RobotState], move: StopMove) -> tuple[tuple[Figure, ...], str]:
+def judge(
+    states: Sequence[RobotState], move: StopTestMove, moment_ns: int | None
+) -> tuple[tuple[Figure, ...], str]:
     """Compute all figures of a move, or say why it was not measured.
+
+    `moment_ns`: time of the stop (host monotonic); None: it was not triggered.
 
     A safety stop and too high a speed fail even if the states have gaps, as gaps cannot cause them.
     """
     if len(states) < FEWEST_SAMPLES:
         return (), f"{len(states)} samples of the arm came (≥ {FEWEST_SAMPLES})"
-    trace = Trace(states, move)
+    trace = Trace(states, move, moment_ns)
     top = float(np.abs(trace.speeds).max())
     always = (
         Figure("held by safety", float(trace.held.sum()), "samples", 0, "no stop may end in one"),
@@ -117,7 +105,7 @@ def _not_measured(trace: Trace, moment: int, rest: int | None) -> str:
     if trace.gap_s > GAP_S:
         return f"no news of the arm for {trace.gap_s:.3f} s (≤ {GAP_S:g}): computer or network is busy"
     speed = _speed_at(trace, moment)
-    if move.moment_ns is None or speed < 0.5 * move.speed_rad_s:
+    if trace.moment_ns is None or speed < 0.5 * move.speed_rad_s:
         return f"the arm turned with {speed:.2f} of {move.speed_rad_s:.2f} rad/s when it was stopped"
     if rest is not None and (watched_s := float(trace.time_s[-1] - trace.time_s[rest])) < WATCHED_S:
         return f"the arm was watched at rest for {watched_s:.1f} s (≥ {WATCHED_S:g})"

@@ -16,7 +16,7 @@ import msgspec
 from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, Vector6
 from station.cell import status
-from station.cell.acceptance import StopTestOffer, StopWay
+from station.cell.acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose
@@ -163,6 +163,7 @@ class Purpose(StrEnum):
     DRIFT_CHECK = "check"
     RESUME = "resume"
     RETAKE = "retake"
+    STOP_TEST = "stop-test"
 
 
 class Hello(Verb[Welcome], frozen=True):
@@ -225,6 +226,17 @@ class MakePlan(Verb[PlanFacts], frozen=True):
     """What the poses should determine: the camera pose, the arm's table, or both and the lens."""
 
 
+class StopTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A slow, short move of one joint that is ended in one way."""
+
+    way: StopWay
+    speed_m_s: Annotated[float, msgspec.Meta(gt=0, le=0.25)]
+    """Speed of the fastest modelled point."""
+    joint: Annotated[int, msgspec.Meta(ge=0, le=5)] = 0
+    forward: bool = True
+    """Direction that is tried first."""
+
+
 class Prepare(Verb[MotionPreview], frozen=True):
     """Check the whole path from where the arm is and offer its approval."""
 
@@ -233,19 +245,8 @@ class Prepare(Verb[MotionPreview], frozen=True):
     purpose: Purpose = Purpose.RUN
     index: int | None = None
     """The pose to retake."""
-
-
-class StopTest(Verb[StopTestOffer], frozen=True):
-    """Check a slow, short move of one joint that is ended in one way, and offer its approval."""
-
-    states = frozenset({S.IDLE})
-    spoken = "a stop test"
-    way: StopWay
-    speed_m_s: Annotated[float, msgspec.Meta(gt=0, le=0.25)]
-    """Speed of the fastest modelled point."""
-    joint: Annotated[int, msgspec.Meta(ge=0, le=5)] = 0
-    forward: bool = True
-    """Direction that is tried first."""
+    stop_test: StopTest | None = None
+    """The move of a stop test."""
 
 
 class Go(Verb[Done], frozen=True):

@@ -9,7 +9,6 @@ from operator import methodcaller
 
 import msgspec
 
-from station.cell.acceptance import StopTestOffer
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionSummary, list_sessions
@@ -130,18 +129,16 @@ class SessionDispatcher:
         return verbs.PlanFacts(len(queue.statuses), queue.sha256)
 
     async def _prepare(self, caller: Peer, args: verbs.Prepare) -> MotionPreview:
-        return await self._session.prepare(caller.client_id, args.purpose, args.index)
-
-    async def _stop_test(self, caller: Peer, args: verbs.StopTest) -> StopTestOffer:
-        self._rule.by_person(await self._asks(caller), "A stop test")
-        return await self._session.prepare_stop_test(caller.client_id, args)
+        if args.stop_test is not None:
+            self._rule.by_person(await self._asks(caller), "A stop test")
+        return await self._session.prepare(caller.client_id, args.purpose, args.index, args.stop_test)
 
     async def _go(self, caller: Peer, args: verbs.Go) -> None:
         asks, waiting = await self._asks(caller), self._session.approvals.waiting
-        if waiting is not None and waiting.beside is not None:
-            how = self._rule.by_person(asks, "This move")
+        if waiting is not None and waiting.motion.stop_test is not None:
+            how = self._rule.by_person(asks, "A stop test")
         else:
-            how = self._rule.approve(asks, args.plan_sha256, waiting.summary.plan_sha256 if waiting else "")
+            how = self._rule.approve(asks, args.plan_sha256, waiting.preview.plan_sha256 if waiting else "")
         approval = f"motion approved by {caller.who}, {how}"
         await self._session.go(caller.client_id, args.token, approval, again=args.headless)
 

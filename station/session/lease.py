@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +12,7 @@ from recordings.errors import Value
 from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError
 from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus, MotionPreview
-from station.protocol.verbs import Purpose
-from station.session.queue import OfferedPoses
+from station.session.motion import Motion
 
 START_TOLERANCE_RAD = 0.005
 """Largest joint difference between where the arm stood when the motion was offered and at its start."""
@@ -56,16 +55,9 @@ class LeaseManager:
 class MotionApproval:
     """Motion offered for approval: what it covers, from where, and for which client."""
 
-    summary: MotionPreview
+    motion: Motion
+    preview: MotionPreview
     client_id: int
-    poses: tuple[int, ...] = ()
-    """Pose numbers that it covers, in order; no others may be driven to."""
-    purpose: Purpose | None = None
-    """None: a stop test."""
-    begins: OfferedPoses | None = None
-    """Poses of the session that begins with this approval; None: none begins."""
-    beside: Drive | None = None
-    """Function that drives a checked motion other than the plan's poses, without recording."""
     expires_s: float = 0.0
     again: bool = False
     """True: poses that do not settle are tried once more at the end, as no person can be asked."""
@@ -74,17 +66,13 @@ class MotionApproval:
 
     @property
     def start_joints_rad(self) -> Vector6:
-        assert self.summary.start_joints_rad is not None
-        return self.summary.start_joints_rad
+        assert self.preview.start_joints_rad is not None
+        return self.preview.start_joints_rad
 
     @property
     def said(self) -> str:
         """Text on the approval for log and recording."""
-        return f"{self.approval}: {self.summary.purpose}, plan {self.summary.plan_sha256[:12]}"
-
-
-Drive = Callable[[MotionApproval], Coroutine[object, object, None]]
-"""Function that carries out an approved motion."""
+        return f"{self.approval}: {self.preview.purpose}, plan {self.preview.plan_sha256[:12]}"
 
 
 class ApprovalManager:
@@ -114,15 +102,15 @@ class ApprovalManager:
     ) -> MotionApproval:
         """Return the approval, once. RefusedError when anything changed since the offer, then void."""
         asked, self.waiting = self.waiting, None
-        if asked is None or not secrets.compare_digest(asked.summary.token.encode(), token.encode()):
+        if asked is None or not secrets.compare_digest(asked.preview.token.encode(), token.encode()):
             raise _void("approval-used", "Approval used or revoked.")
         if self._clock() > asked.expires_s:
             text = f"Approval older than {APPROVAL_LIFETIME_S:.0f} s."
             raise _void("approval-expired", text, limit_s=APPROVAL_LIFETIME_S)
         if asked.client_id != client_id:
             raise _void("approval-of-another", "Approval was asked for by another client.")
-        before = asked.begins.before_sha256 if asked.begins else asked.summary.plan_sha256
-        if asked.beside is None and before != plan_sha256:  # other motions do not depend on the plan
+        # A stop test does not depend on the plan. A new session's poses have the hash of those shown so far.
+        if asked.motion.stop_test is None and asked.preview.plan_sha256 != plan_sha256:
             raise _void("plan-changed", "The plan changed since the approval was asked for.")
         require_start(joints_rad, asked.start_joints_rad, "since the approval was asked for")
         return replace(asked, again=again)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import msgspec
 
@@ -11,25 +10,12 @@ from recordings.errors import CodedError
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose, plan_sha256
 from station.cell.status import PoseState, PoseStatus
-from station.protocol.verbs import Purpose
 
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
 POSE_LIMIT = 2000
 TAKE_AGAIN = "to be captured again"
 STILL_COUNTS = "; its image counts until then"
 NOT_AGAIN = "not captured again: its image counts"
-
-
-@dataclass(frozen=True, eq=False)
-class OfferedPoses:
-    """Poses offered for approval."""
-
-    purpose: Purpose
-    queue: PoseQueue
-    poses: tuple[int, ...]
-    """Pose numbers that the approval covers, in order."""
-    before_sha256: str
-    """Hash of the poses shown until the approval."""
 
 
 class PoseQueue:

@@ -29,9 +29,10 @@ from station.protocol.verbs import Purpose
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import RunRequests, SessionContext
 from station.session.lease import MotionApproval, require_start
-from station.session.queue import BUSY, OfferedPoses
+from station.session.motion import Motion, previewed
+from station.session.queue import BUSY
 from station.session.recording import to_the_end
-from station.session.summary import summarise
+from station.session.stop_move import stop_half_way
 from station.session.threads import DISK, MOTION
 
 log = logging.getLogger(__name__)
@@ -46,13 +47,11 @@ APPROVED_AGAIN = 3
 class Run:
     """Execution of one approval. Run `drive` as a task; when cancelled it ends after writing its data."""
 
-    def __init__(
-        self, context: SessionContext, go: MotionApproval, geometry: CellGeometry | None = None
-    ) -> None:
-        """`geometry`: that by which the motion was checked; None: the cell's, from the approved start."""
+    def __init__(self, context: SessionContext, go: MotionApproval) -> None:
         self._context = context
         self._go = go
-        self._geometry = geometry or self._cell_geometry()
+        self._queue = go.motion.queue
+        self._geometry = self._cell_geometry()
         self._approved_again = 0
         self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
@@ -61,7 +60,7 @@ class Run:
 
     def _cell_geometry(self) -> CellGeometry:
         geometry = geometry_from(self._context.cell.config, self._go.start_joints_rad)
-        return with_plan_speeds(geometry, self._context.require_queue().plan)
+        return with_plan_speeds(geometry, self._queue.plan)
 
     async def drive(self) -> None:
         """Carry out the approval, ending in paused, stopped, fault or idle; raises only when cancelled."""
@@ -74,7 +73,7 @@ class Run:
         """Carry out the approval once; return the error of a delay after which it may go on, else None."""
         try:
             if await self._begin():
-                await self._poses()
+                await self._motion()
         except SafetyStopError as error:
             self._halt(StationState.STOPPED, error)  # the controller itself stopped the arm
         except (RobotError, TriggerError) as error:
@@ -102,7 +101,11 @@ class Run:
         or the controller stopped the arm.
         """
         late = error.code in set(Delay) and self._approved_again < APPROVED_AGAIN
-        return late and self._context.cell.own_simulator and self._go.beside is None and not self._halted
+        return late and self._context.cell.own_simulator and self._records and not self._halted
+
+    @property
+    def _records(self) -> bool:
+        return self._go.motion.stop_test is None
 
     @property
     def _halted(self) -> bool:
@@ -110,23 +113,23 @@ class Run:
 
     async def _approve_again(self, late: StationError) -> bool:
         """Approve the remaining poses in a simulated cell; False: not possible."""
-        context, queue = self._context, self._context.require_queue()
+        context, queue = self._context, self._queue
         store, count = context.store, context.store.status.session.approved_again + 1
         unmark_busy(context)
         store.enter(StationState.CHECKING, late)
         store.problem(late, "warning", store.status.session.current)
-        left = tuple(index for index in self._go.poses if index in queue.open)
+        left = tuple(index for index in self._go.motion.poses if index in queue.open)
         if not left:
             return False
         try:
-            offered = OfferedPoses(Purpose.RESUME, queue, left, queue.sha256)
-            summary = await summarise(context, offered, ())
+            motion = Motion(Purpose.RESUME, queue, left)
+            preview = await previewed(context, motion, ())
         except StationError as trouble:
             store.problem(trouble)
             return False
         self._approved_again += 1
         said = f"approved by this simulated cell itself, {self._approved_again} of at most {APPROVED_AGAIN}"
-        self._go = replace(self._go, summary=summary, begins=None, poses=left, approval=said)
+        self._go = replace(self._go, motion=motion, preview=preview, approval=said)
         self._geometry = self._cell_geometry()
         store.update_session(approved_again=count)
         store.event("approved-again", self._go.said, "warning", None, count=count)
@@ -147,11 +150,11 @@ class Run:
         try:
             if context.recording is not None:
                 # Save the poses before anything moves, so that a restart finds them.
-                await context.recording.save_state(context.require_queue())
+                await context.recording.save_state(self._queue)
             await context.cell.robot.start_control()
             here = (await fresh(context.cell.robot)).joints_rad  # starting control takes a second or two
             require_start(here, self._go.start_joints_rad, "while control was started")
-            if self._go.beside is None:
+            if self._records:
                 await self._open_recording()
         except SafetyStopError:
             raise
@@ -168,14 +171,20 @@ class Run:
         context = self._context
         if context.recorder is not None:
             return
-        await context.open_recording(context.require_queue(), context.store.status.session.check)
+        await context.open_recording(self._queue, context.store.status.session.check)
         context.show_poses()
         recording = context.require_recording()
         context.record_event(Event(time.time_ns(), "info", self._go.said, code="approved"))
         text = f"recording to {recording.folder}, segment {recording.segment}"
         context.store.event("recording", text, segment=recording.segment)
 
-    async def _poses(self) -> None:
+    async def _motion(self) -> None:
+        """Drive what was approved, to the state that follows it."""
+        if (test := self._go.motion.stop_test) is not None:
+            here = (await self._context.arm()).joints_rad
+            move = self._drive(here, self._queue.pose(0).joints_rad, "stop test")
+            await stop_half_way(self._context, test, here, move)
+            return
         recording = self._context.require_recording()
         recording.count_time(running=True)
         try:
@@ -186,10 +195,9 @@ class Run:
             await self._rest()
 
     async def _all_poses(self) -> None:
-        context = self._context
-        queue = context.require_queue()
+        context, queue = self._context, self._queue
         started_s, taken = time.monotonic(), 0
-        todo = list(self._go.poses)
+        todo = list(self._go.motion.poses)
         while not context.requests.halt:
             todo = [index for index in todo if index in queue.open] or self._once_more()
             if self._wants_rest() or not todo or self._failures >= FAILURES_IN_A_ROW:
@@ -208,7 +216,7 @@ class Run:
 
         The approval covers these poses; every path is checked again from where the arm stands.
         """
-        queue = self._context.require_queue()
+        queue = self._queue
         found = [index for index in self._unsettled if queue.status(index).state == "failed"]
         if not self._go.again or self._tried_again or self._wants_rest() or not found:
             return []
@@ -222,8 +230,7 @@ class Run:
         return bool(self._context.requests.pause_by) or self._context.requests.finish
 
     async def _pose(self, index: int) -> None:
-        context = self._context
-        queue = context.require_queue()
+        context, queue = self._context, self._queue
         attempt = queue.start_attempt(index)
         try:
             await self._move_to(index)
@@ -240,8 +247,7 @@ class Run:
 
     async def _move_to(self, index: int) -> None:
         """Move to a pose from where the arm is. LimitError when the path is not free."""
-        context = self._context
-        queue = context.require_queue()
+        context, queue = self._context, self._queue
         here, target = (await context.arm()).joints_rad, queue.pose(index).joints_rad
         queue.mark(index, "moving")
         context.store.enter(StationState.MOVING)
@@ -265,8 +271,7 @@ class Run:
 
     async def _rest(self) -> None:
         """Enter the state after the last pose of the approval: finished, or paused with the reason."""
-        context = self._context
-        queue = context.require_queue()
+        context, queue = self._context, self._queue
         await context.cell.robot.end_control()  # before finishing, as heartbeats end with the run
         if context.requests.halt:
             return
@@ -281,7 +286,7 @@ class Run:
 
     def _why_paused(self) -> tuple[str, str]:
         """Say why the session is paused: code and sentence."""
-        queue, pausing = self._context.require_queue(), self._context.requests.pause_by
+        queue, pausing = self._queue, self._context.requests.pause_by
         if pausing:
             return "paused", f"Paused by {pausing}. Approve again to continue."
         if self._failures >= FAILURES_IN_A_ROW:

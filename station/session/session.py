@@ -11,7 +11,6 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,7 +19,6 @@ import msgspec
 from recordings.errors import RecordingError
 from station.analysis.pool import Workers
 from station.analysis.worker import start_worker, warm_up
-from station.cell.acceptance import StopTestOffer
 from station.cell.errors import RefusedError, RobotError
 from station.cell.plan import Plan
 from station.cell.scene import cell_geometry
@@ -39,11 +37,11 @@ from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
 from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
 from station.session.monitor import DeviceConnector, Previewer
+from station.session.motion import previewed, session_motion
 from station.session.queue import PoseQueue
 from station.session.recording import Logbook, SessionRecording
 from station.session.run import Run, close_or_seal, unmark_busy
-from station.session.stop_test import prepare_stop_test
-from station.session.summary import begun_anew, poses_to_drive, summarise
+from station.session.stop_move import stop_motion
 from station.session.supervisor import SessionSupervisor
 from station.session.threads import DISK
 
@@ -170,43 +168,36 @@ class Session:
 
     # -- from a question to a motion ---------------------------------------------------------------------
 
-    async def prepare(self, client_id: int, purpose: Purpose, index: int | None = None) -> MotionPreview:
+    async def prepare(
+        self,
+        client_id: int,
+        purpose: Purpose,
+        index: int | None = None,
+        stop_test: verbs.StopTest | None = None,
+    ) -> MotionPreview:
         """Check the whole path from where the arm is and offer it for approval, once."""
-        offer = await self._begin_offer(verbs.Prepare, client_id)
-        await look_back(self.context)
-        begun = begun_anew(self.context, purpose)
-        offered = begun or poses_to_drive(self.context, purpose, index)
-        summary = await summarise(self.context, offered, self._notes)
-        offer(MotionApproval(summary, client_id, offered.poses, purpose, begun))
-        return summary
-
-    async def prepare_stop_test(self, client_id: int, request: verbs.StopTest) -> StopTestOffer:
-        """Offer a short move, to be ended in one way, for approval, once."""
-        offer = await self._begin_offer(verbs.StopTest, client_id)
-        drive, found = await prepare_stop_test(self.context, request)
-        offer(MotionApproval(found.go, client_id, beside=drive))
-        return found
-
-    async def _begin_offer(
-        self, verb: type[Verb[object]], client_id: int
-    ) -> Callable[[MotionApproval], None]:
-        """Return a function that offers the checked motion, or RefusedError if anything changed meanwhile."""
-        self.permit(verb, client_id)
-        if verb is not verbs.Prepare:
-            self._require_no_session()
+        context = self.context
+        self.permit(verbs.Prepare, client_id)
         await self._run_ended()  # its control process may still be ending
         self._void()
-        return partial(self._offer, self.approvals.voids)
-
-    def _offer(self, voids: int, asked: MotionApproval) -> None:
-        self.permit(verbs.Prepare, asked.client_id)
+        voids = self.approvals.voids
+        if (purpose is Purpose.STOP_TEST) is (stop_test is None):
+            raise RefusedError("A stop test, and no other motion, names its move.", code="wrong-arguments")
+        if stop_test is not None:
+            motion = await stop_motion(context, stop_test)
+        else:
+            await look_back(context)
+            motion = session_motion(context, purpose, index)
+        preview = await previewed(context, motion, self._notes)
+        self.permit(verbs.Prepare, client_id)
         if self.approvals.voids != voids:
             raise RefusedError(
                 "Conditions changed during the preflight check.", code="changed", remedy="Retry."
             )
-        self.approvals.offer(asked)
+        self.approvals.offer(MotionApproval(motion, preview, client_id))
         # Watchers get it without the token, which is for the client that asked.
-        self.store.update(go=msgspec.structs.replace(asked.summary, token=""))
+        self.store.update(go=msgspec.structs.replace(preview, token=""))
+        return preview
 
     async def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
         """Start the offered motion, which a person approved. RefusedError when anything changed.
@@ -228,15 +219,16 @@ class Session:
             self.store.update(go=None)
         self._notes = ()
         context.requests = RunRequests()
-        if context.recording is None and go.beside is None:
-            context.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
-        if go.begins is not None:
-            context.queue = go.begins.queue
-            context.show_poses()
-        drive = go.beside(go) if go.beside else Run(context, go).drive()
+        run, motion = Run(context, go), go.motion
+        if motion.stop_test is None:
+            if context.recording is None:
+                context.forget_session(check=motion.purpose is Purpose.DRIFT_CHECK)
+            if motion.queue is not context.queue:
+                context.queue = motion.queue
+                context.show_poses()
         self.store.enter(StationState.CHECKING)
-        self.store.event("approved", go.said, plan_sha256=go.summary.plan_sha256)
-        self._run = asyncio.create_task(drive)
+        self.store.event("approved", go.said, plan_sha256=go.preview.plan_sha256)
+        self._run = asyncio.create_task(run.drive())
 
     def pause(self, who: str) -> None:
         """Pause after this pose. Any client may, as it never causes motion."""
@@ -261,10 +253,10 @@ class Session:
         if not closing.cancelled():
             closing.result()
 
-    async def _run_ended(self, wait_s: float = END_RUN_S) -> None:
-        """Wait for the end of the last run; RefusedError when it does not end in time."""
+    async def _run_ended(self, wait_s: float | None = None) -> None:
+        """Wait for the end of the last run; RefusedError when it does not end in time (None: `END_RUN_S`)."""
         if self._run is not None and not self._run.done():
-            await asyncio.wait({self._run}, timeout=wait_s)
+            await asyncio.wait({self._run}, timeout=END_RUN_S if wait_s is None else wait_s)
         self._require_run_ended()
 
     def _require_run_ended(self) -> None:

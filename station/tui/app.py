@@ -382,7 +382,7 @@ class StationApp(KnowingApp):
         """`run` goes on with a session that is paused."""
         paused = self.known.live is not None and self.known.live.state is StationState.PAUSED
         wanted = Purpose.RESUME if purpose == Purpose.RUN and paused else Purpose(purpose)
-        begun = prepared_motion(self.desk, wanted, self.approves, plans_here=self.plans_here)
+        begun = prepared_motion(self.desk, verbs.Prepare(wanted), self.approves, plans_here=self.plans_here)
         if await self.desk.start(begun):
             await self.switch_mode("capture")
 

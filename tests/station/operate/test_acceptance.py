@@ -10,12 +10,11 @@ from typing import Any
 import pytest
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import STOP_GIVEN, ArmSubject, Figure, StopResult, StopTestOffer, StopWay
+from station.cell.acceptance import STOP_GIVEN, ArmSubject, Figure, StopResult, StopTestMove, StopWay
 from station.cell.status import Event, MotionPreview, StationState, StationStatus
 from station.operate import acceptance
 from station.operate.acceptance import TRIES, AcceptanceTest
-from station.operate.stop_judge import StopMove
-from station.protocol.verbs import Go, StopTest, Verb
+from station.protocol.verbs import Go, Prepare, StopTest, Verb
 
 SUBJECT = ArmSubject("real", "UR10e", "1", "5.11", (), "ur_rtde")
 
@@ -34,10 +33,12 @@ class Daemon:
         if isinstance(verb, Go):
             self.went += 1
             return None
-        assert isinstance(verb, StopTest)
-        self.asked.append(verb)
-        preview = MotionPreview(str(len(self.asked)), "", "", 1, 0.1, 0.1, verb.speed_m_s, 3.0, "")
-        return StopTestOffer(preview, SUBJECT, 0, 0.1, 0.1)
+        assert isinstance(verb, Prepare) and verb.stop_test is not None
+        test = verb.stop_test
+        self.asked.append(test)
+        move = StopTestMove(test.way, SUBJECT, 0, 0.1, 0.1)
+        figures = 0.1, 0.1, test.speed_m_s, 3.0
+        return MotionPreview(str(len(self.asked)), "", "", 1, *figures, "", stop_test=move)
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
         given = Event(time.time_ns(), "info", "", code=STOP_GIVEN, values={"moment_ns": 7})
@@ -76,9 +77,9 @@ def bad(monkeypatch: pytest.MonkeyPatch) -> set[StopWay]:
     """Ways that the judge finds bad."""
     found: set[StopWay] = set()
 
-    def judge(_: object, move: StopMove) -> tuple[tuple[Figure, ...], str]:
+    def judge(_: object, move: StopTestMove, moment_ns: int | None) -> tuple[tuple[Figure, ...], str]:
         figure = Figure("rest", 2.0 if move.way in found else 0.0, "s", 1.0, "")
-        return ((), "too early") if move.moment_ns is None else ((figure,), "")
+        return ((), "too early") if moment_ns is None else ((figure,), "")
 
     monkeypatch.setattr(acceptance, "AFTER_S", 0.0)
     monkeypatch.setattr(acceptance, "judge", judge)

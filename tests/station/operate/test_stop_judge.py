@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 
 from recordings.schema.messages import RobotState, Stamps
-from station.cell.acceptance import Figure, StopWay
-from station.operate.stop_judge import StopMove, judge
+from station.cell.acceptance import ArmSubject, Figure, StopTestMove, StopWay
+from station.operate.stop_judge import judge
 from station.simulation.controller.programs import Upload
 from station.simulation.controller.state import Journal, Settings
 from tests.weak_controller import WEAKNESSES, WeakRobot, weak
 
 START = (0.3, -1.6, 1.9, -1.9, -1.57, 0.0)
 TURN_RAD = 0.3
+SUBJECT = ArmSubject("simulated", "UR10e", "1", "5.11", (), "ur_rtde")
 SLOW_RAD_S, FAST_RAD_S = 0.06, 0.3
 """What 0.05 and 0.25 m/s are for a base joint with the arm stretched out."""
 MOVE = "def move():\n  movej([{}], a=1.4, v={})\nend\n"
@@ -77,8 +76,8 @@ class Stand:
         elif way is StopWay.FROZEN:
             self.run(1.0, kicked=False)
         self.run(2.0)
-        self.move = StopMove(way, 0, target, speed_rad_s, self.stopped_ns)
-        figures, not_measured = judge(self.states, self.move)
+        self.move = StopTestMove(way, SUBJECT, 0, target, speed_rad_s)
+        figures, not_measured = judge(self.states, self.move, self.stopped_ns)
         assert not not_measured
         return figures
 
@@ -125,8 +124,8 @@ def test_few_samples_a_gap_and_a_stop_that_was_not_given_are_not_measured() -> N
     states, move = stand.states, stand.move
     stop = next(i for i, s in enumerate(states) if s.stamps.host_monotonic_ns >= stand.stopped_ns)
     late = [s for i, s in enumerate(states) if not stop + 5 < i < stop + 40]
-    for samples, of in (([], move), (late, move), (states, dataclasses.replace(move, moment_ns=None))):
-        figures, not_measured = judge(samples, of)
+    for samples, moment_ns in (([], stand.stopped_ns), (late, stand.stopped_ns), (states, None)):
+        figures, not_measured = judge(samples, move, moment_ns)
         assert not figures and not_measured
 
 
@@ -134,9 +133,8 @@ def test_an_arm_that_stood_still_tells_nothing_of_its_stops() -> None:
     stand = Stand()
     stand.run(3.0)
     moment_ns = stand.states[500].stamps.host_monotonic_ns
-    figures, not_measured = judge(
-        stand.states, StopMove(StopWay.CONTROL, 0, START[0] + TURN_RAD, FAST_RAD_S, moment_ns)
-    )
+    move = StopTestMove(StopWay.CONTROL, SUBJECT, 0, START[0] + TURN_RAD, FAST_RAD_S)
+    figures, not_measured = judge(stand.states, move, moment_ns)
     assert not figures and not_measured
 
 
@@ -144,5 +142,5 @@ def test_an_arm_that_stood_still_tells_nothing_of_its_stops() -> None:
 def test_a_gap_hides_neither_a_protective_stop_nor_too_much_speed(weakness: str) -> None:
     stand = Stand(weakness)
     stand.test(StopWay.KILLED)
-    figures, not_measured = judge(stand.states[:200] + stand.states[300:], stand.move)
+    figures, not_measured = judge(stand.states[:200] + stand.states[300:], stand.move, stand.stopped_ns)
     assert failed(figures) and not not_measured

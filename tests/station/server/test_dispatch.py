@@ -359,6 +359,7 @@ async def test_no_program_and_no_service_gets_a_stop_test_of_a_real_arm(
     async with await served.client() as program:
         await program.request("lease", action="take")
         with pytest.raises(RefusedError) as refused:
-            await program.request("stop_test", way="control", speed_m_s=0.05)
+            move = {"way": "control", "speed_m_s": 0.05}
+            await program.request("prepare", purpose="stop-test", stop_test=move)
         assert refused.value.code == "no-terminal"
     await served.control.close()

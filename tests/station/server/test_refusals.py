@@ -21,7 +21,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "acknowledge": {}, "load_plan": {}, "make_plan": {}, "prepare": {}, "go": {"token": "t"},
     "pause": {}, "finish": {}, "retake": {"index": 0}, "skip": {"index": 1},
     "reorder": {"order": [1, 0, *range(2, POSES)]}, "add": {}, "drop": {"index": 1},
-    "free_drive": {"on": True}, "record": {}, "stop_test": {"way": "control", "speed_m_s": 0.05},
+    "free_drive": {"on": True}, "record": {},
     "observe": {"tag": {"kind": "april-tag", "square_m": 0.05}},
 }  # fmt: skip
 FOR_ANYBODY = {"acknowledge", "pause", "observe"}

@@ -7,6 +7,7 @@ import pytest
 
 from station.cell.acceptance import Acceptance, StopWay, write_acceptance
 from station.cell.errors import RefusedError
+from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, StopTest
 from station.session.checklist import checklist
@@ -14,41 +15,46 @@ from tests.patience import until
 from tests.station.session_rig import NewRig, Rig, sealed
 
 
+async def offered(rig: Rig, speed_m_s: float = 0.05, joint: int = 0, client: int = 1) -> MotionPreview:
+    test = StopTest(StopWay.CONTROL, speed_m_s, joint)
+    return await rig.session.prepare(client, Purpose.STOP_TEST, stop_test=test)
+
+
 @pytest.mark.parametrize("speed_m_s", [0.02, 0.05, 0.25])
 @pytest.mark.parametrize("joint", [0, 2, 5])
 async def test_no_modelled_point_is_faster_than_asked_for(rig: Rig, joint: int, speed_m_s: float) -> None:
-    offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, speed_m_s, joint))
-    assert 0 < offer.go.top_speed_m_s <= speed_m_s
-    assert offer.go.largest_step_rad <= 0.4 and offer.speed_rad_s <= 1.05
+    offer = await offered(rig, speed_m_s, joint)
+    assert 0 < offer.top_speed_m_s <= speed_m_s and offer.largest_step_rad <= 0.4
+    assert offer.stop_test is not None and offer.stop_test.speed_rad_s <= 1.05
     assert rig.arm.log == [], "nothing moved"
 
 
 async def test_a_move_needs_its_own_approval_and_records_nothing(rig: Rig) -> None:
     for _ in range(2):
-        offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, 0.05))
-        await rig.session.go(1, offer.go.token)
+        offer = await offered(rig)
+        await rig.session.go(1, offer.token)
         await rig.until(S.IDLE)
         with pytest.raises(RefusedError) as refused:
-            await rig.session.go(1, offer.go.token)
+            await rig.session.go(1, offer.token)
         assert refused.value.code == "approval-used"
     assert rig.arm.log.count("move") == 2 and rig.camera.taken == 0
     assert rig.session.context.recording is None and rig.cause == "stop-tested"
 
 
 async def test_stop_of_a_person_stays_latched(rig: Rig) -> None:
-    offer = await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, 0.05))
+    offer = await offered(rig)
     rig.arm.slow = True
-    await rig.session.go(1, offer.go.token)
+    await rig.session.go(1, offer.token)
     await rig.until(S.MOVING)
     await rig.session.stop("ben")
     assert rig.state is S.STOPPED
     with pytest.raises(RefusedError):
-        await rig.session.prepare_stop_test(1, StopTest(StopWay.CONTROL, 0.05))
+        await offered(rig)
 
 
 async def test_whoever_has_no_control_gets_no_offer(rig: Rig) -> None:
     with pytest.raises(RefusedError):
-        await rig.session.prepare_stop_test(2, StopTest(StopWay.CONTROL, 0.05))
+        await offered(rig, client=2)
 
 
 async def said(rig: Rig) -> list[bool]:

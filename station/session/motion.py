@@ -1,11 +1,11 @@
-"""Preview of a motion for approval: the checked path from where the arm stands, in figures."""
+"""Motion that a person may approve: poses, what is done at each, and a preview from where the arm is."""
 
 from __future__ import annotations
 
 import math
 import secrets
 import shlex
-from typing import Any
+from dataclasses import dataclass
 
 import msgspec
 
@@ -13,13 +13,14 @@ from recordings.errors import RecordingError
 from recordings.files import require_free_space
 from recordings.schema.messages import RobotState, Vector6
 from station.analysis.worker import check_run
+from station.cell.acceptance import StopTestMove
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import PlanCheck
 from station.cell.plan import Plan
 from station.cell.status import MotionPreview
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext, displacement
-from station.session.queue import OfferedPoses, PoseQueue
+from station.session.queue import PoseQueue
 from station.session.threads import DISK
 
 POSE_OVERHEAD_S = 0.8
@@ -28,22 +29,29 @@ _PROBLEMS_SHOWN = 12
 _SLOW_SLIDER = 0.99
 
 
-def begun_anew(context: SessionContext, purpose: Purpose) -> OfferedPoses | None:
-    """Offer the loaded plan for a new session; None: the approval begins none.
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Poses that one approval covers; no others may be driven to.
 
-    Until the approval the last session stays shown.
+    At each pose an image is captured, or, in a stop test, the move to it is stopped half way.
     """
-    queue = context.queue
-    if purpose is not Purpose.RUN or context.recording is not None or queue is None:
-        return None
-    again = queue.anew()
-    return OfferedPoses(purpose, again, _open(again), queue.sha256)
+
+    purpose: Purpose
+    queue: PoseQueue
+    """Poses of the session: the open one, or the one that begins with the approval."""
+    poses: tuple[int, ...]
+    """Pose numbers, in order."""
+    stop_test: StopTestMove | None = None
+    """Move of a stop test, which records nothing; None: images are captured."""
 
 
-def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None) -> OfferedPoses:
-    """List the poses that an approval for this purpose would cover. RefusedError when there are none."""
-    queue = context.loaded()
-    if purpose in (Purpose.RETAKE, Purpose.RESUME) and context.recording is None:
+def session_motion(context: SessionContext, purpose: Purpose, index: int | None) -> Motion:
+    """Choose the poses that an approval for this purpose would cover. RefusedError when there are none.
+
+    A new session gets poses of its own: until the approval the last session stays shown.
+    """
+    queue, begun = context.loaded(), context.recording is not None
+    if purpose in (Purpose.RETAKE, Purpose.RESUME) and not begun:
         raise RefusedError("No session is open.", code="no-session", remedy="Run the plan to begin one.")
     if purpose is Purpose.RETAKE:
         if index is None:
@@ -52,21 +60,19 @@ def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None)
             )
         if queue.status(index).state != "planned":
             queue.retake(index)
-        return OfferedPoses(purpose, queue, (index,), queue.sha256)
-    if purpose is Purpose.DRIFT_CHECK and context.recording is not None:
+        return Motion(purpose, queue, (index,))
+    if purpose is Purpose.DRIFT_CHECK and begun:
         raise RefusedError("A session is open.", code="session-open", remedy="Finish it first, then check.")
-    return OfferedPoses(purpose, queue, _open(queue), queue.sha256)
-
-
-def _open(queue: PoseQueue) -> tuple[int, ...]:
+    if purpose is Purpose.RUN and not begun:
+        queue = queue.anew()
     if not queue.open:
         raise RefusedError("No pose is left to take.", code="no-pose-left", remedy="Retake some, or finish.")
-    return queue.open
+    return Motion(purpose, queue, queue.open)
 
 
-async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple[str, ...]) -> MotionPreview:
+async def previewed(context: SessionContext, motion: Motion, notes: tuple[str, ...]) -> MotionPreview:
     """Check the whole path in the worker and make the preview. LimitError: not free; RobotError."""
-    if offered.queue.plan.motion != "stops":
+    if motion.queue.plan.motion != "stops":
         raise RefusedError(
             "This plan is a sweep, and sweeps are gone.",
             code="sweep",
@@ -78,36 +84,25 @@ async def summarise(context: SessionContext, offered: OfferedPoses, notes: tuple
         raise RefusedError(f"{full} Nothing moved.", code="disk-full") from None
     arm = await context.arm()
     start = arm.joints_rad
-    queue, poses = offered.queue, offered.poses
+    queue, poses = motion.queue, motion.poses
     plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
     check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
     if check.problems:
         raise await _refused(context, plan, check, start)
-    first = plan.poses[0].joints_rad
-    return motion_preview(
-        check,
-        start,
-        overhead_s=POSE_OVERHEAD_S * len(poses),
-        purpose=_purpose_words(context, offered.purpose, poses),
-        plan_sha256=queue.sha256,
-        poses=len(poses),
-        first_move=f"{displacement(context, start, first)} to pose {poses[0] + 1}",
-        warnings=(*notes, *await motion_warnings(context, arm)),
-    )
-
-
-def motion_preview(
-    check: PlanCheck, start_joints_rad: Vector6, *, overhead_s: float = 0.0, **said: Any
-) -> MotionPreview:
-    """Make a preview from a checked path, further fields, and a new token."""
+    overhead_s = 0.0 if motion.stop_test else POSE_OVERHEAD_S * len(poses)
     return MotionPreview(
         token=secrets.token_urlsafe(16),
+        purpose=_purpose_words(context, motion),
+        plan_sha256=queue.sha256,
+        poses=len(poses),
         path_m=round(check.path_m, 3),
         largest_step_rad=round(check.largest_step_rad, 4),
         top_speed_m_s=round(check.top_speed_m_s, 3),
         duration_s=round(check.duration_s + overhead_s, 1),
-        start_joints_rad=start_joints_rad,
-        **said,
+        first_move=f"{displacement(context, start, plan.poses[0].joints_rad)} to pose {poses[0] + 1}",
+        warnings=(*notes, *await _warnings(context, arm)),
+        start_joints_rad=start,
+        stop_test=motion.stop_test,
     )
 
 
@@ -142,17 +137,19 @@ def _problem_text(check: PlanCheck) -> str:
     return "The plan is refused, nothing moved:\n" + "\n".join([*shown, *tail])
 
 
-def _purpose_words(context: SessionContext, purpose: Purpose, poses: tuple[int, ...]) -> str:
-    if purpose is Purpose.RETAKE:
-        return f"retake pose {poses[0] + 1}"
-    if purpose is Purpose.DRIFT_CHECK:
+def _purpose_words(context: SessionContext, motion: Motion) -> str:
+    if motion.stop_test is not None:
+        return motion.queue.plan.note
+    if motion.purpose is Purpose.RETAKE:
+        return f"retake pose {motion.poses[0] + 1}"
+    if motion.purpose is Purpose.DRIFT_CHECK:
         return "drift check of the installed calibration"
     if context.recording is None:
         return "run plan"
     return f"continue session {context.recording.name}"
 
 
-async def motion_warnings(context: SessionContext, arm: RobotState) -> list[str]:
+async def _warnings(context: SessionContext, arm: RobotState) -> list[str]:
     warnings = []
     slider = arm.target_speed_fraction
     if slider < _SLOW_SLIDER:

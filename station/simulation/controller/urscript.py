@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import operator
 from collections import ChainMap
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping
+from functools import reduce
 from traceback import walk_tb
 from types import GeneratorType
 from typing import Any
@@ -28,14 +29,12 @@ Steps = Generator[None, None, Value]
 """Yields once for every cycle it takes, then returns a value."""
 
 STATEMENTS_PER_CYCLE = 20_000
+_REFUSED = (TypeError, ValueError, ArithmeticError, LookupError, NameError)
+"""What Python raises where URScript stops the program: 1 / 0, 1 + "a", a function that is not known there."""
 
 
 class ScriptRuntimeError(ScriptError):
     """The program did what it may not."""
-
-
-class Pose(list[float]):
-    """p[x, y, z, rx, ry, rz]: metres and a rotation vector."""
 
 
 # -- a running program ----------------------------------------------------------------------------------
@@ -79,14 +78,8 @@ class Scope(ChainMap[str, Value]):
     def global_only(self) -> Scope:
         return Scope(self.maps[-1])
 
-    def set_item(self, name: str, index: Value, value: Value) -> None:
-        """Change the list that has this name now: what made the value may have made another."""
-        items = self[name]
-        items[_place_of(items, index)] = value
-
-    def enter(self, parameters: list[str], given: Sequence[Value], named: Mapping[str, Value]) -> Scope:
+    def enter(self, values: Mapping[str, Value]) -> Scope:
         """Make the scope of a function in this one."""
-        values = {**dict(zip(parameters, given, strict=False)), **named}
         return Scope({name: copied(value) for name, value in values.items()}, *self.maps)
 
 
@@ -102,10 +95,9 @@ class ScriptRun:
         self._spent = 0
         code, program, self._lines = parse(text, builtins)
         names: dict[str, Any] = {
-            "_0": Scope({}), "Pose": Pose, "call": _call, "halt": self._halt, "item": _item, "join": _join,
-            "kill": _kill, "operate": operate, "spend": self._spend,
-            "start": self._start, "truth": truth,
-        } | {f"f_{name}": function for name, function in builtins.items()}  # fmt: skip
+            "_0": Scope({}), "List": List, "Pose": Pose, "call": _call, "halt": self._halt, "join": _join,
+            "kill": _kill, "spend": self._spend, "start": self._start, "truth": truth,
+        } | {f"f_{name}": _builtin(function) for name, function in builtins.items()}  # fmt: skip
         exec(code, names)
         self._start(names[program])
 
@@ -122,6 +114,8 @@ class ScriptRun:
         except ScriptRuntimeError as error:
             error.line = self._line(error)
             raise
+        except _REFUSED as error:
+            raise ScriptRuntimeError(str(error), self._line(error)) from None
         finally:
             self.thread = None
         self._threads = [main, *(t for t in self._threads[1:] if not t.done)]
@@ -154,12 +148,14 @@ class ScriptRun:
             raise ScriptRuntimeError("an infinite loop: it never waits")
 
 
-def _call(name: str, function: Builtin, /, *arguments: Value, **named: Value) -> Steps:
-    try:
-        found = function(*arguments, **named)
-        return (yield from found) if isinstance(found, GeneratorType) else found
-    except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
-        raise ScriptRuntimeError(f"{name}: {error}") from None
+def _call(function: Callable[..., Value], /, *arguments: Value, **named: Value) -> Steps:
+    found = function(*arguments, **named)
+    return copied((yield from found) if isinstance(found, GeneratorType) else found)
+
+
+def _builtin(function: Builtin) -> Builtin:
+    """Take arguments by the names that they have in Python's text."""
+    return lambda *arguments, **named: function(*arguments, **{name[1:]: v for name, v in named.items()})
 
 
 def _kill(thread: Value) -> None:
@@ -174,12 +170,50 @@ def _join(thread: Value) -> Steps:
 
 # -- values ---------------------------------------------------------------------------------------------
 
-_ARITHMETIC: dict[str, Callable[[float, float], float]] = {
-    "+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv, "%": operator.mod,
-}  # fmt: skip
-_ORDER: dict[str, Callable[[float, float], bool]] = {
-    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
-}  # fmt: skip
+
+class _Items(list[Value]):
+    def _place(self, index: Value) -> int:
+        if not isinstance(index, int) or not 0 <= index < len(self):
+            raise ScriptRuntimeError(f"there is no item {index} of {len(self)}")
+        return index
+
+    def __getitem__(self, index: Value) -> Value:
+        """Several indices are those of a matrix, a list of its rows."""
+        if isinstance(index, tuple):
+            return reduce(operator.getitem, index, self)
+        return super().__getitem__(self._place(index))
+
+    def __setitem__(self, index: Value, value: Value) -> None:
+        super().__setitem__(self._place(index), value)
+
+
+class Pose(_Items):
+    """p[x, y, z, rx, ry, rz]: metres and a rotation vector. No operator takes it."""
+
+    __add__ = __iadd__ = __mul__ = __rmul__ = __imul__ = None  # type: ignore[assignment]
+
+
+class List(_Items):
+    """Its arithmetic goes item by item; a number counts for each item."""
+
+    def __neg__(self) -> List:
+        return List(-value for value in self)
+
+
+def _by_item(operate: Callable[[Value, Value], Value], swapped: bool) -> Callable[[List, Value], List]:
+    def method(left: List, right: Value) -> List:
+        others = right if isinstance(right, List) else [right] * len(left)
+        if len(others) != len(left):
+            raise ScriptRuntimeError(f"lists of {len(left)} and {len(others)} items")
+        pairs = zip(others, left, strict=True) if swapped else zip(left, others, strict=True)
+        return List(operate(a, b) for a, b in pairs)
+
+    return method
+
+
+for _sign in ("add", "sub", "mul", "truediv", "mod"):
+    setattr(List, f"__{_sign}__", _by_item(getattr(operator, _sign), swapped=False))
+    setattr(List, f"__r{_sign}__", _by_item(getattr(operator, _sign), swapped=True))
 
 
 def truth(value: Value) -> bool:
@@ -189,42 +223,8 @@ def truth(value: Value) -> bool:
     return bool(value)
 
 
-def _number(value: Value) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScriptRuntimeError(f"{value!r} is no number")
-    return value
-
-
-def operate(sign: str, left: Value, right: Value) -> Value:
-    """Apply an operator to two numbers, or item by item to lists; a number counts for each item."""
-    if sign in ("==", "!="):
-        return (left == right) == (sign == "==")
-    if sign in _ORDER:
-        return _ORDER[sign](_number(left), _number(right))
-    if type(left) is list or type(right) is list:
-        lefts = left if type(left) is list else [left] * len(right)
-        rights = right if type(right) is list else [right] * len(left)
-        if len(lefts) != len(rights):
-            raise ScriptRuntimeError(f"lists of {len(lefts)} and {len(rights)} items")
-        return [operate(sign, a, b) for a, b in zip(lefts, rights, strict=True)]
-    try:
-        return _ARITHMETIC[sign](_number(left), _number(right))
-    except (ZeroDivisionError, OverflowError):
-        raise ScriptRuntimeError(f"{left} {sign} {right} has no result") from None
-
-
 def copied(value: Value) -> Value:
     """Lists are copied by assignment, and where they are given to a function."""
-    return type(value)(value) if isinstance(value, list) else value
-
-
-def _item(items: Value, index: Value) -> Value:
-    return items[_place_of(items, index)]
-
-
-def _place_of(items: Value, index: Value) -> int:
-    if not isinstance(items, list):
-        raise ScriptRuntimeError(f"{items!r} has no items")
-    if not isinstance(index, int) or not 0 <= index < len(items):
-        raise ScriptRuntimeError(f"there is no item {index} of {len(items)}")
-    return index
+    if isinstance(value, Pose):
+        return Pose(value)
+    return List(map(copied, value)) if isinstance(value, list) else value

@@ -1,17 +1,18 @@
-"""The text of a URScript program → Python's code: tokens, then recursive descent that writes Python.
+"""The text of a URScript program → Python's code.
 
-`$ 2 "Robot Program"`, a line in which PolyScope names the node of a program it exports, is a comment here.
-
-Variables of the script are items of a `Scope`, `_0` the global one, `_1` that of the program and so on; its
-functions are generators whose names begin with `f_`. What else is called here is told in `ScriptRun`.
+URScript reads like Python, except that `end` closes a block. So each statement is written as a line of
+Python, token by token, and Python's own parser reads it. No name of Python can be reached: variables are
+items of a `Scope`, `_0` the global one, `_1` that of the program and so on; functions are generators whose
+names begin with `f_`, their parameters begin with `_`. What else is called here is described in `ScriptRun`.
 """
 
 from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from types import CodeType
 from typing import Any, NamedTuple
 
@@ -29,23 +30,21 @@ _TOKEN = re.compile(
     |(?P<sign>==|!=|<=|>=|[-+*/%<>=()\[\],:])""",
     re.VERBOSE,
 )
+"""`$ 2 "Robot Program"`, a line in which PolyScope names the node of a program it exports, is a comment."""
 NOT_SUPPORTED = "not supported by this simulator"
-_STATEMENTS_MISSING = ("switch", "for")
-_WORDS = frozenset(
-    ("and", "break", "continue", "def", "elif", "else", "end", "enter_critical", "exit_critical", "False",
-     "global", "halt", "if", "join", "kill", "local", "not", "or", "pass", "return", "run", "sec", "thread",
-     "True", "while", "xor")
+_FUNCTIONS = ("def", "sec", "thread")
+_HEADS = (*_FUNCTIONS, "if", "elif", "else", "while")
+_IGNORED = ("pass", "enter_critical", "exit_critical")
+"""No thread is interrupted here."""
+_BEGINNINGS = (
+    *_HEADS, *_IGNORED, "end", "return", "break", "continue", "halt", "kill", "join", "global", "local",
 )  # fmt: skip
-_STATEMENTS = (
-    "if", "while", "return", "kill", "join", "break", "continue", "halt", "global", "local",
+"""These begin a statement, without a new line too."""
+_WORDS = frozenset([*_BEGINNINGS, "and", "or", "not", "xor", "run", "True", "False"])
+_UNFINISHED = (
+    "==", "!=", "<=", ">=", "+", "-", "*", "/", "%", "<", ">", "=", "and", "or", "not", "if", "elif", "while",
 )  # fmt: skip
-_LEVELS = (
-    ("or", "xor"), ("and",), ("==", "!=", "<", "<=", ">", ">="), ("+", "-"), ("*", "/", "%"),
-)  # fmt: skip
-"""Binary operators, the loosest first."""
-_NOT_LEVEL = 2
-"""`not` binds looser than a comparison, tighter than `and`."""
-_LOGIC = {"or": "or", "xor": "!=", "and": "and"}
+"""What ends with these goes on in the next line."""
 
 Lines = list[tuple[int, str]]
 """Python, each line with that of the script."""
@@ -68,13 +67,25 @@ class ScriptSyntaxError(ScriptError):
 
 class Token(NamedTuple):
     kind: str
-    """line, float, int, string, name, word, sign; '' ends the text"""
+    """line, float, int, string, name, word, sign"""
     text: str
     line: int
 
+    @property
+    def in_python(self) -> str:
+        """Strings have no escapes; 007 is a number."""
+        if self.kind == "int":
+            return str(int(self.text, 16 if self.text[:2] in ("0x", "0X") else 10))
+        return repr(self.text[1:-1]) if self.kind == "string" else self.text
+
+    @property
+    def is_value(self) -> bool:
+        """An item may be taken of it."""
+        return self.kind in ("name", "string") or self.text in (")", "]")
+
 
 def tokens(text: str) -> list[Token]:
-    """Raises ScriptSyntaxError at a character that begins nothing. Ends of lines inside brackets are none."""
+    """Raises ScriptSyntaxError at a character that begins nothing. Brackets hold several lines together."""
     found, place, line, depth = [], 0, 1, 0
     while place < len(text):
         match = _TOKEN.match(text, place)
@@ -88,53 +99,24 @@ def tokens(text: str) -> list[Token]:
             found.append(Token(kind, word, line))
         line += word.count("\n")
         place = match.end()
-    return [*found, Token("line", "\n", line), Token("", "the end", line)]
+    return found
 
 
-@dataclass
-class Function:
-    """A `def`, `sec` or `thread` while it is read."""
-
-    parameters: dict[str, bool] = field(default_factory=dict)
-    """Those with a default are True."""
-    inner: dict[str, Function] = field(default_factory=dict)
-    written: Lines = field(default_factory=list)
-    """The inner functions in Python."""
-
-
-class Call(NamedTuple):
-    """A call, whose meaning is found when the whole text was read: a function of the script, or a builtin."""
-
-    name: Token
-    around: tuple[Function, ...]
-    plain: int
-    named: list[str]
-    runs: bool
-    """As a thread."""
-
-    def check(self, builtins: Mapping[str, Builtin]) -> None:
-        """Raises ScriptSyntaxError for what is nowhere, or called wrongly."""
-        _, name, line = self.name
-        found = next((f.inner[name].parameters for f in reversed(self.around) if name in f.inner), None)
-        if found is None and name not in builtins:
-            raise ScriptSyntaxError(f"compile_error_name_not_found:{name}: {NOT_SUPPORTED}", line)
-        if found is None and self.runs:
-            raise ScriptSyntaxError(f"{name} is no thread", line)
-        fits = True
-        if found is not None:
-            given = {
-                *list(found)[: self.plain],
-                *self.named,
-                *(n for n, optional in found.items() if optional),
-            }
-            fits = self.plain <= len(found) and given == found.keys()
-        else:
-            try:
-                inspect.signature(builtins[name]).bind(*[0] * self.plain, **dict.fromkeys(self.named))
-            except TypeError:
-                fits = False
-        if not fits:
-            raise ScriptSyntaxError(f"{name} does not take these arguments", line)
+def _statements(text: str) -> Iterator[list[Token]]:
+    """Each statement, and each head of a block with its colon."""
+    found: list[Token] = []
+    for token in tokens(text):
+        ends = token.kind == "line" and not (found and found[-1].text in _UNFINISHED)
+        if found and (ends or token.text in _BEGINNINGS):
+            yield found
+            found = []
+        if token.kind != "line":
+            found.append(token)
+        if token.text == ":":
+            yield found
+            found = []
+    if found:
+        yield found
 
 
 def parse(text: str, builtins: Mapping[str, Builtin]) -> tuple[CodeType, str, list[int]]:
@@ -142,249 +124,208 @@ def parse(text: str, builtins: Mapping[str, Builtin]) -> tuple[CodeType, str, li
 
     The program is a `def name(): … end`, or bare statements. Raises ScriptSyntaxError.
     """
-    parser, lines = _Parser(tokens(text)), [0]
+    lines: list[int] = []
     try:
-        outermost = parser.program()
-        for call in parser.calls:
-            call.check(builtins)
-        lines = [line for line, _ in outermost.written]
-        code = compile("\n".join(python for _, python in outermost.written), SCRIPT, "exec")
+        writer = _Writer(list(_statements(text)))
+        lines = [line for line, _ in writer.program]
+        for call in writer.calls:
+            if call.name not in writer.functions:
+                call.check(builtins)
+        code = compile("\n".join(python for _, python in writer.program), SCRIPT, "exec")
+        return code, f"f_{writer.functions[-1]}", lines
     except SyntaxError as error:
         raise ScriptSyntaxError(error.msg, lines[(error.lineno or 1) - 1]) from None
-    except (RecursionError, MemoryError, ValueError):
-        raise ScriptSyntaxError("nested too deeply") from None
-    (name,) = outermost.inner
-    return code, f"f_{name}", lines
+    except (RecursionError, MemoryError, ValueError) as error:
+        raise ScriptSyntaxError(str(error) or "nested too deeply") from None
 
 
-class _Parser:
-    """Each construct's method reads it and returns it in Python."""
+@dataclass
+class _Call:
+    """A call, whose meaning is found when the whole text was read: a function of the script, or a builtin."""
 
-    def __init__(self, found: list[Token]) -> None:
-        self._tokens = found
-        self._place = 0
-        self.calls: list[Call] = []
-        self._around = [Function()]
+    name: str
+    line: int
+    runs: bool
+    """As a thread."""
+    arguments: int = 1
+    named: list[str] = field(default_factory=list)
+
+    def check(self, builtins: Mapping[str, Builtin]) -> None:
+        """Raises ScriptSyntaxError unless there is such a builtin that takes these arguments."""
+        if self.name not in builtins:
+            raise ScriptSyntaxError(f"compile_error_name_not_found:{self.name}: {NOT_SUPPORTED}", self.line)
+        if self.runs:
+            raise ScriptSyntaxError(f"{self.name} is no thread", self.line)
+        plain = [None] * (self.arguments - len(self.named))
+        try:
+            inspect.signature(builtins[self.name]).bind(*plain, **dict.fromkeys(self.named))
+        except TypeError:
+            raise ScriptSyntaxError(f"{self.name} does not take these arguments", self.line) from None
+
+
+@dataclass
+class _Function:
+    """A `def`, `sec` or `thread` while it is read."""
+
+    name: str
+    head: Lines
+    """Its first line in Python, and the one that makes its scope."""
+    blocks: list[str] = field(default_factory=list)
+    """The words that began what is open."""
+    inner: Lines = field(default_factory=list)
+    """The functions inside it, in Python."""
+    body: Lines = field(default_factory=list)
+
+    def write(self, line: int, python: str) -> None:
+        self.body.append((line, " " * len(self.blocks) + python))
+
+
+class _Writer:
+    """Writes statements in Python."""
+
+    def __init__(self, statements: list[list[Token]]) -> None:
+        self.functions: list[str] = []
+        """Names of all of them, the program's last."""
+        self.calls: list[_Call] = []
+        text = _Function("", [])
+        self._around = [text]
         """The functions that are being read, the innermost last; the first one is the text."""
+        bare = not (statements and statements[0][0].text in ("def", "sec"))
+        if bare:
+            self._open("line", 1, "def f_line():", [])
+        for statement in statements:
+            self._statement(statement)
+        if bare:
+            self._close(0)
+        if len(self._around) > 1:
+            raise ScriptSyntaxError("an end is missing", self._around[-1].head[0][0])
+        self.program = text.inner
 
     @property
     def _scope(self) -> str:
         return f"_{len(self._around) - 1}"
 
-    def _is(self, *words: str) -> bool:
-        token = self._tokens[self._place]
-        return token.text in words and token.kind in ("word", "sign")
+    def _open(self, name: str, line: int, head: str, parameters: list[str]) -> None:
+        around = self._scope
+        self._around.append(_Function(name, [(line, head)]))
+        values = ", ".join(f"{parameter!r}: _{parameter}" for parameter in parameters)
+        self._around[-1].head.append((line, f" {self._scope} = {around}.enter({{{values}}})"))
 
-    def _take(self, *words: str) -> Token | None:
-        """The next token, if it is one of these."""
-        return self._need(*words) if self._is(*words) else None
-
-    def _need(self, *words: str, kind: str = "") -> Token:
-        """The next token. Raises ScriptSyntaxError if it is none of these words, or not of the kind."""
-        token = self._tokens[self._place]
-        if not (token.kind == kind if kind or not words else self._is(*words)):
-            wanted = " or ".join(words) or kind or "nothing more"
-            raise ScriptSyntaxError(f"{token.text!r} where {wanted} was expected", token.line)
-        self._place += 1
-        return token
-
-    def _next_is(self, kind: str, after: str = "") -> bool:
-        """The next token is of this kind (and this sign comes after it)."""
-        token, following = self._tokens[self._place : self._place + 2]
-        return token.kind == kind and (not after or (following.kind, following.text) == ("sign", after))
-
-    def _skip_lines(self) -> None:
-        while self._tokens[self._place].kind == "line":
-            self._place += 1
-
-    # -- functions and statements -----------------------------------------------------------------------
-
-    def program(self) -> Function:
-        """Return the text as a function that holds another: the program."""
-        self._skip_lines()
-        if self._is("def", "sec"):
-            self._function()
-            self._skip_lines()
-        else:
-            self._around.append(Function())
-            self._define("line", 1, [], self._body())
-        if self._tokens[self._place].kind:
-            self._need()
-        return self._around[0]
-
-    def _function(self) -> None:
-        line = self._need("def", "sec", "thread").line
-        name = self._need(kind="name").text
-        self._around.append(Function())
-        parameters, defaults = self._around[-1].parameters, Lines()
-        self._need("(")
-        while not self._take(")"):
-            parameter = self._need(kind="name").text
-            parameters[parameter] = self._take("=") is not None
-            if parameters[parameter]:
-                defaults.append((line, f"if {parameter!r} not in {self._scope}.maps[0]:"))
-                defaults.append((line, f" {self._scope}.local_only[{parameter!r}] = {self._expression()}"))
-            if not self._is(")"):
-                self._need(",")
-        self._define(name, line, defaults, self._block())
-
-    def _define(self, name: str, line: int, defaults: Lines, body: Lines) -> None:
+    def _close(self, line: int) -> None:
         """Functions come first where they are: a script may call what stands below."""
-        scope, function = self._scope, self._around.pop()
-        enter = f"{scope} = {self._scope}.enter({[*function.parameters]}, given, named)"
-        lines = [(line, enter), *defaults, *function.written, *body, (line, "return"), (line, "yield")]
-        outer = self._around[-1]
-        outer.written += [(line, f"def f_{name}(*given, **named):"), *_indented(lines)]
-        outer.inner[name] = function
+        function = self._around.pop()
+        if not self._around or function.blocks:
+            raise ScriptSyntaxError("an end is missing, or there is one too many", line)
+        lines = [*function.inner, *function.body, (line, "return"), (line, "yield")]
+        self._around[-1].inner += [*function.head, *((at, f" {python}") for at, python in lines)]
+        self.functions.append(function.name)
 
-    def _block(self, *others: str) -> Lines:
-        """Read from the colon to `end`, or to one of the other words, which stays."""
-        line = self._need(":").line
-        body = self._body("end", *others)
-        if not self._is(*others):
-            self._need("end")
-        return [*body, (line, "pass")]
+    def _statement(self, found: list[Token]) -> None:
+        first, line = found[0].text if found[0].text in _BEGINNINGS else "", found[0].line
+        function = self._around[-1]
+        if function.name == "" and function.inner:
+            raise ScriptSyntaxError("there is more behind the end of the program", line)
+        if (found[-1].text == ":") != (first in _HEADS):
+            raise ScriptSyntaxError(f"{' '.join(t.text for t in found)}: {NOT_SUPPORTED}", line)
+        if first in _FUNCTIONS:
+            self._function(found)
+        elif first == "end" and function.blocks:
+            function.blocks.pop()
+        elif first == "end":
+            self._close(line)
+        elif first in _HEADS:
+            if first in ("elif", "else") and (not function.blocks or function.blocks.pop() != "if"):
+                raise ScriptSyntaxError(f"{first} without if", line)
+            test = self._expression(found[1:-1])
+            function.write(line, f"{first} truth({test}):" if first != "else" else f"else {test}:")
+            function.blocks.append("if" if first == "elif" else first)
+            function.write(line, "spend()")
+        elif first not in _IGNORED:
+            function.write(line, "spend()")
+            function.write(line, self._simple(first, found))
 
-    def _body(self, *ends: str) -> Lines:
-        """Statements up to one of these words, or to the end of the text."""
-        found = Lines()
-        self._skip_lines()
-        while not self._is(*ends) and self._tokens[self._place].kind:
-            if self._is("def", "sec", "thread"):
-                self._function()
-            elif not self._take("pass", "enter_critical", "exit_critical"):  # no thread is interrupted here
-                found.append((self._tokens[self._place].line, "spend()"))
-                found += self._statement()
-            if not self._is(*ends, *_STATEMENTS):  # a keyword begins a statement without a new line
-                self._need(kind="line")
-            self._skip_lines()
-        return found
+    def _function(self, found: list[Token]) -> None:
+        word, name, *rest = found
+        if name.kind != "name":
+            raise ScriptSyntaxError(f"{word.text} without a name", word.line)
+        parameters = [
+            now.text for before, now in pairwise(rest) if now.kind == "name" and before.text in "(,"
+        ]
+        head = " ".join(f"_{t.text}" if t.kind == "name" else t.in_python for t in rest)
+        self._open(name.text, word.line, f"def f_{name.text} {head}", parameters)
 
-    def _statement(self) -> Lines:
-        line = self._tokens[self._place].line
-        word = self._take(*_STATEMENTS)
-        match word.text if word is not None else "":
-            case "if":
-                return self._if(line)
-            case "while":
-                test = self._expression()
-                return [(line, f"while truth({test}):"), *_indented([(line, "spend()"), *self._block()])]
-            case "global" | "local" as scope:
-                name = self._need(kind="name").text
-                self._need("=")
-                return [(line, f"{self._scope}.{scope}_only[{name!r}] = {self._expression()}")]
-            case "kill" | "join" as verb:
-                return [(line, f"yield from call('{verb}', {verb}, {self._expression()})")]
-            case "return":
-                return [(line, "return " + ("" if self._next_is("line") else self._expression()))]
+    def _simple(self, first: str, found: list[Token]) -> str:
+        """A statement without a block."""
+        rest = self._expression(found[1:]) if first not in ("", "global", "local") else ""
+        match first:
+            case "":
+                return self._expression(found)
+            case "global" | "local":
+                name = found[1].text if [t.kind for t in found[1:2]] == ["name"] else ""
+                return f"{self._scope}.{first}_only[{name!r}] {self._expression(found[2:])}"
             case "halt":
-                return [(line, "yield from halt()")]
-            case "break" | "continue" as leave:
-                return [(line, leave)]
-        return [(line, self._assignment())]
+                return f"yield from halt() {rest}"
+            case "join":
+                return f"yield from join({rest})"
+            case "kill":
+                return f"kill({rest})"
+        return f"{first} {rest}"
 
-    def _assignment(self) -> str:
-        """`a = …`, `a[i] = …`, or an expression for what it does."""
-        token = self._tokens[self._place]
-        if token.text in _STATEMENTS_MISSING and not self._next_is("name", "="):
-            raise ScriptSyntaxError(f"{token.text}: {NOT_SUPPORTED}", token.line)
-        if self._next_is("name", "="):
-            name = self._need(kind="name").text
-            self._need("=")
-            return f"{self._scope}[{name!r}] = {self._expression()}"
-        if self._next_is("name", "["):
-            before, name = self._place, self._need(kind="name").text
-            self._need("[")
-            index = self._expression()
-            if self._take("]") and self._take("="):
-                return f"{self._scope}.set_item({name!r}, {index}, {self._expression()})"
-            self._place = before
-        return self._expression()
-
-    def _if(self, line: int) -> Lines:
-        found = [(line, f"if truth({self._expression()}):"), *_indented(self._block("elif", "else"))]
-        while word := self._take("elif"):
-            found.append((word.line, f"elif truth({self._expression()}):"))
-            found += _indented(self._block("elif", "else"))
-        if word := self._take("else"):
-            found += [(word.line, "else:"), *_indented(self._block())]
-        return found
-
-    # -- expressions ------------------------------------------------------------------------------------
-
-    def _expression(self, level: int = 0) -> str:
-        self._skip_lines()  # what was begun goes on in the next line
-        if level == len(_LEVELS):
-            return self._unary()
-        if level == _NOT_LEVEL and self._take("not"):
-            return f"(not truth({self._expression(level)}))"
-        left = self._expression(level + 1)
-        while sign := self._take(*_LEVELS[level]):
-            right = self._expression(level + 1)
-            if sign.text in _LOGIC:
-                left = f"(truth({left}) {_LOGIC[sign.text]} truth({right}))"
-            else:
-                left = f"operate('{sign.text}', {left}, {right})"
-        return left
-
-    def _unary(self) -> str:
-        if self._take("-"):
-            return f"operate('-', 0, {self._unary()})"
-        if self._take("run"):
-            return self._call(self._need(kind="name"), runs=True)
-        token = self._tokens[self._place]
-        self._place += 1
-        if token.kind == "int":
-            found = str(int(token.text, 16 if token.text[:2] in ("0x", "0X") else 10))
-        elif token.kind == "float" or token.text in ("True", "False"):
-            found = token.text
-        elif token.kind == "string":
-            found = repr(token.text[1:-1])
-        elif (token.kind, token.text) == ("sign", "("):
-            found = self._expression()  # what is written in Python needs no brackets
-            self._need(")")
-        elif (token.kind, token.text) == ("sign", "["):
-            found = f"[{', '.join(self._list(']')[0])}]"
-        elif token.text == "p" and self._take("["):
-            items = self._list("]")[0]  # a single one is an index into a variable of that name
-            found = (
-                f"item({self._scope}['p'], {items[0]})" if len(items) == 1 else f"Pose([{', '.join(items)}])"
-            )
-        elif token.kind != "name":
-            raise ScriptSyntaxError(f"{token.text!r} where a value was expected", token.line)
-        else:
-            found = self._call(token) if self._is("(") else f"{self._scope}[{token.text!r}]"
-        while self._take("["):
-            found = f"item({found}, {self._expression()})"
-            while self._take(","):  # a matrix is a list of its rows
-                found = f"item({found}, {self._expression()})"
-            self._need("]")
-        return found
-
-    def _list(self, end: str) -> tuple[list[str], dict[str, str]]:
-        """Values up to this sign, those with names apart."""
-        plain, named = [], {}
-        while not self._take(end):
-            if end == ")" and self._next_is("name", "="):
-                name = self._need(kind="name").text
-                self._need("=")
-                named[name] = self._expression()
-            else:
-                plain.append(self._expression())
-            if not self._is(end):
-                self._need(",")
-        return plain, named
-
-    def _call(self, name: Token, runs: bool = False) -> str:
-        self._need("(")
-        plain, named = self._list(")")
-        self.calls.append(Call(name, tuple(self._around), len(plain), list(named), runs))
-        found = [f"f_{name.text}", *plain]
-        if named:
-            found.append("**{" + ", ".join(f"{key!r}: {value}" for key, value in named.items()) + "}")
-        start = "start(" if runs else f"(yield from call({name.text!r}, "
-        return start + ", ".join(found) + (")" if runs else "))")
+    def _expression(self, found: list[Token]) -> str:
+        nothing = Token("", "", 0)
+        around = zip([nothing, *found], found, [*found[1:], nothing], strict=False)
+        written, opened = list[str](), -1
+        closing: list[tuple[str, _Call | None]] = []
+        """What closes each open bracket, and whose arguments are in it."""
+        for i, (before, token, after) in enumerate(around):
+            call = closing[-1][1] if closing else None
+            match token.kind, token.text:
+                case _ if i == opened:
+                    pass  # was written with what is before it
+                case "name", name if after.text == "(":
+                    runs, opened = before.text == "run", i + 1
+                    written.append(f"start(f_{name}," if runs else f"(yield from call(f_{name},")
+                    closing.append((")" if runs else "))", _Call(name, token.line, runs)))
+                case "name", "p" if after.text == "[" and _several(found[i + 1 :]):
+                    opened = i + 1
+                    written.append("Pose([")
+                    closing.append(("])", None))
+                case "name", name if after.text == "=" and call:
+                    call.named.append(name)
+                    written.append(f"_{name}")
+                case "name", name:
+                    written.append(f"{self._scope}[{name!r}]")
+                case "sign", "(" | "[" as bracket:
+                    literal = bracket == "[" and not before.is_value
+                    written.append("List([" if literal else bracket)
+                    closing.append(("])" if literal else {"(": ")", "[": "]"}[bracket], None))
+                case "sign", ")" | "]" as bracket:
+                    if not closing or closing[-1][0][0] != bracket:
+                        raise ScriptSyntaxError(f"{bracket} closes nothing", token.line)
+                    if call:
+                        call.arguments -= before.text in ("(", ",")
+                        self.calls.append(call)
+                    written.append(closing.pop()[0])
+                case "word", "run" if after.kind == "name":
+                    pass
+                case "word", "and" | "or" | "not" | "True" | "False" as word:
+                    written.append(word)
+                case "word", word:
+                    raise ScriptSyntaxError(f"{word} here: {NOT_SUPPORTED}", token.line)
+                case _:
+                    if call:
+                        call.arguments += token.text == ","
+                    written.append(token.in_python)
+        return " ".join(written)
 
 
-def _indented(lines: Lines) -> Lines:
-    return [(line, " " + text) for line, text in lines]
+def _several(found: list[Token]) -> bool:
+    """Tell whether there are several items in the bracket that begins here."""
+    depth = 0
+    for token in found:
+        depth += (token.text in ("(", "[")) - (token.text in (")", "]"))
+        if depth == 0:
+            return False
+        if depth == 1 and token.text == ",":
+            return True
+    return False

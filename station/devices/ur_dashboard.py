@@ -7,6 +7,7 @@ per reply, in order. Commands that are not in ALLOWED, such as unlock, power on 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 from collections import deque
 
@@ -21,6 +22,8 @@ ALLOWED = frozenset(
     }
 )  # fmt: skip
 LINE_LIMIT = 4096
+REPEAT_S = 0.25
+"""Period of requests for a connection: the kernel repeats a lost one only after a second."""
 
 
 class DashboardError(RobotError):
@@ -62,7 +65,7 @@ class Dashboard:
         writer = None
         try:
             async with asyncio.timeout(timeout_s):
-                reader, writer = await asyncio.open_connection(host, PORT, limit=LINE_LIMIT)
+                reader, writer = await _connect(host)
                 greeting = await reader.readline()
             if b"Dashboard Server" not in greeting:
                 raise DashboardError(
@@ -141,6 +144,13 @@ class Dashboard:
         self._break("closed")
         self._task.cancel()
         await asyncio.gather(self._task, return_exceptions=True)
+
+
+async def _connect(host: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    while True:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(REPEAT_S):
+                return await asyncio.open_connection(host, PORT, limit=LINE_LIMIT)
 
 
 async def came(reply: asyncio.Future[str], moment_s: float) -> bool:

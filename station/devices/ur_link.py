@@ -40,7 +40,7 @@ FIRST_STATE_S = 4.0
 SUPERVISE_S = 0.2
 _BUSY_SHARE = 0.5
 """Share of time waiting for a processor above which a gap is blamed on this computer, not the network."""
-RECONNECT_S = (0.2, 0.5, 1.0, 2.0)
+RETRY_S = 0.5
 
 
 class UrLink:
@@ -52,8 +52,8 @@ class UrLink:
         """Whether remote control is on; None where there is no such switch (CB3)."""
         self.reader: StateReader | None = None
         """Reader of the state stream, with its counters; a new one after a lost connection."""
-        self._before_ns = 0
-        """Arrival of the newest sample of the previous connection (host monotonic)."""
+        self._arrived_ns = 0
+        """Arrival of the newest state, of this connection or an earlier one (host monotonic); 0: none."""
         self._unread_s = 0.0
         """When this computer last had no processor to read late news (host monotonic)."""
         self.guided = False
@@ -71,6 +71,7 @@ class UrLink:
         """The payload at connect."""
         self._trouble: RobotError | None = None
         self._trouble_since_s = 0.0
+        """Since when the trouble lasts although states come (host monotonic)."""
         self._supervisor: asyncio.Task[None] | None = None
 
     @property
@@ -177,7 +178,7 @@ class UrLink:
         await self._close_link()
         self._unlock()
         self._tool = self._payload = None
-        self._before_ns = 0
+        self._arrived_ns = 0
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -185,7 +186,6 @@ class UrLink:
             self._lock = None
 
     async def _close_link(self) -> None:
-        self._before_ns = self._newest_ns()
         reader, self.reader = self.reader, None
         if reader is not None:
             await asyncio.to_thread(reader.close)
@@ -201,6 +201,9 @@ class UrLink:
         self._subscribers.append(callback)
 
     def _deliver(self, state: RobotState) -> None:
+        before_ns, self._arrived_ns = self._arrived_ns, state.stamps.host_monotonic_ns
+        if self._arrived_ns - before_ns > CURRENT_S * 1e9:
+            self._trouble_since_s = time.monotonic()  # what delayed the states delayed all else, too
         for callback in self._subscribers:
             try:
                 callback(state)
@@ -242,12 +245,7 @@ class UrLink:
         return age_s
 
     def _age_s(self) -> float:
-        return (time.monotonic_ns() - self._newest_ns()) / 1e9 if self._newest_ns() else float("inf")
-
-    def _newest_ns(self) -> int:
-        """Return the newest sample's arrival (host monotonic), if need be of the last connection; 0: none."""
-        sample = self.reader.newest if self.reader is not None else None
-        return self._before_ns if sample is None else sample.state.stamps.host_monotonic_ns
+        return (time.monotonic_ns() - self._arrived_ns) / 1e9 if self._arrived_ns else float("inf")
 
     def latest(self) -> RobotState:
         """Return the newest state; StaleStateError when over 100 ms old, or if its controller time stands."""
@@ -325,7 +323,7 @@ class UrLink:
         if self._trouble is not None:
             recent = time.monotonic() - self._trouble_since_s <= RESTING_S
             if self._trouble.code == DashboardError.code and recent and not self.in_motion:
-                return None  # what held up the news held up the dashboard, too
+                return None
             raise self._trouble
         return state
 
@@ -348,9 +346,10 @@ class UrLink:
         """Hook for the subclass that controls the arm: called when the connection is lost."""
 
     async def _supervise(self) -> None:
-        failures = 0
+        failed = False
         while True:
-            await asyncio.sleep(SUPERVISE_S if not failures else RECONNECT_S[min(failures, 4) - 1])
+            await asyncio.sleep(RETRY_S if failed else SUPERVISE_S)
+            failed = True
             reader = self.reader
             try:
                 if reader is None or reader.ended is not None:
@@ -359,14 +358,12 @@ class UrLink:
                     await self._close_link()
                     await self._open()
                 await self.supervise_more()
-                failures, self._trouble = 0, None
+                failed, self._trouble = False, None
             except StationError as error:
-                failures += 1
                 if self._trouble is None:
                     self._trouble_since_s = time.monotonic()
                 self._trouble = RobotError(error.text, code=error.code, remedy=error.remedy, **error.values)
             except Exception:
-                failures += 1
                 log.exception("the robot's supervision failed; it goes on")
 
     async def renew_dashboard(self) -> Dashboard:

@@ -14,6 +14,7 @@ from station.cell.config import RobotConfig
 from station.cell.errors import StaleStateError
 from station.devices.base import fresh
 from station.devices.news import Delay, Evidence, is_loopback, largest_gap, longest_silence_s
+from station.devices.ur_dashboard import DashboardError
 from station.devices.ur_link import UrLink
 from tests.codes import raises
 from tests.station.devices.test_ur_moves import STATE
@@ -26,12 +27,13 @@ def arrived(host_s: float, controller_s: float = 0.0) -> RobotState:
 class Reader:
     """A connection whose newest state came so long ago; `unread`: what waits in the socket came just now."""
 
-    def __init__(self, age_s: float, *, unread: bool = False, ended: str | None = None) -> None:
-        self.ended, self.stands_still, self._unread = ended, False, unread
+    def __init__(self, made: Any, age_s: float, *, unread: bool = False, ended: str | None = None) -> None:
+        self.ended, self.stands_still, self._unread, self._link = ended, False, unread, made
         self._come(age_s)
 
     def _come(self, age_s: float) -> None:
         self.newest = SimpleNamespace(state=arrived(time.monotonic() - age_s))
+        self._link._deliver(self.newest.state)
 
     def read_waiting(self) -> bool:
         if self._unread:
@@ -41,7 +43,7 @@ class Reader:
 
 def link(age_s: float, *, moving: bool = False, **how: Any) -> UrLink:
     made: Any = UrLink(RobotConfig(model="UR10", host="192.0.2.10"))
-    made.reader, made.guided = Reader(age_s, **how), moving
+    made.reader, made.guided = Reader(made, age_s, **how), moving
     return made  # type: ignore[no-any-return]
 
 
@@ -72,6 +74,20 @@ def test_a_connection_that_ended_is_waited_for_at_rest_only() -> None:
     assert link(0.05, ended="reset").news() is None
     with raises("link-lost"):
         link(0.05, moving=True, ended="reset").news()
+
+
+def test_a_resting_arm_waits_for_its_dashboard_from_when_news_are_back() -> None:
+    """The cable was out: the dashboard's trouble is old, and it can be asked again only now."""
+    late: Any = link(0.0)
+    late._trouble, late._trouble_since_s = DashboardError("no answer"), time.monotonic() - 5.0
+    late._tool = late._payload = None
+    for age_s in (3.0, 0.0):
+        late._deliver(arrived(time.monotonic() - age_s))
+    assert late.check() is None
+    late._trouble_since_s -= 1.1
+    late._deliver(arrived(time.monotonic()))
+    with raises("dashboard"):
+        late.check()
 
 
 async def test_the_news_that_come_are_the_ones_that_are_decided_on() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
 
 import pytest
 
@@ -81,6 +82,22 @@ async def test_something_else_on_the_port(serve: Serve, greeting: bytes) -> None
     async with asyncio.timeout(PATIENCE_S):
         with pytest.raises(DashboardError):
             await Dashboard.open(host, timeout_s=0.3)
+
+
+async def test_a_request_to_connect_that_was_lost_is_repeated(
+    serve: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    host, lost, connect = await serve(E_SERIES), [asyncio.Event()], asyncio.open_connection
+
+    async def first_is_lost(*where: Any, **how: Any) -> Any:
+        if lost:
+            await lost.pop().wait()
+        return await connect(*where, **how)
+
+    monkeypatch.setattr(asyncio, "open_connection", first_is_lost)
+    dashboard = await Dashboard.open(host)
+    assert dashboard.alive
+    await dashboard.close()
 
 
 async def test_a_reply_that_is_too_late_breaks_the_connection(serve: Serve) -> None:

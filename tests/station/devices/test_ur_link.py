@@ -19,6 +19,7 @@ from station.devices.rtde import HEADER, PORT, PacketType, packet
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import ProbeResult, RobotLock
 from tests.codes import raises
+from tests.station.devices.test_ur_moves import STATE
 
 CONFIG = RobotConfig(model="UR10", host="127.0.0.1", serial="2016")
 
@@ -37,8 +38,8 @@ def test_a_listener_that_fails_is_dropped_alone(link: Any) -> None:
 
     for listener in (lambda state: heard.append("first"), fails, lambda state: heard.append("last")):
         link.subscribe(listener)
-    link._deliver(None)
-    link._deliver(None)
+    link._deliver(STATE)
+    link._deliver(STATE)
     assert heard == ["first", "fails", "last", "first", "last"]
 
 

@@ -36,7 +36,6 @@ SHOWN: dict[str, str] = {
     "watch": r"^\| (repeated|any) .* of ",
     "drift": r"planned \| [38] \|",
     "stop_latency": r"^\| both \| (first|bytes).* 200 \||no heartbeat \| rest",
-    "stop_denied": "busy|fake",
 }
 """The rows of each benchmark that the page shows, as a pattern; in the page's order."""
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")

@@ -21,7 +21,6 @@ from station.cli.console import err
 from station.cli.daemon import answers, ensure_daemon, own_daemon, tell_what_goes_on, user_config
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import found_cameras
-from station.devices.ur_condition import what_holds
 from station.devices.ur_dashboard import STOP, DashboardError
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import probe, unsupported_model
@@ -38,7 +37,7 @@ class GuidedArm(UrLink):
 
     def trouble(self) -> str:
         try:
-            return what_holds(self.latest())
+            return self.condition(self.latest()).held
         except RobotError as problem:
             return str(problem)
 

@@ -6,7 +6,7 @@ import asyncio
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
@@ -80,6 +80,19 @@ class ArmNews(Protocol):
         """Return `news`; RobotError where nothing may be captured, as after a safety stop or TCP change."""
 
 
+class ArmCondition(NamedTuple):
+    """Condition of an arm in words, by one of its states."""
+
+    mode: str
+    """'RUNNING', 'POWER OFF' …"""
+    safety: str
+    """'NORMAL', 'PROTECTIVE STOP' …"""
+    program: str
+    """State of the robot's program: stopped, playing, paused."""
+    held: str
+    """Why the arm cannot move now, and the remedy at the pendant; empty: it can."""
+
+
 class Robot(ArmNews, Protocol):
     """An arm. Connecting only reads; `start_control`, after an approval, replaces the robot's program."""
 
@@ -93,6 +106,15 @@ class Robot(ArmNews, Protocol):
     @property
     def control_path(self) -> str:
         """Driver of the arm: ur_rtde or script; empty where no real arm moves."""
+
+    def control_trouble(self) -> tuple[str, str]:
+        """Say why this driver cannot be used, and the remedy; both empty: it can."""
+
+    def condition(self, state: RobotState) -> ArmCondition:
+        """Describe the arm's condition in one of its states."""
+
+    async def missing(self) -> str:
+        """Find what keeps the arm's states from coming, with the remedy; takes at most a few seconds."""
 
     @property
     def kinematics(self) -> ArmKinematics | None:

@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 from recordings.schema.messages import RobotState
 from station.cell.errors import StaleStateError
-from station.devices.ur_condition import APPROVE_AGAIN
+
+APPROVE_AGAIN = "then approve motion again"
 
 CURRENT_S = 0.1
 """Largest age of news that count as the present state of the arm."""

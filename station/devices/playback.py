@@ -35,6 +35,7 @@ from station.cell.config import StationConfig, vector6
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import pose_vector
+from station.devices.base import ArmCondition
 from station.devices.cell import Cell
 from station.devices.frames import CameraCounts, FrameTiming
 
@@ -220,6 +221,16 @@ class PlaybackRobot:
         await asyncio.sleep(MOVE_S)
 
     def heartbeat(self) -> None: ...
+
+    def control_trouble(self) -> tuple[str, str]:
+        return "", ""
+
+    def condition(self, state: RobotState) -> ArmCondition:
+        """Describe it as running, as the recorded arm holds nobody up."""
+        return ArmCondition("RUNNING", "NORMAL", "stopped", "")
+
+    async def missing(self) -> str:
+        return "play a recording that can be read"
 
     def stop_one_way(self, way: StopWay) -> None:
         raise RobotError("a played-back arm has no ways to stop", code="playback")

@@ -23,6 +23,7 @@ from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.base import fresh, ready
 from station.devices.news import (
+    APPROVE_AGAIN,
     RESTING_S,
     Evidence,
     longest_silence_s,
@@ -30,7 +31,6 @@ from station.devices.news import (
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import (
-    APPROVE_AGAIN,
     foreign_program,
     not_powered,
     program_ended,
@@ -107,6 +107,9 @@ class UrRobot(UrLink):
         self._tool_looked_s = 0.0
         """When TCP and payload were last checked during a move (host monotonic)."""
         self._background: set[asyncio.Task[object]] = set()
+
+    def control_trouble(self) -> tuple[str, str]:
+        return control_trouble(self.control_path)
 
     @property
     def control_path(self) -> ControlPath:

@@ -23,7 +23,7 @@ from recordings.errors import ErrorData
 from recordings.files import open_regular
 from station.cell.config import ControlPath
 from station.cell.errors import RobotError
-from station.devices.ur_condition import APPROVE_AGAIN
+from station.devices.news import APPROVE_AGAIN
 
 log = logging.getLogger(__name__)
 

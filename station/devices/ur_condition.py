@@ -6,9 +6,9 @@ from enum import IntEnum
 
 from recordings.schema.messages import RobotState
 from station.cell.errors import RobotError, SafetyStopError
+from station.devices.base import ArmCondition
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 
-APPROVE_AGAIN = "then approve motion again"
 NOT_STARTED_REMEDY = (
     "Clear the pendant's messages, and look there why programs from the network are not started."
 )
@@ -117,11 +117,14 @@ def _held(state: RobotState) -> tuple[str, str, str] | None:
     return None
 
 
-def what_holds(state: RobotState) -> str:
-    """Say why the arm cannot move now, and the remedy; empty: it can."""
-    if (held := _held(state)) is not None:
-        return f"{held[1]}: {held[2]}"
-    return str(not_powered(state) or "")
+def condition(state: RobotState) -> ArmCondition:
+    """Describe the arm's condition in words."""
+    if (stop := _held(state)) is not None:
+        held = f"{stop[1]}: {stop[2]}"
+    else:
+        held = str(not_powered(state) or "")
+    mode = _word(RobotMode, state.robot_mode, "MODE")
+    return ArmCondition(mode, safety_word(state), program_word(state), held)
 
 
 def not_powered(state: RobotState) -> RobotError | None:
@@ -183,11 +186,6 @@ def program_word(state: RobotState) -> str:
 def safety_word(state: RobotState) -> str:
     """Name the safety mode: 'PROTECTIVE STOP' …"""
     return _word(SafetyMode, state.safety_mode, "SAFETY MODE")
-
-
-def mode_word(state: RobotState) -> str:
-    """Name the robot mode: 'RUNNING' …"""
-    return _word(RobotMode, state.robot_mode, "MODE")
 
 
 def _word(kind: type[IntEnum], value: int, unknown: str) -> str:

@@ -18,8 +18,9 @@ from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.cell.process import waited_share
 from station.cell.scene import arm_model
+from station.devices.base import ArmCondition
 from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_loopback, largest_gap
-from station.devices.ur_condition import safety_stop
+from station.devices.ur_condition import condition, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_probe import (
     SCRIPT_PORT,
@@ -28,6 +29,7 @@ from station.devices.ur_probe import (
     check_port,
     identify,
     lock_name,
+    probe,
     unsupported_model,
     why_no_dashboard,
 )
@@ -326,6 +328,19 @@ class UrLink:
                 return None
             raise self._trouble
         return state
+
+    def condition(self, state: RobotState) -> ArmCondition:
+        return condition(state)
+
+    async def missing(self) -> str:
+        host = self.config.host
+        if not host:
+            return "give robot.host in the configuration"
+        found = await probe(host)
+        if not found.answers:
+            return f"switch the robot on, plug in its network cable, and check robot.host ({host})"
+        who = f"{found.model} {found.serial}" if found.model else "something"
+        return "; ".join([f"{who} answers at {host}", *found.problems])
 
     def check_tool(self, sample: Sample) -> None:
         """Raise RobotError when TCP or payload differ from those at connect; works in motion, too."""

@@ -15,9 +15,8 @@ from dataclasses import dataclass, field
 from recordings.schema.messages import RobotState, Vector6
 from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2
 from station.cell.errors import RobotError
-from station.devices.news import MOVING_S
+from station.devices.news import APPROVE_AGAIN, MOVING_S
 from station.devices.ur_condition import (
-    APPROVE_AGAIN,
     not_powered,
     program_not_running,
     safety_stop,

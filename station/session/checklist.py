@@ -14,9 +14,6 @@ from station.cell.errors import CameraError, RobotError
 from station.cell.process import GRANT_REAL_TIME, in_real_time
 from station.cell.status import StationState
 from station.devices.discovery import USB3_MBIT_S, FoundCamera, UsbCamera, discover, discover_usb
-from station.devices.ur import control_trouble
-from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
-from station.devices.ur_probe import probe
 from station.protocol.verbs import Check
 from station.session.context import SessionContext
 from station.session.threads import ASKED
@@ -45,15 +42,12 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
     try:
         state = robot.latest()
     except RobotError as error:
-        return [Check("robot", "failed", troubles.get("robot", str(error)), await _from_outside(host))]
-    identity = robot.identity
-    checks = [Check("robot", "ok", f"{identity.model} {identity.serial} at {host}, {mode_word(state)}")]
-    trouble = safety_stop(state) or not_powered(state)
-    checks.append(
-        Check("safety", "failed", safety_word(state), str(trouble))
-        if trouble is not None
-        else Check("safety", "ok", safety_word(state))
-    )
+        return [Check("robot", "failed", troubles.get("robot", str(error)), await robot.missing())]
+    identity, condition = robot.identity, robot.condition(state)
+    checks = [
+        Check("robot", "ok", f"{identity.model} {identity.serial} at {host}, {condition.mode}"),
+        Check("safety", "failed" if condition.held else "ok", condition.safety, condition.held),
+    ]
     if robot.remote is False:
         checks.append(Check("remote control", "failed", "local", "switch the pendant to Remote (top right)"))
     else:
@@ -65,7 +59,7 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
 
 def _control_check(context: SessionContext) -> Check:
     path = context.cell.robot.control_path
-    trouble, remedy = control_trouble(path)
+    trouble, remedy = context.cell.robot.control_trouble()
     if trouble:
         return Check("control", "failed", trouble, remedy)
     if trouble := context.cell.acceptance_trouble(context.root):
@@ -83,17 +77,6 @@ def _computer_check(context: SessionContext) -> Check:
     return Check(
         "computer", "warning", text, f"run it as the service station, or grant it: {GRANT_REAL_TIME}"
     )
-
-
-async def _from_outside(host: str) -> str:
-    """Make the remedy for a robot without state: which of its ports answer."""
-    if not host:
-        return "give robot.host in the configuration"
-    found = await probe(host)
-    if not found.answers:
-        return f"switch the robot on, plug in its network cable, and check robot.host ({host})"
-    who = f"{found.model} {found.serial}" if found.model else "something"
-    return "; ".join([f"{who} answers at {host}", *found.problems])
 
 
 async def _camera_check(context: SessionContext, troubles: dict[str, str]) -> Check:

@@ -35,7 +35,6 @@ from station.cell.status import (
     TriggerStatus,
 )
 from station.cell.stillness import NotStillError
-from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Observation, Observe, PreviewImage
 from station.session.capture import at_exposure
@@ -124,14 +123,15 @@ class Monitor:
             state = robot.latest()
         except RobotError:
             return base
+        words = robot.condition(state)
         return msgspec.structs.replace(
             base,
             connected=True,
             age_ms=round((time.monotonic_ns() - state.stamps.host_monotonic_ns) / 1e6, 0),
-            safety=safety_word(state),
-            mode=mode_word(state),
-            held="" if context.cell.source == "playback" else what_holds(state),
-            program=program_word(state),
+            safety=words.safety,
+            mode=words.mode,
+            held=words.held,
+            program=words.program,
             speed_m_s=round(point_speed_m_s(context.geometry, state.joints_rad, state.joint_speeds_rad_s), 3),
             slider=round(state.target_speed_fraction, 3),
             joints_rad=state.joints_rad,

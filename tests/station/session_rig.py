@@ -29,10 +29,12 @@ from station.cell.acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
 from station.cell.status import DetectionStatus, Event, StationState
-from station.devices.base import Robot
+from station.devices.base import ArmCondition, Robot
 from station.devices.cell import Cell
 from station.devices.frames import CameraCounts, FrameTiming
 from station.devices.news import Evidence
+from station.devices.ur import control_trouble
+from station.devices.ur_condition import condition
 from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.scenes import cell_config, make_cell
@@ -159,6 +161,15 @@ class ArmInMemory:
 
     def heartbeat(self) -> None:
         self.beats += 1
+
+    def control_trouble(self) -> tuple[str, str]:
+        return control_trouble(self.control_path)
+
+    def condition(self, state: RobotState) -> ArmCondition:
+        return condition(state)
+
+    async def missing(self) -> str:
+        return "switch it on"
 
     def stop_one_way(self, way: StopWay) -> None:
         self.log.append(f"stop by {way.value}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 import struct
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from station.cell.process import waited_share
 from station.devices.rtde import HEADER, PORT, PacketType, packet
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import ProbeResult, RobotLock
+from station.simulation.launch import SimulatedController
 from tests.codes import raises
 from tests.station.devices.test_ur_moves import STATE
 
@@ -116,3 +118,22 @@ def test_the_share_of_time_that_programs_wait_is_the_kernels(tmp_path: Path) -> 
     assert waited_share(pressure) == 0.0
     pressure.write_text("some avg10=97.54 avg60=91.66 avg300=80.04 total=10610028320\n")
     assert waited_share(pressure) == 0.9754
+
+
+@pytest.mark.parametrize(
+    ("host", "remedy"),
+    [
+        ("", "give robot.host in the configuration"),
+        ("127.77.1.9", "switch the robot on, plug in its network cable, and check robot.host (127.77.1.9)"),
+    ],
+)
+async def test_where_nothing_answers_the_remedy_is_one_sentence(host: str, remedy: str) -> None:
+    assert await UrLink(RobotConfig(host=host)).missing() == remedy
+
+
+@pytest.mark.process
+async def test_a_robot_that_only_lacks_its_stream_is_told_by_name(
+    controller: Callable[..., SimulatedController],
+) -> None:
+    host = controller("UR10e").host
+    assert f"UR10e 20263000001 answers at {host}" in await UrLink(RobotConfig(host=host)).missing()

@@ -1,5 +1,5 @@
 """A simulated Universal Robots controller: a process of its own that unmodified clients connect to.
 
-`python -m station.simulation.controller --help`; described in docs/contributor/simulator.md. It imports
-neither numpy nor anything of the offline rooms, so it starts in 0.1 s.
+`python -m station.simulation.controller --help`; described in docs/contributor/simulator.md. It starts
+without NumPy and without anything of the offline packages, in 0.1 s.
 """

@@ -15,7 +15,7 @@ import msgspec
 
 from station.simulation.controller.admin import AdminServer
 from station.simulation.controller.kinematics import TABLES
-from station.simulation.controller.machine import Machine
+from station.simulation.controller.machine import Machine, precise_loop
 from station.simulation.controller.state import Settings, Six, version_of
 
 PARENT_POLL_S = 0.5
@@ -54,7 +54,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"cannot start: {of}{error}", file=sys.stderr)
         return 2
     try:
-        asyncio.run(_serve(options.host, settings, parent if options.die_with_parent else None))
+        with asyncio.Runner(loop_factory=precise_loop) as runner:
+            runner.run(_serve(options.host, settings, parent if options.die_with_parent else None))
     except OSError as error:
         print(
             f"cannot listen on {options.host}: {error.strerror or error}. Another controller runs on this "

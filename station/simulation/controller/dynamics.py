@@ -3,6 +3,7 @@
 Masses, centres of mass and largest torques: Universal Robots, "DH parameters for calculations of kinematics
 and dynamics" and "Max. joint torques". Each link counts as a point. Universal Robots publishes neither the
 rotors' inertia nor friction: both are assumed, of the size that MuJoCo Menagerie gives its UR10e.
+The only module of the controller that needs NumPy: loaded where a controller takes torques.
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ from itertools import groupby
 from operator import itemgetter
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from station.simulation.controller.kinematics import (
     ArmGeometry,
     Rigid,
     Vector,
-    cross,
-    dot,
     frames,
     place,
-    plus,
     read_table,
 )
 
-Matrix = list[list[float]]
+Array = NDArray[np.float64]
 
 ROTOR_KG_M2 = 0.1
 """Each joint's rotor, as its link feels it."""
@@ -66,102 +67,58 @@ class Posture:
     """
 
     def __init__(self, table: ArmGeometry, joints_rad: Vector, speeds_rad_s: Vector) -> None:
-        self._frames = frames(table, joints_rad)
-        self._speeds = speeds_rad_s
-        self._axes: list[Vector] = [(T[2], T[6], T[10]) for T in self._frames[:-1]]
-        self._points: list[Vector] = [place(T) for T in self._frames[:-1]]
-        self._velocities = [self._velocity(p, j) for j, p in enumerate(self._points)]
-        turns: list[Vector] = [(0.0, 0.0, 0.0)]
-        for axis, speed in zip(self._axes, speeds_rad_s, strict=True):
-            turns.append(plus(turns[-1], axis, speed))
-        self._axis_rates = [cross(turn, axis) for turn, axis in zip(turns, self._axes, strict=False)]
+        self._frames = np.reshape(frames(table, joints_rad), (7, 3, 4))
+        self._speeds = np.array(speeds_rad_s)
+        self._axes, self._points = self._frames[:-1, :, 2], self._frames[:-1, :, 3]
+        turns = np.cumsum(self._speeds[:, None] * self._axes, axis=0)
+        self._axis_rates = np.cross(np.vstack([np.zeros(3), turns[:-1]]), self._axes)
+        self._velocities = self._speeds @ self._columns(self._points, np.arange(6))
 
-    def _columns(self, x: Vector, link: int) -> list[Vector]:
-        """Compute how fast a point of a link moves per speed of each joint before it."""
-        pairs = zip(self._axes[:link], self._points, strict=False)
-        return [cross(z, plus(x, p, -1)) for z, p in pairs]
+    def _columns(self, x: Array, links: NDArray[np.intp]) -> Array:
+        """(n, 6, 3): how fast points (n, 3) of links move per speed of each joint before them."""
+        return np.where(_before(links), np.cross(self._axes, x[:, None] - self._points), 0.0)
 
-    def _velocity(self, x: Vector, link: int) -> Vector:
-        return _combined(self._columns(x, link), self._speeds)
+    def _column_rates(self, x: Array, links: NDArray[np.intp]) -> Array:
+        v = self._speeds @ self._columns(x, links)
+        rates = np.cross(self._axis_rates, x[:, None] - self._points)
+        rates += np.cross(self._axes, v[:, None] - self._velocities)
+        return np.where(_before(links), rates, 0.0)
 
-    def _column_rates(self, x: Vector, link: int) -> list[Vector]:
-        v = self._velocity(x, link)
-        return [
-            plus(
-                cross(self._axis_rates[j], plus(x, self._points[j], -1)),
-                cross(self._axes[j], plus(v, self._velocities[j], -1)),
-            )
-            for j in range(link)
-        ]
+    def _placed(self, bodies: Sequence[Body]) -> tuple[Array, Array, NDArray[np.intp]]:
+        """Masses (n,), places (n, 3) in base, and links (n,)."""
+        links, masses, places = (np.array(column) for column in zip(*bodies, strict=True))
+        T = self._frames[links]
+        return masses, np.einsum("nij,nj->ni", T[:, :, :3], places) + T[:, :, 3], links
 
-    def _placed(self, body: Body) -> Vector:
-        T, (x, y, z) = self._frames[body.link], body.place_m
-        return (
-            T[0] * x + T[1] * y + T[2] * z + T[3],
-            T[4] * x + T[5] * y + T[6] * z + T[7],
-            T[8] * x + T[9] * y + T[10] * z + T[11],
-        )
-
-    def mass_matrix(self, bodies: Sequence[Body]) -> Matrix:
+    def mass_matrix(self, bodies: Sequence[Body]) -> Array:
         """(6, 6) [kg m²]"""
-        M = [[ROTOR_KG_M2 * (i == j) for j in range(6)] for i in range(6)]
-        for body in bodies:
-            columns = self._columns(self._placed(body), body.link)
-            for i, a in enumerate(columns):
-                for j, b in enumerate(columns):
-                    M[i][j] += body.mass_kg * dot(a, b)
-        return M
+        masses, x, links = self._placed(bodies)
+        columns = self._columns(x, links)
+        return np.asarray(ROTOR_KG_M2 * np.eye(6) + np.einsum("n,nik,njk->ij", masses, columns, columns))
 
-    def coriolis(self, bodies: Sequence[Body]) -> list[float]:
+    def coriolis(self, bodies: Sequence[Body]) -> Array:
         """(6,) [Nm]"""
-        torques = [0.0] * 6
-        for body in bodies:
-            x = self._placed(body)
-            acceleration = _combined(self._column_rates(x, body.link), self._speeds)
-            for j, column in enumerate(self._columns(x, body.link)):
-                torques[j] += body.mass_kg * dot(column, acceleration)
-        return torques
+        masses, x, links = self._placed(bodies)
+        accelerations = self._speeds @ self._column_rates(x, links)
+        return np.asarray(np.einsum("n,njk,nk->j", masses, self._columns(x, links), accelerations))
 
-    def accelerations(self, bodies: Sequence[Body], most_nm: Vector, torques_nm: Vector) -> list[float]:
+    def accelerations(self, bodies: Sequence[Body], most_nm: Vector, torques_nm: Vector) -> Array:
         """(6,) [rad/s²] that torques give beside those against gravity; none is larger than most_nm."""
-        left = [
-            max(-most, min(most, torque)) - c - FRICTION_S * most * speed
-            for torque, most, c, speed in zip(
-                torques_nm, most_nm, self.coriolis(bodies), self._speeds, strict=True
-            )
-        ]
-        return solved(self.mass_matrix(bodies), left)
+        most = np.array(most_nm)
+        friction = FRICTION_S * most * self._speeds
+        left = np.clip(torques_nm, -most, most) - self.coriolis(bodies) - friction
+        return np.linalg.solve(self.mass_matrix(bodies), left)
 
-    def jacobian(self, base_from_tool: Rigid) -> Matrix:
+    def jacobian(self, base_from_tool: Rigid) -> Array:
         """(6, 6): the tool's velocity [m/s] and rotation [rad/s] in base, per joint speed."""
-        return _rows(self._columns(place(base_from_tool), 6), self._axes)
+        x, last = np.array([place(base_from_tool)]), np.array([6])
+        return np.vstack([self._columns(x, last)[0].T, self._axes.T])
 
-    def jacobian_rate(self, base_from_tool: Rigid) -> Matrix:
-        return _rows(self._column_rates(place(base_from_tool), 6), self._axis_rates)
-
-
-def solved(M: Matrix, right: Sequence[float]) -> list[float]:
-    """x of M x = right, M positive definite: Gauss's elimination needs no pivoting."""
-    rows = [[*row, value] for row, value in zip(M, right, strict=True)]
-    count = len(rows)
-    for i, row in enumerate(rows):
-        for other in rows[i + 1 :]:
-            share = other[i] / row[i]
-            for j in range(i, count + 1):
-                other[j] -= share * row[j]
-    found = [0.0] * count
-    for i in reversed(range(count)):
-        known = sum(rows[i][j] * found[j] for j in range(i + 1, count))
-        found[i] = (rows[i][count] - known) / rows[i][i]
-    return found
+    def jacobian_rate(self, base_from_tool: Rigid) -> Array:
+        x, last = np.array([place(base_from_tool)]), np.array([6])
+        return np.vstack([self._column_rates(x, last)[0].T, self._axis_rates.T])
 
 
-def _rows(linear: Sequence[Vector], angular: Sequence[Vector]) -> Matrix:
-    return [list(row) for columns in (linear, angular) for row in zip(*columns, strict=True)]
-
-
-def _combined(vectors: Sequence[Vector], shares: Sequence[float]) -> Vector:
-    total: Vector = (0.0, 0.0, 0.0)
-    for vector, share in zip(vectors, shares, strict=False):
-        total = plus(total, vector, share)
-    return total
+def _before(links: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """(n, 6, 1): whether a joint moves a link."""
+    return np.asarray((np.arange(6) < links[:, None])[..., None])

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import ctypes
-import os
+import selectors
 import time
 from collections.abc import Callable
 
@@ -20,16 +19,10 @@ CHUNK = 25
 LATE_CYCLES = 4
 """More cycles behind than this: the process was held up, and the cycles count as late."""
 
-_CLOEXEC_NONBLOCK = os.O_CLOEXEC | os.O_NONBLOCK
-_ABSOLUTE = 1
 
-
-class _Timespec(ctypes.Structure):
-    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
-
-
-class _Itimerspec(ctypes.Structure):
-    _fields_ = (("interval", _Timespec), ("value", _Timespec))
+def precise_loop() -> asyncio.AbstractEventLoop:
+    """Make an event loop whose timers are due to the microsecond; the usual one rounds up to milliseconds."""
+    return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
 class Clock:
@@ -39,8 +32,7 @@ class Clock:
         """cycle_s: in host seconds; differs from the controller's dt by its clock's drift."""
         self._cycle_ns = cycle_s * 1e9
         self._tick = tick
-        self._libc = ctypes.CDLL(None, use_errno=True)
-        self._fd = -1
+        self._timer: asyncio.TimerHandle | None = None
         self.start_ns = 0
         """Host time of the controller's time 0."""
         self.count = 0
@@ -52,33 +44,21 @@ class Clock:
     def due_ns(self, cycle: int) -> int:
         return self.start_ns + round(cycle * self._cycle_ns)
 
-    def start(self) -> None:
-        self._fd = self._libc.timerfd_create(time.CLOCK_MONOTONIC, _CLOEXEC_NONBLOCK)
-        if self._fd < 0:
-            raise OSError(ctypes.get_errno(), "timerfd_create")
-        asyncio.get_running_loop().add_reader(self._fd, self._wake)
-        self.restart()
-
     def restart(self) -> None:
-        """Controller time begins at 0 again."""
+        """Controller time begins at 0."""
         self.start_ns, self.count = time.monotonic_ns(), 0
         self._arm()
 
     def stop(self) -> None:
-        asyncio.get_running_loop().remove_reader(self._fd)
-        os.close(self._fd)
+        if self._timer is not None:
+            self._timer.cancel()
 
     def _arm(self) -> None:
+        self.stop()
         at_ns = max(self.due_ns(self.count + 1), self.hold_until_ns)
-        spec = _Itimerspec(_Timespec(0, 0), _Timespec(at_ns // 1_000_000_000, at_ns % 1_000_000_000))
-        if self._libc.timerfd_settime(self._fd, _ABSOLUTE, ctypes.byref(spec), None) != 0:
-            raise OSError(ctypes.get_errno(), "timerfd_settime")
+        self._timer = asyncio.get_running_loop().call_at(at_ns / 1e9, self._wake)
 
     def _wake(self) -> None:
-        try:
-            os.read(self._fd, 8)
-        except BlockingIOError:
-            return
         try:
             self._catch_up(time.monotonic_ns())
         finally:
@@ -115,7 +95,7 @@ class Machine:
         """Raises OSError when a port of the address is taken."""
         for service in self.services:
             service.open()
-        self.clock.start()
+        self.clock.restart()
         self._begin()
 
     def _begin(self) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from math import hypot, inf, isfinite, sqrt
 
 from station.simulation.controller.arm import JOINT_SPEED_RAD_S, JointMotion, Speeds
-from station.simulation.controller.dynamics import DRIVES, Body, Posture
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
     Rigid,
@@ -267,6 +266,8 @@ class ArmMotions:
         optimal: dict[str, Builtin] = {"optimovej": self._optimovej, "optimovel": self._optimovel}
         if settings.version < (5, 23):
             return optimal
+        from station.simulation.controller.dynamics import DRIVES, Body, Posture  # needs NumPy: slow to load
+
         drives = DRIVES[settings.model]
 
         def posture() -> Posture:
@@ -282,7 +283,7 @@ class ArmMotions:
             def wanted(joints: Vector, dt_s: float) -> Vector:
                 speeds = arm.stream_speeds
                 rates = Posture(robot.table, joints, speeds).accelerations(load, drives.most_nm, asked)
-                faster = tuple(v + dt_s * r for v, r in zip(speeds, rates, strict=True))
+                faster = tuple(v + dt_s * float(r) for v, r in zip(speeds, rates, strict=True))
                 if max(map(abs, faster)) > JOINT_SPEED_RAD_S:
                     raise UnreachableError("a joint exceeds its speed limit")
                 return faster
@@ -304,10 +305,10 @@ class ArmMotions:
             "direct_torque": scaled
             if settings.version >= (5, 25, 1)
             else lambda torque, friction_comp=True: turn(torque),
-            "get_mass_matrix": lambda: posture().mass_matrix(bodies()),
-            "get_coriolis_and_centrifugal_torques": lambda: posture().coriolis(bodies()),
-            "get_jacobian": lambda: posture().jacobian(self._tool(arm.actual)),
-            "get_jacobian_time_derivative": lambda: posture().jacobian_rate(self._tool(arm.actual)),
+            "get_mass_matrix": lambda: posture().mass_matrix(bodies()).tolist(),
+            "get_coriolis_and_centrifugal_torques": lambda: posture().coriolis(bodies()).tolist(),
+            "get_jacobian": lambda: posture().jacobian(self._tool(arm.actual)).tolist(),
+            "get_jacobian_time_derivative": lambda: posture().jacobian_rate(self._tool(arm.actual)).tolist(),
             "get_target_joint_accelerations": lambda: list(robot.outputs.vector("target_qdd")),
         }
 

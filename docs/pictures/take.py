@@ -171,15 +171,12 @@ async def drive(camera: Camera, done: Callable[[], object]) -> None:
 
 
 async def look(cameras: list[Camera], socket: Path) -> None:
-    async def connect() -> Client:
-        return await Client.connect(socket, "operator")
-
     async def enter(left: list[Camera]) -> None:
         if not left:
             await photograph(cameras, socket)
             return
         camera = left[0]
-        camera.app = StationApp(connect)
+        camera.app = StationApp(Client(socket, "operator"))
         camera.app.theme = f"station-{camera._theme}"
         async with camera.app.run_test(size=SIZES[camera._size]) as camera.pilot:
             await enter(left[1:])

@@ -63,14 +63,16 @@ async def _accept(socket: Path | None, joint: int, speed_m_s: float, quiet: bool
             shell.require_simulated()
         host = (await shell.client.call(Configuration())).robot.host
         tester = _ShellTester(shell, status.simulated, quiet)
+        root = shell.client.root
+        assert root is not None
         test = AcceptanceTest(shell.client, tester, TraceRecorder(host), speed_m_s, joint)
         try:
             acceptance = await test.run()
         except BaseException:
             if test.results:  # what was measured is not lost
-                _keep(shell.client.root, test.outcome())
+                _keep(root, test.outcome())
             raise
-        _keep(shell.client.root, acceptance)
+        _keep(root, acceptance)
         if not quiet:
             words, style = _verdict(acceptance)
             err.print(words, style=style)

@@ -29,13 +29,13 @@ from station.operate.motion import (
     watched,
 )
 from station.protocol.client import Client
-from station.protocol.verbs import Lease, Purpose, Stop
+from station.protocol.verbs import Purpose, Stop
 
 STOP_ANSWER_S = 3.0
 
 
 class Attended:
-    """A connection that has control, and the person, or the approved hash, behind it."""
+    """A connection, and the person, or the approved hash, behind it."""
 
     def __init__(
         self, socket: Path, client: Client, simulated: bool, headless: bool, approved: str, quiet: bool
@@ -110,14 +110,13 @@ class Attended:
 async def attended(
     socket: Path | None, headless: bool = False, approved: str = "", quiet: bool = False, camera: bool = True
 ) -> AsyncIterator[Attended]:
-    """Control of the cell that serves `socket`, its devices connected. Ctrl-C stops what was approved.
+    """A connection to the cell that serves `socket`, its devices connected. Ctrl-C stops what was approved.
 
     `camera`: it is needed, too.
     """
     path = socket or default_socket()
-    async with await Client.connect(path) as client:
+    async with Client(path) as client:
         simulated = (await wait_until_idle(client, camera=camera)).simulated
-        await client.call(Lease("take"))
         shell = Attended(path, client, simulated, headless, approved, quiet)
         try:
             yield shell

@@ -16,9 +16,9 @@ from station.cell.socket_folder import default_socket
 from station.cell.status import StationState, StationStatus
 from station.cli.console import AsJson, Socket, out, print_json
 from station.operate.motion import status_now
-from station.protocol.client import Client, ask
+from station.protocol.client import ask
 from station.protocol.stop_client import stop_and_tell
-from station.protocol.verbs import Acknowledge, Check, Doctor, Finish, Lease, Pause, Retake, Skip, Verb
+from station.protocol.verbs import Acknowledge, Check, Doctor, Finish, Pause, Retake, Skip
 
 PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
 _MARKS = {
@@ -116,7 +116,7 @@ def finish_command(socket: Socket = None) -> None:
 
     A pose under way is captured first. Next: `calibrate solve RECORDING`; `station status` names it.
     """
-    _command(socket, Finish())
+    ask(socket or default_socket(), Finish())
     status = status_of(socket)
     _print_state(status)
     if status.session.recording:
@@ -125,7 +125,7 @@ def finish_command(socket: Socket = None) -> None:
 
 def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
     """Mark a pose to be captured again by the next run."""
-    _command(socket, Retake(pose - 1))
+    ask(socket or default_socket(), Retake(pose - 1))
     out.print(f"pose {pose}: {_why(socket, pose)}. Next: `station resume`")
 
 
@@ -134,7 +134,7 @@ def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
 
     `station retake` brings it back. A pose that has a view keeps it: only its retake is left out.
     """
-    _command(socket, Skip(pose - 1))
+    ask(socket or default_socket(), Skip(pose - 1))
     out.print(f"pose {pose}: {_why(socket, pose)}; `station retake {pose}` plans it")
 
 
@@ -211,14 +211,3 @@ def board_command(context: typer.Context) -> None:
 
     done = subprocess.run([sys.executable, "-m", "calibrate.cli", "board", *context.args])
     raise typer.Exit(done.returncode)
-
-
-def _command(socket: Path | None, verb: Verb[object]) -> None:
-    """A command of whoever has control: takes it when it is free, and gives it back."""
-
-    async def once() -> None:
-        async with await Client.connect(socket or default_socket()) as client:
-            await client.call(Lease("take"))
-            await client.call(verb)
-
-    asyncio.run(once())

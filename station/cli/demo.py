@@ -38,7 +38,7 @@ from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
 from station.operate.motion import carry_out, wait_until_idle
 from station.plan.choose import Aim
 from station.protocol.client import Client
-from station.protocol.verbs import Lease, MakePlan, Purpose
+from station.protocol.verbs import MakePlan, Purpose
 from station.simulation.cell import CellTruth
 from station.simulation.netns import is_isolated, isolated_command
 
@@ -190,9 +190,8 @@ def _run(
 
 
 async def _captured(socket: Path, plan: MakePlan, progress: SessionProgress) -> StationStatus:
-    async with await Client.connect(socket, "the demo") as client:
+    async with Client(socket, "the demo") as client:
         await wait_until_idle(client)
-        await client.call(Lease("take"))
         progress.say(f"planning {plan.poses} poses")
         await client.call(plan, timeout_s=120.0)
         with progress:

@@ -48,7 +48,7 @@ def touch_test_command(
     path, pointer_m = socket or default_socket(), None if pointer_mm is None else pointer_mm / 1000
 
     async def look() -> tuple[SeenBoard, Path | None, str]:
-        async with await Client.connect(path) as client:
+        async with Client(path) as client:
             return await see_board(client, calibration), client.root, client.camera
 
     board, root, camera = asyncio.run(look())

@@ -55,7 +55,7 @@ def watch_command(
 
 async def _cell(path: Path) -> tuple[Path | None, str, BoardSpec]:
     """State folder, camera and board of the daemon. Raises StationError."""
-    async with await Client.connect(path) as client:
+    async with Client(path) as client:
         return client.root, client.camera, (await client.call(Configuration())).board
 
 

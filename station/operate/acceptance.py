@@ -17,9 +17,9 @@ from recordings.schema.messages import RobotState
 from station.cell.acceptance import STOP_GIVEN, Acceptance, ArmSubject, StopResult, StopWay
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview
-from station.operate.motion import Link, prepared_motion
+from station.operate.motion import prepared_motion
 from station.operate.stop_judge import WATCHED_S, judge
-from station.protocol.client import DaemonGoneError
+from station.protocol.client import Client, DaemonGoneError
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Prepare, Purpose, StopTest
 
@@ -55,7 +55,7 @@ class PersonAtArm(Protocol):
 class AcceptanceTest:
     """The test and its results. A test of only some `ways` never accepts the arm."""
 
-    link: Link
+    link: Client
     person: PersonAtArm
     recorder: StateRecorder
     speed_m_s: float

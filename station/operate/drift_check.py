@@ -8,7 +8,8 @@ from calibrate.files.install import installed_calibration
 from calibrate.quality.drift_history import find_trend, read_checks
 from station.cell.status import SessionStatus, StationState, StationStatus
 from station.operate.ending import Ending, after_drift_check
-from station.operate.motion import PREPARE_S, Approve, Link, prepared_motion
+from station.operate.motion import PREPARE_S, Approve, prepared_motion
+from station.protocol.client import Client
 from station.protocol.verbs import GetPlan, LoadPlan, MakePlan, Prepare, Purpose
 
 POSES = 8
@@ -18,7 +19,7 @@ SEED = 0
 
 
 async def start_drift_check(
-    link: Link, status: StationStatus, approve: Approve, poses: int = POSES, headless: bool = False
+    link: Client, status: StationStatus, approve: Approve, poses: int = POSES, headless: bool = False
 ) -> str:
     """Plan a few poses, ask, start. Returns the plan's SHA-256; empty: not approved, nothing moved.
 
@@ -47,7 +48,7 @@ def _never_run(status: StationStatus) -> bool:
     return bool(poses) and not any(pose.attempt for pose in poses)
 
 
-async def recorded(link: Link, plan_sha256: str) -> SessionStatus | None:
+async def recorded(link: Client, plan_sha256: str) -> SessionStatus | None:
     """Wait until the recording of the plan's session is finished, also after pauses; return the session.
 
     None when another plan takes its place, or when the daemon ends.

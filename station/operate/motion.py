@@ -5,19 +5,17 @@ from __future__ import annotations
 import contextlib
 import math
 from asyncio import timeout
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Protocol, TypeVar
 
 import msgspec
 
 from station.cell.errors import RefusedError, StationError
 from station.cell.plan import Criterion
 from station.cell.status import MotionPreview, StationState, StationStatus
-from station.protocol.client import ANSWER_S, Client, DaemonGoneError
-from station.protocol.verbs import PLANNED_ELSEWHERE, Finish, GetPlan, Go, MakePlan, Prepare, Purpose, Verb
+from station.protocol.client import Client, DaemonGoneError
+from station.protocol.verbs import PLANNED_ELSEWHERE, Finish, GetPlan, Go, MakePlan, Prepare, Purpose
 
-R = TypeVar("R")
 Watcher = Callable[[StationStatus], None]
 Approve = Callable[[MotionPreview], Awaitable[bool]]
 """Function that shows a person a motion; True: they approve exactly this one."""
@@ -33,33 +31,15 @@ PREPARE_S = 200.0
 _RESTING = (StationState.PAUSED, StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED)
 
 
-class Link(Protocol):
-    """Connection to the daemon: `protocol.client.Client`, or the screen's."""
-
-    @property
-    def root(self) -> Path | None:
-        """Folder in which the daemon keeps sessions and installed calibrations."""
-
-    @property
-    def camera(self) -> str:
-        """Name of the daemon's camera."""
-
-    async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
-        """Carry out a verb; return its result. RefusedError with the daemon's code; StationError: gone."""
-
-    def statuses(self) -> AsyncIterator[StationStatus]:
-        """Yield the status, never older than the last call, and every change; ends with the daemon."""
-
-
 async def status_now(socket: Path) -> StationStatus:
     """Return the present status by a new connection, on which none can be queued."""
-    async with await Client.connect(socket) as client:
+    async with Client(socket) as client:
         async for status in client.statuses():
             return status
     raise DaemonGoneError("The daemon ended before it told its status.", remedy="Start it again.")
 
 
-async def wait_until_idle(link: Link, *, camera: bool = True) -> StationStatus:
+async def wait_until_idle(link: Client, *, camera: bool = True) -> StationStatus:
     """Wait until robot and camera are connected; return the status. RefusedError names what is missing."""
     status, told = StationStatus(), False
     with contextlib.suppress(TimeoutError):
@@ -79,7 +59,7 @@ async def wait_until_idle(link: Link, *, camera: bool = True) -> StationStatus:
 
 
 async def prepared_motion(
-    link: Link,
+    link: Client,
     wanted: Prepare,
     approve: Approve,
     *,
@@ -126,7 +106,7 @@ def motion_facts(preview: MotionPreview) -> list[tuple[str, str]]:
 
 
 async def carry_out(
-    link: Link,
+    link: Client,
     purpose: Purpose,
     approve: Approve,
     watch: Watcher,
@@ -145,7 +125,7 @@ def not_approved() -> RefusedError:
     return RefusedError("Nothing moved: the motion was not approved.", code="not-approved")
 
 
-async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> StationStatus:
+async def watched(link: Client, watch: Watcher, finish_with_loss: bool = False) -> StationStatus:
     """Watch a session until it ends or pauses; `finish_with_loss`: finish it although poses failed."""
     status = await _until_rest(link, watch)
     if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
@@ -154,7 +134,7 @@ async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) ->
     return status
 
 
-async def _until_rest(link: Link, watch: Watcher) -> StationStatus:
+async def _until_rest(link: Client, watch: Watcher) -> StationStatus:
     async for status in link.statuses():
         watch(status)
         if status.state in _RESTING:

@@ -29,7 +29,7 @@ from station.cell.config import PointerConfig, Vector3
 from station.cell.errors import RefusedError
 from station.cell.status import StationStatus
 from station.operate.ending import after_touches
-from station.operate.motion import Link
+from station.protocol.client import Client
 from station.protocol.verbs import Configuration, Observe
 
 LOOK_S = 30.0
@@ -50,7 +50,7 @@ class SeenBoard:
     """The pendant's tool centre point."""
 
 
-async def see_board(link: Link, file: Path | None) -> SeenBoard:
+async def see_board(link: Client, file: Path | None) -> SeenBoard:
     """Take an image and find the board by the calibration in `file`; None: by the installed one.
 
     Raises StationError, CalibrationError.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import getpass
 import os
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,7 +18,7 @@ from recordings.files import MAIN_CAMERA
 from recordings.plain_text import plain_data
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus
-from station.protocol.messages import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Request
+from station.protocol.messages import LINE_LIMIT_BYTES, Request
 from station.protocol.stop_client import send_stop
 from station.protocol.verbs import Hello, Verb
 
@@ -73,26 +73,36 @@ class _Incoming(msgspec.Struct):
 
 
 class Client:
-    """Connection to the daemon. If it is lost, so is control: the daemon stops the arm and pauses."""
+    """Connection to the daemon: of a command while its block runs, of a screen opened again after a loss.
 
-    def __init__(self, path: Path, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._path, self._reader, self._writer = path, reader, writer
+    If it is lost, so is control: the daemon stops the arm and pauses.
+    """
+
+    def __init__(self, path: Path, who: str = "") -> None:
+        """`who`: name that others see, by default user and terminal."""
+        self._path, self._who = path, who
         self._next_id = 1
         self._waiting: dict[int, asyncio.Future[_Incoming]] = {}
         self._plain_status: dict[str, object] | None = None
-        self._fresh = asyncio.Event()
-        self._gone = False
-        self.root = Path()
-        """Folder in which the daemon keeps sessions and installed calibrations."""
+        self._news = asyncio.Event()
+        """Set, and replaced, with every new status and at the connection's end."""
+        self._writer: asyncio.StreamWriter | None = None
+        """None: not connected."""
+        self._reading: asyncio.Task[None] | None = None
+        self.root: Path | None = None
+        """Folder in which the daemon keeps sessions and installed calibrations; None until connected."""
         self.camera = MAIN_CAMERA
         self.max_age_days: float | None = None
-        self._one_at_a_time = asyncio.Lock()
-        """Lock that keeps the pieces of two long requests apart."""
-        self._task = asyncio.create_task(self._read(), name="client-read")
+        self.own_id: int | None = None
+        """The daemon's number of this connection, by which the lease names it."""
+        self.guard: Callable[[Verb[object]], AbstractContextManager[object]] = nullcontext
+        """Context of every call, in which a screen shows what is asked, or refuses it."""
 
-    @classmethod
-    async def connect(cls, path: Path, who: str = "") -> Client:
-        """Connect to a daemon. DaemonGoneError with the remedy when none serves the socket."""
+    async def open(self) -> Client:
+        """Connect, unless connected. DaemonGoneError with the remedy when no daemon serves the socket."""
+        if self.connected:
+            return self
+        path = self._path
         try:
             async with asyncio.timeout(CONNECT_S):
                 reader, writer = await asyncio.open_unix_connection(str(path), limit=_ANSWER_LIMIT_BYTES)
@@ -110,38 +120,55 @@ class Client:
             ) from None
         except (OSError, TimeoutError) as error:
             raise DaemonGoneError(f"{path}: the daemon does not answer ({error or 'timeout'}).") from None
-        client = cls(path, reader, writer)
+        self._writer, self._plain_status = writer, None
+        self._reading = asyncio.create_task(self._read(reader, writer), name="client-read")
         try:
-            hello = await client.call(Hello(who or who_am_i()), timeout_s=CONNECT_S)
+            hello = await self.call(Hello(self._who or who_am_i()), timeout_s=CONNECT_S)
         except StationError:
-            await client.close()
+            await self.close()
             raise
-        client.root, client.camera = Path(hello.root), hello.camera
-        client.max_age_days = hello.max_age_days
-        return client
+        self.root, self.camera, self.own_id = Path(hello.root), hello.camera, hello.client_id
+        self.max_age_days = hello.max_age_days
+        return self
+
+    @property
+    def connected(self) -> bool:
+        return self._writer is not None
+
+    def send_stop(self) -> bool:
+        """Send STOP by its own socket, which needs no connection; False: nobody listens there."""
+        return send_stop(self._path)
 
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
         """Carry out a verb; return its result. Raises RefusedError, DaemonGoneError, NoAnswerError."""
-        answer = await self.request(verb.verb(), timeout_s=timeout_s, **msgspec.to_builtins(verb))
-        result: R = msgspec.convert(answer, verb.result())
-        return result
+        with self.guard(verb):
+            answer = await self.request(verb.verb(), timeout_s=timeout_s, **msgspec.to_builtins(verb))
+            result: R = msgspec.convert(answer, verb.result())
+            return result
 
     async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: object) -> object:
         """Carry out a verb by its name; return its result as plain data."""
         if verb == "stop":
-            send_stop(self._path)  # by STOP's own socket, which cannot be delayed; then ask for the answer
-        if self._gone:
+            self.send_stop()  # by STOP's own socket, which cannot be delayed; then ask for the answer
+        if (writer := self._writer) is None:
             raise DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
-        request = Request(self._next_id, verb, args)
+        request = Request(self._next_id, verb, msgspec.Raw(msgspec.json.encode(args)))
         self._next_id += 1
         line = msgspec.json.encode(request) + b"\n"
         if len(line) > LINE_LIMIT_BYTES:
-            return await self._request_in_pieces(verb, line, timeout_s)
+            raise RefusedError(
+                f"{verb}: {len(line) / 1e6:.1f} MB are more than the daemon takes "
+                f"({LINE_LIMIT_BYTES / 1e6:.1f} MB).",
+                code="request-too-long",
+                remedy="Make a plan of fewer poses, or shorten its notes.",
+                size_bytes=len(line),
+                limit_bytes=LINE_LIMIT_BYTES,
+            )
         answer: asyncio.Future[_Incoming] = asyncio.get_running_loop().create_future()
         self._waiting[request.id] = answer
         try:
-            self._writer.write(line)
-            await self._writer.drain()
+            writer.write(line)
+            await writer.drain()
             async with asyncio.timeout(timeout_s):
                 reply = await answer
         except TimeoutError:
@@ -160,53 +187,40 @@ class Client:
             raise RefusedError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
         return reply.result
 
-    async def _request_in_pieces(self, verb: str, whole: bytes, timeout_s: float) -> object:
-        if len(whole) > REQUEST_LIMIT_BYTES:
-            raise RefusedError(
-                f"{verb}: {len(whole) / 1e6:.1f} MB are more than the daemon takes "
-                f"({REQUEST_LIMIT_BYTES / 1e6:.1f} MB).",
-                code="request-too-long",
-                remedy="Make a plan of fewer poses, or shorten its notes.",
-                size_bytes=len(whole),
-                limit_bytes=REQUEST_LIMIT_BYTES,
-            )
-        async with self._one_at_a_time:
-            for start in range(0, len(whole), PIECE_BYTES):
-                piece = base64.b64encode(whole[start : start + PIECE_BYTES]).decode()
-                await self.request("part", base64=piece)
-            return await self.request("whole", timeout_s=timeout_s)
-
     async def statuses(self) -> AsyncIterator[StationStatus]:
         """Yield the status now and after every change (a slow reader gets only the newest).
 
         Never older than the last answer, before which the daemon sends the changes.
         """
         await self.request("watch")
-        if self._plain_status is not None:
-            self._fresh.set()  # watched before: what is known is the start
+        seen = None
         while True:
-            await self._fresh.wait()
-            self._fresh.clear()
-            if self._plain_status is not None:
-                yield msgspec.convert(self._plain_status, StationStatus)
-            if self._gone:
+            if self._plain_status is not seen:
+                seen = self._plain_status
+                yield msgspec.convert(seen, StationStatus)
+            elif self.connected:
+                await self._news.wait()
+            else:
                 return
 
     async def close(self) -> None:
-        self._task.cancel()
-        self._writer.close()
-        await asyncio.gather(self._task, return_exceptions=True)
+        if self._reading is not None:
+            self._reading.cancel()
+            await asyncio.gather(self._reading, return_exceptions=True)
+        if self._writer is not None:  # reading had not begun
+            self._writer.close()
+            self._writer = None
 
     async def __aenter__(self) -> Client:
-        return self
+        return await self.open()
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()
 
-    async def _read(self) -> None:
+    async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         decoder = msgspec.json.Decoder(_Incoming)
         try:
-            while line := await self._reader.readline():
+            while line := await reader.readline():
                 message = decoder.decode(line)
                 if _SUSPECT.search(line):
                     message = msgspec.convert(plain_data(msgspec.to_builtins(message)), _Incoming)
@@ -214,23 +228,28 @@ class Client:
         except (OSError, ValueError, msgspec.DecodeError):
             pass  # treat invalid messages as a lost connection
         finally:
-            self._gone = True
+            writer.close()
+            self._writer = None
             for answer in self._waiting.values():
                 if not answer.done():
                     answer.set_exception(self._gone_error())
-            self._fresh.set()
+            self._tell()
 
     def _take(self, message: _Incoming) -> None:
         if message.id is not None:
             answer = self._waiting.get(message.id)
             if answer is not None and not answer.done():
                 answer.set_result(message)
-            return
-        if message.status is not None:
+        elif message.status is not None:
             self._plain_status = message.status
+            self._tell()
         elif message.changes is not None and self._plain_status is not None:
             self._plain_status = self._plain_status | message.changes
-        self._fresh.set()
+            self._tell()
+
+    def _tell(self) -> None:
+        self._news.set()
+        self._news = asyncio.Event()
 
     def _gone_error(self) -> DaemonGoneError:
         """Make the error for a daemon lost during a request, which may or may not have been carried out."""
@@ -246,7 +265,7 @@ def ask(path: Path, verb: Verb[R]) -> R:
     """Carry out one verb without an event loop. Raises as `Client.call` does."""
 
     async def once() -> R:
-        async with await Client.connect(path) as client:
+        async with Client(path) as client:
             return await client.call(verb)
 
     return asyncio.run(once())

@@ -1,12 +1,12 @@
-"""Messages on the control socket: JSON lines of at most 64 kB.
+"""Messages on the control socket: JSON lines of at most 1 MB.
 
 client → daemon   {"id": 1, "verb": "go", "args": {…}}
 daemon → client   {"id": 1, "ok": true, "result": {…}}
                   {"id": 1, "ok": false, "error": "…", "problem": {"code": …, "text": …, "remedy": …, …}}
                   {"status": {…}}      full, right after `watch`
                   {"changes": {…}}     changed top-level sections of the status
-The verbs: `station.protocol.verbs`. `stop` needs no control and is handled before anything that is queued,
-pieces of a long request included; it also has a socket of its own: `station.server.stop_server`.
+The verbs: `station.protocol.verbs`. `stop` needs no control and is handled before anything that is queued;
+it also has a socket of its own: `station.server.stop_server`.
 """
 
 from __future__ import annotations
@@ -16,10 +16,8 @@ import msgspec
 from recordings.errors import CodedError, ErrorData
 from station.cell.status import StationStatus
 
-LINE_LIMIT_BYTES = 64 * 1024
-REQUEST_LIMIT_BYTES = 2 * 1024 * 1024
-"""Largest request in pieces, enough for a plan of some thousand poses; bounds memory per connection."""
-PIECE_BYTES = 32 * 1024
+LINE_LIMIT_BYTES = 1024 * 1024
+"""Longest request, enough for a plan of a thousand poses; bounds memory per connection."""
 CLIENT_LIMIT = 64
 USER_CLIENT_LIMIT = 16
 """Most clients of one user, so that places are left for others."""
@@ -28,7 +26,8 @@ USER_CLIENT_LIMIT = 16
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     id: int
     verb: str
-    args: dict[str, object] = {}
+    args: msgspec.Raw = msgspec.Raw(b"{}")
+    """Kept as it came until the verb tells its type: nothing large is made of nonsense."""
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):

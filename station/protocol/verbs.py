@@ -15,7 +15,6 @@ import msgspec
 
 from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, Vector6
-from station.cell import status
 from station.cell.acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
@@ -89,6 +88,8 @@ class Done(msgspec.Struct, frozen=True):
 class Welcome(msgspec.Struct, frozen=True):
     version: str
     pid: int
+    client_id: int
+    """Number of this connection, by which the lease names it."""
     root: str
     """Folder of sessions and installed calibrations."""
     camera: str = MAIN_CAMERA
@@ -179,11 +180,12 @@ class Watch(Verb[Done], frozen=True):
     control = False
 
 
-class Lease(Verb[status.LeaseStatus], frozen=True):
-    """Take or release control; `lost`: the person left the screen that has it."""
+class Release(Verb[Done], frozen=True):
+    """Release control, which the first request that needs it takes; the arm decelerates."""
 
     control = False
-    action: Literal["take", "release", "lost"] = "take"
+    silent: bool = False
+    """The screen releases it, as its person's terminal does not answer."""
 
 
 class Stop(Verb[Done], frozen=True):
@@ -353,19 +355,6 @@ class Configuration(Verb[StationConfig], frozen=True):
 
 class Sessions(Verb[list[SessionSummary]], frozen=True):
     """List the sessions on the disk, newest first."""
-
-    control = False
-
-
-class Part(Verb[Done], frozen=True):
-    """Send the next piece of a request that is longer than a line."""
-
-    control = False
-    base64: str = ""
-
-
-class Whole(Verb[object], frozen=True):
-    """Carry out the request whose pieces were sent, and return its result."""
 
     control = False
 

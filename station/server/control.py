@@ -6,7 +6,6 @@ The server never waits for a slow, hostile or stuck client: its memory is bounde
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import logging
 import os
@@ -25,7 +24,6 @@ from station.cell.status import StationStatus, changed_sections
 from station.protocol.messages import (
     CLIENT_LIMIT,
     LINE_LIMIT_BYTES,
-    REQUEST_LIMIT_BYTES,
     USER_CLIENT_LIMIT,
     Notice,
     Reply,
@@ -51,7 +49,7 @@ class Handler(Protocol):
     def stop_now(self, peer: Peer) -> Awaitable[object] | None:
         """Begin STOP, from any client; it goes on if the client leaves. May return an awaitable."""
 
-    async def handle(self, peer: Peer, verb: str, args: dict[str, object]) -> object:
+    async def handle(self, peer: Peer, verb: str, args: msgspec.Raw) -> object:
         """Carry out a verb and return its result; a CodedError becomes the reply's `problem`."""
 
     def gone(self, peer: Peer) -> None:
@@ -193,8 +191,6 @@ class _Connection:
         self._reader, self._writer, self._handler = reader, writer, handler
         self._publish = publish
         self._tasks: set[asyncio.Task[None]] = set()
-        self._pieces = bytearray()
-        """Pieces received of a request that is longer than a line."""
 
     async def run(self) -> None:
         decoder = msgspec.json.Decoder(Request)
@@ -202,7 +198,7 @@ class _Connection:
             while line := await self._reader.readline():
                 try:
                     self._take(decoder.decode(line))
-                except (ValueError, RecursionError) as error:  # msgspec's, base64's
+                except (ValueError, RecursionError) as error:  # msgspec's
                     self.refuse(0, RefusedError(f"not a request: {error}", code="not-a-request"))
                 await asyncio.sleep(0)  # readline never pauses while lines wait: let others' STOP in
         except ValueError:  # readline: the line is longer than the limit
@@ -219,12 +215,6 @@ class _Connection:
             # Before any limit is checked and any later line is read.
             stopping = self._handler.stop_now(self.peer)
             self._spawn(self._answer_stop(request.id, stopping))
-        elif request.verb == "part":
-            self._take_piece(request)
-        elif request.verb == "whole":
-            whole, self._pieces = bytes(self._pieces), bytearray()
-            inner = msgspec.json.decode(whole, type=Request)
-            self._take(Request(request.id, inner.verb, inner.args))
         elif request.verb not in VERBS:
             self.refuse(request.id, RefusedError(f"there is no verb '{request.verb}'", code="unknown-verb"))
         elif len(self._tasks) >= OPEN_REQUESTS_LIMIT:
@@ -237,17 +227,6 @@ class _Connection:
             self.refuse(request.id, busy)
         else:
             self._spawn(self._answer(request))
-
-    def _take_piece(self, request: Request) -> None:
-        piece = base64.b64decode(str(request.args.get("base64", "")), validate=True)
-        if len(self._pieces) + len(piece) > REQUEST_LIMIT_BYTES:
-            self._pieces.clear()
-            text = f"more than {REQUEST_LIMIT_BYTES} bytes in one request: nothing of it is kept"
-            limit = REQUEST_LIMIT_BYTES
-            self.refuse(request.id, RefusedError(text, code="request-too-long", limit_bytes=limit))
-            return
-        self._pieces += piece
-        self.reply(Reply(request.id, True, {}))
 
     def _spawn(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.create_task(work)

@@ -13,7 +13,7 @@ from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionSummary, list_sessions
 from station.cell.socket_folder import user_name
-from station.cell.status import LeaseStatus, MotionPreview
+from station.cell.status import MotionPreview
 from station.protocol import verbs
 from station.protocol.verbs import VERBS, Verb
 from station.server.approval import ApprovalRule, Peer, Process, process
@@ -22,7 +22,7 @@ from station.session.recording import software
 from station.session.session import Session
 from station.session.threads import ASKED, NAMES
 
-CONNECTION = {"watch", "stop", "part", "whole"}
+CONNECTION = {"watch", "stop"}
 """Verbs that `server.control` carries out itself."""
 _WHO_LIMIT = 60
 
@@ -73,17 +73,18 @@ class SessionDispatcher:
         task.add_done_callback(self._leaving.discard)
         return asyncio.shield(task)
 
-    async def handle(self, peer: Peer, verb: str, args: dict[str, object]) -> object:
+    async def handle(self, peer: Peer, verb: str, args: msgspec.Raw) -> object:
         """Carry out a verb. RefusedError for wrong arguments, in a wrong state, or without control."""
         if verb == "watch":
             return {}
         kind = VERBS[verb]
         try:
-            request = msgspec.convert(args, kind)
-        except msgspec.ValidationError as error:
+            request = msgspec.json.decode(args, type=kind)
+        except msgspec.DecodeError as error:
             raise RefusedError(f"{verb}: wrong arguments ({error})", code="wrong-arguments") from None
-        self._session.permit(kind, peer.client_id)
-        result = await self._methods[verb](self._caller(peer), request)
+        caller = self._caller(peer)
+        self._session.admit(kind, caller.client_id, caller.who)
+        result = await self._methods[verb](caller, request)
         return msgspec.to_builtins(verbs.Done() if result is None else result)
 
     def _caller(self, peer: Peer) -> Peer:
@@ -100,14 +101,12 @@ class SessionDispatcher:
         context = self._session.context
         config = context.cell.config
         rule_days = config.validity.max_age_days
-        return verbs.Welcome(self._version, os.getpid(), str(context.root), config.camera.name, rule_days)
+        return verbs.Welcome(
+            self._version, os.getpid(), caller.client_id, str(context.root), config.camera.name, rule_days
+        )
 
-    async def _lease(self, caller: Peer, args: verbs.Lease) -> LeaseStatus:
-        if args.action == "take":
-            return self._session.take_lease(caller.client_id, caller.who)
-        ending = self._session.release_lease if args.action == "release" else self._session.lease_lost
-        await self._to_the_end(ending(caller.client_id))
-        return self._session.leases.lease
+    async def _release(self, caller: Peer, args: verbs.Release) -> None:
+        await self._to_the_end(self._session.release(caller.client_id, args.silent))
 
     async def _acknowledge(self, caller: Peer, args: verbs.Acknowledge) -> None:
         await self._session.acknowledge(caller.who)

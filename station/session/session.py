@@ -270,9 +270,10 @@ class Session:
         self.store.update(lease=lease)
         return lease
 
-    async def release_lease(self, client_id: int) -> None:
-        """Release control; during a run the arm decelerates as when control is lost."""
-        await self.lease_lost(client_id, "{} released control.")
+    async def release(self, client_id: int, silent: bool = False) -> None:
+        """Release control, as asked or as the terminal is `silent`; a moving arm decelerates."""
+        how = "The terminal of {} does not answer." if silent else "{} released control."
+        await self.lease_lost(client_id, how)
 
     def load_plan(self, client_id: int, plan: Plan) -> None:
         self.permit(verbs.LoadPlan, client_id)
@@ -345,6 +346,16 @@ class Session:
     async def record(self, client_id: int) -> int:
         self.permit(verbs.Record, client_id)
         return await self.freedrive.record()
+
+    def admit(self, verb: type[Verb[object]], client_id: int, who: str) -> None:
+        """Permit a request that arrives; control that nobody has is given to the first that needs it.
+
+        Not by an approval: it holds only under the control under which the motion was offered.
+        """
+        if verb.control and verb is not verbs.Go and self.leases.lease.client_id is None:
+            self._require_state(verb)
+            self.take_lease(client_id, who)
+        self.permit(verb, client_id)
 
     def permit(self, verb: type[Verb[object]], client_id: int) -> None:
         """Raise RefusedError unless a verb is allowed to this client in the present state."""

@@ -30,10 +30,9 @@ from station.operate.motion import prepared_motion
 from station.protocol import verbs
 from station.protocol.client import Client
 from station.protocol.states import RUNNING
-from station.protocol.stop_client import send_stop
 from station.protocol.verbs import Purpose
 from station.tui.connect import ConnectScreen
-from station.tui.desk import Connect, Desk, KnowingApp, ScreenLink, StatusChanged
+from station.tui.desk import Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion, Help
 from station.tui.frame import SESSION
 from station.tui.installed import LOOK_S, Marks, Result, marks, read_past, read_result, state_root
@@ -174,9 +173,9 @@ class StationApp(KnowingApp):
         ),
     ]
 
-    def __init__(self, connect: Connect) -> None:
+    def __init__(self, client: Client) -> None:
         super().__init__()
-        self.desk = Desk(self, connect)
+        self.desk = Desk(self, client)
         self._greeted = False
 
     def on_mount(self) -> None:
@@ -203,7 +202,7 @@ class StationApp(KnowingApp):
             self._unanswered = 0
             return
         if self._unanswered >= UNANSWERED:
-            await self.desk.ask(verbs.Lease("lost"))
+            await self.desk.ask(verbs.Release(silent=True))
             self._unanswered = 0
             self.notify(TERMINAL_SILENT.format(ASK_S * UNANSWERED), severity="error", timeout=3600)
             return
@@ -217,11 +216,9 @@ class StationApp(KnowingApp):
         """Only for a screen that shows them, and only as large as it can show."""
         while True:
             await asyncio.sleep(PREVIEW_PERIOD_S)
-            if (link := self.desk.link) is None:
-                continue
             for preview in self.screen.query(PreviewPane):
                 with contextlib.suppress(OSError, StationError):
-                    await preview.fetch(link)
+                    await preview.fetch(self.desk.client)
 
     def on_status_changed(self, message: StatusChanged) -> None:
         before, status = self.known.live, message.status
@@ -241,10 +238,8 @@ class StationApp(KnowingApp):
     async def greet(self) -> None:
         """Learn the cell, if the daemon tells it; show what is missing to who starts for the first time."""
         status = self.known.shown
-        if self.desk.link is not None:
-            with contextlib.suppress(OSError, StationError):
-                told = await self.desk.link.call(verbs.Configuration())
-                self.known = replace(self.known, configuration=told)
+        with contextlib.suppress(OSError, StationError):
+            self.known = replace(self.known, configuration=await self.desk.client.call(verbs.Configuration()))
         if status.playback:
             return
         missing = status.state is StationState.DISCONNECTED
@@ -259,11 +254,11 @@ class StationApp(KnowingApp):
 
     @work(exclusive=True, group="sessions", exit_on_error=False)
     async def action_look_at_sessions(self) -> None:
-        root, sessions = self.desk.root, await self.desk.ask(verbs.Sessions())
+        root, sessions = self.desk.client.root, await self.desk.ask(verbs.Sessions())
         if sessions is None:
             self._marks = ("", frozenset())  # why was said; what was known stays until the next look
             return
-        past = await asyncio.to_thread(read_past, root, self.desk.camera, sessions)
+        past = await asyncio.to_thread(read_past, root, self.desk.client.camera, sessions)
         self.known = replace(self.known, past=past)
 
     def watch_result_path(self) -> None:
@@ -295,7 +290,7 @@ class StationApp(KnowingApp):
         """The shown file, and marks of all below the root; None without a root."""
         live = self.known.live
         path = self.result_path or ("" if live is None else live.session.calibration)
-        root = state_root(path) if path else self.desk.root
+        root = state_root(path) if path else self.desk.client.root
         return None if root is None else (path, await asyncio.to_thread(marks, root))
 
     # --- wishes of the screens ---
@@ -382,7 +377,9 @@ class StationApp(KnowingApp):
         """`run` goes on with a session that is paused."""
         paused = self.known.live is not None and self.known.live.state is StationState.PAUSED
         wanted = Purpose.RESUME if purpose == Purpose.RUN and paused else Purpose(purpose)
-        begun = prepared_motion(self.desk, verbs.Prepare(wanted), self.approves, plans_here=self.plans_here)
+        begun = prepared_motion(
+            self.desk.client, verbs.Prepare(wanted), self.approves, plans_here=self.plans_here
+        )
         if await self.desk.start(begun):
             await self.switch_mode("capture")
 
@@ -427,7 +424,7 @@ class StationApp(KnowingApp):
         if self.known.live.state not in RUNNING or await self.desk.question(
             Confirm("Release control?", body, yes="Release")
         ):
-            await self.desk.ask(verbs.Lease("release"))
+            await self.desk.ask(verbs.Release())
             self.notify("Control released: another screen or command may take it.")
 
     @work(exclusive=True, group="command", exit_on_error=False)
@@ -479,10 +476,5 @@ class StationApp(KnowingApp):
 def run(socket: Path, who: str = "") -> None:
     """Opens the screen on the daemon that serves `socket` and returns when it is closed."""
 
-    async def connect() -> ScreenLink:
-        return await Client.connect(socket, who)
-
-    app = StationApp(connect)
     PreviewPane.graphics = detect()
-    app.desk.stop_unconnected = partial(send_stop, socket)
-    app.run()
+    StationApp(Client(socket, who)).run()

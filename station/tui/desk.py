@@ -1,13 +1,13 @@
-"""The daemon as the screens ask it: connection, control, silence, and what is said when it refuses."""
+"""The daemon as the screens ask it: connection, silence, and what is said when it refuses."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import msgspec
 from textual.message import Message
@@ -15,12 +15,10 @@ from textual.reactive import reactive
 from textual.screen import Screen
 
 from recordings.errors import CodedError
-from recordings.files import MAIN_CAMERA
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus
-from station.operate import motion
 from station.protocol import verbs
-from station.protocol.client import ANSWER_S
+from station.protocol.client import ANSWER_S, Client
 from station.protocol.verbs import Verb
 from station.tui.task import Known
 from station.tui.themes import ThemedApp
@@ -43,18 +41,6 @@ REMEDIES = {
 """By an error's code, where the way out on a screen is another than in a shell."""
 
 
-class ScreenLink(motion.Link, Protocol):
-    """A connection: `station.protocol.client.Client`, or a test's own."""
-
-    max_age_days: float | None
-    """Oldest proof of a calibration by the cell's rule; None: none."""
-
-    async def close(self) -> None: ...
-
-
-Connect = Callable[[], Awaitable[ScreenLink]]
-
-
 class StatusChanged(Message):
     """None: there is no daemon, and `why`."""
 
@@ -70,32 +56,14 @@ class KnowingApp(ThemedApp[None]):
 
 
 class Desk:
-    """Every wish goes through `call`; the daemon decides, nothing is decided here.
+    """The screen's connection: kept open, listened to for silence, and every refusal a notice.
 
-    For the flows of `station.operate` it is a link: it takes control where a verb needs it, and says on every
-    screen what the daemon is at work on.
+    The daemon decides, nothing is decided here.
     """
 
-    link: ScreenLink | None = None
-    """The connection while there is one."""
-    stop_unconnected: Callable[[], bool] = staticmethod(lambda: False)
-    """Sends STOP where there is no connection (`protocol.stop_client.send_stop`); False: nobody listens."""
-    own_id: int | None = None
-    """The daemon's number of this connection, once it had control."""
-
-    def __init__(self, app: KnowingApp, connect: Connect) -> None:
-        self.app, self._connect = app, connect
-        self._newest: StationStatus | None = None
-        self._news = asyncio.Event()
-        """Set, and replaced, with every new status."""
-
-    @property
-    def root(self) -> Path | None:
-        return None if self.link is None else self.link.root
-
-    @property
-    def camera(self) -> str:
-        return MAIN_CAMERA if self.link is None else self.link.camera
+    def __init__(self, app: KnowingApp, client: Client) -> None:
+        self.app, self.client = app, client
+        client.guard = self._guard
 
     @property
     def known(self) -> Known:
@@ -108,21 +76,16 @@ class Desk:
         while True:
             why = GONE
             try:
-                self.link = await self._connect()
-                self.app.run_worker(self._listen(self.link), group="listen", exclusive=True)
-                async for status in self.link.statuses():
-                    self._newest = status
-                    self._news.set()
-                    self._news = asyncio.Event()
+                await self.client.open()
+                self.app.run_worker(self._listen(), group="listen", exclusive=True)
+                async for status in self.client.statuses():
                     await self._pace(status)
                     self.app.post_message(StatusChanged(status))
             except (OSError, StationError) as problem:
                 why = str(problem)
             except msgspec.ValidationError as problem:
                 why = f"The daemon is of another version than this screen ({problem}): restart the older one."
-            gone, self.link = self.link, None
-            if gone is not None:
-                await gone.close()
+            await self.client.close()
             self.app.post_message(StatusChanged(None, why))
             await asyncio.sleep(RECONNECT_S)
 
@@ -132,11 +95,11 @@ class Desk:
         if shown is not None and (shown.state, shown.reason) == (status.state, status.reason):
             await asyncio.sleep(STATUS_PERIOD_S)
 
-    async def _listen(self, link: ScreenLink) -> None:
+    async def _listen(self) -> None:
         """Ask something small until the link ends: a daemon that hangs keeps its socket open."""
         while True:
             asked_s = time.monotonic()
-            answer = asyncio.ensure_future(link.call(verbs.Watch(), timeout_s=_PATIENT_S))
+            answer = asyncio.ensure_future(self.client.call(verbs.Watch(), timeout_s=_PATIENT_S))
             try:
                 while not (await asyncio.wait({answer}, timeout=LISTEN_S))[0]:
                     if (waited_s := time.monotonic() - asked_s) >= SILENT_S:
@@ -155,11 +118,10 @@ class Desk:
 
     # --- the screen → the daemon ---
 
-    async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
-        """The verb's result. Raises StationError, also while the daemon is silent, when nothing is sent."""
-        if self.link is None:
-            raise StationError("No connection to the daemon: nothing was sent.", code="no-daemon")
-        if self.known.silent_s is not None:
+    @contextmanager
+    def _guard(self, verb: Verb[object]) -> Iterator[None]:
+        """Show what takes long on every screen; to a daemon that is silent send nothing but STOP."""
+        if self.known.silent_s is not None and not isinstance(verb, verbs.Stop | verbs.Watch):
             raise StationError("The station does not answer: nothing was sent.", code="no-answer")
         words = busy_words(verb)
         if words and self.known.busy:
@@ -167,21 +129,10 @@ class Desk:
         if words:
             self.app.known = replace(self.known, busy=words)
         try:
-            if verb.control and not isinstance(verb, verbs.Go):  # who approves had it before
-                self.own_id = (await self.link.call(verbs.Lease("take"))).client_id
-            return await self.link.call(verb, timeout_s=timeout_s)
+            yield
         finally:
             if words:
                 self.app.known = replace(self.known, busy="")
-
-    async def statuses(self) -> AsyncIterator[StationStatus]:
-        """Every new status from now on, before the screens' own slower pace; slow readers the newest only."""
-        seen = self._newest
-        while True:
-            while self._newest is None or self._newest is seen:
-                await self._news.wait()
-            seen = self._newest
-            yield seen
 
     async def attempt(self, work: Awaitable[R]) -> R | None:
         """Its result, or None after a notice that says why not."""
@@ -196,7 +147,7 @@ class Desk:
 
     async def ask(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R | None:
         """Call a verb; a notice takes the place of an error."""
-        return await self.attempt(self.call(verb, timeout_s=timeout_s))
+        return await self.attempt(self.client.call(verb, timeout_s=timeout_s))
 
     async def question(self, screen: Screen[R]) -> R:
         """Ask the person; only in a worker."""
@@ -211,19 +162,19 @@ class Desk:
     def has_control(self) -> bool:
         """Tell whether this screen has control."""
         holder = None if self.known.live is None else self.known.live.lease.client_id
-        return holder is not None and holder == self.own_id
+        return holder is not None and holder == self.client.own_id
 
     async def stop(self) -> None:
         """STOP, whatever is shown, and also where nobody answers or no connection is left."""
-        if self.link is None:
-            if self.stop_unconnected():
+        if not self.client.connected:
+            if self.client.send_stop():
                 self.app.notify("STOP was sent without a connection: look at the arm.", severity="warning")
             else:
                 self.app.notify("No connection to the daemon: nothing was sent.", severity="error")
             return
         if self.known.silent_s is not None:
             self.app.notify(STOP_UNHEARD, severity="error", timeout=10)
-        await self.attempt(self.link.call(verbs.Stop()))
+        await self.attempt(self.client.call(verbs.Stop()))
 
 
 def told(problem: CodedError | OSError) -> str:

@@ -54,16 +54,16 @@ async def check_drift(desk: Desk, approves: Approve) -> None:
     """Plan, ask, capture, also after pauses and new approvals in between; then the verdict."""
     if (status := desk.known.live) is None:
         return
-    plan_sha256 = await desk.start(start_drift_check(desk, status, approves))
+    plan_sha256 = await desk.start(start_drift_check(desk.client, status, approves))
     if not plan_sha256:
         return
     await desk.app.switch_mode("capture")
-    session = await recorded(desk, plan_sha256)
+    session = await recorded(desk.client, plan_sha256)
     if session is None:
         desk.app.notify(NO_VERDICT, timeout=10)
         return
     await check_session(desk, session.recording, session.folder)
-    if (end := judged(session.folder, desk.camera)) is not None:
+    if (end := judged(session.folder, desk.client.camera)) is not None:
         desk.app.notify(str(end), title="Drift check", timeout=60, markup=False)
 
 
@@ -81,7 +81,7 @@ async def install_result(desk: Desk, result: Result, calibration: Calibration) -
     if not await desk.question(Confirm("Install this calibration?", body, yes="Install")):
         return
     cell: Cell = "simulated" if desk.known.live is not None and desk.known.live.simulated else "real"
-    oldest = None if desk.link is None else desk.link.max_age_days
+    oldest = desk.client.max_age_days
     put = partial(install, Path(result.path), state_root(result.path), cell=cell, max_age_days=oldest)
     try:
         try:

@@ -82,7 +82,7 @@ class TouchCorners(Question[list[Touch]]):
 
 async def run_touch_test(desk: Desk, path: Path) -> bool:
     """Read corners until the person ends it. True when something was written into the file."""
-    board = await desk.attempt(see_board(desk, path))
+    board = await desk.attempt(see_board(desk.client, path))
     if board is None or not (touches := await desk.question(TouchCorners(board))):
         return False
     words = await desk.attempt(asyncio.to_thread(note_touches, state_root(str(path)), path, touches))

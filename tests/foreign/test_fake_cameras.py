@@ -28,7 +28,7 @@ from station.cell.status import MotionPreview, StationState, StationStatus
 from station.operate.motion import carry_out, prepared_motion, wait_until_idle
 from station.plan.planner import make_plan
 from station.protocol.client import Client
-from station.protocol.verbs import Check, Doctor, Finish, Lease, LoadPlan, Purpose, Stop
+from station.protocol.verbs import Check, Doctor, Finish, LoadPlan, Purpose, Stop
 from station.simulation.camera_process import CameraProcess
 from station.simulation.cell import write_truth
 from station.simulation.launch import SimulatedController, start_controller
@@ -77,9 +77,8 @@ async def served(config: StationConfig, folder: Path) -> AsyncIterator[Client]:
         try:
             assert daemon.stdout is not None
             assert await asyncio.to_thread(daemon.stdout.readline), "it did not start"
-            async with await Client.connect(socket) as client:
+            async with Client(socket) as client:
                 await wait_until_idle(client)
-                await client.call(Lease("take"))
                 yield client
         finally:
             daemon.terminate()

@@ -83,8 +83,7 @@ async def test_the_loop_of_the_heartbeat_touches_no_file(
     await ready.wait()
     _LOOPS.add(threading.get_ident())
     try:
-        async with await Client.connect(tmp_path / "s") as anna:
-            await anna.request("lease", action="take")
+        async with Client(tmp_path / "s") as anna:
             await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
             await anna.request("doctor")
             summary = await anna.request("prepare", purpose="run")

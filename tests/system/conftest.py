@@ -88,7 +88,7 @@ class DaemonProcess:
         assert line, "the daemon ended at once; see its log"
 
     async def client(self) -> Client:
-        return await Client.connect(self.socket)
+        return await Client(self.socket).open()
 
     def end(self) -> None:
         if self.process.poll() is None:
@@ -164,7 +164,6 @@ async def go(client: Client, plan: Plan | None, purpose: str = "run") -> None:
     """Take control, load the plan and approve its motion, like an operator."""
     rest = (StationState.IDLE, StationState.PAUSED)
     await status_when(client, lambda s: s.state in rest and s.camera.connected)
-    await client.request("lease", action="take")
     if plan is not None:
         await client.request("load_plan", plan=msgspec.to_builtins(plan))
     summary = await client.request("prepare", purpose=purpose)

@@ -18,7 +18,7 @@ from station.cell.status import StationState as S
 from station.devices.ur_state import TraceRecorder
 from station.operate.acceptance import AcceptanceTest
 from station.protocol.client import Client
-from station.protocol.verbs import Lease, Stop
+from station.protocol.verbs import Stop
 from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
 from tests.system.conftest import AT_REST_RAD_S, TRUTH, SystemRig, both_paths, status_when
@@ -52,7 +52,6 @@ async def begun(
     daemon = await rig.daemon()
     client = await daemon.client()
     await status_when(client, lambda s: s.state is S.IDLE)
-    await client.call(Lease("take"))
     tester = SimulatedHands(rig.admin, holds)
     return (
         client,

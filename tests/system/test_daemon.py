@@ -96,7 +96,6 @@ async def test_a_daemon_that_hangs_is_killed_or_told_to_end_stops_the_arm(
         assert captured >= 1
         await rig.stays_at_rest()
         await status_when(anna, lambda s: s.robot.connected and s.camera.connected)
-        await anna.request("lease", action="take")
         await anna.request("acknowledge")
         await go(anna, None, "resume")
         await rig.moving()
@@ -172,7 +171,7 @@ async def test_a_stale_socket_of_a_crash_is_no_obstacle(rig: SystemRig) -> None:
     await asyncio.to_thread(first.process.wait)
     assert first.socket.exists()
     with pytest.raises(DaemonGoneError):
-        await Client.connect(first.socket)
+        await Client(first.socket).open()
     first.socket.rename(rig.folder / "2.sock")
     second = await rig.daemon()
     async with await second.client() as anna:

@@ -25,9 +25,8 @@ async def test_every_pose_has_the_picture_of_its_own_pulse(lonely_network: None,
     truth = make_cell()
     plan = quick_plan(cell_config(truth), truth, seed=0, count=POSES)
     with simulated_daemon(tmp_path, ["--gige", "--hardware-trigger"]) as socket:
-        async with await Client.connect(socket) as client:
+        async with Client(socket) as client:
             await wait_until_idle(client)
-            await client.request("lease", action="take")
             await client.request("load_plan", plan=msgspec.to_builtins(plan))
             ended = await carry_out(client, Purpose.RUN, approve_simulated, lambda status: None)
     assert ended.session.captured == POSES, ended.reason

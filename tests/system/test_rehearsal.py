@@ -25,7 +25,7 @@ from station.cell.status import MotionPreview, StationState
 from station.operate.motion import carry_out, wait_until_idle
 from station.operate.new_cell import write_config
 from station.protocol.client import Client
-from station.protocol.verbs import GetPlan, Lease, MakePlan, Purpose
+from station.protocol.verbs import GetPlan, MakePlan, Purpose
 from station.simulation.cell import read_truth
 from station.simulation.scenes import make_cell
 from tests.command_line import call
@@ -92,11 +92,10 @@ async def test_nothing_of_the_configuration_is_connected_to(
     config = tmp_path / "station.yaml"
     config.write_text(text)
     with rehearsing(config, tmp_path) as control:
-        async with await Client.connect(control) as client:
+        async with Client(control) as client:
             status = await wait_until_idle(client)
             assert status.simulated and status.state is StationState.IDLE
             assert status.robot.host not in (ROBOT, "") and status.robot.speed_limit_m_s == 0.2
-            await client.call(Lease("take"))
             await client.call(MakePlan(4, 0), timeout_s=60.0)
             assert len((await client.call(GetPlan())).plan.poses) == 4
             assert client.root == tmp_path / "rehearsal"
@@ -117,9 +116,8 @@ async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path
         return True
 
     with rehearsing(tmp_path / "station.yaml", tmp_path) as control:
-        async with await Client.connect(control) as client:
+        async with Client(control) as client:
             await wait_until_idle(client)
-            await client.call(Lease("take"))
             await client.call(MakePlan(POSES, 0), timeout_s=120.0)
             outcome = await carry_out(
                 client, Purpose.RUN, approved, lambda _: None, finish_with_loss=True, headless=True

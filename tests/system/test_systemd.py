@@ -101,7 +101,7 @@ async def station(machine: Machine, rig: SystemRig) -> AsyncIterator[Machine]:
 
 
 async def client_of(machine: Machine) -> Client:
-    return await Client.connect(machine.path(SOCKET))
+    return await Client(machine.path(SOCKET)).open()
 
 
 async def test_stopping_the_service_stops_the_arm_seals_and_ends(
@@ -169,7 +169,6 @@ async def test_a_hung_daemon_is_killed_and_the_next_one_waits_for_a_person(
         assert status.cause == "interrupted"
         assert not status.robot.control
         await rig.stays_at_rest(1.0)
-        await anna.request("lease", action="take")
         await anna.request("acknowledge")
         await anna.request("finish")
         await status_when(anna, lambda s: bool(s.session.recording))

@@ -68,7 +68,7 @@ async def test_a_camera_knocked_by_3_mm_between_jobs_is_noticed(rig: SystemRig, 
     ready = asyncio.Event()
     served = asyncio.create_task(daemon.run(ready.set))
     await ready.wait()
-    async with await Client.connect(socket) as client:
+    async with Client(socket) as client:
         await status_when(client, lambda s: s.state is S.IDLE and s.camera.connected)
     produced = asyncio.create_task(produce(rig))
     code, lines = await watch(socket, 90)

@@ -23,7 +23,6 @@ from station.cell.config import PAPER_BOARD, PoseGuess
 from station.cell.session_folder import SessionSummary
 from station.cell.status import (
     CameraStatus,
-    LeaseStatus,
     MotionPreview,
     PoseStatus,
     RobotStatus,
@@ -31,7 +30,8 @@ from station.cell.status import (
     StationState,
     StationStatus,
 )
-from station.protocol.verbs import Configuration, Done, Preview, PreviewImage, Sessions, Verb, Watch
+from station.protocol.client import Client
+from station.protocol.verbs import VERBS, Configuration, Done, Preview, PreviewImage, Sessions, Verb, Watch
 from station.simulation.placement import cell_description
 from station.tui.app import StationApp
 from tests.patience import PATIENCE_S
@@ -67,32 +67,39 @@ async def until(pilot: Pilot[None], condition: Callable[[], object]) -> None:
         await pilot.pause(0.02)
 
 
-class FakeLink:
+class FakeLink(Client):
     """Answers like a daemon in a good mood; `refuse` maps verbs to errors."""
 
-    root: Path | None = None
-    camera = "main"
-    max_age_days: float | None = None
-
     def __init__(self) -> None:
+        super().__init__(Path("/nowhere/control.sock"))
+        self.own_id = 7
         self.asked: list[Verb[Any]] = []
         self.refuse: dict[str, Exception] = {}
         self.answers: dict[str, Any] = {
             "prepare": SUMMARY,
             "preview": _image(),
-            "lease": LeaseStatus("me", 7),
             "sessions": [summary("s-0")],
             "configuration": CELL,
         }
         self.silent = asyncio.Event()
         """While set nothing is answered, as by a daemon that hangs."""
         self.same_image, self._images = False, 0
-        self._statuses: asyncio.Queue[StationStatus | None] = asyncio.Queue()
+        self._serves = False
         self.show(idle())
 
     def show(self, status: StationStatus | None) -> None:
         """The next status; None = the daemon dies."""
-        self._statuses.put_nowait(status)
+        self._plain_status = None if status is None else msgspec.to_builtins(status)
+        self._serves = self._serves and status is not None
+        self._tell()
+
+    async def open(self) -> Client:
+        self._serves = True
+        return self
+
+    @property
+    def connected(self) -> bool:
+        return self._serves
 
     @property
     def verbs(self) -> list[str]:
@@ -102,23 +109,20 @@ class FakeLink:
             if not isinstance(verb, (Configuration, Preview, Sessions, Watch))
         ]
 
-    async def call(self, verb: Verb[Any], *, timeout_s: float = 0.0) -> Any:
-        self.asked.append(verb)
+    async def request(self, verb: str, *, timeout_s: float = 0.0, **args: object) -> object:
+        self.asked.append(msgspec.convert(args, VERBS[verb]))
         while self.silent.is_set():
             await asyncio.sleep(0.01)
-        if verb.verb() in self.refuse:
-            raise self.refuse[verb.verb()]
-        if isinstance(verb, Preview):
+        if verb in self.refuse:
+            raise self.refuse[verb]
+        answer = self.answers.get(verb, Done())
+        if verb == "preview":
             self._images += not self.same_image
-            return msgspec.structs.replace(self.answers["preview"], sequence=self._images)
-        return self.answers.get(verb.verb(), Done())
-
-    async def statuses(self) -> AsyncIterator[StationStatus]:
-        while (status := await self._statuses.get()) is not None:
-            yield status
+            answer = msgspec.structs.replace(answer, sequence=self._images)
+        return msgspec.to_builtins(answer)
 
     async def close(self) -> None:
-        self.show(None)
+        self._serves = False
 
 
 def summary(name: str, calibration: Path | str = "") -> SessionSummary:
@@ -149,10 +153,7 @@ def link() -> FakeLink:
 
 
 def app_on(link: FakeLink) -> StationApp:
-    async def connect() -> FakeLink:
-        return link
-
-    return StationApp(connect)
+    return StationApp(link)
 
 
 @asynccontextmanager

@@ -11,7 +11,7 @@ from station.protocol import verbs
 from station.tui import app as attendance
 from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 
-LOST = verbs.Lease("lost")
+LOST = verbs.Release(silent=True)
 
 
 def commanded(state: StationState, client_id: int = 7) -> StationStatus:
@@ -42,7 +42,6 @@ async def test_who_commands_a_moving_arm_is_asked_for(
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-        app.desk.own_id = 7
         if answered:
             app.post_message(events.CursorPosition(0, 0))
         for _ in range(2 * attendance.UNANSWERED):
@@ -59,7 +58,6 @@ async def test_a_terminal_that_answers_keeps_control(link: FakeLink, monkeypatch
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-        app.desk.own_id = 7
         for _ in range(3):
             app.post_message(events.CursorPosition(0, 0))
             await until(pilot, lambda: app._unanswered == 0)

@@ -57,11 +57,11 @@ async def test_stop_works_inside_the_question_too(link: FakeLink) -> None:
 
 
 async def test_a_refusal_is_said_and_nothing_moves(link: FakeLink) -> None:
-    link.refuse["lease"] = RefusedError("held by anna on tty1")
+    link.refuse["prepare"] = RefusedError("held by anna on tty1")
     async with opened(link, notifications=True) as pilot:
         await pilot.press("f5")
         await until(pilot, lambda: any("held by anna" in n.message for n in pilot.app._notifications))
-        assert link.verbs == ["lease"]
+        assert link.verbs == ["prepare"]
 
 
 async def test_the_bar_says_state_robot_and_stop_key(link: FakeLink) -> None:
@@ -84,8 +84,8 @@ async def test_a_key_sends_its_wish_at_once(link: FakeLink) -> None:
     wishes = {
         "f6": ["pause"],
         "f8": ["acknowledge"],
-        "f3": ["lease", "free_drive"],
-        "f2": ["lease", "record"],
+        "f3": ["free_drive"],
+        "f2": ["record"],
         "f12": ["stop"],
     }
     async with opened(link) as pilot:
@@ -103,7 +103,7 @@ async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
         await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         assert link.verbs == []
         await pilot.click("#yes")
-        await until(pilot, lambda: link.verbs == ["lease", "finish"])
+        await until(pilot, lambda: link.verbs == ["finish"])
 
 
 async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(link: FakeLink) -> None:
@@ -169,31 +169,29 @@ async def test_stop_works_in_the_command_palette(link: FakeLink) -> None:
         await until(pilot, lambda: link.verbs == ["stop"])
 
 
-def commanded(state: StationState) -> StationStatus:
-    """By the screen that `FakeLink` tells it is client 7."""
-    return msgspec.structs.replace(idle(state), lease=LeaseStatus("anna on tty1", 7))
+def commanded(state: StationState, client_id: int) -> StationStatus:
+    """The screen of `FakeLink` is client 7."""
+    return msgspec.structs.replace(idle(state), lease=LeaseStatus("anna on tty1", client_id))
 
 
 @pytest.mark.parametrize("key", ["ctrl+q", "f4"])
 async def test_what_ends_control_asks_while_the_arm_works_by_it(link: FakeLink, key: str) -> None:
     async with opened(link) as pilot:
-        await pilot.press("f3")  # takes control
-        await until(pilot, lambda: "free_drive" in link.verbs)
-        link.show(commanded(StationState.MOVING))
+        link.show(commanded(StationState.MOVING, 7))
         await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
         await pilot.press(key)
         await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
         assert "decelerates" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
         await pilot.press("escape")
         await pilot.pause()
-        assert verbs.Lease("release") not in link.asked
+        assert verbs.Release() not in link.asked
 
 
 @pytest.mark.parametrize("state", [StationState.MOVING, StationState.PAUSED])
 async def test_who_only_watches_is_told_that_closing_changes_nothing(
     link: FakeLink, state: StationState
 ) -> None:
-    link.show(commanded(state))
+    link.show(commanded(state, 8))
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: state.value.upper() in text_of(pilot.app, "#bar"))
         await pilot.press("ctrl+q")
@@ -202,16 +200,16 @@ async def test_who_only_watches_is_told_that_closing_changes_nothing(
 
 
 async def test_control_is_let_go_of_by_its_holder_alone(link: FakeLink) -> None:
-    link.show(commanded(StationState.PAUSED))
+    link.show(commanded(StationState.PAUSED, 8))
     async with app_on(link).run_test(size=(160, 24), notifications=True) as pilot:
         await until(pilot, lambda: "control: anna on tty1" in text_of(pilot.app, "#bar"))
         await pilot.press("f4")
         await until(pilot, lambda: any("anna on tty1 does" in n.message for n in pilot.app._notifications))
         assert link.verbs == []
-        await pilot.press("f3")  # takes it, as if anna had let go
-        await until(pilot, lambda: "free_drive" in link.verbs)
+        link.show(commanded(StationState.PAUSED, 7))
+        await until(pilot, lambda: pilot.app.known.live.lease.client_id == 7)  # type: ignore[attr-defined]
         await pilot.press("f4")
-        await until(pilot, lambda: verbs.Lease("release") in link.asked)
+        await until(pilot, lambda: verbs.Release() in link.asked)
 
 
 async def test_after_looking_the_line_says_which_key_goes_on(link: FakeLink) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -23,9 +22,9 @@ class SlowPlanner(FakeLink):
         super().__init__()
         self.made = asyncio.Event()
 
-    async def call(self, verb: verbs.Verb[Any], *, timeout_s: float = 0.0) -> Any:
-        answer = await super().call(verb)
-        if isinstance(verb, verbs.MakePlan):
+    async def request(self, verb: str, *, timeout_s: float = 0.0, **args: object) -> object:
+        answer = await super().request(verb, **args)
+        if verb == "make_plan":
             await self.made.wait()
         return answer
 

@@ -45,7 +45,6 @@ class Desk:
 
     async def load(self, plan: Plan) -> None:
         client = await self.rig.daemons[-1].client()
-        await client.request("lease", action="take")
         await client.request("load_plan", plan=msgspec.to_builtins(plan))
         await client.close()
 

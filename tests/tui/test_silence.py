@@ -7,9 +7,8 @@ import pytest
 from textual.widgets import DataTable
 
 from station.cell.status import Event, StationState
-from station.protocol.client import DaemonGoneError
+from station.protocol.client import Client, DaemonGoneError
 from station.tui import desk
-from station.tui.app import StationApp
 from station.tui.desk import STOP_UNHEARD
 from station.tui.live import LiveScreen
 from station.tui.task import SILENT
@@ -107,16 +106,21 @@ async def test_a_screen_that_was_away_meanwhile_shows_what_was_known_last(link: 
         assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose 8 (8 of 25): OLD"
 
 
-async def test_without_a_connection_stop_is_sent_all_the_same() -> None:
-    async def nobody() -> FakeLink:
-        raise DaemonGoneError("16 clients of this user are connected already")
+@pytest.mark.parametrize(("heard", "said"), [(True, "without a connection"), (False, "nothing was sent")])
+async def test_without_a_connection_stop_is_sent_all_the_same(heard: bool, said: str) -> None:
+    class Nobody(FakeLink):
+        async def open(self) -> Client:
+            raise DaemonGoneError("16 clients of this user are connected already")
+
+        def send_stop(self) -> bool:
+            sent.append(True)
+            return heard
 
     sent: list[bool] = []
-    app = StationApp(nobody)
-    app.desk.stop_unconnected = lambda: sent.append(True) is None
-    async with app.run_test(size=(80, 24)) as pilot:
+    async with app_on(Nobody()).run_test(size=(80, 24), notifications=True) as pilot:
         await pilot.press("f12")
-        await until(pilot, lambda: bool(sent))
+        await until(pilot, lambda: any(said in notice.message for notice in pilot.app._notifications))
+    assert sent
 
 
 async def test_news_that_arrive_while_the_screen_closes_do_no_harm(

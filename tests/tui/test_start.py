@@ -23,7 +23,6 @@ THERE = [Check("robot", "ok", "UR10")]
 
 
 async def test_without_a_robot_the_checklist_comes_first(link: FakeLink) -> None:
-    link._statuses.get_nowait()
     link.show(idle(StationState.DISCONNECTED))
     link.answers["doctor"] = MISSING
     async with app_on(link).run_test(size=(80, 24)) as pilot:
@@ -57,7 +56,6 @@ async def test_what_was_missing_is_looked_for_on_every_screen(
 
 
 async def test_before_the_first_session_too(link: FakeLink) -> None:
-    link._statuses.get_nowait()
     fresh = idle()
     link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
     link.answers |= {"doctor": THERE, "sessions": []}
@@ -84,7 +82,6 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
         ("7", "v", "No session is recorded yet"),
         ("7", "c", "No session is recorded yet"),
     ]
-    link._statuses.get_nowait()
     fresh = idle()
     link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
     link.answers |= {"doctor": THERE, "sessions": []}
@@ -110,14 +107,6 @@ async def test_an_empty_list_says_how_to_begin_but_not_before_it_is_known(link: 
         await until(pilot, lambda: hint.display)
 
 
-async def test_without_a_daemon_every_key_says_so(link: FakeLink) -> None:
-    link.show(None)
-    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
-        await pilot.press("f12")
-        await until(pilot, lambda: any("nothing was sent" in n.message for n in pilot.app._notifications))
-
-
 async def test_help_names_every_key_of_the_screen_and_stop_works_in_it(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 60)) as pilot:
         await pilot.pause()
@@ -133,7 +122,6 @@ async def test_help_names_every_key_of_the_screen_and_stop_works_in_it(link: Fak
 
 
 async def test_the_highlighted_pose_is_told_in_full(link: FakeLink) -> None:
-    link._statuses.get_nowait()
     status = idle()
     poses = list(status.session.poses)
     reason = "no board in the picture: " + "look at the light " * 4

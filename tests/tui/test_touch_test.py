@@ -79,7 +79,7 @@ async def test_what_is_read_goes_into_the_file_and_the_installed_one(
         (found,) = read_calibration(calibration).verification
         assert found.offset_mm == pytest.approx((-0.5, -0.25), abs=0.02)
         assert installed_calibration(root) == read_calibration(calibration)
-        assert not {"lease", "prepare", "go"} & set(link.verbs), "nothing moves"
+        assert not {"prepare", "go"} & set(link.verbs), "nothing moves"
 
 
 async def test_the_pointers_length_is_asked_for(link: FakeLink, calibration: Path, daemon: Daemon) -> None:

@@ -21,8 +21,8 @@ from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
-from station.operate.motion import Link
 from station.protocol import verbs
+from station.protocol.client import Client
 from station.tui.widgets.graphics import PERIOD_S, SHARE, Graphics, SharpPicture
 
 Grey = NDArray[np.uint8]
@@ -66,7 +66,7 @@ class PreviewPane(Widget):
         self._next_s = 0.0
         """Not before: drawing takes no more than its share of the computer."""
 
-    async def fetch(self, link: Link) -> None:
+    async def fetch(self, link: Client) -> None:
         """Ask for an image and show it. What the daemon sees in it stands in the status, shown or not.
 
         Until the next one may be drawn the smallest will do: a large one is dear to send and to read.

@@ -92,7 +92,7 @@ def test_only_a_plan_of_default_poses_is_made_again(criterion: Any) -> None:
         return True
 
     def started(link: Elsewhere) -> bool:
-        begun = motion.prepared_motion(cast("motion.Link", link), Prepare(Purpose.RUN), yes, plans_here=yes)
+        begun = motion.prepared_motion(cast("motion.Client", link), Prepare(Purpose.RUN), yes, plans_here=yes)
         return asyncio.run(begun)
 
     plan = Plan("UR10", "eye-in-hand", (PlannedPose("p01", (0.0,) * 6),), criterion=criterion)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import json
 import os
@@ -14,19 +13,14 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from recordings.errors import ErrorData
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
-from station.protocol.messages import (
-    LINE_LIMIT_BYTES,
-    PIECE_BYTES,
-    REQUEST_LIMIT_BYTES,
-    USER_CLIENT_LIMIT,
-    Reply,
-)
+from station.protocol.messages import LINE_LIMIT_BYTES, USER_CLIENT_LIMIT, Reply
 from station.protocol.verbs import Go
 from station.server.approval import Peer
 from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer
@@ -44,15 +38,15 @@ class RecordingHandler:
     def stop_now(self, peer: Peer) -> None:
         self.order.append("stop")
 
-    async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
+    async def handle(self, peer: Peer, verb: str, args: msgspec.Raw) -> Any:
         if verb == "make_plan":
             await self.release.wait()
         if verb == "go":
             raise RefusedError("no", code="no-control", remedy="Take it.", holder="anna")
         if verb == "skip":
-            return {"index": int(args["index"])}
+            return {"index": msgspec.json.decode(args)["index"]}
         self.order.append(verb)
-        return {"version": "0", "pid": peer.pid, "root": "/"}
+        return {"version": "0", "pid": peer.pid, "client_id": peer.client_id, "root": "/"}
 
     def gone(self, peer: Peer) -> None:
         self.lost.append(peer.client_id)
@@ -87,13 +81,13 @@ async def raw(path: Path, *lines: bytes) -> list[dict[str, Any]]:
 async def test_the_socket_is_the_groups_and_knows_its_peer(server: Served) -> None:
     _, path = server
     assert stat.S_IMODE(path.stat().st_mode) == 0o660
-    async with await Client.connect(path) as client:
+    async with Client(path) as client:
         assert (await client.request("doctor"))["pid"] == os.getpid()
 
 
 async def test_stop_passes_everything_that_is_queued(server: Served, handler: RecordingHandler) -> None:
     _, path = server
-    async with await Client.connect(path) as busy, await Client.connect(path) as other:
+    async with Client(path) as busy, Client(path) as other:
         planning = asyncio.create_task(busy.request("make_plan", poses=25))
         await asyncio.sleep(0)
         await busy.request("stop")
@@ -106,7 +100,7 @@ async def test_stop_passes_everything_that_is_queued(server: Served, handler: Re
 
 async def test_refusals_keep_their_code_values_and_remedy(server: Served) -> None:
     _, path = server
-    async with await Client.connect(path) as client:
+    async with Client(path) as client:
         with pytest.raises(RefusedError) as refused:
             await client.call(Go("x"))
     assert refused.value.data == ErrorData("no-control", "no", "Take it.", {"holder": "anna"})
@@ -114,7 +108,7 @@ async def test_refusals_keep_their_code_values_and_remedy(server: Served) -> Non
 
 async def test_watchers_get_everything_once_then_only_changes(server: Served) -> None:
     control, path = server
-    async with await Client.connect(path) as client:
+    async with Client(path) as client:
         statuses = client.statuses()
         assert (await anext(statuses)).state is StationState.DISCONNECTED
         control.publish(StationStatus(state=StationState.IDLE, cell="lab"))
@@ -128,15 +122,15 @@ async def test_who_was_answered_knows_what_came_of_it(tmp_path: Path) -> None:
     state = StationState.IDLE
 
     class Running(RecordingHandler):
-        async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
+        async def handle(self, peer: Peer, verb: str, args: msgspec.Raw) -> Any:
             nonlocal state
             if verb == "skip":
                 state = StationState.CHECKING
-            return await super().handle(peer, verb, {"index": 0})
+            return await super().handle(peer, verb, msgspec.Raw(b'{"index": 0}'))
 
     control = ControlServer(tmp_path / "s", Running(), lambda: StationStatus(state=state))
     await control.start()
-    async with await Client.connect(tmp_path / "s") as client:
+    async with Client(tmp_path / "s") as client:
         assert (await anext(client.statuses())).state is StationState.IDLE
         await client.request("skip")
         assert (await anext(client.statuses())).state is StationState.CHECKING
@@ -159,7 +153,7 @@ async def test_nonsense_is_answered_and_others_are_served(server: Served, line: 
     _, path = server
     answers = await raw(path, line)
     assert answers[0]["problem"]["code"] == code and answers[0]["error"]
-    async with await Client.connect(path) as client:
+    async with Client(path) as client:
         assert await client.request("doctor")
 
 
@@ -214,33 +208,13 @@ async def test_a_flood_of_lines_holds_up_neither_stop_nor_the_heartbeat(
     assert len(answered) < 100
 
 
-async def test_a_long_request_goes_in_pieces_and_stop_passes_between_them(
-    server: Served, handler: RecordingHandler
-) -> None:
+async def test_a_long_request_is_carried_out_and_one_that_is_too_long_refused(server: Served) -> None:
     _, path = server
-    long = {"note": "ü" * 200_000, "index": 7}
-    async with await Client.connect(path) as client, await Client.connect(path) as other:
-        twice = await asyncio.gather(client.request("skip", **long), client.request("skip", **long))
-        assert twice == [{"index": 7}, {"index": 7}]
-        await client.request("part", base64=base64.b64encode(b'{"id": 1, "verb"').decode())
-        await other.request("stop")
-        await client.request("stop")
-        assert handler.order.count("stop") == 2
+    async with Client(path) as client:
+        assert await client.request("skip", note="ü" * 200_000, index=7) == {"index": 7}
         with pytest.raises(RefusedError) as refused:
-            await client.request("skip", note="x" * REQUEST_LIMIT_BYTES)
-        assert refused.value.values["limit_bytes"] == REQUEST_LIMIT_BYTES
-
-
-async def test_pieces_without_end_or_sense_are_answered_in_words(server: Served) -> None:
-    _, path = server
-    piece = base64.b64encode(bytes(PIECE_BYTES)).decode()
-    lines = [json.dumps({"id": i, "verb": "part", "args": {"base64": piece}}).encode() for i in range(70)]
-    answers = await raw(path, b"\n".join(lines) + b"\n")
-    refused = [answer["problem"]["code"] for answer in answers if not answer["ok"]]
-    assert refused == ["request-too-long"]
-    nonsense = (b'{"id": 1, "verb": "part", "args": {"base64": "%"}}\n', b'{"id": 2, "verb": "whole"}\n')
-    for answer in await raw(path, *nonsense):
-        assert answer["problem"]["code"] == "not-a-request"
+            await client.request("skip", note="x" * LINE_LIMIT_BYTES)
+        assert refused.value.values["limit_bytes"] == LINE_LIMIT_BYTES
 
 
 async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: RecordingHandler) -> None:
@@ -249,7 +223,7 @@ async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: R
     stuck.setblocking(False)
     stuck.connect(str(path))
     stuck.send(b'{"id": 1, "verb": "watch"}\n')
-    async with await Client.connect(path) as client:
+    async with Client(path) as client:
         for i in range(200):
             control.publish(StationStatus(reason=str(i) * 50_000))
             await asyncio.sleep(0)
@@ -260,7 +234,7 @@ async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: R
 
 async def test_more_clients_than_seats_are_told(server: Served) -> None:
     _, path = server
-    clients = [await Client.connect(path) for _ in range(USER_CLIENT_LIMIT)]
+    clients = [await Client(path).open() for _ in range(USER_CLIENT_LIMIT)]
     answers = await raw(path)
     assert answers[0]["problem"]["code"] == "house-full"
     for client in clients:
@@ -269,7 +243,7 @@ async def test_more_clients_than_seats_are_told(server: Served) -> None:
 
 async def test_a_lost_connection_is_told_to_the_handler(server: Served, handler: RecordingHandler) -> None:
     _, path = server
-    client = await Client.connect(path)
+    client = await Client(path).open()
     await client.close()
     await until(lambda: handler.lost)
 
@@ -290,13 +264,13 @@ async def test_a_stale_socket_is_replaced_a_living_one_is_not(server: Served, tm
 
 async def test_without_a_daemon_the_remedy_is_named(tmp_path: Path) -> None:
     with pytest.raises(DaemonGoneError) as gone:
-        await Client.connect(tmp_path / "none.sock")
+        await Client(tmp_path / "none.sock").open()
     assert "station serve" in gone.value.remedy
 
 
 async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None:
     control, path = server
-    client = await Client.connect(path)
+    client = await Client(path).open()
     statuses = client.statuses()
     await anext(statuses)
     planning = asyncio.create_task(client.request("make_plan"))

@@ -41,7 +41,7 @@ class Served:
         self.control = ControlServer(path, SessionDispatcher(rig.session, see))
 
     async def client(self) -> Client:
-        return await Client.connect(self.path, "tty1")
+        return await Client(self.path, "tty1").open()
 
 
 @pytest.fixture
@@ -56,10 +56,10 @@ async def served(new_rig: NewRig, tmp_path: Path) -> AsyncIterator[Served]:
 
 async def test_a_capture_over_the_socket(served: Served, small_plan: Plan) -> None:
     async with await served.client() as anna:
-        lease = await anna.request("lease", action="take")
-        assert "tty1" in lease["holder"] and "pid" in lease["holder"]
         answer = await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
         assert answer["sha256"] == plan_sha256(small_plan)
+        lease = served.rig.session.store.status.lease
+        assert lease.client_id == anna.own_id and "tty1" in lease.holder and "pid" in lease.holder
         summary = await anna.request("prepare", purpose="run")
         assert summary["poses"] == POSES
         assert any("SIMULATED" in warning for warning in summary["warnings"])
@@ -81,7 +81,9 @@ async def test_requests_that_hang_hold_up_no_approved_motion(
     answers = threading.Event()
     monkeypatch.setattr(dispatch, "list_sessions", lambda root: answers.wait(60) and [])
     see, session = SessionDispatcher(served.rig.session), served.rig.session
-    asking = [asyncio.create_task(see.handle(Peer(9, 0, 0), "sessions", {})) for _ in range(40)]
+    asking = [
+        asyncio.create_task(see.handle(Peer(9, 0, 0), "sessions", msgspec.Raw(b"{}"))) for _ in range(40)
+    ]
     try:
         session.take_lease(1, "anna")
         session.load_plan(1, small_plan)
@@ -93,7 +95,7 @@ async def test_requests_that_hang_hold_up_no_approved_motion(
     finally:
         answers.set()
         await asyncio.gather(*asking, return_exceptions=True)
-    assert await see.handle(Peer(9, 0, 0), "sessions", {}) == []
+    assert await see.handle(Peer(9, 0, 0), "sessions", msgspec.Raw(b"{}")) == []
 
 
 async def test_poses_of_a_check_are_planned_for_a_known_lens(
@@ -107,7 +109,6 @@ async def test_poses_of_a_check_are_planned_for_a_known_lens(
 
     monkeypatch.setattr(served.rig.session.context.workers, "call", call)
     async with await served.client() as anna:
-        await anna.request("lease", action="take")
         await anna.request("make_plan", poses=6, lens_known=True)
         await anna.request("make_plan", poses=25)
     assert asked == [True, False]
@@ -115,9 +116,8 @@ async def test_poses_of_a_check_are_planned_for_a_known_lens(
 
 async def test_the_second_operator_may_watch_pause_and_stop_only(served: Served, small_plan: Plan) -> None:
     async with await served.client() as anna, await served.client() as bert:
-        await anna.request("lease", action="take")
+        await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
         for verb, args in (
-            ("lease", {"action": "take"}),
             ("load_plan", {"plan": msgspec.to_builtins(small_plan)}),
             ("prepare", {}),
             ("finish", {}),
@@ -128,19 +128,19 @@ async def test_the_second_operator_may_watch_pause_and_stop_only(served: Served,
                 await bert.request(verb, **args)
         await bert.request("stop")
         assert served.rig.state is StationState.STOPPED
-        await anna.request("lease", action="release")
-        await bert.request("lease", action="take")
+        await bert.request("acknowledge")
+        await anna.request("release")
+        await bert.request("prepare")
 
 
 async def test_a_screen_at_which_nobody_is_may_say_that_it_is_lost(served: Served, small_plan: Plan) -> None:
     async with await served.client() as anna:
-        await anna.request("lease", action="take")
         await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
         served.rig.arm.slow = True
         offer = await anna.request("prepare")
         await anna.request("go", token=offer["token"], plan_sha256=offer["plan_sha256"])
         await served.rig.until(StationState.MOVING)
-        await anna.request("lease", action="lost")
+        await anna.request("release", silent=True)
         assert served.rig.state is StationState.PAUSED
         assert "tty1" in served.rig.session.store.status.reason
         assert served.rig.cause == "control-lost"
@@ -156,7 +156,7 @@ async def test_a_screen_at_which_nobody_is_may_say_that_it_is_lost(served: Serve
         ("make_plan", {"poses": 1_000_000}),
         ("reorder", {"order": [0, 0]}),
         ("load_plan", {"plan": {"robot": "UR10"}}),
-        ("lease", {"action": "steal"}),
+        ("release", {"silent": "yes"}),
         ("prepare", {"purpose": "dance"}),
     ],
 )
@@ -164,7 +164,6 @@ async def test_arguments_that_do_not_fit_are_refused_in_words(
     served: Served, verb: str, args: dict[str, object]
 ) -> None:
     async with await served.client() as anna:
-        await anna.request("lease", action="take")
         with pytest.raises(RefusedError) as caught:
             await anna.request(verb, **args)  # type: ignore[arg-type]
         assert len(str(caught.value).split()) > 3
@@ -193,7 +192,6 @@ ME = user_name(os.getuid())
 
 
 async def offered(client: Client, plan: Plan) -> dict[str, Any]:
-    await client.request("lease", action="take")
     await client.request("load_plan", plan=msgspec.to_builtins(plan))
     answer: dict[str, Any] = await client.request("prepare")
     return answer
@@ -341,12 +339,13 @@ async def test_who_is_turned_away_is_not_kept(served: Served) -> None:
 
 async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
     async with await served.client() as anna:
-        await anna.request("lease", action="take")
         await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
         summary = await anna.request("prepare")
     async with await served.client() as bert:
         await until(lambda: not served.rig.session.store.status.lease.holder)
-        await bert.request("lease", action="take")
+        with raises("no-control"):
+            await bert.request("go", token=summary["token"])
+        await bert.request("skip", index=0)
         with raises("approval-used"):
             await bert.request("go", token=summary["token"])
 
@@ -357,7 +356,6 @@ async def test_no_program_and_no_service_gets_a_stop_test_of_a_real_arm(
 ) -> None:
     served = await real_cell(new_rig, tmp_path, with_none, approval)
     async with await served.client() as program:
-        await program.request("lease", action="take")
         with pytest.raises(RefusedError) as refused:
             move = {"way": "control", "speed_m_s": 0.05}
             await program.request("prepare", purpose="stop-test", stop_test=move)

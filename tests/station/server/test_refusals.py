@@ -28,9 +28,12 @@ FOR_ANYBODY = {"acknowledge", "pause", "observe"}
 """They only ever make the arm do less, or nothing."""
 
 
-def arguments(verb: str, plan: Plan) -> dict[str, Any]:
+NONE = msgspec.Raw(b"{}")
+
+
+def arguments(verb: str, plan: Plan) -> msgspec.Raw:
     made = {"load_plan": {"plan": plan}, "add": {"pose": plan.poses[0]}}
-    return made.get(verb, ARGUMENTS[verb])
+    return msgspec.Raw(msgspec.json.encode(made.get(verb, ARGUMENTS[verb])))
 
 
 def test_every_verb_that_depends_on_a_state_is_tried_here() -> None:
@@ -62,8 +65,19 @@ async def test_whoever_does_not_hold_the_lease_commands_nothing(
     dispatcher, calm = SessionDispatcher(rig.session), rig.session.store.status.session
     with raises("control-held"):
         await dispatcher.handle(BERT, verb, arguments(verb, small_plan))
-    await rig.session.release_lease(1)
-    with raises("no-control"):
-        await dispatcher.handle(ANNA, verb, arguments(verb, small_plan))
     assert rig.session.store.status.session == calm
     assert rig.state is S.IDLE and "move" not in rig.arm.log
+
+
+async def test_control_that_nobody_has_goes_to_the_first_that_needs_it(rig: Rig, small_plan: Plan) -> None:
+    dispatcher, lease = SessionDispatcher(rig.session), rig.session.leases
+    await rig.session.release(1)
+    for verb, code in (("go", "no-control"), ("record", "wrong-state"), ("reorder", "wrong-arguments")):
+        with raises(code):  # an approval of another's motion, nothing that could be done, no request
+            await dispatcher.handle(BERT, verb, NONE if verb == "reorder" else arguments(verb, small_plan))
+    await dispatcher.handle(BERT, "configuration", NONE)
+    assert lease.lease.client_id is None
+    await dispatcher.handle(BERT, "skip", arguments("skip", small_plan))
+    assert lease.lease.client_id == BERT.client_id == rig.session.store.status.lease.client_id
+    with raises("control-held"):
+        await dispatcher.handle(ANNA, "skip", arguments("skip", small_plan))

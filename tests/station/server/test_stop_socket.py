@@ -369,15 +369,15 @@ async def test_one_user_s_connections_are_counted_and_stop_needs_none(tmp_path: 
     await control.start()
     station = Station(tmp_path / "c.sock")
     station.start()
-    clients = [await Client.connect(tmp_path / "c.sock") for _ in range(USER_CLIENT_LIMIT)]
+    clients = [await Client(tmp_path / "c.sock").open() for _ in range(USER_CLIENT_LIMIT)]
     with pytest.raises((DaemonGoneError, RefusedError)):
-        await Client.connect(tmp_path / "c.sock")
+        await Client(tmp_path / "c.sock").open()
     assert await stopped(tmp_path / "c.sock") is Outcome.RESTS
     await clients.pop().close()
     async with asyncio.timeout(PATIENCE_S):
         while len(clients) < USER_CLIENT_LIMIT:
             try:
-                clients.append(await Client.connect(tmp_path / "c.sock"))
+                clients.append(await Client(tmp_path / "c.sock").open())
             except StationError:
                 await asyncio.sleep(0.01)
     for client in clients:

@@ -69,7 +69,7 @@ async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: 
     assert rig.state is S.STOPPED and "stop" in rig.arm.log
 
 
-@pytest.mark.parametrize("change", ["stop", "edit", "lease", "prepare"])
+@pytest.mark.parametrize("change", ["stop", "edit", "release", "prepare"])
 async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, change: str) -> None:
     gate = Gate(rig)
     preparing = asyncio.ensure_future(rig.session.prepare(1, Purpose.RUN))
@@ -79,8 +79,8 @@ async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, chan
         await rig.session.acknowledge("anna")
     elif change == "edit":
         await rig.session.edit(Reorder, 1, lambda queue: queue.reorder([1, 0, *range(2, POSES)]))
-    elif change == "lease":
-        await rig.session.release_lease(1)
+    elif change == "release":
+        await rig.session.release(1)
         rig.session.take_lease(1, "anna")
     else:
         later = asyncio.ensure_future(rig.session.prepare(1, Purpose.RUN))
@@ -161,7 +161,7 @@ async def test_finish_waits_for_what_is_being_written(rig: Rig, held_disk: HeldD
     assert "move" not in rig.arm.log[2:]
 
 
-@pytest.mark.parametrize("verb", ["stop", "lease"])
+@pytest.mark.parametrize("verb", ["stop", "release"])
 async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_path: Path, verb: str) -> None:
     control = ControlServer(tmp_path / "s", SessionDispatcher(rig.session))
     await control.start()
@@ -176,10 +176,9 @@ async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_p
     with socket.socket(socket.AF_UNIX) as client:
         client.setblocking(False)
         await asyncio.get_running_loop().sock_connect(client, str(tmp_path / "s"))
-        if verb == "lease":
+        if verb == "release":
             rig.session.leases.lease = msgspec.structs.replace(rig.session.leases.lease, client_id=1)
-        args = {"action": "release"} if verb == "lease" else {}
-        client.send(msgspec.json.encode({"id": 1, "verb": verb, "args": args}) + b"\n")
+        client.send(msgspec.json.encode({"id": 1, "verb": verb}) + b"\n")
         await until(lambda: "stop" in rig.arm.log)
     await asyncio.sleep(0.15)
     assert rig.pose_states == ["planned"] * POSES
@@ -294,10 +293,9 @@ async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> 
 
     control = ControlServer(tmp_path / "s", SessionDispatcher(rig.session))
     await control.start()
-    await rig.session.release_lease(1)
+    await rig.session.release(1)
     rig.session.context.queue = None
-    async with await Client.connect(tmp_path / "s", "tty1") as anna:
-        await anna.request("lease", action="take")
+    async with Client(tmp_path / "s", "tty1") as anna:
         async with asyncio.timeout(PATIENCE_S):
             with pytest.raises(StationError):
                 await anna.request("go", token="made up")

@@ -185,7 +185,7 @@ async def test_who_lets_go_in_mid_move_stops_the_arm_and_is_named(rig: Rig) -> N
     await rig.go_until_it_moves()
     with raises("control-held"):
         rig.session.take_lease(2, "bert")
-    await rig.session.release_lease(1)
+    await rig.session.release(1)
     assert rig.state is S.PAUSED
     assert "stop" in rig.arm.log
     assert rig.cause == "control-lost" and "anna" in rig.session.store.status.reason

@@ -14,6 +14,7 @@ from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, MirroredImagesError, SquaresCountedError, TooFewViewsError
 from calibrate.geometry import Array, pose, rotation_exp
+from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.kinematics import MODELS, RobotModel, table_of_axes
 from calibrate.results import RejectedView
 from calibrate.views import BoardView, ViewSet
@@ -31,7 +32,6 @@ from recordings.schema.messages import (
     View,
 )
 
-FEWEST_TO_SOLVE = 4
 Progress = Callable[[int, int, str], None]
 """done, of, name of the picture"""
 

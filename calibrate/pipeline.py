@@ -16,6 +16,7 @@ from calibrate.boards.model import check_board
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
 from calibrate.handeye.arm_result import verify_elsewhere
+from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Solution, SolveOptions, Verification
 from calibrate.handeye.solve import solve_views
@@ -23,7 +24,7 @@ from calibrate.job import JobOptions, PreparedViews, SolvedRecording
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
-from calibrate.load import FEWEST_TO_SOLVE, Progress, load_views, without_views
+from calibrate.load import Progress, load_views, without_views
 from calibrate.projection import intrinsics_names
 from calibrate.quality.gates import GateInputs, judge
 from calibrate.views import ViewSet

@@ -24,7 +24,7 @@ from calibrate.boards.corners import (
     square_contrast,
     square_means,
 )
-from calibrate.boards.model import FEWEST_CORNERS, board_points, looks_same_turns
+from calibrate.boards.model import FEWEST_ON_A_SIDE, board_points, looks_same_turns
 from calibrate.geometry import Array
 from recordings.schema.messages import BoardKind, BoardSpec
 
@@ -104,7 +104,7 @@ def other_size(grey: Grey, spec: BoardSpec) -> tuple[int, int] | None:
     One smaller each way is looked for by name: that is what a board looks like whose squares were counted.
     """
     seen = seen_size(grey)
-    if seen is None or min(spec.columns, spec.rows) <= FEWEST_CORNERS:
+    if seen is None or min(spec.columns, spec.rows) <= FEWEST_ON_A_SIDE:
         return seen
     smaller = msgspec.structs.replace(spec, columns=spec.columns - 1, rows=spec.rows - 1)
     found = find_chessboard(grey, smaller) is not None

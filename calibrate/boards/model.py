@@ -21,7 +21,7 @@ from recordings.schema.messages import (
 )
 
 APRIL_DICTIONARY = "DICT_APRILTAG_36h11"
-FEWEST_CORNERS = 3
+FEWEST_ON_A_SIDE = 3
 """Inner corners on a side of a chessboard that OpenCV finds."""
 _LARGEST_SIDE = 200
 _WITH_MARKERS = (BoardKind.CHARUCO, BoardKind.APRIL_GRID)
@@ -56,7 +56,7 @@ def check_board(spec: BoardSpec) -> None:
     tag, charuco, april = (spec.kind in SINGLE_TAGS, *(spec.kind is kind for kind in _WITH_MARKERS))
     columns, rows, smallest = spec.columns, spec.rows, 1 if april or tag else 2
     if spec.kind is BoardKind.CHESSBOARD:
-        smallest = FEWEST_CORNERS
+        smallest = FEWEST_ON_A_SIDE
     _require(
         all(smallest <= side <= _LARGEST_SIDE for side in (columns, rows)),
         "board-columns-rows",

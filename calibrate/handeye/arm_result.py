@@ -14,7 +14,7 @@ from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.estimate import CellFit
 from calibrate.handeye.solution import MEASURED, Solution, TableRefusal, TableResult, Verification
-from calibrate.handeye.workspace import MIDDLE, SPREAD, Workspace, sample_workspace
+from calibrate.handeye.workspace import SPREAD, Workspace, sample_workspace
 from calibrate.kinematics import forward
 from calibrate.projection import intrinsics_vector
 from calibrate.results import SHAPE
@@ -40,7 +40,7 @@ def table_result(
     def over(q: Array, spread: Array) -> Workspace:
         return Workspace.of(fit.views.mount, arm.model, q, state.X, state.Y, distance_m, spread)
 
-    room = over(joints, MIDDLE)
+    room = over(joints, SPREAD[:1])
     by_errors = (over(joints, SPREAD) + over(arm.joints_rad, SPREAD)).for_uncorrected()
     both = np.concatenate([np.eye(6), by_errors], axis=1)
     with_table_m = room.rms_m(covariance)

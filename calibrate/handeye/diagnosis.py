@@ -65,30 +65,22 @@ def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: f
 
 
 def error_shares(fit: CellFit) -> dict[str, float]:
-    """Split X's variance by source into shares, mean over directions, summing to 1.
+    """Split X's variance by source into shares that sum to 1, mean over directions.
 
-    The share of lens, board shape or arm is the variance that would vanish if it were known exactly; the
-    rest is split between the noise of corners, robot translation and robot rotation.
+    The share of the lens is the variance that would vanish if it were known exactly, that of the board what
+    would vanish besides if it were known, too, then that of the arm's table. What is left is the noise of
+    corners, robot translation and robot rotation.
     """
-    state, covariance = fit.estimate.state, fit.estimate.covariance
-    at = Layout.of(state)
+    covariance, at = fit.estimate.covariance, Layout.of(fit.estimate.state)
     whiten = np.linalg.inv(covariance[:6, :6])
     shares = {}
     for name, part in (("intrinsics", at.lens), ("board", at.shape), ("kinematics", at.table)):
-        cross, inner = covariance[:6, part], covariance[part, part]
-        taken = cross @ np.linalg.pinv(inner, hermitian=True) @ cross.T if inner.size else np.zeros((6, 6))
-        shares[name] = float(np.trace(whiten @ taken)) / 6
-    modelled = min(sum(shares.values()), 0.99)
-    shares = {name: share * modelled / max(sum(shares.values()), 1e-12) for name, share in shares.items()}
-    corners, translation, rotation = fit.estimate.noise_parts.tolist()
-    total = corners + translation + rotation
-    left = 1.0 - modelled
-    return {
-        "corners": left * corners / total,
-        "robot_translation": left * translation / total,
-        "robot_rotation": left * rotation / total,
-        **shares,
-    }
+        known = covariance[:, part] @ np.linalg.pinv(covariance[part, part], hermitian=True)
+        taken = known @ covariance[part]
+        shares[name] = float(np.trace(whiten @ taken[:6, :6])) / 6
+        covariance = covariance - taken
+    noise = fit.estimate.noise_parts / fit.estimate.noise_parts.sum() * (1.0 - sum(shares.values()))
+    return dict(zip(("corners", "robot_translation", "robot_rotation"), noise.tolist(), strict=True)) | shares
 
 
 _COMPONENTS = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
@@ -138,8 +130,6 @@ def _chance(residual: Array, covariance: Array) -> float:
 
 FOLDS = 5
 FEWEST_FOR_FOLDS = 6
-_STEPS = 3
-"""Linearisations for each fold; few suffice, as it starts from the estimate of all views."""
 _CALLED_TOO_SMALL = 1e-4
 """Probability that a correct predicted error is reported as too small."""
 
@@ -207,7 +197,7 @@ def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:
     others = np.setdiff1d(np.arange(len(fit.views)), left_out)
     whole = fit.estimate
     start = whole.state.with_boards(whole.state.C[others])
-    found = estimate(fit.observed.part(others), start, fit.priors, whole.scales, max_steps=_STEPS)
+    found = estimate(fit.observed.part(others), start, fit.priors, whole.scales)
     seen = found.state.with_boards(whole.board_poses[left_out])
     linear = Linear.at(fit.observed.part(left_out), seen, whole.corner_weights[left_out])
     return linear.m, linear.predicted(found.scales, found.covariance)

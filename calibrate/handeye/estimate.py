@@ -19,14 +19,13 @@ from calibrate.handeye.axxb.global_start import GlobalResult
 from calibrate.handeye.axxb.pairs import Pairs
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corner_modes import STUDENT
-from calibrate.handeye.linear import Fit, Linear
+from calibrate.handeye.linear import MAX_STEPS, Fit, Linear
 from calibrate.handeye.mixture import weights_of
 from calibrate.handeye.noise_scales import ROBOT_PRIOR_COUNT, WIDE, Scales
 from calibrate.handeye.priors import Priors
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.views import Observations, ViewSet
 
-MAX_STEPS = 15
 REJECTED = 0.05
 """Weight at or below which a view is rejected."""
 FULL = 0.35
@@ -113,7 +112,6 @@ def estimate(
     scales: Scales | None = None,
     wide: float = WIDE,
     fit_scales: bool = True,
-    max_steps: int = MAX_STEPS,
 ) -> Estimate:
     """Find the maximum of the posterior from `start`.
 
@@ -127,7 +125,7 @@ def estimate(
     linear = Linear.at(observed, state, weights)
     scales = scales or linear.first_scales(wide)
     try:
-        while steps < max_steps and not converged:
+        while steps < MAX_STEPS and not converged:
             steps += 1
             solved = linear.solve(priors.linearise(state, scales.table), scales, fit)
             scales = solved.scales

@@ -8,13 +8,12 @@ import numpy as np
 from scipy import special
 
 from calibrate.errors import PosesDisagreeError
-from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
+from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.arm import RELATIVE_SIGMA, arm_postures, by_parameters, flex_motion
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.estimate import (
-    MAX_STEPS,
     CellFit,
     Estimate,
     MeanParts,
@@ -22,9 +21,9 @@ from calibrate.handeye.estimate import (
     estimate,
     is_settled,
 )
-from calibrate.handeye.linear import Linear, LinearSolution
+from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
 from calibrate.handeye.metrics import require_motion
-from calibrate.handeye.pose_fit import BoardPoses, agreed_start
+from calibrate.handeye.pose_fit import BoardPoses, agreed_start, pose_distances
 from calibrate.handeye.priors import Priors
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.results import SHAPE
@@ -76,11 +75,11 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
 
 _SIZES = np.array([0.03, 0.06, 0.12, 0.25, 0.5, 1.0])
 """1σ of the errors of an arm's table, mm and mrad: no arm is exactly its table."""
-_BENDS = np.array([1e-6, 0.1, 0.4, 1.6])
-"""1σ of a bracket's compliance, mrad; the first stands for a rigid bracket, which has probability ½."""
-_BENDS_BEFOREHAND = np.array([3.0, 1.0, 1.0, 1.0]) / 6
 _NONE = 1e-6
-_ROUNDS = 3
+"""1σ, mm and mrad, that stands for none: no error of the table, or a rigid bracket."""
+_BENDS = np.array([_NONE, 0.1, 0.4, 1.6])
+"""1σ of a bracket's compliance, mrad; a rigid bracket has probability ½."""
+_BENDS_BEFOREHAND = np.array([3.0, 1.0, 1.0, 1.0]) / 6
 _WORTH_SOLVING = 1e-3
 """Probability below which a pair of sizes is dropped after the first step."""
 
@@ -129,7 +128,7 @@ def allow_for_table(
         solutions: list[LinearSolution] = []
         for i in kept:  # neighbours have nearly the same noise
             start = solutions[-1].scales if solutions else scales
-            solutions.append(linear.solve(priors.linearise(state, sizes.sigma[i]), start, "robot", _ROUNDS))
+            solutions.append(linear.solve(priors.linearise(state, sizes.sigma[i]), start, "robot"))
         log_evidence = np.array([solution.log_evidence for solution in solutions])
         log_all = special.logsumexp(log_evidence, b=sizes.beforehand[kept])
         chances = sizes.beforehand[kept] * np.exp(log_evidence - log_all)
@@ -209,7 +208,6 @@ def require_plausible_noise(found: Estimate) -> None:
 
 
 _MEND = "Check the mounting, units and order of poses, and that each belongs to its image."
-_LEVER_M = 0.5
 _NEARER = 0.2
 """A rotated board is accepted when its distance to the board's pose falls below this share of before."""
 
@@ -217,21 +215,17 @@ _NEARER = 0.2
 def set_boards_right(views: ViewSet, X: Array, Y: Array) -> tuple[ViewSet, tuple[int, ...]]:
     """Rotate boards onto themselves where that fits Y (4, 4); return the views, and the indices rotated."""
     H = mount_poses(views.base_from_flange, views.mount)
+    apart = pose_distances(H @ X @ views.camera_from_board, Y[None])
     kept, turned = list(views.views), []
     for place, view in enumerate(views):
-        apart = _distance(H[place] @ X @ view.camera_from_board, Y)
         for turn in _turns(view):
             trial = _turned(view, turn)
-            if _distance(H[place] @ X @ trial.camera_from_board, Y) < _NEARER * apart:
+            placed = H[place] @ X @ trial.camera_from_board
+            if pose_distances(placed[None], Y[None]) < _NEARER * apart[place]:
                 kept[place] = trial
                 turned.append(place)
                 break
     return (replace(views, views=tuple(kept)) if turned else views), tuple(turned)
-
-
-def _distance(found: Array, expected: Array) -> float:
-    delta = difference(found, expected)
-    return float(np.linalg.norm(delta[:3]) + _LEVER_M * np.linalg.norm(delta[3:]))
 
 
 def _turns(view: BoardView) -> list[Array]:

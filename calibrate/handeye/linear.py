@@ -21,7 +21,10 @@ from calibrate.handeye.reprojection import linearise_corners
 from calibrate.handeye.uncertainty import information_lost, inverse_of
 from calibrate.views import Observations
 
-ROUNDS = 8
+ROUNDS = 4
+"""Rounds of expectation and maximisation at one linearisation; the next linearisation goes on with them."""
+MAX_STEPS = 15
+"""Most linearisations of a fit."""
 Fit = Literal["all", "robot", "nothing"]
 """Which noise scales are fitted."""
 
@@ -94,12 +97,10 @@ class Linear:
         """Take initial noise scales from the residuals, the robot's times `wide`."""
         return first_scales(self.m, 1.0 if self.modes is None else self.modes.typical_px, wide)
 
-    def solve(
-        self, prior: Quadratic, scales: Scales, fit: Fit = "all", rounds: int = ROUNDS
-    ) -> LinearSolution:
+    def solve(self, prior: Quadratic, scales: Scales, fit: Fit = "all") -> LinearSolution:
         """Find the step and the noise scales to be fitted, by rounds of expectation and maximisation."""
         residual, modes = self.m, self.modes
-        for _ in range(1 if fit == "nothing" else rounds):
+        for _ in range(1 if fit == "nothing" else ROUNDS):
             S, S_inverse = self.noise(scales)
             chances, _ = class_chances(residual, S, S_inverse, scales.shares)
             WJ = expected(chances, S_inverse) @ self.J

@@ -102,30 +102,28 @@ def require_motion(pairs: Pairs) -> None:
         )
 
 
-MIN_VIEWS = 4
-
-
-FEWEST_CORNERS = 4
-
-
+FEWEST_TO_SOLVE = 4
+"""Fewest views of a solve."""
+FEWEST_CORNERS_IN_VIEW = 4
+"""Fewest corners of a view: they fix its board pose."""
 MAX_VIEWS = 20_000
 """Most views: more would need over a minute and a gigabyte."""
 
 
 def require_solvable(views: ViewSet) -> None:
     """Check number and content of views. Raises TooFewViewsError or BadViewsError, naming view and remedy."""
-    if len(views) < MIN_VIEWS:
+    if len(views) < FEWEST_TO_SOLVE:
         raise TooFewViewsError(
-            f"{len(views)} usable views (minimum {MIN_VIEWS}).",
+            f"{len(views)} usable views (minimum {FEWEST_TO_SOLVE}).",
             remedy="Record 15 to 25 poses, or check why the board was not found in the others.",
             views=len(views),
-            minimum=MIN_VIEWS,
+            minimum=FEWEST_TO_SOLVE,
         )
     if len(views) > MAX_VIEWS:
         raise BadViewsError(
             f"{len(views)} views (limit {MAX_VIEWS}).", code="too-many-views", remedy="Split the recording."
         )
-    fewest = FEWEST_CORNERS if any(len(view.pixels) for view in views) else 0
+    fewest = FEWEST_CORNERS_IN_VIEW if any(len(view.pixels) for view in views) else 0
     if views.camera.matrix is not None or fewest:
         camera_matrix(views.camera)
         if not np.isfinite(views.camera.distortion).all():
@@ -217,7 +215,8 @@ def distance_in_sigmas(X: Array, reference: Array, covariance: Array) -> float:
 
 
 HELD_OUT = 6
-_FEWEST_FITTED = 5
+FEWEST_FITTED = 5
+"""Fewest views that a fit to be scored by the held-out ones has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +228,7 @@ class HeldOut:
 def held_out_views(views: ViewSet) -> HeldOut | None:
     """Hold out all pairs inside the last 6 views; None for too few views."""
     fitted = len(views) - HELD_OUT
-    if fitted < _FEWEST_FITTED:
+    if fitted < FEWEST_FITTED:
         return None
     last = views.select(list(range(fitted, len(views))))
     H = mount_poses(last.base_from_flange, views.mount)
@@ -241,6 +240,6 @@ def held_out_pairs(views: ViewSet) -> HeldOut | None:
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = consecutive_pairs(H, C)
     count = len(pairs) - HELD_OUT
-    if count + 1 < _FEWEST_FITTED:
+    if count + 1 < FEWEST_FITTED:
         return None
     return HeldOut(views.select(list(range(count + 1))), pairs.select(slice(count, None)))

@@ -27,6 +27,7 @@ from calibrate.handeye.axxb.peer_methods import (
 )
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import estimate
+from calibrate.handeye.linear import MAX_STEPS
 from calibrate.handeye.metrics import (
     HeldOut,
     board_spread,
@@ -187,9 +188,6 @@ def _with_samples(row: PeerResult, partial_X: Array | None, pairs: Pairs) -> Pee
     return replace(row, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()), samples_e_t_m=e_t, samples_e_R=e_R)
 
 
-_STEPS = 8
-
-
 def reprojection_px(views: ViewSet, X: Array) -> float | None:
     """Compute the rms distance over all corners at the best board pose for this X; None without pixels.
 
@@ -202,7 +200,7 @@ def reprojection_px(views: ViewSet, X: Array) -> float | None:
     camera_from_place = inverse(H @ X)
     Y = mean_pose(placed_boards(H, C, X))
     best = np.inf
-    for _ in range(_STEPS):
+    for _ in range(MAX_STEPS):
         C = camera_from_place @ Y
         square = float((corner_residuals(observed, views.camera, C) ** 2).sum())
         if not np.isfinite(square) or square >= best * (1 - 1e-9):

@@ -17,7 +17,7 @@ from calibrate.geometry import Array, difference, inverse, perturb, pose, projec
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.cell_state import Quadratic, flange_derivatives
 from calibrate.handeye.corner_modes import CornerModes
-from calibrate.handeye.linear import Linear, LinearSolution
+from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.reprojection import linearise_corners
 from calibrate.projection import intrinsics_vector
@@ -29,7 +29,8 @@ _VOTERS = 60
 """Most views, evenly spread, that candidates are compared by."""
 _SHARE = 0.55
 """Share of the views that have to agree with a start."""
-_OPEN = 0.1
+FREE = 1.0
+"""1σ, relative, of a factor about which nothing is known."""
 _LEVER_M = 0.5
 """Lever by which rotations are converted to lengths."""
 
@@ -60,8 +61,8 @@ class BoardPoses:
 
     @property
     def open(self) -> Places:
-        """Indices of the factors that are too uncertain to start at 1."""
-        return np.flatnonzero(self.sigma > _OPEN)
+        """Indices of the factors about which nothing is known: they do not start at 1."""
+        return np.flatnonzero(self.sigma >= FREE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +136,7 @@ def central_pose(places: Array) -> Array:
     """Average the poses nearest to the most central one of `places` (n, 4, 4) → (4, 4)."""
     some = places[:: 1 + len(places) // (4 * _VOTERS)]
     middle = some[int(_reach(some).argmin())]
-    near = np.argsort(_distance(places, middle[None])[:, 0], kind="stable")[: _quorum(len(places)) + 1]
+    near = np.argsort(pose_distances(places, middle[None])[:, 0], kind="stable")[: _quorum(len(places)) + 1]
     return pose(project_to_rotation(places[near, :3, :3].mean(axis=0)), places[near, :3, 3].mean(axis=0))
 
 
@@ -146,18 +147,17 @@ def _quorum(count: int) -> int:
 def _reach(places: Array) -> Array:
     """Compute the distance (..., n) within which each place has `_SHARE` of the others."""
     quorum = _quorum(places.shape[-3])
-    return np.asarray(np.partition(_distance(places, places), quorum, axis=-1)[..., quorum])
+    return np.asarray(np.partition(pose_distances(places, places), quorum, axis=-1)[..., quorum])
 
 
-def _distance(first: Array, second: Array) -> Array:
-    """Compute distances (..., n, m) between poses: metres, and radians times `_LEVER_M`."""
+def pose_distances(first: Array, second: Array) -> Array:
+    """Compute distances (..., n, m) of each pose to each: metres, and radians times `_LEVER_M`."""
     shift = np.linalg.norm(first[..., :, None, :3, 3] - second[..., None, :, :3, 3], axis=-1)
     R, Q = (places[..., :3, :3].reshape(*places.shape[:-2], 9) for places in (first, second))
     cosine = (R @ np.swapaxes(Q, -1, -2) - 1) / 2
     return np.asarray(shift + _LEVER_M * np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-_STEPS = 8
 _SETTLED = 0.3
 """Step length, in sigmas, below which the fit has converged: the evidence need not be exact."""
 
@@ -236,7 +236,7 @@ def fit_poses(views: PoseViews, seed: int = 0) -> PoseFit:
     """Find the most likely X, board pose and factors. LinAlgError where the views determine none."""
     X, Y, factors = _start(views, seed)
     scales: Scales | None = None
-    for _ in range(_STEPS):
+    for _ in range(MAX_STEPS):
         linear = _linearise(views, X, Y, factors)
         scales = scales or linear.first_scales()
         solved = linear.solve(_prior(views.boards, len(X) + len(Y), factors), scales, "robot")

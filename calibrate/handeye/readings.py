@@ -22,14 +22,12 @@ from calibrate.geometry import (
     rotation_exp,
     rotation_log,
 )
-from calibrate.handeye.pose_fit import BoardPoses, Moved, PoseFit, PoseViews, fit_poses
+from calibrate.handeye.pose_fit import FREE, BoardPoses, Moved, PoseFit, PoseViews, fit_poses
 from calibrate.handeye.solution import Explanation, Reading
 from calibrate.views import ViewSet
 
 _CLEAR = 10.0
 """Log evidence, besides the logarithm of the number of views, by which another reading has to win."""
-_MOST_VIEWS = 60
-"""Most views that are fitted: evenly spread ones (consecutive ones for shifted images)."""
 _LARGEST_SHIFT = 3
 _FEWEST_PER_PART = 4
 _LOST_VIEW = 15.0
@@ -40,8 +38,6 @@ _NEAR = 0.1
 """Relative distance of a factor from 1000 within which millimetres were given for metres."""
 _LEAST = 0.01
 """Relative distance of a factor from 1 below which it is a tolerance, not another reading."""
-_FREE = 1.0
-"""1σ of a factor that a reading leaves open."""
 
 
 _FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL, Reading.REFOCUSED: -1}
@@ -116,7 +112,7 @@ def _changes(views: PoseViews, as_recorded: PoseFit | None) -> list[int]:
 
 def _let_free(boards: BoardPoses, factor: int) -> BoardPoses:
     sigma = boards.sigma.copy()
-    sigma[factor] = _FREE
+    sigma[factor] = FREE
     return replace(boards, sigma=sigma)
 
 
@@ -127,7 +123,7 @@ def _refocused(boards: BoardPoses, later: NDArray[np.bool_]) -> BoardPoses:
     return replace(
         boards,
         motion=np.concatenate([boards.motion[:_FOCAL], parts]),
-        sigma=np.array([*boards.sigma[:_FOCAL], _FREE, _FREE]),
+        sigma=np.array([*boards.sigma[:_FOCAL], FREE, FREE]),
     )
 
 

@@ -28,6 +28,7 @@ from calibrate.handeye.diagnosis import (
 from calibrate.handeye.estimate import FULL, CellFit, estimate
 from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.metrics import (
+    FEWEST_FITTED,
     HELD_OUT,
     board_spread,
     distance_in_sigmas,
@@ -218,7 +219,7 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
     """
     used = np.flatnonzero(fit.estimate.used)
     first, last = used[:-HELD_OUT], used[-HELD_OUT:]
-    if len(first) < 5:
+    if len(first) < FEWEST_FITTED:
         return None
     whole = fit.estimate
     try:

@@ -16,15 +16,13 @@ from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA, by_parameters
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many
 from recordings.schema.messages import Mount
 
-POSES = 400
 _SHELL = (0.35, 0.9)
 """Reach of the sampled flange positions, as shares of upper arm and forearm together."""
-MIDDLE = np.zeros((1, 2))
 SPREAD = 0.25 * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
-"""Directions of points beside the camera's axis, radians: on the axis alone a roll of X has no effect."""
+"""Directions of points about the camera's axis, radians, itself first: there a roll of X has no effect."""
 
 
-def sample_workspace(model: RobotModel, like_rad: Array, count: int = POSES, seed: int = 0) -> Array:
+def sample_workspace(model: RobotModel, like_rad: Array, count: int = 400, seed: int = 0) -> Array:
     """Draw joints (count, 6) over the arm's reach above its base, in the arm branch of `like_rad` (n, 6).
 
     Positions are uniform in a shell about the shoulder, orientations uniform. Deterministic.
@@ -75,7 +73,7 @@ class Workspace:
         X: Array,
         Y: Array,
         distance_m: float,
-        spread: Array = MIDDLE,
+        spread: Array = SPREAD[:1],
     ) -> Workspace:
         """Linearise at X and Y (4, 4); `distance_m` from the camera (eye-in-hand).
 

@@ -11,18 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibrate.geometry import Array, pose, project_to_rotation, skew
+from calibrate.geometry import Array, pose, project_to_rotation
 from calibrate.handeye.axxb.certificate import Certificate, certify
 from calibrate.handeye.axxb.evolution import EvolutionSettings, evolve
-from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective
+from calibrate.handeye.axxb.objective import GENERATORS, QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pairs import Pairs
 
 SETTINGS = EvolutionSettings(population=30, generations=40)
 MAX_RESTARTS = 6
 """Runs (about 20 ms each) after which the result is returned uncertified, and marked so."""
 _POLISH_STEPS = 40
-_GENERATORS = skew(np.eye(3))
-"""(3, 3, 3) d Exp(δ) / dδ_k at 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +94,7 @@ def polish(objective: QuadraticObjective, R: Array) -> tuple[Array, Array]:
     damping = np.zeros(len(R))
     for _ in range(_POLISH_STEPS):
         gamma = ((R.reshape(-1, 9) - centre) @ quadratic + linear).reshape(-1, 3, 3)
-        P = np.einsum("kij,mjl->mkil", _GENERATORS, R).reshape(-1, 3, 9)
+        P = np.einsum("kij,mjl->mkil", GENERATORS, R).reshape(-1, 3, 9)
         turned = gamma @ np.swapaxes(R, 1, 2)
         trace = np.trace(turned, axis1=1, axis2=2)
         H = P @ quadratic @ np.swapaxes(P, 1, 2) + (turned + np.swapaxes(turned, 1, 2)) / 2

@@ -17,7 +17,8 @@ from calibrate.geometry import Array, project_to_rotation, skew
 from calibrate.handeye.axxb.pairs import Pairs
 
 Form = Literal["log", "chordal"]
-_I3 = np.eye(3)
+GENERATORS = skew(np.eye(3))
+"""(3, 3, 3) d Exp(δ) / dδ_k at 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +58,8 @@ class QuadraticObjective:
     def curvature(self, X: Array) -> Array:
         """Compute half the Gauss-Newton Hessian (6, 6) at X, for `geometry.perturb`'s delta."""
         J = np.zeros((13, 6))
-        J[9:12, :3] = _I3
-        J[:9, 3:] = (skew(_I3) @ X[:3, :3]).reshape(3, 9).T
+        J[9:12, :3] = np.eye(3)
+        J[:9, 3:] = (GENERATORS @ X[:3, :3]).reshape(3, 9).T
         return np.asarray(J.T @ self.gram @ J)
 
     @cached_property
@@ -80,19 +81,19 @@ def build_objective(
     """
     R0 = closed_form_rotation(pairs) if centre is None else centre[:3, :3]
     R_A, b_A, b_B = pairs.A[:, :3, :3], pairs.A[:, :3, 3], pairs.B[:, :3, 3]
-    D = R_A - _I3
+    D = R_A - np.eye(3)
     b0 = _closed_form_translation(D, b_A - b_B @ R0.T) if centre is None else centre[:3, 3]
     residual_t = (D.reshape(-1, 3) @ b0).reshape(-1, 3) + b_A - b_B @ R0.T
     G = np.zeros((13, 13))
     if form == "log":
         alpha, beta = pairs.alpha, pairs.beta
         residual_r = alpha - beta @ R0.T
-        G[:9, :9] = np.kron(_I3, beta.T @ beta)
+        G[:9, :9] = np.kron(np.eye(3), beta.T @ beta)
         G[:9, 12] = -(residual_r.T @ beta).reshape(9)
         G[12, 12] = (residual_r**2).sum()
     else:
         _add_chordal(G, R_A, pairs.B[:, :3, :3], R0)
-    G[:9, :9] += weight * np.kron(_I3, b_B.T @ b_B)
+    G[:9, :9] += weight * np.kron(np.eye(3), b_B.T @ b_B)
     G[:9, 12] -= weight * (residual_t.T @ b_B).reshape(9)
     G[:9, 9:12] = -weight * (D.reshape(-1, 9).T @ b_B).reshape(3, 3, 3).transpose(0, 2, 1).reshape(9, 3)
     flat = D.reshape(-1, 3)
@@ -157,7 +158,7 @@ def _gradients(pairs: Pairs, X: Array) -> Array:
     R_A, R_B, b_B = pairs.A[:, :3, :3], pairs.B[:, :3, :3], pairs.B[:, :3, 3] @ R.T
     residual = R_A @ R - R @ R_B
     gamma = (np.swapaxes(R_A, 1, 2) @ residual - residual @ np.swapaxes(R_B, 1, 2)) / 2
-    turn = np.einsum("nij,kij->nk", gamma, skew(np.eye(3)) @ R)
+    turn = np.einsum("nij,kij->nk", gamma, GENERATORS @ R)
     D = R_A - np.eye(3)
     shift = D @ b + pairs.A[:, :3, 3] - b_B
     return np.concatenate([np.einsum("nji,nj->ni", D, shift), turn - np.cross(b_B, shift)], axis=1)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.handeye import arm, corner_modes, estimate, fit, mixture, noise_scales, priors, readings
+from calibrate.handeye import arm, corner_modes, fit, linear, mixture, noise_scales, priors, readings
 from calibrate.handeye.axxb import certificate, paper
 from calibrate.handeye.axxb.pairs import MAX_PAIRS
 from calibrate.quality import drift
@@ -36,7 +36,7 @@ PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
         (priors.BoardTolerance().flatness_m, 0.001, "`flatness_m` (1 mm)"),
         (priors._KNOWN_SHARE, 0.002, "0.2 % of focal length and width"),
         (priors.ASPECT_SIGMA, 0.001, "pixels square to 0.1 %"),
-        (estimate.MAX_STEPS, 15, "At most 15 linearisations"),
+        (linear.MAX_STEPS, 15, "At most 15 linearisations"),
         ([len(arm.PARAMETERS), len(arm.FLEX)], [18, 9], "18 errors of the Denavit-Hartenberg table and 9 of"),
         (fit._SIZES[[0, -1]], [0.03, 1.0], "over six sizes from 0.03 to 1 mm and mrad"),
         (

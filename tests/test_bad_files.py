@@ -84,7 +84,6 @@ PLACES: dict[str, Place] = {
     "configuration, plan": ("station.yaml", _command(station, "plan", "--config", "FILE", "-o", "NEW")),
     "calibration, install": ("cell.yaml", _command(calibrate, "install", "FILE", "--root", "NEW")),
     "plan": ("plan.yaml", _command(station, "plan", "--check", "FILE")),
-    "list of poses": ("poses.csv", _command(station, "plan", "--from-list", "FILE", "-o", "NEW")),
     "taught recording": ("taught.mcap", _command(station, "plan", "--taught", "FILE", "-o", "NEW")),
     "plan to capture": ("plan.yaml", _command(station, "capture", "--plan", "FILE", "--socket", "NEW")),
     "replay": ("session.mcap", _command(station, "serve", "--replay", "FILE", "--root", "NEW")),

@@ -10,8 +10,8 @@ import msgspec
 from recordings.schema.messages import Matrix4, Mount, Vector6
 
 Criterion = Literal["A", "D", "arm", "all"]
-"""Criterion of a plan. A: smallest error of X; D: smallest ellipsoid of X; arm: smallest error over the
-workspace with the arm's corrected table; all: smallest ellipsoid of X, board, lens and table together."""
+"""Criterion of a plan. A: smallest error of X; arm: smallest error over the workspace with the arm's
+corrected table; all: smallest ellipsoid of X, board, lens and table together; D: of earlier releases."""
 
 
 class ExpectedView(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):

@@ -32,7 +32,11 @@ STATION = LazyGroup(
                 "station plan --config station.yaml -o plan.yaml  # from where the arm stands",
                 "station plan --config station.yaml --check plan.yaml --picture plan.png",
             ),
-            gone={"--foxglove": "`--picture plan.png` draws the plan; Plan (2) on the screen turns it."},
+            gone={
+                "--foxglove": "`--picture plan.png` draws the plan; Plan (2) on the screen turns it.",
+                "--d-optimal": "Leave it out: the poses are chosen for the smallest error.",
+                "--from-list": "Write the joints into a plan (robot, mount, poses) and `--check` it.",
+            },
         ),
         "capture": LazyCommand(
             "station.cli.session:capture_command",

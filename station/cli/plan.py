@@ -23,13 +23,13 @@ from station.cell.config import StationConfig
 from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, LimitError, StationError
 from station.cell.limits import PlanCheck, Problem, check_plan
-from station.cell.plan import Criterion, Plan, plan_sha256
+from station.cell.plan import Plan, plan_sha256
 from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
 from station.cell.socket_folder import default_socket
 from station.cli.console import AsJson, Socket, err, out, print_json
 from station.operate.motion import status_now
 from station.plan.choose import CRITERIA, WITH_TABLE, Aim
-from station.plan.files import import_list, load_plan, save_plan, taught_plan
+from station.plan.files import load_plan, save_plan, taught_plan
 from station.plan.planner import make_plan
 from station.plan.predict import ArmForecast, forecast_arm, with_forecast
 from station.plan.preview import save_picture
@@ -48,7 +48,6 @@ def plan_command(
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Where plan.yaml goes")] = None,
     check: Annotated[Path | None, typer.Option(help="Check this plan instead of making one")] = None,
-    from_list: Annotated[Path | None, typer.Option(help="CSV of joints or flange poses instead")] = None,
     taught: Annotated[
         Path | None, typer.Option(help="Recording whose poses become the plan, e.g. guided by hand")
     ] = None,
@@ -63,9 +62,6 @@ def plan_command(
     purpose: Annotated[
         Aim, typer.Option("--for", help="arm: its table too; both: board and lens too")
     ] = "camera",
-    d_optimal: Annotated[
-        bool, typer.Option("--d-optimal", help="Minimize the error ellipsoid instead of the error")
-    ] = False,
     picture: Annotated[Path | None, typer.Option(help="Save a picture of the plan (png, svg, pdf)")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -81,8 +77,8 @@ def plan_command(
     cell, standing = _cell(config, scene, start)
     if config is not None and standing is None:
         standing = asked_standing(cell, socket or default_socket())
-    criterion = _criterion(purpose, d_optimal)
-    plan = _given(cell, standing, check, from_list, taught)
+    criterion = CRITERIA[purpose]
+    plan = _given(cell, check, taught)
     if plan is None:
         with _progress(quiet=as_json) as report:
             plan = make_plan(
@@ -109,15 +105,6 @@ def plan_command(
             _show_arm(arm)
     if outcome.problems:
         raise typer.Exit(LimitError.exit_code)
-
-
-def _criterion(purpose: Aim, d_optimal: bool) -> Criterion:
-    criterion = CRITERIA[purpose]
-    if d_optimal and criterion != "A":
-        raise ConfigError(
-            f"--d-optimal is for the camera, not for --for {purpose}.", code="usage", remedy="Leave it out."
-        )
-    return "D" if d_optimal else criterion
 
 
 def _show_arm(arm: ArmForecast) -> None:
@@ -222,20 +209,16 @@ def _joints(text: str) -> list[float]:
 
 def _given(
     cell: StationConfig,
-    standing: list[float] | None,
     check: Path | None,
-    from_list: Path | None,
     taught: Path | None,
 ) -> Plan | None:
     """The plan that is there already; None when one is to be made."""
-    if sum(path is not None for path in (check, from_list, taught)) > 1:
+    if check is not None and taught is not None:
         raise ConfigError(
-            "--check, --from-list and --taught exclude each other.", code="usage", remedy="Give one of them."
+            "--check and --taught exclude each other.", code="usage", remedy="Give one of them."
         )
     if check is not None:
         return load_plan(check)
-    if from_list is not None:
-        return import_list(from_list, cell.robot.model, cell.mount, standing)
     return None if taught is None else taught_plan(taught, cell.robot.model, cell.mount)
 
 

@@ -29,8 +29,8 @@ WITH_TABLE = ("arm", "all")
 Aim = Literal["camera", "arm", "both"]
 CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm", "both": "all"}
 """Aim of a plan, as users name it → criterion."""
-_LENS_SHARE = {"A": 0.02, "D": 0.2, "arm": 0.0, "all": 0.0}
-"""Weight of the lens in each criterion, so that the views cover the image."""
+_LENS_SHARE = 0.02
+"""Weight of the lens in criterion A, so that the views cover the image."""
 TABLE_MM = 0.3
 """1σ of the errors of an arm's table that is assumed in planning, mm and mrad."""
 _ENOUGH_TO_RANK, _SHORTLIST = 8, 60
@@ -59,30 +59,24 @@ class Objective:
             assert self.workspace is not None
             C = covariance_of(information, self.prior)
             return np.asarray(np.log(np.einsum("ij,...ji->...", self.workspace, C)))
-        covariance, share = covariance_of(information, self.prior), _LENS_SHARE[self.criterion]
-        if self.criterion == "D":
-            return np.asarray(np.linalg.slogdet(covariance[..., :6, :6])[1] + share * self._lens(covariance))
+        covariance = covariance_of(information, self.prior)
         diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)
         spread = diagonal[..., :3].sum(axis=-1) + self.lever_m**2 * diagonal[..., 3:6].sum(axis=-1)
-        return np.asarray(np.log(spread) + share * self._lens(covariance))
+        return np.asarray(np.log(spread) + _LENS_SHARE * self._lens(covariance))
 
     def slope(self, information: Array) -> Array:
         """Compute G (p, p): adding dM to the information changes the value by -trace(G dM), first order."""
         C = covariance_of(information, self.prior)
         if self.criterion == "all":
             return C
-        inner = np.zeros_like(C)
         if self.criterion == "arm":
             assert self.workspace is not None
             return np.asarray(C @ self.workspace @ C / np.trace(self.workspace @ C))
-        if self.criterion == "D":
-            inner[:6, :6] = np.linalg.inv(C[:6, :6])
-        else:
-            weight = np.repeat([1.0, self.lever_m**2], 3)
-            inner[:6, :6] = np.diag(weight / (weight * np.diag(C)[:6]).sum())
+        weight, inner = np.repeat([1.0, self.lever_m**2], 3), np.zeros_like(C)
+        inner[:6, :6] = np.diag(weight / (weight * np.diag(C)[:6]).sum())
         if self.lens is not None:
             lens = C[self.lens, self.lens]
-            inner[self.lens, self.lens] = _LENS_SHARE[self.criterion] * np.linalg.inv(lens)
+            inner[self.lens, self.lens] = _LENS_SHARE * np.linalg.inv(lens)
         return np.asarray(C @ inner @ C)
 
     def _lens(self, covariance: Array) -> Array:
@@ -133,17 +127,14 @@ def choose(
     keep: tuple[int, ...] = (),
     sweeps: int = 6,
     progress: Callable[[float], None] = lambda done: None,
-    known: Array | None = None,
 ) -> list[int]:
     """Choose `count` members of the pool (n, p, p), greedily, then by exchanges until none helps.
 
-    `keep`: indices that stay chosen; `known`: (p, p) information of other views. Returns indices.
-    Deterministic for a given state of rng; ties go to the lower index.
+    `keep`: indices that stay chosen. Returns indices. Deterministic for a given state of rng; ties go to the
+    lower index.
     """
-    chosen = list(keep)
-    if not chosen and known is None:
-        chosen = [int(rng.integers(len(pool)))]
-    total = pool[chosen].sum(axis=0) + (0.0 if known is None else known)
+    chosen = list(keep) or [int(rng.integers(len(pool)))]
+    total = pool[chosen].sum(axis=0)
     while len(chosen) < min(count, len(pool)):
         place, _ = _best_addition(pool, total, chosen, objective)
         chosen.append(place)

@@ -182,14 +182,13 @@ def plan_scene(
     options: PlanOptions,
     start_joints_rad: Sequence[float] | None = None,
     progress: Progress = lambda text, done: None,
-    captured: Array | None = None,
 ) -> Plan:
-    """Make a plan for a scene, as `make_plan`; `captured`: flange poses (n, 4, 4) of views already taken."""
+    """Make a plan for a scene, as `make_plan`."""
     rng = np.random.default_rng(options.seed)
     start = None if start_joints_rad is None else np.asarray(start_joints_rad, dtype=float)
     progress("looking for poses", 0.0)
     pool, notes = candidate_pool(scene, options, start, rng)
-    plan = _choose_and_order(scene, options, pool, start, rng, progress, captured)
+    plan = _choose_and_order(scene, options, pool, start, rng, progress)
     progress("done", 1.0)
     return msgspec.structs.replace(plan, note="; ".join(notes))
 
@@ -246,13 +245,11 @@ def _choose_and_order(
     start: Array | None,
     rng: np.random.Generator,
     progress: Progress,
-    captured: Array | None,
 ) -> Plan:
     """Choose and order poses, and check the plan; repeat without poses that no free path leads to."""
     joints = pool.joints_rad if options.criterion in WITH_TABLE else None
     objective = objective_for(scene, options.criterion, options.free_intrinsics, joints)
     information = informations(scene, pool.base_from_flange, joints, options.noise)
-    known = None if captured is None else informations(scene, captured, noise=options.noise).sum(axis=0)
     left = np.arange(len(pool))
     picked: list[int] = []
     while len(left) >= options.count:
@@ -266,14 +263,13 @@ def _choose_and_order(
             keep=kept,
             sweeps=0 if kept else 6,
             progress=lambda done: progress("choosing", 0.3 + 0.5 * done),
-            known=known,
         )
         progress("ordering", 0.85)
         places = left[chosen]
         order, blocked = _ordered(scene, pool.joints_rad[places], start, options.seed)
         if not blocked:
             places = places[order]
-            plan = _describe(scene, options, pool.joints_rad[places], information[places], objective, known)
+            plan = _describe(scene, options, pool.joints_rad[places], information[places], objective)
             progress("checking", 0.95)
             blocked = _failing(plan, start, scene)
             if not blocked:
@@ -317,9 +313,8 @@ def _describe(
     joints: Array,
     gained: Array,
     objective: Objective,
-    before: Array | None,
 ) -> Plan:
-    known = gained.cumsum(axis=0) + (0.0 if before is None else before)
+    known = gained.cumsum(axis=0)
     poses = tuple(
         planned_pose(scene, number, q, sigma_of(total, objective.prior)[0])
         for number, (q, total) in enumerate(zip(joints, known, strict=True))

@@ -23,20 +23,7 @@ from station.plan.candidates import find_candidates
 from station.plan.choose import TABLE_MM, Objective, informations, objective_for
 from station.plan.visibility import planned_pose, view_range, visible
 
-_FURTHER_POSES = 60
-_TRIES = 12
-
-
-@dataclass(frozen=True)
-class Advice:
-    sigma_m: float
-    """Expected 1σ of X's translation after the captured poses."""
-    enough: bool
-    text: str
-    next_pose: PlannedPose | None = None
-    """Most useful pose that is reachable from where the arm is; None when enough or when none helps."""
-    poses_missing: int | None = None
-    """Number of further poses that reach the goal; None: not reachable."""
+_FURTHER_POSES, _CANDIDATES, _TRIES = 60, 150, 12
 
 
 _OPEN = 0.7
@@ -109,47 +96,28 @@ def _whole(scene: Scene, base_from_flange: Array) -> NDArray[np.bool_]:
     return visible(scene.camera, scene.seen(base_from_flange, board_points(scene.board)), 0.0)
 
 
-def advise(
-    scene: Scene,
-    captured: ArrayLike,
-    goal_m: float,
-    joints_now_rad: Sequence[float],
-    pool_size: int = 150,
-) -> Advice:
-    """Tell whether the captured flange poses (n, 4, 4) are enough, else the next best pose and how many."""
-    flange = np.asarray(captured, dtype=float).reshape(-1, 4, 4)
+def next_best(
+    scene: Scene, base_from_flange: ArrayLike, goal_m: float, joints_now_rad: Sequence[float]
+) -> tuple[PlannedPose, int | None] | None:
+    """Find the most useful next pose with a free path from where the arm is, after views from flange poses.
+
+    The second value is the number of further poses that reach the goal (1σ of X's translation); None: too
+    many. None without poses when the goal is reached, or when no pose is reachable.
+    """
+    flange = np.asarray(base_from_flange, dtype=float).reshape(-1, 4, 4)
     objective = objective_for(scene, "A", free_intrinsics=True)
     known = informations(scene, flange).sum(axis=0)
-    now = sigma_of(known, objective.prior)[0]
-    state = f"expected error {1000 * now:.2f} mm after {len(flange)} views"
-    if now <= goal_m:
-        return Advice(now, True, f"enough: {state}, the goal is {1000 * goal_m:.2f} mm")
+    if sigma_of(known, objective.prior)[0] <= goal_m:
+        return None
     start = np.asarray(joints_now_rad, dtype=float)
-    pool = find_candidates(scene, view_range(scene), pool_size, np.random.default_rng(0), start)
-    if len(pool) == 0:
-        return Advice(now, False, f"{state}; no further pose is reachable with the board in view")
+    pool = find_candidates(scene, view_range(scene), _CANDIDATES, np.random.default_rng(0), start)
     gains = informations(scene, pool.base_from_flange)
-    best = _best_free(scene, start, pool.joints_rad, objective(known + gains))
-    if best is None:
-        return Advice(
-            now, False, f"{state}; no free path from here to a pose that helps: jog the arm and ask again"
-        )
-    missing = _missing(known, gains, goal_m, objective)
-    after = sigma_of(known + gains[best], objective.prior)[0]
-    joints = pool.joints_rad[best]
-    pose = planned_pose(scene, len(flange), joints, after)
-    more = (
-        f"about {missing} more" if missing else f"more than {_FURTHER_POSES} more, or a better camera or arm"
-    )
-    text = f"{state}; the goal of {1000 * goal_m:.2f} mm needs {more}. Next best: {pose.why}"
-    return Advice(now, False, text, pose, missing)
-
-
-def _best_free(scene: Scene, start: Array, joints_rad: Array, scores: Array) -> int | None:
-    """Find the row of joints (n, 6) of lowest score with a free path from `start` (6,); tries only a few."""
-    for place in np.argsort(scores, kind="stable")[:_TRIES]:
-        if not check_path(scene.geometry, start, joints_rad[place]).problems:
-            return int(place)
+    for place in np.argsort(objective(known + gains), kind="stable")[:_TRIES]:
+        joints = pool.joints_rad[place]
+        if not check_path(scene.geometry, start, joints).problems:
+            after_m = sigma_of(known + gains[place], objective.prior)[0]
+            pose = planned_pose(scene, len(flange), joints, after_m)
+            return pose, _missing(known, gains, goal_m, objective)
     return None
 
 
@@ -170,10 +138,11 @@ def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_ra
     """
     goal_m = config.capture.goal_m
     try:
-        advice = advise(scene_of(config), base_from_flange, goal_m, joints_now_rad)
+        found = next_best(scene_of(config), base_from_flange, goal_m, joints_now_rad)
     except StationError:
         return ""
-    if advice.next_pose is None:
+    if found is None:
         return ""
-    missing = f"at best {advice.poses_missing} more" if advice.poses_missing else "many more poses"
-    return f"{missing} for {1000 * goal_m:.2g} mm; the next best: {advice.next_pose.why}"
+    pose, poses = found
+    missing = f"at best {poses} more" if poses else "many more poses"
+    return f"{missing} for {1000 * goal_m:.2g} mm; the next best: {pose.why}"

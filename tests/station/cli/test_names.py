@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shutil
 from pathlib import Path
 
 import msgspec
@@ -10,6 +11,7 @@ import pytest
 import typer
 from rich.console import Console
 
+import recordings
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import Event, MotionPreview, PoseStatus, SessionStatus, StationStatus
 from station.cli import control as cli_control
@@ -23,6 +25,7 @@ from tests.command_line import call
 
 NAMES = ("[red]x[/]", "[/]", "a :bug: [bold]", "end\\")
 ALL = " ".join(NAMES)
+SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 
 
 @pytest.fixture
@@ -49,10 +52,8 @@ def test_a_plan_and_its_poses(folder: Path) -> None:
     for name in NAMES:
         assert f"why {name}" in done.stdout
     assert f"note: {ALL}" in done.stdout
-    list_file = folder / "].csv"
-    rows = [[f"j{i}_rad" for i in range(1, 7)], *([str(v) for v in q] for q in joints)]
-    list_file.write_text("\n".join(",".join(row) for row in rows))
-    assert f"written to {shown}" in call(main, "plan", "--from-list", list_file, "-o", shown).stdout
+    taught = Path(shutil.copy(SAMPLE, folder / "].mcap"))
+    assert f"written to {shown}" in call(main, "plan", "--taught", taught, "-o", shown).stdout
 
 
 def test_a_plan_that_breaks_a_limit(folder: Path) -> None:

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 import recordings
-from calibrate.geometry import quaternion_from_matrix
 from calibrate.kinematics import MODELS, forward
 from recordings.reader import open_recording
 from station.cell.errors import ConfigError
 from station.cell.plan import ExpectedView, Plan, PlannedPose, plan_sha256
-from station.plan.files import import_list, load_plan, parse_plan, save_plan, taught_plan
+from station.plan.files import load_plan, parse_plan, save_plan, taught_plan
 from tests.codes import raises
 
 SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
@@ -87,51 +86,6 @@ def test_a_missing_file_is_a_sentence(tmp_path):
         load_plan(tmp_path / "none.yaml")
 
 
-def test_joint_lists_in_degrees_and_radians(tmp_path):
-    header = ",".join(f"j{i}_deg" for i in range(1, 7))
-    (tmp_path / "d.csv").write_text(
-        f"name,{header}\nfirst,0,-90,90,-90,-90,0\n\nsecond,10,-90,90,-90,-90,0\n"
-    )
-    made = import_list(tmp_path / "d.csv", "UR10", "eye-in-hand")
-    assert [pose.name for pose in made.poses] == ["first", "second"]
-    np.testing.assert_allclose(made.poses[1].joints_rad, np.deg2rad([10, -90, 90, -90, -90, 0]))
-    (tmp_path / "r.csv").write_text(header.replace("deg", "rad") + "\n" + ",".join(map(str, Q)) + "\n")
-    assert import_list(tmp_path / "r.csv", "UR10", "eye-in-hand").poses[0].joints_rad == pytest.approx(Q)
-
-
-def test_flange_poses_take_the_branch_of_the_arm(tmp_path):
-    near = np.array(Q)
-    lines = ["x,y,z,qx,qy,qz,qw"]
-    for step in range(3):
-        T = forward(MODELS["UR10"], near + 0.1 * step)
-        lines.append(",".join(f"{v:.9f}" for v in [*T[:3, 3], *quaternion_from_matrix(T[:3, :3])]))
-    (tmp_path / "poses.csv").write_text("\n".join(lines))
-    made = import_list(tmp_path / "poses.csv", "UR10", "eye-in-hand", Q)
-    for step, pose in enumerate(made.poses):
-        np.testing.assert_allclose(pose.joints_rad, near + 0.1 * step, atol=1e-5)
-    with raises("start-needed"):
-        import_list(tmp_path / "poses.csv", "UR10", "eye-in-hand")
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("", "empty"),
-        ("a,b\n1,2\n", "columns"),
-        ("j1_deg;j2_deg;j3_deg;j4_deg;j5_deg;j6_deg\n1;2;3;4;5;6\n", "commas between them"),
-        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3\n", "row 2"),
-        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3,4,5,six\n", "row 2"),
-        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3,4,5,nan\n", "finite"),
-        ("x,y,z,qx,qy,qz,qw\n900,0,300,0,0,0,1\n", "metres"),
-        ("x,y,z,qx,qy,qz,qw\n0.5,0,0.3,0,0,0,0\n", "quaternion"),
-    ],
-)
-def test_a_wrong_list_names_row_and_remedy(tmp_path, text, told):
-    (tmp_path / "list.csv").write_text(text)
-    with raises("invalid-list"):
-        import_list(tmp_path / "list.csv", "UR10", "eye-in-hand", Q)
-
-
 def test_poses_that_were_guided_by_hand_become_a_plan():
     made = taught_plan(SAMPLE, "UR10", "eye-in-hand")
     views = open_recording(SAMPLE).views()
@@ -140,9 +94,3 @@ def test_poses_that_were_guided_by_hand_become_a_plan():
     np.testing.assert_allclose(made.poses[0].base_from_flange, forward(MODELS["UR10"], views[0].joints_rad))
     with raises("other-cell"):
         taught_plan(SAMPLE, "UR5e", "eye-in-hand")
-
-
-def test_a_list_from_a_spreadsheet_begins_with_a_mark(tmp_path):
-    (tmp_path / "list.csv").write_text("\ufeffj1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3,4,5,6\n")
-    [pose] = import_list(tmp_path / "list.csv", "UR10", "eye-in-hand").poses
-    np.testing.assert_allclose(np.rad2deg(pose.joints_rad), [1, 2, 3, 4, 5, 6])

@@ -41,7 +41,7 @@ CELLS = [
 
 
 FEW = PlanOptions(pool=150)
-"""Fewer candidates than usual, for what does not depend on their number."""
+"""Fewer candidates than usual (1200), for what does not depend on their number."""
 
 
 @cache
@@ -53,7 +53,7 @@ def cell(scene="paper", mount="eye-in-hand", seed=0):
 @cache
 def planned(scene="paper", mount="eye-in-hand", seed=0, count=25):
     truth, config = cell(scene, mount, seed)
-    return make_plan(config, start_joints_rad=truth.start_joints_rad, seed=1, count=count)
+    return plan_scene(scene_of(config), replace(FEW, count=count, seed=1), truth.start_joints_rad)
 
 
 @pytest.mark.parametrize("which", CELLS)
@@ -136,18 +136,13 @@ def test_all_poses_stand_in_one_arm_branch():
 def test_the_same_seed_gives_the_same_plan_and_another_seed_another():
     truth, config = cell()
     told = []
-    again = make_plan(
-        config,
-        start_joints_rad=truth.start_joints_rad,
-        seed=1,
-        progress=lambda text, done: told.append(done),
-    )
-    assert told == sorted(told) and told[-1] == 1.0
-    assert again == planned()
-    one, two = (
-        plan_scene(scene_of(config), replace(FEW, seed=seed), truth.start_joints_rad).poses for seed in (1, 2)
-    )
-    assert one != two
+
+    def again(seed):
+        options, start = replace(FEW, seed=seed), truth.start_joints_rad
+        return plan_scene(scene_of(config), options, start, lambda _, done: told.append(done))
+
+    assert again(1) == planned() and told == sorted(told) and told[-1] == 1.0
+    assert again(2).poses != planned().poses
 
 
 def test_the_choice_beats_random_poses_of_the_same_pool():
@@ -156,11 +151,10 @@ def test_the_choice_beats_random_poses_of_the_same_pool():
     rng = np.random.default_rng(0)
     pool = find_candidates(scene, replace(view_range(scene), doubt=0.0), 200, rng, None)
     each = informations(scene, pool.base_from_flange)
-    for criterion in ("A", "D"):
-        objective = objective_for(scene, criterion, True)
-        best = float(objective(each[choose(each, 15, objective, rng)].sum(axis=0)))
-        scores = [float(objective(each[rng.permutation(len(each))[:15]].sum(axis=0))) for _ in range(40)]
-        assert best < min(scores)
+    objective = objective_for(scene, "A", True)
+    best = float(objective(each[choose(each, 15, objective, rng)].sum(axis=0)))
+    scores = [float(objective(each[rng.permutation(len(each))[:15]].sum(axis=0))) for _ in range(40)]
+    assert best < min(scores)
 
 
 def test_kept_poses_stay_chosen():
@@ -270,9 +264,7 @@ def test_every_lens_model_can_be_planned_with(kind, distortion):
 
 def test_a_plan_without_a_start_and_with_few_poses():
     _, config = cell()
-    plan = plan_scene(
-        scene_of(config), replace(FEW, count=4, criterion="D", view=replace(ViewRange(), doubt=1.0))
-    )
+    plan = plan_scene(scene_of(config), replace(FEW, count=4, view=replace(ViewRange(), doubt=1.0)))
     assert len(plan.poses) == 4
     assert check_plan(plan, None, cell_geometry(config)).problems == ()
 

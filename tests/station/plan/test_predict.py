@@ -16,8 +16,8 @@ from station.cell.limits import check_path
 from station.cell.plan import PlannedPose
 from station.cell.scene import scene_of
 from station.plan.choose import CRITERIA
-from station.plan.planner import make_plan
-from station.plan.predict import advise, forecast_arm, forecast_views, next_best_text, with_forecast
+from station.plan.planner import PlanOptions, plan_scene
+from station.plan.predict import forecast_arm, forecast_views, next_best, next_best_text, with_forecast
 from station.simulation.scenes import cell_config, make_cell
 
 
@@ -25,8 +25,8 @@ from station.simulation.scenes import cell_config, make_cell
 def world():
     truth = make_cell("paper", 0, "low", "eye-in-hand")
     config = cell_config(truth)
-    plan = make_plan(config, start_joints_rad=truth.start_joints_rad)
     scene = scene_of(config)
+    plan = plan_scene(scene, PlanOptions(pool=600), truth.start_joints_rad)
     return scene, plan, np.array([pose.base_from_flange for pose in plan.poses])
 
 
@@ -59,35 +59,21 @@ def test_a_known_lens_and_less_noise_make_it_better():
     assert forecast_views(scene, flange, noise=half)[-1] == pytest.approx(usual / 2, rel=0.05)
 
 
-def test_enough_is_said_when_the_goal_is_reached():
-    scene, plan, flange = world()
-    advice = advise(scene, flange, 0.001, plan.poses[-1].joints_rad)
-    assert advice.enough
-    assert advice.next_pose is None
-    assert "enough" in advice.text
-
-
 def test_the_next_best_pose_helps_and_is_free_to_reach():
     scene, plan, flange = world()
     here = np.array(plan.poses[7].joints_rad)
-    advice = advise(scene, flange[:8], 0.00025, here)
-    assert not advice.enough
-    assert advice.next_pose is not None
-    assert check_path(scene.geometry, here, advice.next_pose.joints_rad).problems == ()
-    more = np.concatenate([flange[:8], forward(scene.geometry.model, advice.next_pose.joints_rad)[None]])
-    found = forecast_views(scene, more)[-1]
-    assert found < advice.sigma_m
-    assert found == pytest.approx(advice.next_pose.predicted_sigma_m, rel=1e-6)
-    assert advice.poses_missing is not None and 1 < advice.poses_missing < 25
-    assert "0.25 mm" in advice.text
+    pose, missing = next_best(scene, flange[:8], 0.00025, here)
+    assert check_path(scene.geometry, here, pose.joints_rad).problems == ()
+    more = np.concatenate([flange[:8], forward(scene.geometry.model, pose.joints_rad)[None]])
+    before, after = forecast_views(scene, more)[-2:]
+    assert after < before and after == pytest.approx(pose.predicted_sigma_m, rel=1e-6)
+    assert 1 < missing < 25
 
 
 def test_a_goal_beyond_the_arm_is_not_promised():
     scene, plan, flange = world()
-    advice = advise(scene, flange, 1e-6, plan.poses[-1].joints_rad, pool_size=60)
-    assert not advice.enough
-    assert advice.poses_missing is None
-    assert "better camera or arm" in advice.text
+    _, missing = next_best(scene, flange, 1e-6, plan.poses[-1].joints_rad)
+    assert missing is None
 
 
 def test_the_session_names_the_next_best_pose_until_it_is_enough():
@@ -107,7 +93,7 @@ def test_poses_for_the_arm_tell_more_of_its_table_than_poses_for_the_camera(aim,
     scene, plan, _ = world()
     truth = make_cell("paper", 0, "low", "eye-in-hand")
     start = truth.start_joints_rad
-    own = make_plan(cell_config(truth), start_joints_rad=start, criterion=CRITERIA[aim])
+    own = plan_scene(scene, PlanOptions(pool=600, criterion=CRITERIA[aim]), start)
     planned, usual = forecast_arm(scene, own), forecast_arm(scene, plan)
     assert planned.with_table_m < share * usual.with_table_m
     assert planned.if_measured_m <= planned.with_table_m

@@ -12,17 +12,17 @@ from typing import Literal
 import msgspec
 
 from recordings.files import read_file
-from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
+from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount
 from station.cell.errors import ConfigError
+from station.simulation.controller.state import ArmTruth
 
 _LIMIT_BYTES = 1024 * 1024
 SceneName = Literal["paper", "blog", "paper-binned"]
 NoiseLevel = Literal["low", "mid", "high"]
 
 
-class CellTruth(msgspec.Struct, frozen=True, omit_defaults=True):
+class CellTruth(ArmTruth, frozen=True, kw_only=True, omit_defaults=True):
     scene: str
-    seed: int
     mount: Mount
     robot_model: str
     board: BoardSpec
@@ -32,22 +32,6 @@ class CellTruth(msgspec.Struct, frozen=True, omit_defaults=True):
     """True X: flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand)."""
     board_place: Matrix4
     """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)."""
-    start_joints_rad: Vector6
-    robot_sigma_m: float = 0.00005
-    """Repeatability: 1σ of the flange's position per axis, drawn at every stop."""
-    robot_sigma_rad: float = 8.7e-5
-    dh_delta_a_m: Vector6 = (0.0,) * 6
-    """Systematic error: true minus the controller's a, per joint."""
-    dh_delta_d_m: Vector6 = (0.0,) * 6
-    dh_delta_alpha_rad: Vector6 = (0.0,) * 6
-    dh_delta_theta_rad: Vector6 = (0.0,) * 6
-    factory_a_m: Vector6 = (0.0,) * 6
-    """Factory calibration: the controller's minus the published a, per joint."""
-    factory_d_m: Vector6 = (0.0,) * 6
-    factory_alpha_rad: Vector6 = (0.0,) * 6
-    factory_theta_rad: Vector6 = (0.0,) * 6
-    states_factory: bool = True
-    """True: port 30001 states the factory-calibrated table; False: the published one."""
     pixel_noise: float = 2.0
     """Noise of a pixel, 1σ, grey levels, at gain 0 dB."""
     blur_px: float = 0.7
@@ -57,7 +41,6 @@ class CellTruth(msgspec.Struct, frozen=True, omit_defaults=True):
     gain_db: float = 0.0
     camera_clock_offset_ns: int = 0
     camera_clock_drift_ppm: float = 0.0
-    controller_clock_drift_ppm: float = 0.0
 
 
 def write_truth(truth: CellTruth, path: Path) -> None:

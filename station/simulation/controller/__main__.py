@@ -16,7 +16,7 @@ import msgspec
 from station.simulation.controller.admin import AdminServer
 from station.simulation.controller.kinematics import TABLES
 from station.simulation.controller.machine import Machine, precise_loop
-from station.simulation.controller.state import Settings, Six, version_of
+from station.simulation.controller.state import ArmTruth, Settings, version_of
 
 PARENT_POLL_S = 0.5
 
@@ -98,12 +98,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--serial", help="answer to `get serial number`")
     add("--local", dest="remote", action="store_const", const=False, help="start in local control (e-Series)")
     add("--time-scale", type=float, metavar="F", help="the arm moves F times faster; for tests")
-    text = "registers act this much later; default 0"
-    add("--input-delay", dest="input_delay_cycles", type=int, metavar="CYCLES", help=text)
-    add(
-        "--protective-stop-ends-program", dest="paused_by_protective_stop", action="store_const", const=False,
-        help="runtime state 1 instead of 4 after a protective stop (controllers differ)",
-    )  # fmt: skip
     add("--die-with-parent", action="store_true", help="end when standard input closes or the parent is gone")
     return parser
 
@@ -114,12 +108,9 @@ def _settings(options: argparse.Namespace) -> Settings:
     named = (text.partition("=") for text in options.program)
     programs = {name: Path(file).read_text() if file else None for name, _, file in named}
     given = {name: value for name, value in vars(options).items() if value is not None}
-    kind = _OfTruth if options.truth is not None else Settings
-    return msgspec.convert({**truth, **given, "programs": programs}, kind)
-
-
-class _OfTruth(Settings, frozen=True, kw_only=True):
-    start_joints_rad: Six
+    if options.truth is not None:
+        msgspec.convert(truth, ArmTruth)  # refuses what is no truth
+    return msgspec.convert({**truth, **given, "programs": programs}, Settings)
 
 
 async def _serve(host: str, settings: Settings, parent: int | None) -> None:

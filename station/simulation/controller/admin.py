@@ -16,14 +16,13 @@ from typing import Annotated, Any, get_type_hints
 import msgspec
 from msgspec import Meta
 
-from station.simulation.controller.arm import Vibration
 from station.simulation.controller.interpreted import InterpretedProgram
 from station.simulation.controller.machine import Machine
 from station.simulation.controller.network import Cut
 from station.simulation.controller.paths import JointPath, UnreachableError
 from station.simulation.controller.robot import WAITS
 from station.simulation.controller.rtde_server import ADMIN
-from station.simulation.controller.state import ZEROS, Six
+from station.simulation.controller.state import Six
 
 PORT = 29990
 LINE_LIMIT = 1_000_000
@@ -89,48 +88,9 @@ def in_use(machine: Machine, inputs: list[str], on: bool = True) -> None:
             raise ValueError(f"{name} is owned by a client already")
 
 
-def vibrate(
-    machine: Machine,
-    amplitude_rad: Annotated[float, Meta(ge=0, le=0.1)],
-    frequency_hz: NotNegative = 12.0,
-    decay_s: Annotated[float, Meta(ge=1e-3)] | None = None,
-    joint: Annotated[int, Meta(ge=0, le=5)] = 1,
-) -> None:
-    """A joint shakes about its rest: for ever, or fading after each motion. amplitude_rad 0 ends it."""
-    vibration = Vibration(amplitude_rad, frequency_hz, decay_s, joint)
-    machine.robot.arm.vibration = vibration if amplitude_rad > 0 else None
-
-
-def offset(machine: Machine, joints_rad: Six = ZEROS) -> None:
-    """From the next motion on the arm rests this much short of its command (none: as commanded)."""
-    machine.robot.arm.offset = joints_rad
-
-
-def dh(
-    machine: Machine,
-    a_m: Six = ZEROS,
-    d_m: Six = ZEROS,
-    alpha_rad: Six = ZEROS,
-    theta_rad: Six = ZEROS,
-) -> None:
-    """The true arm differs from the nominal table by these; what the controller reports does not."""
-    machine.robot.true_table = machine.robot.table.plus(a_m, d_m, alpha_rad, theta_rad)
-
-
 def contact(machine: Machine, cycles: Count = 10) -> None:
     """The tool touches something: `tool_contact` answers that it has for so many cycles (0: nothing)."""
     machine.robot.contact_cycles = cycles
-
-
-def wires(
-    machine: Machine,
-    digital: Annotated[int, Meta(ge=0, lt=2**18)] = 0,
-    analog: tuple[float, float] = (0.0, 0.0),
-) -> None:
-    """Inputs: digital bits (standard 0-7, configurable 8-15, tool 16-17), analog 0 and 1 (V or A)."""
-    machine.robot.outputs.set("actual_digital_input_bits", digital)
-    for i, value in enumerate(analog):
-        machine.robot.outputs.set(f"standard_analog_input{i}", value)
 
 
 def foreign(machine: Machine, name: str = "palletising.urp") -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from math import dist, exp, inf, pi, sin
+from math import dist, exp, inf, pi
 
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
@@ -81,21 +80,6 @@ class Stream(JointMotion):
         return moved
 
 
-@dataclass
-class Vibration:
-    """Oscillation of one joint about its rest; `decay_s` None = for ever."""
-
-    amplitude_rad: float
-    frequency_hz: float
-    decay_s: float | None
-    joint: int
-    time_s: float = 0.0
-
-    def now(self) -> float:
-        fade = 1.0 if self.decay_s is None else exp(-self.time_s / self.decay_s)
-        return self.amplitude_rad * fade * sin(2 * pi * self.frequency_hz * self.time_s)
-
-
 class SimulatedArm:
     """Joints that move in time. Speeds in rad/s of simulated time; `scale` is slider × pause."""
 
@@ -105,7 +89,6 @@ class SimulatedArm:
         self.command = joints_rad
         self.command_speed = ZERO
         self.actual = joints_rad
-        self._lagged = joints_rad
         self.actual_speed = ZERO
         self.scale = 1.0
         self.motion: JointMotion | None = None
@@ -114,10 +97,6 @@ class SimulatedArm:
         self.miss = draw_miss()
         """(6,) [δt (m), δφ (rad)] by which the true flange misses its pose now."""
         self._misses = (self.miss, self.miss)
-        self.offset: Vector = ZERO
-        """Joints where the arm rests short of its command; takes effect with the next motion."""
-        self._offset_now: Vector = ZERO
-        self.vibration: Vibration | None = None
 
     @property
     def moving(self) -> bool:
@@ -138,7 +117,6 @@ class SimulatedArm:
         motion.path = motion.make_path(self.command)
         motion.profile = Trapezoid(motion.path.length, motion.speed, motion.acceleration)
         self.motion = motion
-        self._offset_now = self.offset
         self._misses = (self.miss, self._draw_miss())
 
     @property
@@ -210,8 +188,8 @@ class SimulatedArm:
         if self.motion is not None:
             self.motion.done = True
             self.motion = None
-        self.command = self._lagged = self.actual
-        self.command_speed = self.actual_speed = self._offset_now = ZERO
+        self.command = self.actual
+        self.command_speed = self.actual_speed = ZERO
 
     def step(self, dt_s: float, wanted_scale: float) -> None:
         """One cycle. Raises UnreachableError when the path leaves the arm's reach (the arm then rests)."""
@@ -258,27 +236,17 @@ class SimulatedArm:
         motion.done = True
         following = self._next
         self.motion = self._next = None
-        if self.vibration is not None:
-            self.vibration.time_s = 0.0
         if following is not None:
             self._begin(following)
 
     def _lag(self, dt_s: float) -> None:
-        goal = tuple(c - o for c, o in zip(self.command, self._offset_now, strict=True))
-        before = self.actual
-        if goal != self._lagged:
-            share = 1 - exp(-dt_s / LAG_S)
-            near = max(abs(g - a) for g, a in zip(goal, self._lagged, strict=True)) < 1e-9
-            self._lagged = goal if near else between(self._lagged, goal, share)
-        self.actual = self._lagged
-        if self.vibration is not None:
-            self.vibration.time_s += dt_s
-            joint, shake = self.vibration.joint, self.vibration.now()
-            self.actual = (*self.actual[:joint], self.actual[joint] + shake, *self.actual[joint + 1 :])
-        if self.actual is before:
+        before, goal = self.actual, self.command
+        if goal == before:
             self.actual_speed = ZERO
-        else:
-            self.actual_speed = tuple((b - a) / dt_s for a, b in zip(before, self.actual, strict=True))
+            return
+        near = max(abs(g - a) for g, a in zip(goal, before, strict=True)) < 1e-9
+        self.actual = goal if near else between(before, goal, 1 - exp(-dt_s / LAG_S))
+        self.actual_speed = tuple((b - a) / dt_s for a, b in zip(before, self.actual, strict=True))
 
 
 class History:

@@ -6,7 +6,6 @@ Knows no socket, so that every rule here can be tested without one.
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable
 from math import inf
 
@@ -36,8 +35,6 @@ WAITS = "while True:\n  sync()\nend"
 class SimulatedRobot(ControllerState):
     def __init__(self, settings: Settings, journal: Journal) -> None:
         super().__init__(settings, journal)
-        self._waiting: deque[tuple[int, tuple[str, ...], tuple[float, ...]]] = deque()
-        """Inputs on their way: cycle in which they act, names, elements."""
         self.program: InterpretedProgram | None = None
         self._secondary: list[InterpretedProgram] = []
         """Run beside the program, without moving."""
@@ -51,8 +48,6 @@ class SimulatedRobot(ControllerState):
         process was held up; such time does not count as the client's silence."""
         self.ticks += 1
         self.time_s = self.ticks * self.dt_s
-        while self._waiting and self._waiting[0][0] <= self.ticks:
-            self._write_inputs(*self._waiting.popleft()[1:])
         if self._starting is not None:
             self._count_down()
         if self.program is not None and self.runtime_state == RuntimeState.PLAYING:
@@ -114,13 +109,7 @@ class SimulatedRobot(ControllerState):
         return False
 
     def receive_inputs(self, names: tuple[str, ...], elements: tuple[float, ...]) -> None:
-        """A data packet: it acts in the next cycle, or `input_delay_cycles` later."""
-        if self.settings.input_delay_cycles:
-            self._waiting.append((self.ticks + 1 + self.settings.input_delay_cycles, names, elements))
-        else:
-            self._write_inputs(names, elements)
-
-    def _write_inputs(self, names: tuple[str, ...], elements: tuple[float, ...]) -> None:
+        """A data packet: it acts in the next cycle."""
         self.inputs.write(names, elements)
         get = self.inputs.get
         for name in names:
@@ -254,7 +243,7 @@ class SimulatedRobot(ControllerState):
         self.journal.note("controller", "protective stop", reason=reason)
         self._safety(SafetyMode.PROTECTIVE_STOP)
         self.arm.freeze()
-        if self.program is None or not self.settings.paused_by_protective_stop:
+        if self.program is None:
             self.stop_program("protective stop")
         else:
             self.runtime_state = RuntimeState.PAUSED
@@ -303,7 +292,6 @@ class SimulatedRobot(ControllerState):
 
     def reset(self, running: bool) -> None:
         """After a reboot."""
-        self._waiting.clear()
         self.clear()
         self._safety(SafetyMode.NORMAL)
         self.robot_mode = RobotMode.RUNNING if running else RobotMode.POWER_OFF

@@ -61,35 +61,36 @@ Six = Annotated[Vector, Meta(min_length=6, max_length=6)]
 ZEROS: Vector = (0.0,) * 6
 
 
-class Settings(msgspec.Struct, frozen=True):
-    """Those that a truth of a simulated cell has too are named as there."""
+class ArmTruth(msgspec.Struct, frozen=True, kw_only=True):
+    """What is true of a simulated arm and its controller, whatever the controller states."""
 
+    start_joints_rad: Six
+    seed: int = 0
+    robot_sigma_m: float = 0.0
+    """Repeatability: 1σ of the flange's position per axis, drawn at every stop."""
+    robot_sigma_rad: float = 0.0
+    dh_delta_a_m: Six = ZEROS
+    """Systematic error: true minus the controller's a, per joint."""
+    dh_delta_d_m: Six = ZEROS
+    dh_delta_alpha_rad: Six = ZEROS
+    dh_delta_theta_rad: Six = ZEROS
+    factory_a_m: Six = ZEROS
+    """Factory calibration: the controller's minus the published a, per joint."""
+    factory_d_m: Six = ZEROS
+    factory_alpha_rad: Six = ZEROS
+    factory_theta_rad: Six = ZEROS
+    states_factory: bool = True
+    """True: port 30001 states the factory-calibrated table; False: the published one."""
+    controller_clock_drift_ppm: float = 0.0
+
+
+class Settings(ArmTruth, frozen=True, kw_only=True):
     model: str = "UR10"
     start_joints_rad: Six = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
     serial: str = "20263000001"
     time_scale: Annotated[float, Meta(gt=0)] = 1.0
     """The arm moves this many times faster than it says; clocks stay real. For tests."""
-    robot_sigma_m: float = 0.0
-    robot_sigma_rad: float = 0.0
-    seed: int = 0
-    dh_delta_a_m: Six = ZEROS
-    """These of the true arm against the table that the controller uses."""
-    dh_delta_d_m: Six = ZEROS
-    dh_delta_alpha_rad: Six = ZEROS
-    dh_delta_theta_rad: Six = ZEROS
-    factory_a_m: Six = ZEROS
-    """The same of the controller's table, its maker's calibration, against the published one."""
-    factory_d_m: Six = ZEROS
-    factory_alpha_rad: Six = ZEROS
-    factory_theta_rad: Six = ZEROS
-    states_factory: bool = True
-    """Port 30001 states the table in use; else the published one, which is then not true."""
-    controller_clock_drift_ppm: float = 0.0
     remote: bool = True
-    paused_by_protective_stop: bool = True
-    """runtime_state after a protective stop: paused (4), else stopped (1)."""
-    input_delay_cycles: Annotated[int, Meta(ge=0)] = 0
-    """Registers act this many cycles later than the next one."""
     programs: dict[str, str | None] = {}
     """That the dashboard can load: name → URScript; None: one that only waits."""
     software: tuple[int, ...] = ()

@@ -69,7 +69,6 @@ def test_the_admin_port_explains_itself_and_survives_nonsense(controller, admin)
         ({"cmd": "delay", "ms": float("nan")}, "lists the names"),
         ({"cmd": "delay", "ms": -1}, "$.ms"),
         ({"cmd": "jog", "joints_rad": HOME, "speed_rad_s": 0}, "$.speed_rad_s"),
-        ({"cmd": "vibrate", "amplitude_rad": 0.001, "decay_s": 0}, "$.decay_s"),
         ({"cmd": "tcp", "pose": "here"}, "$.pose"),
         ({"cmd": "jog"}, "`joints_rad`"),
         ({"cmd": "jog", "joint": HOME}, "`joint`"),

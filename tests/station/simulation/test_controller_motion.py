@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.simulation.controller.arm import SimulatedArm, Vibration
+from station.simulation.controller.arm import SimulatedArm
 from station.simulation.controller.kinematics import TABLES, Vector, compose, forward, from_pose
 from station.simulation.controller.paths import JointPath, LinePath, Trapezoid, UnreachableError
 
@@ -220,35 +220,6 @@ def test_a_polyline_passes_its_corners() -> None:
     assert path.length == pytest.approx(1.0)
     assert path.at(0.5) == pytest.approx(corners[1]) and path.at(2.0) == corners[2]
     assert path.at(0.25)[0] == pytest.approx(0.25)
-
-
-def test_vibration_fades_after_each_motion_or_never() -> None:
-    arm = make_arm()
-    arm.vibration = Vibration(1e-3, 12.0, 0.1, joint=1)
-    go(arm, (0.3, *HOME[1:]))
-    run(arm, 1.5)
-    early = max(abs(arm.actual_speed[1]) for _ in range(12) if arm.step(DT, 1.0) is None)
-    run(arm, 1.5)
-    late = max(abs(arm.actual_speed[1]) for _ in range(12) if arm.step(DT, 1.0) is None)
-    assert early > 100 * late
-    arm.vibration = Vibration(1e-3, 12.0, None, joint=1)
-    run(arm, 3.0)
-    peaks = []
-    for _ in range(20):
-        arm.step(DT, 1.0)
-        peaks.append(abs(arm.actual[1] - HOME[1]))
-    assert max(peaks) == pytest.approx(1e-3, rel=0.2)
-    assert arm.command[1] == HOME[1]
-
-
-def test_an_offset_leaves_the_arm_short_of_its_next_goal() -> None:
-    arm = make_arm()
-    arm.offset = (0.01, 0.0, 0.0, 0.0, 0.0, 0.0)
-    run(arm, 0.5)
-    assert arm.actual == HOME
-    go(arm, (0.5, *HOME[1:]))
-    run(arm, 2.0)
-    assert arm.command[0] == 0.5 and arm.actual[0] == pytest.approx(0.49, abs=1e-8)
 
 
 def test_every_stop_misses_differently_and_never_jumps() -> None:

@@ -28,14 +28,6 @@ def test_protective_stop_rests_at_once_and_holds_the_word(script) -> None:
     assert script.robot.arm.actual == where
 
 
-def test_protective_stop_may_stop_the_program_instead(context, rtde_script) -> None:
-    made = context(paused_by_protective_stop=False)
-    made.start_script(rtde_script)
-    made.robot.protective_stop("test")
-    made.run(0.02)
-    assert made.output("runtime_state") == RuntimeState.STOPPED
-
-
 @pytest.mark.parametrize(("model", "mode"), [("UR10", RobotMode.POWER_OFF), ("UR10e", RobotMode.IDLE)])
 def test_emergency_stop_bits_and_way_back(context, model, mode, rtde_script) -> None:
     made = context(model=model)

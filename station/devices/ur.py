@@ -7,7 +7,6 @@ ur_rtde its own process. Rules: docs/operator/safety.md, faults: docs/contributo
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import os
 import signal
@@ -20,48 +19,27 @@ from pathlib import Path
 from recordings.schema.messages import RobotState
 from station.cell.acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
-from station.cell.errors import RobotError, SafetyStopError, StaleStateError
+from station.cell.errors import RobotError
 from station.devices.base import fresh, ready
-from station.devices.news import (
-    APPROVE_AGAIN,
-    RESTING_S,
-    Evidence,
-    longest_silence_s,
-)
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
-from station.devices.ur_condition import (
-    foreign_program,
-    not_powered,
-    program_ended,
-    program_not_running,
-    program_replaced,
-    safety_stop,
-)
+from station.devices.ur_condition import arm_held, control_ended, foreign_program, local_control
 from station.devices.ur_control import LIBRARY_REMEDY
 from station.devices.ur_dashboard import STOP, Dashboard, came
-from station.devices.ur_link import UrLink, link_lost
+from station.devices.ur_end_cause import cause_of_end
+from station.devices.ur_link import POLL_S, UrLink, link_lost
 from station.devices.ur_moves import MoveWatch, check_goal
 from station.devices.ur_probe import SCRIPT_PORT, check_port
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.005
 TOOL_S = 0.04
 """Period of the checks of TCP and payload during a move; each takes up to a millisecond."""
 ONE_WAY_S = 1.0
 RESTING_RAD_S = 0.005
 STOP_WAIT_S = 0.05
-OUTLIVED_S: dict[ControlPath, float] = {"ur_rtde": 0.3, "script": 0.6}
-"""If the control program still plays so long after a pause of this computer began, that pause did not stop
-it. The station's own script plays until the arm rests, after up to 0.26 s of braking."""
-OUR_PROGRAMS = ("rtde_control", "station_control")
-REPLACED_S = 0.1
-"""Time after the end of our program within which another one that replaced it starts to play."""
-MAY_BE_REPLACED = ("program-ended", "watchdog", "off-path", "ended-short", "no-progress")
-PROGRAM_START_NS = 200_000_000
-LEFTOVER_WAIT_NS = 2_000_000_000
-NEWS_WAIT_NS = 250_000_000
+PROGRAM_START_S = 0.2
+LEFTOVER_WAIT_S = 2.0
 CLOSE_WAIT_S = 0.5
 
 
@@ -102,8 +80,6 @@ class UrRobot(UrLink):
         """True while that error's cause is being looked for."""
         self._one_way_s: float | None = None
         """When the stop test triggered its single stop (host monotonic); None before and after it."""
-        self._played_s = 0.0
-        """When the control program was last seen playing (host monotonic)."""
         self._tool_looked_s = 0.0
         """When TCP and payload were last checked during a move (host monotonic)."""
         self._background: set[asyncio.Task[object]] = set()
@@ -149,14 +125,14 @@ class UrRobot(UrLink):
             if (why := self._why_stopped()) and isinstance(error, RobotError):
                 raise _stopped(f" while control was starting{why}") from None
             raise
-        self.control, self._played_s = True, time.monotonic()
+        self.control = True
 
     async def _heard(self, child: ControlChild) -> None:
         """Wait for the program's first heartbeat; raise the reason why it was not taken."""
         try:
             await child.heard()
         except RobotError as error:
-            raise await self._look_again(self._program_trouble(self.latest()) or error, child) from None
+            raise await cause_of_end(self, child, self._program_trouble(self.latest()) or error) from None
 
     async def _may_start(self) -> None:
         """Check that control can be started without replacing a program; else RobotError with remedy."""
@@ -165,12 +141,11 @@ class UrRobot(UrLink):
         self.remote = await dashboard.remote()
         state = await fresh(self)
         if self.remote is False:
-            raise _local_control()
+            raise local_control()
         program = await dashboard.ask("programState")
         if self._primary is not None:
             self._primary.started = ""
-        trouble = safety_stop(state) or not_powered(state) or foreign_program(state, program)
-        if trouble is not None:
+        if (trouble := arm_held(state) or foreign_program(state, program)) is not None:
             raise trouble
         await check_port(self.config.host, SCRIPT_PORT)
 
@@ -213,12 +188,14 @@ class UrRobot(UrLink):
             self._sent = True
             await self._follow(watch, child, child.move(joints_rad, speed_rad_s, acceleration_rad_s2))
         except BaseException as error:
-            cause = self._explain(error, child)
+            cause = self._known_cause(error) if isinstance(error, RobotError) else error
             try:
                 await self._one_way_ends()
             finally:
                 await asyncio.shield(self.stop(str(cause) or type(cause).__name__))
-            raise await self._look_again(cause, child) from None
+            if isinstance(cause, RobotError):
+                cause = await cause_of_end(self, child, cause)
+            raise cause from None
         finally:
             self._moving = self._sent = False
             self.notice, self._one_way_s = "", None
@@ -252,7 +229,6 @@ class UrRobot(UrLink):
             sent.result()
         self.news()
         sample = self.newest()
-        self._note_playing(sample.state)
         if watch.step(sample.state, sample.operation, time.monotonic()) and sent.done():
             return True
         if (now_s := time.monotonic()) > self._tool_looked_s + TOOL_S:
@@ -262,79 +238,11 @@ class UrRobot(UrLink):
         self.notice = watch.notice
         return False
 
-    def _explain(self, error: BaseException, child: ControlChild) -> BaseException:
-        """Find the cause of an error as far as known at once: STOP, then a safety stop, then a lost link."""
-        if not isinstance(error, RobotError):
-            return error
+    def _known_cause(self, error: RobotError) -> RobotError:
+        """Name STOP or a lost connection, even if it is back by now, in place of what followed from it."""
         if self._stop_reason:
             return _stopped(f": {self._stop_reason}")
-        reader = self.reader
-        state = reader.newest.state if reader is not None and reader.newest is not None else None
-        stop = safety_stop(state) or not_powered(state) if state is not None else None
-        if stop is not None:
-            return stop
-        if self._link_loss:  # even if the link is back by now
-            return link_lost(self._link_loss)
-        child.read_waiting()  # its last messages tell when the watchdog was reset
-        return error
-
-    async def _look_again(self, error: BaseException, child: ControlChild) -> BaseException:
-        """Find a cause that only news after the stop tell: a safety stop, lost power, the switch to local
-        control, and what was late when the watchdog or late news ended the program."""
-        if not isinstance(error, RobotError) or isinstance(error, SafetyStopError):
-            return error
-        now_ns, late = time.monotonic_ns(), error.code == StaleStateError.code
-        ended = error.code in ("program-ended", "watchdog")
-        if late or ended:
-            state = await self._state_after(now_ns, round(RESTING_S * 1e9) if late else NEWS_WAIT_NS)
-            if state is not None and (held := safety_stop(state) or not_powered(state)) is not None:
-                return held
-            if state is not None or not late:
-                error = self._evidence(child, late).error() or error
-        if self.remote and self.dashboard is not None:
-            with contextlib.suppress(RobotError, TimeoutError):
-                async with asyncio.timeout(0.3):
-                    self.remote = await self.dashboard.remote()
-        if self.remote is False:
-            return _local_control()
-        wait_s = REPLACED_S if ended else 0.0
-        other = await self._other_program(wait_s) if error.code in MAY_BE_REPLACED else None
-        if other is not None:
-            return program_replaced(other)
-        return program_ended(RuntimeState.STOPPED) if error.code == "watchdog" else error
-
-    def _evidence(self, child: ControlChild, late: bool) -> Evidence:
-        """Measure what was late before the control program ended, or (`late`) since the last news."""
-        states = self.reader.history.copy() if self.reader is not None else ()
-        ended = (s for s in states if s.runtime_state != RuntimeState.PLAYING)
-        after_s = (s.stamps.host_monotonic_ns / 1e9 for s in ended)
-        now_s = time.monotonic()
-        until_s = now_s if late else next((t for t in after_s if t > self._played_s), now_s)
-        since_s = (self._played_s if late else until_s) - OUTLIVED_S[self.control_path]
-        silence_s = 0.0 if late else longest_silence_s(child.kicks_s, since_s, until_s)
-        return self.evidence(silence_s, since_s, until_s)
-
-    async def _other_program(self, wait_s: float) -> str | None:
-        """Find a program of another client that started after ours: its name, '' if unnamed, None if none.
-
-        Our own stop may already have ended it.
-        """
-        give_up_s = time.monotonic() + wait_s
-        while True:
-            name = self._primary.started if self._primary is not None else ""
-            if name and name not in OUR_PROGRAMS:
-                return name
-            if not name and self._plays_again():
-                return ""
-            if time.monotonic() > give_up_s:
-                return None
-            await asyncio.sleep(POLL_S)
-
-    def _plays_again(self) -> bool:
-        """Tell whether a program stopped, and one played, since ours was last seen playing."""
-        states = self.reader.history.copy() if self.reader is not None else ()
-        since = [s.runtime_state for s in states if s.stamps.host_monotonic_ns > self._played_s * 1e9]
-        return RuntimeState.STOPPED in since and since[-1] == RuntimeState.PLAYING
+        return link_lost(self._link_loss) if self._link_loss else error
 
     async def stop(self, reason: str) -> None:
         """Decelerate now, by both stop paths, and end control; idempotent, in any state, never raises.
@@ -405,18 +313,9 @@ class UrRobot(UrLink):
 
         It moves nothing, but would look like another client's. Waits for news newer than the kill.
         """
-        state = await self._state_after(time.monotonic_ns() + PROGRAM_START_NS, LEFTOVER_WAIT_NS)
+        state = await self.state_after(time.monotonic() + PROGRAM_START_S, LEFTOVER_WAIT_S)
         if state is not None and state.runtime_state == RuntimeState.PLAYING and self._child is None:
             await self._dashboard_stop_anew()
-
-    async def _state_after(self, moment_ns: int, wait_ns: int) -> RobotState | None:
-        """Wait for the first state after a moment (monotonic ns); None: none within `wait_ns` of it."""
-        while time.monotonic_ns() < moment_ns + wait_ns:
-            sample = self.reader.newest if self.reader is not None else None
-            if sample is not None and sample.state.stamps.host_monotonic_ns > moment_ns:
-                return sample.state
-            await asyncio.sleep(POLL_S)
-        return None
 
     async def _dashboard_stop_anew(self) -> None:
         try:
@@ -450,26 +349,18 @@ class UrRobot(UrLink):
         except RobotError as error:
             self._explaining = True
             try:
-                cause = self._explain(error, child)
+                cause = self._known_cause(error)
                 await self.stop(str(cause))
-                cause = await self._look_again(cause, child)
+                self._ended_by = await cause_of_end(self, child, cause)
             finally:
                 self._explaining = False
-            assert isinstance(cause, RobotError)
-            self._ended_by = cause
-            raise cause from None
-        if state is not None:
-            self._note_playing(state)
-
-    def _note_playing(self, state: RobotState) -> None:
-        if state.runtime_state == RuntimeState.PLAYING:
-            self._played_s = state.stamps.host_monotonic_ns / 1e9
+            raise self._ended_by from None
 
     def _program_trouble(self, state: RobotState) -> RobotError | None:
         """Find what is wrong with the control program by state and dashboard; None: nothing."""
         if self.remote is False:
-            return _local_control()
-        return safety_stop(state) or not_powered(state) or program_not_running(state)
+            return local_control()
+        return control_ended(state)
 
     async def close(self) -> None:
         """Stop the arm, end control and close every connection."""
@@ -493,11 +384,3 @@ class UrRobot(UrLink):
 
 def _stopped(how: str = "") -> RobotError:
     return RobotError(f"stopped{how}", code="stopped")
-
-
-def _local_control() -> RobotError:
-    return RobotError(
-        "the robot is in local control",
-        code="local-control",
-        remedy=f"Switch the pendant to Remote (top right), {APPROVE_AGAIN}.",
-    )

@@ -77,6 +77,8 @@ class ControlChild:
         self._number = 0
         self._beat_ns = 0
         self._answered_ns = 0
+        self.started_s = 0.0
+        """When the control program was ready (host monotonic)."""
         self.kicks_s: deque[float] = deque(maxlen=KEPT)
         """When the newest heartbeats reset the watchdog (host monotonic)."""
         self.stop_acknowledged: asyncio.Future[None] = self._loop.create_future()
@@ -128,6 +130,7 @@ class ControlChild:
             raise self._trouble(
                 f"the control process was not ready within {timeout_s:g} s and was killed", limit_s=timeout_s
             ) from None
+        self.started_s = time.monotonic()
         self._beat_ns = 0  # heartbeats unanswered until now are no sign that the process hangs
         if answer.refused is not None or answer.died:
             self.kill()
@@ -245,6 +248,8 @@ class ControlChild:
         """SIGKILL; immediate, from any state."""
         with contextlib.suppress(OSError):
             self._process.kill()
+        while self._receive():  # its last messages tell when the watchdog was reset
+            pass
         self._close()
 
     async def reap(self) -> None:
@@ -264,11 +269,6 @@ class ControlChild:
         if code < 0:
             return f" (signal {-code}, {signal.Signals(-code).name})"
         return f" (exit code {code})"
-
-    def read_waiting(self) -> None:
-        """Read all waiting messages, without waiting for the event loop to do so."""
-        while self._receive():
-            pass
 
     def _receive(self) -> bool:
         """Read and handle one message; False: there was none."""

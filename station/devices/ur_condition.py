@@ -7,6 +7,7 @@ from enum import IntEnum
 from recordings.schema.messages import RobotState
 from station.cell.errors import RobotError, SafetyStopError
 from station.devices.base import ArmCondition
+from station.devices.news import APPROVE_AGAIN
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 
 NOT_STARTED_REMEDY = (
@@ -135,9 +136,23 @@ def not_powered(state: RobotState) -> RobotError | None:
     return RobotError(what, code="not-powered", remedy=f"{remedy}.", mode=state.robot_mode)
 
 
-def program_not_running(state: RobotState) -> RobotError | None:
-    """Make the error where the control program does not play, as it must; None where it does."""
-    return None if state.runtime_state == RuntimeState.PLAYING else program_ended(state.runtime_state)
+def arm_held(state: RobotState) -> RobotError | None:
+    """Make the error for an arm that cannot move, by a safety stop or without power; None: it can."""
+    return safety_stop(state) or not_powered(state)
+
+
+def control_ended(state: RobotState) -> RobotError | None:
+    """Make the error for an arm that is held, or a control program that does not play; None: all is well."""
+    playing = state.runtime_state == RuntimeState.PLAYING
+    return arm_held(state) or (None if playing else program_ended(state.runtime_state))
+
+
+def local_control() -> RobotError:
+    return RobotError(
+        "the robot is in local control",
+        code="local-control",
+        remedy=f"Switch the pendant to Remote (top right), {APPROVE_AGAIN}.",
+    )
 
 
 def program_ended(runtime_state: int) -> RobotError:

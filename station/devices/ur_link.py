@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from calibrate.kinematics import MODELS
 from recordings.schema.clocks import ClockFit
@@ -38,6 +38,7 @@ from station.devices.ur_tool import Installation, PrimaryReader, TcpCheck, check
 
 log = logging.getLogger(__name__)
 
+POLL_S = 0.005
 FIRST_STATE_S = 4.0
 SUPERVISE_S = 0.2
 _BUSY_SHARE = 0.5
@@ -275,17 +276,11 @@ class UrLink:
 
     def evidence(self, pause_s: float, since_s: float, until_s: float) -> Evidence:
         """What was late in a span (host monotonic). `pause_s`: for how long this computer kicked nothing."""
-        gap_s, clock_gap_s = self.largest_gap(since_s, until_s)
+        period_s = 1 / self.reader.rate_hz if self.reader is not None and self.reader.rate_hz else 0.0
+        gap_s, clock_gap_s = largest_gap(self.states(), since_s, until_s, period_s)
         if self._unread_s > since_s:
             pause_s = max(pause_s, gap_s)
         return Evidence(pause_s, gap_s, clock_gap_s, is_loopback(self.config.host))
-
-    def largest_gap(self, since_s: float, until_s: float) -> tuple[float, float]:
-        """Find the longest gap between arrivals, and the controller's part; see `news.largest_gap`."""
-        reader = self.reader
-        if reader is None or not reader.rate_hz:
-            return 0.0, 0.0
-        return largest_gap(reader.history.copy(), since_s, until_s, 1 / reader.rate_hz)
 
     def stale(self, age_s: float, limit_s: float) -> StaleStateError:
         """Make the error that says why the newest state is too old."""
@@ -307,7 +302,25 @@ class UrLink:
         """Interpolate the state at a host time within the last 10 s; StaleStateError outside."""
         if self.reader is None:
             raise StaleStateError("not connected to the robot", code="not-connected")
-        return state_at(self.reader.history.copy(), self.clock(), host_monotonic_ns)
+        return state_at(self.states(), self.clock(), host_monotonic_ns)
+
+    def states(self) -> Sequence[RobotState]:
+        """Return the states of the last 10 s, as far as this connection gave them."""
+        return self.reader.history.copy() if self.reader is not None else ()
+
+    async def state_after(self, moment_s: float, wait_s: float) -> RobotState | None:
+        """Wait for the first state after a moment (host monotonic); None: none within `wait_s` of it."""
+        while time.monotonic() < moment_s + wait_s:
+            sample = self.reader.newest if self.reader is not None else None
+            if sample is not None and sample.state.stamps.host_monotonic_ns > moment_s * 1e9:
+                return sample.state
+            await asyncio.sleep(POLL_S)
+        return None
+
+    @property
+    def program_started(self) -> str:
+        """Name of the program that started last, as far as the robot told."""
+        return self._primary.started if self._primary is not None else ""
 
     def clock(self) -> ClockFit | None:
         """Return the controller's clock against the host's; None before there are enough samples."""

@@ -16,11 +16,7 @@ from recordings.schema.messages import RobotState, Vector6
 from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2
 from station.cell.errors import RobotError
 from station.devices.news import APPROVE_AGAIN, MOVING_S
-from station.devices.ur_condition import (
-    not_powered,
-    program_not_running,
-    safety_stop,
-)
+from station.devices.ur_condition import control_ended
 
 ARRIVED_RAD = 0.01
 STRAYED_RAD = 0.05
@@ -101,8 +97,7 @@ class MoveWatch:
 
     def step(self, state: RobotState, word: int, now_s: float) -> bool:
         """Check a state; True when arrived. Raises RobotError where the move ended otherwise."""
-        trouble = safety_stop(state) or not_powered(state) or program_not_running(state)
-        if trouble is not None:
+        if (trouble := control_ended(state)) is not None:
             raise trouble
         joint, off_rad = beside(self.start_rad, self.target_rad, state.joints_rad)
         if off_rad > STRAYED_RAD:

@@ -2,85 +2,71 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import pytest
 
+from recordings.schema.messages import RobotState
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
-from station.devices.ur_condition import (
-    foreign_program,
-    not_powered,
-    program_not_running,
-    safety_stop,
-)
+from station.devices.ur_condition import arm_held, control_ended, foreign_program
 from tests.station.devices.test_ur_moves import STATE
 
-MOVES = {SafetyMode.NORMAL, SafetyMode.REDUCED}
-HARMLESS = {SafetyStatus.NORMAL, SafetyStatus.REDUCED}
+SAFETY = {
+    None: (1, 2),
+    "protective-stop": (3,),
+    "recovery-mode": (4,),
+    "safeguard-stop": (5, 12, 16, 18, 19, 21),
+    "emergency-stop": (6, 7, 15, 20),
+    "safety-fault": (8, 9),
+    "enabling-stop": (13, 14),
+    "safety-stop": (10, 11, 17, 99),
+}
+BITS = SafetyStatus.STOPPED_DUE_TO_SAFETY | SafetyStatus.PROTECTIVE_STOPPED
 
 
-@pytest.mark.parametrize("mode", SafetyMode)
-def test_an_arm_moves_in_normal_and_reduced_mode_only(mode: SafetyMode) -> None:
-    stop = safety_stop(msgspec.structs.replace(STATE, safety_mode=mode))
-    assert (stop is None) == (mode in MOVES)
-    assert stop is None or stop.remedy
+def now(**how: Any) -> RobotState:
+    return msgspec.structs.replace(STATE, **how)
 
 
-@pytest.mark.parametrize(
-    ("mode", "code"),
-    [
-        (10, "safety-stop"),
-        (11, "safety-stop"),
-        (12, "safeguard-stop"),
-        (13, "enabling-stop"),
-        (14, "enabling-stop"),
-        (15, "emergency-stop"),
-        (16, "safeguard-stop"),
-        (17, "safety-stop"),
-        (18, "safeguard-stop"),
-        (19, "safeguard-stop"),
-        (20, "emergency-stop"),
-        (21, "safeguard-stop"),
-        (99, "safety-stop"),
-    ],
-)
-def test_newer_safety_modes_hold_the_arm_each_by_its_name(mode: int, code: str) -> None:
-    stop = safety_stop(msgspec.structs.replace(STATE, safety_mode=mode))
-    assert stop is not None and stop.code == code and stop.remedy
+def code(state: RobotState) -> str | None:
+    held = arm_held(state)
+    assert held is None or held.remedy
+    return held and held.code
+
+
+@pytest.mark.parametrize("held", SAFETY)
+def test_every_safety_mode_holds_the_arm_by_its_name_but_normal_and_reduced(held: str | None) -> None:
+    assert {code(now(safety_mode=mode)) for mode in SAFETY[held]} == {held}
+    assert set(SafetyMode) <= {mode for modes in SAFETY.values() for mode in modes}
 
 
 @pytest.mark.parametrize("bit", SafetyStatus)
 def test_each_bit_that_tells_of_a_stop_is_one(bit: SafetyStatus) -> None:
-    stop = safety_stop(msgspec.structs.replace(STATE, safety_status_bits=SafetyStatus.NORMAL | bit))
-    assert (stop is None) == (bit in HARMLESS)
+    harmless = bit in (SafetyStatus.NORMAL, SafetyStatus.REDUCED)
+    assert (code(now(safety_status_bits=SafetyStatus.NORMAL | bit)) is None) == harmless
 
 
-def test_the_gravest_reason_is_told_first() -> None:
-    bits = SafetyStatus.STOPPED_DUE_TO_SAFETY | SafetyStatus.PROTECTIVE_STOPPED
-    for worse, code in (
-        (SafetyStatus(0), "protective-stop"),
-        (SafetyStatus.FAULT, "safety-fault"),
-        (SafetyStatus.EMERGENCY_STOPPED, "emergency-stop"),
-    ):
-        bits |= worse
-        stop = safety_stop(msgspec.structs.replace(STATE, safety_status_bits=bits))
-        assert stop is not None and stop.code == code
+@pytest.mark.parametrize(
+    ("bits", "gravest"),
+    [
+        (BITS, "protective-stop"),
+        (BITS | SafetyStatus.FAULT, "safety-fault"),
+        (BITS | SafetyStatus.FAULT | SafetyStatus.EMERGENCY_STOPPED, "emergency-stop"),
+    ],
+)
+def test_the_gravest_reason_is_told_first(bits: SafetyStatus, gravest: str) -> None:
+    assert code(now(safety_status_bits=bits, robot_mode=RobotMode.IDLE)) == gravest
 
 
 @pytest.mark.parametrize("mode", RobotMode)
 def test_every_mode_but_running_says_what_to_do(mode: RobotMode) -> None:
-    trouble = not_powered(msgspec.structs.replace(STATE, robot_mode=mode))
-    assert (trouble is None) == (mode is RobotMode.RUNNING)
-    assert trouble is None or (trouble.remedy and trouble.values["mode"] == mode)
+    assert code(now(robot_mode=mode)) == (None if mode is RobotMode.RUNNING else "not-powered")
 
 
 @pytest.mark.parametrize("state", RuntimeState)
 def test_control_starts_only_where_no_program_runs_and_ours_must_play(state: RuntimeState) -> None:
-    now = msgspec.structs.replace(STATE, runtime_state=state)
-    assert (foreign_program(now, "pick.urp") is None) == (state is RuntimeState.STOPPED)
-    assert (program_not_running(now) is None) == (state is RuntimeState.PLAYING)
-
-
-def test_a_foreign_program_is_named() -> None:
-    playing = msgspec.structs.replace(STATE, runtime_state=RuntimeState.PLAYING)
-    trouble = foreign_program(playing, "pick.urp")
-    assert trouble is not None and trouble.values == {"program": "pick.urp"}
+    foreign = foreign_program(now(runtime_state=state), "pick.urp")
+    assert (foreign is None) == (state is RuntimeState.STOPPED)
+    assert foreign is None or foreign.values == {"program": "pick.urp"}
+    assert (control_ended(now(runtime_state=state)) is None) == (state is RuntimeState.PLAYING)

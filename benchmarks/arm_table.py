@@ -43,7 +43,7 @@ from calibrate.projection import intrinsics_names, intrinsics_vector, project_pi
 from calibrate.quality.gates import GateInputs, GateLimits, judge
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import Mount
-from station.cell.plan import Criterion
+from station.cell.pose_plan import Criterion
 from station.plan.choose import TABLE_MM, Objective, choose
 
 ARM = MODELS["UR10e"]

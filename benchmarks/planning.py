@@ -40,9 +40,9 @@ from calibrate.projection import project
 from calibrate.results import SHAPE
 from calibrate.views import Observations, extent_of
 from station.cell.errors import LimitError
+from station.cell.layout import CellLayout, layout_of
 from station.cell.limits import allowed_speed, check_plan, sample_path
-from station.cell.plan import Plan
-from station.cell.scene import Scene, scene_of
+from station.cell.pose_plan import Plan
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, candidate_pool, plan_scene
 from station.plan.visibility import ViewRange
@@ -93,7 +93,7 @@ def measure(seed: int) -> CellResult:
 
 def _compare_choices(cell: RandomCell, result: CellResult, rng: np.random.Generator, seed: int) -> None:
     """Planned against random poses of one pool; the pool is of poses that truly see the board."""
-    scene = scene_of(cell.exact())
+    scene = layout_of(cell.exact())
     for name, view in (("moderate", MODERATE), ("wide", WIDE)):
         options = PlanOptions(seed=seed, noise=NOISE, view=view)
         pool, _ = candidate_pool(scene, options, cell.start, rng)
@@ -117,7 +117,7 @@ def _squares(errors: Array, X: Array) -> tuple[float, float, float]:
 
 
 def _plan_and_check(cell: RandomCell, result: CellResult, rng: np.random.Generator, seed: int) -> None:
-    scene = scene_of(cell.config)
+    scene = layout_of(cell.config)
     begin, begin_cpu = time.perf_counter(), time.process_time()
     try:
         plan = plan_scene(scene, PlanOptions(seed=seed, noise=NOISE), cell.start.tolist())
@@ -150,7 +150,7 @@ def _check_path(start: Array, target: Array, cell: RandomCell, result: CellResul
     result.narrow += bool(itself.min() < 0 or (from_cell < CLEARANCES_M).any())
 
 
-def _random_time(scene: Scene, plan: Plan, cell: RandomCell, rng: np.random.Generator) -> float:
+def _random_time(scene: CellLayout, plan: Plan, cell: RandomCell, rng: np.random.Generator) -> float:
     """Motion time of the same poses in random order, each move as fast as its limits allow."""
     order = rng.permutation(len(plan.poses))
     joints = [cell.start, *(np.array(plan.poses[i].joints_rad) for i in order)]

@@ -28,7 +28,7 @@ from station.cell.config import (
     RobotConfig,
     StationConfig,
 )
-from station.cell.scene import guess_from
+from station.cell.layout import guess_from
 
 ARM = MODELS["UR10"]
 CAMERA = CameraModel(

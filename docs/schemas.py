@@ -26,7 +26,7 @@ from recordings.errors import ErrorReport
 from recordings.info import RecordingInfoJson
 from recordings.recover import Recovery
 from station.cell.config import StationConfig
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationStatus
 from station.cli.control import DoctorJson
 from station.cli.demo import DemoJson

@@ -22,7 +22,7 @@ from calibrate.quality.drift_history import read_checks
 from recordings.cli import main as recordings
 from recordings.errors import CodedError
 from recordings.importers.bags import open_bag
-from station.cell.acceptance import read_acceptance
+from station.cell.arm_acceptance import read_acceptance
 from station.cell.session_folder import interrupted_session, list_sessions
 from station.cli import main as station
 from station.operate.draft import Draft, load_draft

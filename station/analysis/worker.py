@@ -24,10 +24,10 @@ from calibrate.geometry import Array
 from recordings.images import Pixels, eight_bits, viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Vector6
 from station.cell.config import StationConfig
+from station.cell.layout import geometry_from
 from station.cell.limits import PlanCheck, check_plan
-from station.cell.plan import ExpectedView, Plan
+from station.cell.pose_plan import ExpectedView, Plan
 from station.cell.process import die_with_parent
-from station.cell.scene import geometry_from
 from station.cell.status import DetectionStatus
 from station.protocol.verbs import PreviewImage
 

@@ -17,7 +17,7 @@ from calibrate.geometry import Array, difference
 from calibrate.kinematics import JOINT_NAMES, forward
 from station.cell.collision import SPACING_M, CellGeometry, Contact, margins, moving_points, surface_speeds
 from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2, SPEED_CAP_M_S, LimitsConfig
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 
 JOINT_SPEED_CAP_RAD_S = 1.05
 JOINT_ACCELERATION_CAP_RAD_S2 = 1.4

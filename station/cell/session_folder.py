@@ -16,7 +16,7 @@ import msgspec
 from recordings.files import PART_SUFFIX, read_file, session_name_from, sync_folder, write_atomically
 from recordings.schema.messages import Source
 from station.cell.errors import StationError
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import PoseStatus
 
 STATE_FILE = "session.json"

@@ -9,7 +9,7 @@ import msgspec
 
 from recordings.errors import Value
 from recordings.schema.messages import Matrix4, Mount, Source, TimeSource, Vector6
-from station.cell.acceptance import StopTestMove
+from station.cell.arm_acceptance import StopTestMove
 
 
 class StationState(StrEnum):

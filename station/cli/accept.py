@@ -8,13 +8,13 @@ from typing import Annotated
 
 import typer
 
-from station.cell.acceptance import Acceptance, Figure, StopResult, read_acceptance, write_acceptance
+from station.cell.arm_acceptance import Acceptance, Figure, StopResult, read_acceptance, write_acceptance
 from station.cell.config import SPEED_CAP_M_S
 from station.cell.errors import RefusedError
 from station.cell.status import MotionPreview
 from station.cli.attended import Attended, attended, confirmed, no_terminal
 from station.cli.console import AsJson, Socket, err, print_json
-from station.operate.acceptance import AcceptanceTest
+from station.operate.stop_test import AcceptanceTest
 from station.protocol.verbs import Configuration
 
 _SHOWN = ("reaction", "rest", "distance")

@@ -22,9 +22,9 @@ from recordings.schema.messages import Mount, Vector6
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, LimitError, StationError
+from station.cell.layout import CellLayout, cell_geometry, geometry_from, layout_of
 from station.cell.limits import PlanCheck, Problem, check_plan
-from station.cell.plan import Plan, plan_sha256
-from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
+from station.cell.pose_plan import Plan, plan_sha256
 from station.cell.socket_folder import default_socket
 from station.cli.console import AsJson, Socket, err, out, print_json
 from station.operate.motion import status_now
@@ -183,10 +183,10 @@ async def _read_joints(cell: StationConfig) -> Vector6:
         await link.close()
 
 
-def _scene(cell: StationConfig, needed: bool) -> Scene | None:
+def _scene(cell: StationConfig, needed: bool) -> CellLayout | None:
     """The scene to draw and forecast. Checking needs none: None where the configuration says too little."""
     try:
-        return scene_of(cell)
+        return layout_of(cell)
     except ConfigError:
         if needed:
             raise

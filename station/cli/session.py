@@ -15,7 +15,7 @@ import msgspec
 import typer
 from rich.text import Text
 
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState, StationStatus
 from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, Socket, err, out, print_json

@@ -18,7 +18,7 @@ from station.cell.socket_folder import default_socket
 from station.cli.attended import no_terminal
 from station.cli.console import Socket, err, out
 from station.operate.motion import status_now
-from station.operate.touch_test import SeenBoard, note_touches, pointer_tip, read_touch, see_board
+from station.operate.tip_offsets import SeenBoard, note_touches, pointer_tip, read_touch, see_board
 from station.protocol.client import Client
 
 

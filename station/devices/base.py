@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
-from station.cell.acceptance import StopWay
+from station.cell.arm_acceptance import StopWay
 from station.cell.errors import StaleStateError
 from station.devices.frames import CameraCounts, FrameTiming, TriggerPulse
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 
 from recordings.schema.messages import CameraModel, Source
-from station.cell.acceptance import ArmSubject, not_accepted, read_acceptance
+from station.cell.arm_acceptance import ArmSubject, not_accepted, read_acceptance
 from station.cell.config import SPEED_CAP_M_S, StationConfig
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.devices.base import Camera, Robot, Trigger
 
 

@@ -30,11 +30,11 @@ from recordings.schema.messages import (
     Vector6,
     View,
 )
-from station.cell.acceptance import StopWay
+from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig, vector6
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
-from station.cell.plan import Plan, PlannedPose
-from station.cell.scene import pose_vector
+from station.cell.layout import pose_vector
+from station.cell.pose_plan import Plan, PlannedPose
 from station.devices.base import ArmCondition
 from station.devices.cell import Cell
 from station.devices.frames import CameraCounts, FrameTiming

@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import StopWay
+from station.cell.arm_acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
 from station.devices.base import fresh, ready

@@ -16,8 +16,8 @@ from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
+from station.cell.layout import arm_model
 from station.cell.process import waited_share
-from station.cell.scene import arm_model
 from station.devices.base import ArmCondition
 from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_loopback, largest_gap
 from station.devices.ur_condition import condition, safety_stop

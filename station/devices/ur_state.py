@@ -28,7 +28,7 @@ from recordings.schema.clocks import ClockEstimator, ClockFit, monotonic_from_wa
 from recordings.schema.messages import RobotState, Stamps, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError, StaleStateError
-from station.cell.scene import pose_vector
+from station.cell.layout import pose_vector
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, Recipe, RtdeError, RtdeLink
 from station.devices.ur_dashboard import connect_trouble
 

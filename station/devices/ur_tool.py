@@ -28,7 +28,7 @@ from calibrate.kinematics import RobotModel, forward
 from recordings.schema.messages import ArmKinematics, RobotState, Vector6
 from station.cell.config import vector6
 from station.cell.errors import RobotError
-from station.cell.scene import pose_vector
+from station.cell.layout import pose_vector
 from station.devices.ur_state import Payload
 
 log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from calibrate.geometry import Array
 from recordings.files import ASKED_FOR, write_atomically
 from recordings.schema.messages import BoardSpec, Image, Mount, RobotState
 from station.cell.errors import RobotError, StationError
-from station.cell.scene import flange_pose
+from station.cell.layout import flange_pose
 from station.operate import draft as drafts
 from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep, Draft, Hardware
 from station.operate.guided_views import (

@@ -23,7 +23,7 @@ from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, Rob
 from station.analysis.estimation import quick_sigma, solve_quickly
 from station.analysis.worker import CapturedView, assess
 from station.cell.config import matrix4
-from station.cell.scene import board_place, flange_pose
+from station.cell.layout import board_place, flange_pose
 from station.operate.draft import Draft, GuidedView
 
 FEWEST_GUIDED, MOST_GUIDED = 4, 6

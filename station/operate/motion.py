@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from station.cell.errors import RefusedError, StationError
-from station.cell.plan import Criterion
+from station.cell.pose_plan import Criterion
 from station.cell.status import MotionPreview, StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
 from station.protocol.verbs import PLANNED_ELSEWHERE, Finish, GetPlan, Go, MakePlan, Prepare, Purpose

@@ -28,7 +28,7 @@ from station.cell.config import (
 )
 from station.cell.config_file import config_error, examine_config
 from station.cell.errors import ConfigError, RefusedError
-from station.cell.scene import guess_from, scene_of
+from station.cell.layout import guess_from, layout_of
 from station.operate.draft import STEPS, CellStep, Draft
 from station.operate.guided_views import FEWEST_GUIDED, FoundCell, enough, find_cell
 
@@ -254,5 +254,5 @@ def write_config(draft: Draft, path: Path) -> StationConfig:
     report = examine_config(path)
     if report.config is None:
         raise config_error(path, report.wrong)
-    scene_of(report.config)
+    layout_of(report.config)
     return report.config

@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.geometry import Array
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import Figure, StopTestMove, StopWay
+from station.cell.arm_acceptance import Figure, StopTestMove, StopWay
 
 RESTING_RAD_S = 0.01
 """An arm slower than this rests: joint speeds of a resting UR read up to some mrad/s."""

@@ -14,8 +14,8 @@ from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.kinematics import inverse_many, singularity_measure
 from calibrate.projection import camera_matrix
 from station.cell.collision import Contact, margins
+from station.cell.layout import CellLayout
 from station.cell.limits import joint_bounds
-from station.cell.scene import Scene
 from station.plan.order import move_times
 from station.plan.visibility import ViewRange, seen_for_certain, sees_past_the_arm
 
@@ -64,7 +64,7 @@ class CandidateSet:
         )
 
 
-def camera_views(scene: Scene, view: ViewRange, count: int, rng: np.random.Generator) -> Array:
+def camera_views(layout: CellLayout, view: ViewRange, count: int, rng: np.random.Generator) -> Array:
     """Draw views of the board, camera_from_board (count, 4, 4), spread over the range."""
     low, high = view.distance_m
     distance = rng.uniform(low, high, count)
@@ -72,14 +72,14 @@ def camera_views(scene: Scene, view: ViewRange, count: int, rng: np.random.Gener
     cosine = rng.uniform(np.cos(view.tilt_rad[1]), np.cos(view.tilt_rad[0]), count)
     tilt, around = np.arccos(cosine), rng.uniform(-np.pi, np.pi, count)
     roll = view.roll_centre_rad + rng.uniform(-view.roll_rad, view.roll_rad, count)
-    points = board_points(scene.board)
+    points = board_points(layout.board)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     axis = np.stack([np.cos(around), np.sin(around), np.zeros(count)], axis=1)
     turn = rotation_exp(axis * tilt[:, None])
     rolled = rotation_exp(np.stack([np.zeros(count), np.zeros(count), roll], axis=1))
     R = rolled @ turn
-    K = camera_matrix(scene.camera)
-    half = np.array([scene.camera.width, scene.camera.height]) / 2
+    K = camera_matrix(layout.camera)
+    half = np.array([layout.camera.width, layout.camera.height]) / 2
     aim = half + view.off_centre * half * rng.uniform(-1, 1, (count, 2))
     ray = np.concatenate([(aim - K[:2, 2]) / np.diag(K)[:2], np.ones((count, 1))], axis=1)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -87,7 +87,7 @@ def camera_views(scene: Scene, view: ViewRange, count: int, rng: np.random.Gener
 
 
 def find_candidates(
-    scene: Scene,
+    layout: CellLayout,
     view: ViewRange,
     count: int,
     rng: np.random.Generator,
@@ -98,14 +98,14 @@ def find_candidates(
 
     `tries` (None: `count`) views are drawn; the first `count` that certainly show the board are used.
     """
-    views = camera_views(scene, view, tries or count, rng)
-    flange = scene.base_from_flange(views)
-    seen = seen_for_certain(scene, flange, view)
+    views = camera_views(layout, view, tries or count, rng)
+    flange = layout.base_from_flange(views)
+    seen = seen_for_certain(layout, flange, view)
     lost = Counter({NOT_IN_PICTURE: int((~seen).sum())})
     views, flange = views[seen][:count], flange[seen][:count]
-    rows, joints, branches = _all_branches(scene, flange, near_joints_rad)
+    rows, joints, branches = _all_branches(layout, flange, near_joints_rad)
     lost[OUT_OF_REACH] = len(views) - len(np.unique(rows))
-    checks, worst = _checks(scene, view, joints, flange[rows])
+    checks, worst = _checks(layout, view, joints, flange[rows])
     keep = np.logical_and.reduce(list(checks.values()))
     failing = np.sum([~good for good in checks.values()], axis=0)
     alone = Counter({name: int((~good & (failing == 1)).sum()) for name, good in checks.items()})
@@ -115,18 +115,18 @@ def find_candidates(
 
 
 def _checks(
-    scene: Scene, view: ViewRange, joints: Array, base_from_flange: Array
+    layout: CellLayout, view: ViewRange, joints: Array, base_from_flange: Array
 ) -> tuple[dict[str, NDArray[np.bool_]], Array]:
     """Check joints (n, 6): return results (n,) by name of the limit, and the smallest margins (n,)."""
-    low, high = joint_bounds(scene.geometry)
+    low, high = joint_bounds(layout.geometry)
     checks: dict[str, NDArray[np.bool_]] = {
         "the joint range": np.asarray(((joints >= low) & (joints <= high)).all(axis=1)),
         "singular postures": np.asarray(
-            singularity_measure(scene.geometry.model, joints) >= view.smallest_singular
+            singularity_measure(layout.geometry.model, joints) >= view.smallest_singular
         ),
-        ARM_IN_SIGHT: sees_past_the_arm(scene, joints, base_from_flange),
+        ARM_IN_SIGHT: sees_past_the_arm(layout, joints, base_from_flange),
     }
-    gaps, contacts = margins(scene.geometry, joints)
+    gaps, contacts = margins(layout.geometry, joints)
     for contact, gap in zip(contacts, gaps.T, strict=True):
         name = _limit_of(contact)
         good = np.asarray(gap >= _PATH_RESERVE_M)
@@ -144,11 +144,11 @@ def _limit_of(contact: Contact) -> str:
 
 
 def _all_branches(
-    scene: Scene, flange: Array, near: Array | None
+    layout: CellLayout, flange: Array, near: Array | None
 ) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
     """Compute inverse kinematics: row in `flange` (m,), joints (m, 6), and arm branch (m,)."""
-    low, high = joint_bounds(scene.geometry)
-    rows, q, branches = inverse_many(scene.geometry.model, flange)
+    low, high = joint_bounds(layout.geometry)
+    rows, q, branches = inverse_many(layout.geometry.model, flange)
     for branch in np.unique(branches):
         here = branches == branch
         q[here] = _gather(q[here], near, low, high)
@@ -166,7 +166,7 @@ def _gather(q: Array, near: Array | None, low: Array, high: Array) -> Array:
 
 
 def best_group(
-    scene: Scene, found: CandidateSet, start: Array | None, wanted: int, plenty: int
+    layout: CellLayout, found: CandidateSet, start: Array | None, wanted: int, plenty: int
 ) -> CandidateSet:
     """Choose at most `wanted` candidates of one arm branch with free direct moves to a common hub.
 
@@ -180,7 +180,7 @@ def best_group(
         branches.sort(key=lambda branch: float(np.abs(branch.joints_rad - start).max(axis=1).min()))
     best = found.take(np.zeros(0, dtype=int))
     for branch in branches:
-        group = _best_of_branch(scene, branch.take(np.arange(min(wanted, len(branch)))), start)
+        group = _best_of_branch(layout, branch.take(np.arange(min(wanted, len(branch)))), start)
         if len(group) > len(best):
             best = group
         if len(best) >= plenty:
@@ -188,12 +188,12 @@ def best_group(
     return best
 
 
-def _best_of_branch(scene: Scene, branch: CandidateSet, start: Array | None) -> CandidateSet:
+def _best_of_branch(layout: CellLayout, branch: CandidateSet, start: Array | None) -> CandidateSet:
     groups = [branch.take(np.zeros(0, dtype=int))]
     for hub in _hubs(branch.joints_rad, start):
-        free = np.isfinite(_moves(scene, hub, branch.joints_rad))
+        free = np.isfinite(_moves(layout, hub, branch.joints_rad))
         group = branch.take(np.flatnonzero(free))
-        if start is None or np.isfinite(_moves(scene, start, group.joints_rad, reach_rad=np.inf)).any():
+        if start is None or np.isfinite(_moves(layout, start, group.joints_rad, reach_rad=np.inf)).any():
             groups.append(group)
         if len(groups[-1]) >= _NEARLY_ALL * len(branch):
             break
@@ -214,9 +214,9 @@ def _hubs(joints: Array, start: Array | None) -> Iterator[Array]:
         hub = int(away.argmax())
 
 
-def _moves(scene: Scene, hub: Array, members: Array, reach_rad: float = _REACH_RAD) -> Array:
+def _moves(layout: CellLayout, hub: Array, members: Array, reach_rad: float = _REACH_RAD) -> Array:
     """Compute durations (n,) of direct moves from hub to members; infinite where too far or not free."""
     near = np.abs(members - hub).max(axis=1) <= reach_rad
     times = np.full(len(members), np.inf)
-    times[near] = move_times(scene.geometry, np.repeat(hub[None], int(near.sum()), axis=0), members[near])
+    times[near] = move_times(layout.geometry, np.repeat(hub[None], int(near.sum()), axis=0), members[near])
     return times

@@ -22,8 +22,8 @@ from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import with_near_axes
 from calibrate.projection import intrinsics_names
-from station.cell.plan import Criterion
-from station.cell.scene import Scene
+from station.cell.layout import CellLayout
+from station.cell.pose_plan import Criterion
 
 WITH_TABLE = ("arm", "all")
 Aim = Literal["camera", "arm", "both"]
@@ -86,37 +86,37 @@ class Objective:
 
 
 def informations(
-    scene: Scene,
+    layout: CellLayout,
     base_from_flange: Array,
     joints_rad: Array | None = None,
     noise: MeasurementNoise = USUAL_NOISE,
 ) -> Array:
     """Compute the information (n, p, p) of each pose; with joints (n, 6) also about the arm's table."""
-    points, motion = board_points(scene.board), None
+    points, motion = board_points(layout.board), None
     if joints_rad is not None:
-        motion = by_parameters(with_near_axes(scene.geometry.model), joints_rad) * RELATIVE_SIGMA
+        motion = by_parameters(with_near_axes(layout.geometry.model), joints_rad) * RELATIVE_SIGMA
     return view_information(
-        scene.mount, scene.camera, base_from_flange, scene.X, scene.Y, points, noise, motion
+        layout.mount, layout.camera, base_from_flange, layout.X, layout.Y, points, noise, motion
     )
 
 
 def objective_for(
-    scene: Scene, criterion: Criterion, free_intrinsics: bool, joints_rad: Array | None = None
+    layout: CellLayout, criterion: Criterion, free_intrinsics: bool, joints_rad: Array | None = None
 ) -> Objective:
     """Make the objective of a criterion.
 
     `joints_rad`: (n, 6) postures that stand for the workspace, needed by the criteria with the arm's table.
     """
     table_mm = TABLE_MM if criterion in WITH_TABLE else 0.0
-    prior = prior_information(scene.camera, not free_intrinsics, BoardTolerance.of(scene.board), table_mm)
-    lens = slice(12, 12 + len(intrinsics_names(scene.camera))) if free_intrinsics else None
+    prior = prior_information(layout.camera, not free_intrinsics, BoardTolerance.of(layout.board), table_mm)
+    lens = slice(12, 12 + len(intrinsics_names(layout.camera))) if free_intrinsics else None
     K = None
     if joints_rad is not None and table_mm:
-        model = with_near_axes(scene.geometry.model)
+        model = with_near_axes(layout.geometry.model)
         room = sample_workspace(model, joints_rad)
-        over = Workspace.of(scene.mount, model, room, scene.X, scene.Y, scene.working_distance_m)
+        over = Workspace.of(layout.mount, model, room, layout.X, layout.Y, layout.working_distance_m)
         K = over.among(len(prior))
-    return Objective(criterion, scene.working_distance_m, prior, lens, K)
+    return Objective(criterion, layout.working_distance_m, prior, lens, K)
 
 
 def choose(

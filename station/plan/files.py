@@ -17,8 +17,8 @@ from recordings.reader import open_recording
 from recordings.schema.messages import Mount
 from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2
 from station.cell.errors import ConfigError
-from station.cell.plan import Plan
-from station.cell.scene import pose_at
+from station.cell.layout import pose_at
+from station.cell.pose_plan import Plan
 
 _POSE_LIMIT = 200
 

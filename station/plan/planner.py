@@ -16,9 +16,9 @@ from calibrate.kinematics import forward
 from station.cell.collision import margins
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
+from station.cell.layout import CellLayout, layout_of, require_kept_clear
 from station.cell.limits import check_plan
-from station.cell.plan import Criterion, Plan
-from station.cell.scene import Scene, require_kept_clear, scene_of
+from station.cell.pose_plan import Criterion, Plan
 from station.plan.candidates import (
     ARM_IN_SIGHT,
     NOT_IN_PICTURE,
@@ -57,12 +57,12 @@ _KEYHOLE = 10
 
 
 def explain_shortage(
-    scene: Scene, wanted: int, group: CandidateSet, found: CandidateSet, start: Array | None
+    layout: CellLayout, wanted: int, group: CandidateSet, found: CandidateSet, start: Array | None
 ) -> LimitError:
     """Make the error that says why there is no plan. `group`: usable candidates; `found`: all."""
     counts = {"possible": len(group), "wanted": wanted}
-    if looks_back(scene, found):
-        angle_deg = float(np.rad2deg(np.arccos(np.clip(scene.X[2, 2], -1.0, 1.0))))
+    if looks_back(layout, found):
+        angle_deg = float(np.rad2deg(np.arccos(np.clip(layout.X[2, 2], -1.0, 1.0))))
         return LimitError(
             f"The camera looks back at the arm: camera_guess's z axis is {angle_deg:.0f}° away from where "
             f"the flange points, and in {found.alone[ARM_IN_SIGHT]} postures the arm would hide the board",
@@ -71,12 +71,12 @@ def explain_shortage(
             **counts,
         )
     if start is not None and len(found) >= wanted and len(group) < wanted:
-        return _start_is_cut_off(scene, counts, len(found), start)
+        return _start_is_cut_off(layout, counts, len(found), start)
     few = f"Only {len(group)} of the wanted {wanted} poses are possible"
     few = few if len(group) else "No pose is possible"
     lost, alone = found.lost, found.alone
     if lost[OUT_OF_REACH] > 2 * len(found) and lost[OUT_OF_REACH] >= alone.total():
-        return _out_of_reach(scene, few, counts, lost[OUT_OF_REACH])
+        return _out_of_reach(layout, few, counts, lost[OUT_OF_REACH])
     binding = []
     if not alone.total() and lost[NOT_IN_PICTURE] > max(lost.values(), default=0) / 2:
         binding.append(NOT_IN_PICTURE)
@@ -106,18 +106,18 @@ def _remedy(limit: str) -> str:
     return _REMEDIES.get(limit, other)
 
 
-def looks_back(scene: Scene, found: CandidateSet) -> bool:
+def looks_back(layout: CellLayout, found: CandidateSet) -> bool:
     """Tell whether the configured camera looks back at the arm, which then hides the board in most views."""
-    backwards = scene.mount == "eye-in-hand" and scene.X[2, 2] < _BACKWARDS
+    backwards = layout.mount == "eye-in-hand" and layout.X[2, 2] < _BACKWARDS
     return bool(backwards and found.alone[ARM_IN_SIGHT] > _KEYHOLE * len(found))
 
 
-def _out_of_reach(scene: Scene, few: str, counts: dict[str, int], beyond: int) -> LimitError:
-    model = scene.geometry.model
+def _out_of_reach(layout: CellLayout, few: str, counts: dict[str, int], beyond: int) -> LimitError:
+    model = layout.geometry.model
     arm_m = abs(model.a_m[1]) + abs(model.a_m[2]) + model.d_m[4]
-    thing, centre = "camera", scene.X[:3, 3]
-    if scene.mount == "eye-in-hand":
-        thing, centre = "board", transform_points(scene.Y, board_points(scene.board).mean(axis=0))
+    thing, centre = "camera", layout.X[:3, 3]
+    if layout.mount == "eye-in-hand":
+        thing, centre = "board", transform_points(layout.Y, board_points(layout.board).mean(axis=0))
     away_m = float(np.linalg.norm(centre - [0.0, 0.0, model.d_m[0]]))
     return LimitError(
         f"{few}: {beyond} views of the board lie beyond the arm's reach. The {thing} stands {away_m:.2f} m "
@@ -130,8 +130,8 @@ def _out_of_reach(scene: Scene, few: str, counts: dict[str, int], beyond: int) -
     )
 
 
-def _start_is_cut_off(scene: Scene, counts: dict[str, int], passing: int, start: Array) -> LimitError:
-    gaps, contacts = margins(scene.geometry, start)
+def _start_is_cut_off(layout: CellLayout, counts: dict[str, int], passing: int, start: Array) -> LimitError:
+    gaps, contacts = margins(layout.geometry, start)
     worst = int(gaps[0].argmin())
     near = f"; {contacts[worst]}, {-1000 * gaps[0, worst]:.0f} mm too close" if gaps.min() < 0 else ""
     return LimitError(
@@ -174,21 +174,21 @@ def make_plan(
     """
     require_kept_clear(config)
     options = PlanOptions(count=count, seed=seed, criterion=criterion, free_intrinsics=not lens_known)
-    return plan_scene(scene_of(config), options, start_joints_rad, progress)
+    return plan_scene(layout_of(config), options, start_joints_rad, progress)
 
 
 def plan_scene(
-    scene: Scene,
+    layout: CellLayout,
     options: PlanOptions,
     start_joints_rad: Sequence[float] | None = None,
     progress: Progress = lambda text, done: None,
 ) -> Plan:
-    """Make a plan for a scene, as `make_plan`."""
+    """Make a plan for a layout, as `make_plan`."""
     rng = np.random.default_rng(options.seed)
     start = None if start_joints_rad is None else np.asarray(start_joints_rad, dtype=float)
     progress("looking for poses", 0.0)
-    pool, notes = candidate_pool(scene, options, start, rng)
-    plan = _choose_and_order(scene, options, pool, start, rng, progress)
+    pool, notes = candidate_pool(layout, options, start, rng)
+    plan = _choose_and_order(layout, options, pool, start, rng, progress)
     progress("done", 1.0)
     return msgspec.structs.replace(plan, note="; ".join(notes))
 
@@ -209,37 +209,37 @@ def _relaxed(view: ViewRange, start_roll_rad: float | None) -> list[tuple[ViewRa
     ]
 
 
-def _start_roll(scene: Scene, start: Array | None) -> float | None:
+def _start_roll(layout: CellLayout, start: Array | None) -> float | None:
     """Compute the board's roll in the view from the start, rad; None where it is not seen from there."""
     if start is None:
         return None
-    flange = forward(scene.geometry.model, start)
-    if not visible(scene.camera, scene.seen(flange[None], board_points(scene.board)), 0.0)[0]:
+    flange = forward(layout.geometry.model, start)
+    if not visible(layout.camera, layout.seen(flange[None], board_points(layout.board)), 0.0)[0]:
         return None
-    return expected_view(scene, flange).roll_rad
+    return expected_view(layout, flange).roll_rad
 
 
 def candidate_pool(
-    scene: Scene, options: PlanOptions, start: Array | None, rng: np.random.Generator
+    layout: CellLayout, options: PlanOptions, start: Array | None, rng: np.random.Generator
 ) -> tuple[CandidateSet, list[str]]:
     """Find the candidates of the best branch, and notes. LimitError where the widest range has too few."""
     best: tuple[CandidateSet, CandidateSet, str] | None = None
-    for view, note in _relaxed(options.view or view_range(scene), _start_roll(scene, start)):
-        found = find_candidates(scene, view, 2 * options.pool, rng, start, _TRIES * options.pool)
-        group = best_group(scene, found, start, options.pool, 3 * options.count)
+    for view, note in _relaxed(options.view or view_range(layout), _start_roll(layout, start)):
+        found = find_candidates(layout, view, 2 * options.pool, rng, start, _TRIES * options.pool)
+        group = best_group(layout, found, start, options.pool, 3 * options.count)
         if best is None or len(group) > len(best[0]):
             best = group, found, note
         if len(group) >= 3 * options.count:
             break
     assert best is not None
     group, found, note = best
-    if len(group) < options.count or looks_back(scene, found):
-        raise explain_shortage(scene, options.count, group, found, start)
+    if len(group) < options.count or looks_back(layout, found):
+        raise explain_shortage(layout, options.count, group, found, start)
     return group, [note] if note else []
 
 
 def _choose_and_order(
-    scene: Scene,
+    layout: CellLayout,
     options: PlanOptions,
     pool: CandidateSet,
     start: Array | None,
@@ -248,8 +248,8 @@ def _choose_and_order(
 ) -> Plan:
     """Choose and order poses, and check the plan; repeat without poses that no free path leads to."""
     joints = pool.joints_rad if options.criterion in WITH_TABLE else None
-    objective = objective_for(scene, options.criterion, options.free_intrinsics, joints)
-    information = informations(scene, pool.base_from_flange, joints, options.noise)
+    objective = objective_for(layout, options.criterion, options.free_intrinsics, joints)
+    information = informations(layout, pool.base_from_flange, joints, options.noise)
     left = np.arange(len(pool))
     picked: list[int] = []
     while len(left) >= options.count:
@@ -266,31 +266,33 @@ def _choose_and_order(
         )
         progress("ordering", 0.85)
         places = left[chosen]
-        order, blocked = _ordered(scene, pool.joints_rad[places], start, options.seed)
+        order, blocked = _ordered(layout, pool.joints_rad[places], start, options.seed)
         if not blocked:
             places = places[order]
-            plan = _describe(scene, options, pool.joints_rad[places], information[places], objective)
+            plan = _describe(layout, options, pool.joints_rad[places], information[places], objective)
             progress("checking", 0.95)
-            blocked = _failing(plan, start, scene)
+            blocked = _failing(plan, start, layout)
             if not blocked:
                 return plan
         gone = places[blocked]
         left, picked = np.setdiff1d(left, gone), [p for p in places if p not in gone]
-    raise explain_shortage(scene, options.count, pool.take(left), pool, start)
+    raise explain_shortage(layout, options.count, pool.take(left), pool, start)
 
 
-def _ordered(scene: Scene, joints: Array, start: Array | None, seed: int) -> tuple[list[int], list[int]]:
+def _ordered(
+    layout: CellLayout, joints: Array, start: Array | None, seed: int
+) -> tuple[list[int], list[int]]:
     """Find a short order of joints (n, 6), preferring moves that keep the board in the image.
 
     The second list holds the indices of poses without a free path.
     """
-    times = time_matrix(scene.geometry, joints)
+    times = time_matrix(layout.geometry, joints)
     i, j = np.triu_indices(len(joints), 1)
     blind = np.zeros_like(times)
-    blind[i, j] = blind[j, i] = blind_share(scene, joints[i], joints[j])
+    blind[i, j] = blind[j, i] = blind_share(layout, joints[i], joints[j])
     lead = np.zeros(len(joints))
     if start is not None:
-        lead = move_times(scene.geometry, np.repeat(start[None], len(joints), axis=0), joints)
+        lead = move_times(layout.geometry, np.repeat(start[None], len(joints), axis=0), joints)
     order = short_order(times * (1 + _BLIND * blind), lead, seed)
     if lead[order[0]] == BLOCKED:
         return order, [order[0]]
@@ -298,9 +300,9 @@ def _ordered(scene: Scene, joints: Array, start: Array | None, seed: int) -> tup
     return order, [min(legs, key=lambda m: free[m]) for legs in pairwise(order) if times[legs] == BLOCKED]
 
 
-def _failing(plan: Plan, start: Array | None, scene: Scene) -> list[int]:
+def _failing(plan: Plan, start: Array | None, layout: CellLayout) -> list[int]:
     """List the poses whose move fails the dense check. LimitError when the plan itself violates a limit."""
-    check = check_plan(plan, start, scene.geometry)
+    check = check_plan(plan, start, layout.geometry)
     failing = [place for place, move in enumerate(check.moves) if move.problems]
     if check.problems and not failing:
         raise LimitError("\n".join(map(str, check.problems)), code="plan-breaks-limits")
@@ -308,7 +310,7 @@ def _failing(plan: Plan, start: Array | None, scene: Scene) -> list[int]:
 
 
 def _describe(
-    scene: Scene,
+    layout: CellLayout,
     options: PlanOptions,
     joints: Array,
     gained: Array,
@@ -316,13 +318,13 @@ def _describe(
 ) -> Plan:
     known = gained.cumsum(axis=0)
     poses = tuple(
-        planned_pose(scene, number, q, sigma_of(total, objective.prior)[0])
+        planned_pose(layout, number, q, sigma_of(total, objective.prior)[0])
         for number, (q, total) in enumerate(zip(joints, known, strict=True))
     )
-    limits = scene.geometry.limits
+    limits = layout.geometry.limits
     return Plan(
-        robot=scene.geometry.model.name,
-        mount=scene.mount,
+        robot=layout.geometry.model.name,
+        mount=layout.mount,
         poses=poses,
         joint_speed_rad_s=limits.joint_speed_rad_s,
         joint_acceleration_rad_s2=limits.joint_acceleration_rad_s2,

@@ -16,9 +16,9 @@ from calibrate.handeye.information import USUAL_NOISE, MeasurementNoise, covaria
 from calibrate.handeye.solution import MEASURED
 from station.cell.config import StationConfig
 from station.cell.errors import StationError
+from station.cell.layout import CellLayout, flange_poses, layout_of
 from station.cell.limits import check_path
-from station.cell.plan import Plan, PlannedPose
-from station.cell.scene import Scene, flange_poses, scene_of
+from station.cell.pose_plan import Plan, PlannedPose
 from station.plan.candidates import find_candidates
 from station.plan.choose import TABLE_MM, Objective, informations, objective_for
 from station.plan.visibility import planned_pose, view_range, visible
@@ -42,32 +42,34 @@ class ArmForecast:
     """Parameters of the table that the plan does not determine."""
 
 
-def forecast_arm(scene: Scene, plan: Plan) -> ArmForecast:
+def forecast_arm(layout: CellLayout, plan: Plan) -> ArmForecast:
     """Predict errors with the arm's table, for usual noise and usual errors of the table."""
     joints = np.array([pose.joints_rad for pose in plan.poses])
-    gains = informations(scene, flange_poses(scene, plan), joints)
+    gains = informations(layout, flange_poses(layout, plan), joints)
     total, expected = gains.sum(axis=0), []
-    for tolerance in (scene.board.square_tolerance, MEASURED):
-        board = msgspec.structs.replace(scene.board, square_tolerance=tolerance)
-        objective = objective_for(replace(scene, board=board), "arm", free_intrinsics=True, joints_rad=joints)
+    for tolerance in (layout.board.square_tolerance, MEASURED):
+        board = msgspec.structs.replace(layout.board, square_tolerance=tolerance)
+        objective = objective_for(
+            replace(layout, board=board), "arm", free_intrinsics=True, joints_rad=joints
+        )
         expected.append(float(np.exp(objective(total) / 2)))
-        if tolerance is scene.board.square_tolerance:
+        if tolerance is layout.board.square_tolerance:
             left = np.diag(covariance_of(total, objective.prior))[-len(PARAMETERS) :]
     wide = np.sqrt(left) > _OPEN * 1e-3 * TABLE_MM
     names = tuple(name for name, stays in zip(PARAMETERS, wide, strict=True) if stays)
     return ArmForecast(expected[0], expected[1], names)
 
 
-def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
+def with_forecast(layout: CellLayout, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
     """Add the expected sigma after each pose where it is missing, for usual noise.
 
     The second value names the poses in which the board is expected to be cut off.
     """
-    flange = flange_poses(scene, plan)
-    cut = tuple(pose.name for pose, seen in zip(plan.poses, _whole(scene, flange), strict=True) if not seen)
+    flange = flange_poses(layout, plan)
+    cut = tuple(pose.name for pose, seen in zip(plan.poses, _whole(layout, flange), strict=True) if not seen)
     if all(pose.predicted_sigma_m is not None for pose in plan.poses):
         return plan, cut
-    expected = forecast_views(scene, flange)
+    expected = forecast_views(layout, flange)
     poses = tuple(
         msgspec.structs.replace(pose, predicted_sigma_m=after)
         for pose, after in zip(plan.poses, expected, strict=True)
@@ -76,7 +78,7 @@ def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
 
 
 def forecast_views(
-    scene: Scene,
+    layout: CellLayout,
     base_from_flange: Array,
     free_intrinsics: bool = True,
     noise: MeasurementNoise = USUAL_NOISE,
@@ -85,19 +87,19 @@ def forecast_views(
 
     A view that is not expected to show the whole board adds nothing.
     """
-    objective = objective_for(scene, "A", free_intrinsics)
-    gains = informations(scene, base_from_flange, noise=noise)
-    gains[~_whole(scene, base_from_flange)] = 0.0
+    objective = objective_for(layout, "A", free_intrinsics)
+    gains = informations(layout, base_from_flange, noise=noise)
+    gains[~_whole(layout, base_from_flange)] = 0.0
     return [sigma_of(information, objective.prior)[0] for information in gains.cumsum(axis=0)]
 
 
-def _whole(scene: Scene, base_from_flange: Array) -> NDArray[np.bool_]:
+def _whole(layout: CellLayout, base_from_flange: Array) -> NDArray[np.bool_]:
     """Tell for each pose whether all points of the board are expected in the image, (n,)."""
-    return visible(scene.camera, scene.seen(base_from_flange, board_points(scene.board)), 0.0)
+    return visible(layout.camera, layout.seen(base_from_flange, board_points(layout.board)), 0.0)
 
 
 def next_best(
-    scene: Scene, base_from_flange: ArrayLike, goal_m: float, joints_now_rad: Sequence[float]
+    layout: CellLayout, base_from_flange: ArrayLike, goal_m: float, joints_now_rad: Sequence[float]
 ) -> tuple[PlannedPose, int | None] | None:
     """Find the most useful next pose with a free path from where the arm is, after views from flange poses.
 
@@ -105,18 +107,18 @@ def next_best(
     many. None without poses when the goal is reached, or when no pose is reachable.
     """
     flange = np.asarray(base_from_flange, dtype=float).reshape(-1, 4, 4)
-    objective = objective_for(scene, "A", free_intrinsics=True)
-    known = informations(scene, flange).sum(axis=0)
+    objective = objective_for(layout, "A", free_intrinsics=True)
+    known = informations(layout, flange).sum(axis=0)
     if sigma_of(known, objective.prior)[0] <= goal_m:
         return None
     start = np.asarray(joints_now_rad, dtype=float)
-    pool = find_candidates(scene, view_range(scene), _CANDIDATES, np.random.default_rng(0), start)
-    gains = informations(scene, pool.base_from_flange)
+    pool = find_candidates(layout, view_range(layout), _CANDIDATES, np.random.default_rng(0), start)
+    gains = informations(layout, pool.base_from_flange)
     for place in np.argsort(objective(known + gains), kind="stable")[:_TRIES]:
         joints = pool.joints_rad[place]
-        if not check_path(scene.geometry, start, joints).problems:
+        if not check_path(layout.geometry, start, joints).problems:
             after_m = sigma_of(known + gains[place], objective.prior)[0]
-            pose = planned_pose(scene, len(flange), joints, after_m)
+            pose = planned_pose(layout, len(flange), joints, after_m)
             return pose, _missing(known, gains, goal_m, objective)
     return None
 
@@ -138,7 +140,7 @@ def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_ra
     """
     goal_m = config.capture.goal_m
     try:
-        found = next_best(scene_of(config), base_from_flange, goal_m, joints_now_rad)
+        found = next_best(layout_of(config), base_from_flange, goal_m, joints_now_rad)
     except StationError:
         return ""
     if found is None:

@@ -15,8 +15,8 @@ from calibrate.projection import camera_matrix, project
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.collision import ARM_BODIES, body_segments, segment_distance
 from station.cell.config import matrix4, vector6
-from station.cell.plan import ExpectedView, PlannedPose
-from station.cell.scene import Scene, printed_corners
+from station.cell.layout import CellLayout, printed_corners
+from station.cell.pose_plan import ExpectedView, PlannedPose
 
 _ON_THE_WAY = 7
 """Positions along a move at which visibility is checked."""
@@ -46,14 +46,14 @@ _FOCUS = (0.6, 1.6)
 """Range of distances with sharp images, as multiples of the working distance."""
 
 
-def view_range(scene: Scene) -> ViewRange:
+def view_range(layout: CellLayout) -> ViewRange:
     """Choose distances at which the board fills the image well, near the working distance."""
-    K = camera_matrix(scene.camera)
-    points = board_points(scene.board)
-    size_m = (points.max(axis=0) - points.min(axis=0))[:2] + scene.board.square_m
-    picture = np.array([scene.camera.width, scene.camera.height])
+    K = camera_matrix(layout.camera)
+    points = board_points(layout.board)
+    size_m = (points.max(axis=0) - points.min(axis=0))[:2] + layout.board.square_m
+    picture = np.array([layout.camera.width, layout.camera.height])
     full_m = float((np.diag(K)[:2] * size_m / picture).max())
-    focus = np.array(_FOCUS) * scene.working_distance_m
+    focus = np.array(_FOCUS) * layout.working_distance_m
     near, far = (float(d) for d in np.clip([full_m / _NEAR_FILL, full_m / _FAR_FILL], *focus))
     if far < 1.2 * near:
         near, far = full_m / _NEAR_FILL, full_m / _FAR_FILL
@@ -89,44 +89,44 @@ def lens_radius(camera: CameraModel) -> float:
     return float(radii[falling[0]] if len(falling) else radii[-1])
 
 
-def seen_for_certain(scene: Scene, base_from_flange: Array, view: ViewRange) -> NDArray[np.bool_]:
+def seen_for_certain(layout: CellLayout, base_from_flange: Array, view: ViewRange) -> NDArray[np.bool_]:
     """Tell for n poses whether the whole board is in the image despite the uncertainty of the initial poses.
 
     Every point of the outline must be `border_px` plus `doubt` standard deviations away from the edge.
     """
-    rim = outline(scene.board)
-    good = visible(scene.camera, scene.seen(base_from_flange, rim), view.border_px)
+    rim = outline(layout.board)
+    good = visible(layout.camera, layout.seen(base_from_flange, rim), view.border_px)
     left = np.flatnonzero(good)
-    pixels, sigma_px = uncertain_pixels(scene, base_from_flange[left], rim)
+    pixels, sigma_px = uncertain_pixels(layout, base_from_flange[left], rim)
     border = view.border_px + view.doubt * sigma_px
-    size = np.array([scene.camera.width, scene.camera.height]) - 1
+    size = np.array([layout.camera.width, layout.camera.height]) - 1
     good[left] = ((pixels >= border) & (pixels <= size - border)).all(axis=(1, 2))
     return good
 
 
-def uncertain_pixels(scene: Scene, base_from_flange: Array, points: Array) -> tuple[Array, Array]:
+def uncertain_pixels(layout: CellLayout, base_from_flange: Array, points: Array) -> tuple[Array, Array]:
     """Project board points (k, 3) into n images: pixels and their standard deviations, (n, k, 2) each.
 
     To first order. Position errors of camera and board are isotropic; an orientation error of the camera
     moves a point about the camera, one of the board about the board's origin.
     """
-    seen = scene.seen(base_from_flange, points)
-    lever = seen - scene.seen(base_from_flange, np.zeros((1, 3)))
-    variance = (scene.x_sigma[0] ** 2 + scene.y_sigma[0] ** 2) * np.eye(3)
-    for arm, sigma_rad in ((seen, scene.x_sigma[1]), (lever, scene.y_sigma[1])):
+    seen = layout.seen(base_from_flange, points)
+    lever = seen - layout.seen(base_from_flange, np.zeros((1, 3)))
+    variance = (layout.x_sigma[0] ** 2 + layout.y_sigma[0] ** 2) * np.eye(3)
+    for arm, sigma_rad in ((seen, layout.x_sigma[1]), (lever, layout.y_sigma[1])):
         across = (arm**2).sum(axis=-1)[..., None, None] * np.eye(3) - arm[..., :, None] * arm[..., None, :]
         variance = variance + sigma_rad**2 * across
-    projected = project(scene.camera, seen)
+    projected = project(layout.camera, seen)
     J = projected.by_point
     return projected.pixels, np.sqrt(np.einsum("nkij,nkjl,nkil->nki", J, variance, J))
 
 
-def blind_share(scene: Scene, joints_from: Array, joints_to: Array) -> Array:
+def blind_share(layout: CellLayout, joints_from: Array, joints_to: Array) -> Array:
     """Compute the share (n,), 0…1, of moves (n, 6) → (n, 6) during which the board is not wholly seen."""
     steps = np.linspace(0, 1, _ON_THE_WAY + 2)[1:-1]
     paths = joints_from[:, None] + steps[:, None] * (joints_to - joints_from)[:, None]
-    flange = forward(scene.geometry.model, paths.reshape(-1, 6))
-    seen = visible(scene.camera, scene.seen(flange, outline(scene.board)), 0.0)
+    flange = forward(layout.geometry.model, paths.reshape(-1, 6))
+    seen = visible(layout.camera, layout.seen(flange, outline(layout.board)), 0.0)
     return np.asarray(1.0 - seen.reshape(len(joints_from), _ON_THE_WAY).mean(axis=1))
 
 
@@ -141,28 +141,28 @@ def outline(board: BoardSpec) -> Array:
     return np.array(grid)
 
 
-def sees_past_the_arm(scene: Scene, joints_rad: Array, base_from_flange: Array) -> NDArray[np.bool_]:
+def sees_past_the_arm(layout: CellLayout, joints_rad: Array, base_from_flange: Array) -> NDArray[np.bool_]:
     """Tell for n postures whether the arm is clear of all lines of sight to the board's outline: (n,)."""
-    starts, ends, radii = body_segments(scene.geometry, joints_rad)
+    starts, ends, radii = body_segments(layout.geometry, joints_rad)
     links = slice(2, len(ARM_BODIES))
-    if scene.mount == "eye-in-hand":
-        eye = transform_points(base_from_flange, scene.X[None, :3, 3])
-        board = np.broadcast_to(transform_points(scene.Y, outline(scene.board)), (len(eye), 8, 3))
+    if layout.mount == "eye-in-hand":
+        eye = transform_points(base_from_flange, layout.X[None, :3, 3])
+        board = np.broadcast_to(transform_points(layout.Y, outline(layout.board)), (len(eye), 8, 3))
     else:
-        eye = np.broadcast_to(scene.X[:3, 3], (len(joints_rad), 1, 3))
-        board = transform_points(base_from_flange @ scene.Y, outline(scene.board))
+        eye = np.broadcast_to(layout.X[:3, 3], (len(joints_rad), 1, 3))
+        board = transform_points(base_from_flange @ layout.Y, outline(layout.board))
     gap = segment_distance(eye[:, :, None], board[:, :, None], starts[:, None, links], ends[:, None, links])
     return np.asarray((gap > radii[links]).all(axis=(1, 2)))
 
 
-def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
+def expected_view(layout: CellLayout, base_from_flange: Array) -> ExpectedView:
     """Predict the view of the board from a flange pose (4, 4)."""
-    camera_from_board = scene.camera_from_board(base_from_flange)
-    points = board_points(scene.board)
+    camera_from_board = layout.camera_from_board(base_from_flange)
+    points = board_points(layout.board)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     R, t = camera_from_board[:3, :3], camera_from_board[:3, 3]
-    seen = np.vstack([centre, printed_corners(scene.board)]) @ R.T + t
-    pixels = project(scene.camera, np.maximum(seen, [-np.inf, -np.inf, 0.02])).pixels
+    seen = np.vstack([centre, printed_corners(layout.board)]) @ R.T + t
+    pixels = project(layout.camera, np.maximum(seen, [-np.inf, -np.inf, 0.02])).pixels
     area = abs(float(cv2.contourArea(pixels[1:].astype(np.float32))))
     return ExpectedView(
         distance_m=float(np.linalg.norm(seen[0])),
@@ -170,26 +170,26 @@ def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
         # Rotation about the optical axis that is left after the tilt, the shortest rotation, is removed.
         roll_rad=float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])),
         centre_px=(float(pixels[0, 0]), float(pixels[0, 1])),
-        coverage=min(1.0, area / (scene.camera.width * scene.camera.height)),
+        coverage=min(1.0, area / (layout.camera.width * layout.camera.height)),
     )
 
 
-def planned_pose(scene: Scene, number: int, joints_rad: Array, sigma_m: float | None) -> PlannedPose:
+def planned_pose(layout: CellLayout, number: int, joints_rad: Array, sigma_m: float | None) -> PlannedPose:
     """Make a pose of a plan with its expected view and the reason in a few words."""
-    base_from_flange = forward(scene.geometry.model, joints_rad)
-    view = expected_view(scene, base_from_flange)
+    base_from_flange = forward(layout.geometry.model, joints_rad)
+    view = expected_view(layout, base_from_flange)
     return PlannedPose(
         name=f"p{number + 1:02d}",
         joints_rad=vector6(joints_rad),
         base_from_flange=matrix4(base_from_flange),
         view=view,
-        why=_why(scene, view),
+        why=_why(layout, view),
         predicted_sigma_m=sigma_m,
     )
 
 
-def _why(scene: Scene, view: ExpectedView) -> str:
-    half = np.array([scene.camera.width, scene.camera.height]) / 2
+def _why(layout: CellLayout, view: ExpectedView) -> str:
+    half = np.array([layout.camera.width, layout.camera.height]) / 2
     x, y = (np.array(view.centre_px) - half) / half
     side = " ".join(
         word

@@ -15,10 +15,10 @@ import msgspec
 
 from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, Vector6
-from station.cell.acceptance import StopWay
+from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.session_folder import SessionSummary
 from station.cell.status import MotionPreview
 from station.cell.status import StationState as S

@@ -18,7 +18,7 @@ from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
-from station.cell.scene import flange_pose
+from station.cell.layout import flange_pose
 from station.cell.status import PoseState, StationState
 from station.devices.news import RESTING_S
 from station.session.context import SessionContext

@@ -10,7 +10,7 @@ import numpy as np
 from recordings.errors import RecordingError
 from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError, RobotError, StaleStateError, StationError, TriggerError
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState
 from station.cell.stillness import NotStillError
 from station.devices.base import fresh

@@ -23,8 +23,8 @@ from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, preview_image, sight
 from station.cell.config import SPEED_CAP_M_S, matrix4
 from station.cell.errors import CameraError, RefusedError, RobotError, StationError
+from station.cell.layout import flange_pose
 from station.cell.limits import point_speed_m_s
-from station.cell.scene import flange_pose
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import (
     CameraStatus,

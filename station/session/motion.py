@@ -13,10 +13,10 @@ from recordings.errors import RecordingError
 from recordings.files import require_free_space
 from recordings.schema.messages import RobotState, Vector6
 from station.analysis.worker import check_run
-from station.cell.acceptance import StopTestMove
+from station.cell.arm_acceptance import StopTestMove
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import PlanCheck
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import MotionPreview
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext, displacement

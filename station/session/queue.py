@@ -8,7 +8,7 @@ import msgspec
 
 from recordings.errors import CodedError
 from station.cell.errors import RefusedError
-from station.cell.plan import Plan, PlannedPose, plan_sha256
+from station.cell.pose_plan import Plan, PlannedPose, plan_sha256
 from station.cell.status import PoseState, PoseStatus
 
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})

@@ -32,8 +32,8 @@ from recordings.schema.messages import (
 )
 from station.cell.config import matrix4
 from station.cell.errors import CameraError
-from station.cell.plan import Plan
-from station.cell.scene import guess_matrix
+from station.cell.layout import guess_matrix
+from station.cell.pose_plan import Plan
 from station.cell.session_folder import (
     SessionState,
     clear_active,

@@ -19,8 +19,8 @@ from station.cell.errors import (
     StationError,
     TriggerError,
 )
+from station.cell.layout import geometry_from
 from station.cell.limits import check_path, with_plan_speeds
-from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError
 from station.devices.base import fresh

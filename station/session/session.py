@@ -20,8 +20,8 @@ from recordings.errors import RecordingError
 from station.analysis.pool import Workers
 from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import RefusedError, RobotError
-from station.cell.plan import Plan
-from station.cell.scene import cell_geometry
+from station.cell.layout import cell_geometry
+from station.cell.pose_plan import Plan
 from station.cell.session_folder import SessionState, interrupted_session
 from station.cell.status import LeaseStatus, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor

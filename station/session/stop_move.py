@@ -1,6 +1,6 @@
 """Move of the acceptance test: one joint turns, slowly, and is stopped half way in one way.
 
-Nothing is recorded here: the stop is judged from another connection to the arm (`operate.acceptance`).
+Nothing is recorded here: the stop is judged from another connection to the arm (`operate.stop_test`).
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import numpy as np
 
 from calibrate.kinematics import JOINT_NAMES
 from recordings.schema.messages import Vector6
-from station.cell.acceptance import STOP_GIVEN, STOP_TESTED, StopTestMove, StopWay
+from station.cell.arm_acceptance import STOP_GIVEN, STOP_TESTED, StopTestMove, StopWay
 from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError, RobotError, SafetyStopError, StaleStateError
+from station.cell.layout import geometry_from, pose_at
 from station.cell.limits import MoveCheck, check_path, check_plan, slower
-from station.cell.plan import Plan
-from station.cell.scene import geometry_from, pose_at
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState
 from station.protocol.verbs import Purpose, StopTest
 from station.session.context import SessionContext

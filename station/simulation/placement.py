@@ -17,7 +17,7 @@ from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.cell.collision import body_segments, margins, segment_distance
 from station.cell.config import CameraConfig, LimitsConfig, Plane, PoseGuess, RobotConfig, StationConfig
 from station.cell.errors import ConfigError
-from station.cell.scene import Scene, guess_from, scene_of
+from station.cell.layout import CellLayout, guess_from, layout_of
 from station.plan.candidates import find_candidates
 from station.plan.visibility import view_range
 
@@ -128,14 +128,14 @@ def _shell_point(rng: np.random.Generator) -> Array:
     return np.array([radius * np.cos(around), radius * np.sin(around), rng.uniform(0.45, 0.9)])
 
 
-def _exact_scene(mount: Mount, camera: CameraModel, board: BoardSpec, X: Array, Y: Array) -> Scene:
+def _exact_scene(mount: Mount, camera: CameraModel, board: BoardSpec, X: Array, Y: Array) -> CellLayout:
     # 1σ of 20 mm for what is fixed in the cell leaves room for the rough poses of the configuration.
     camera_sigma_m, board_sigma_m = (0.0, 0.02) if mount == "eye-in-hand" else (0.02, 0.0)
     guesses = guess_from(X, camera_sigma_m, 0.0), guess_from(Y, board_sigma_m, 0.0)
-    return scene_of(cell_description(mount, camera, board, *guesses))
+    return layout_of(cell_description(mount, camera, board, *guesses))
 
 
-def _comfortable_start(scene: Scene, base_from_flange: Array, rng: np.random.Generator) -> Array | None:
+def _comfortable_start(scene: CellLayout, base_from_flange: Array, rng: np.random.Generator) -> Array | None:
     solutions = inverse_all(MODELS[ROBOT], base_from_flange)
     if len(solutions) == 0:
         return None
@@ -147,7 +147,7 @@ def _comfortable_start(scene: Scene, base_from_flange: Array, rng: np.random.Gen
     return None if len(good) == 0 else np.asarray(solutions[rng.choice(good)])
 
 
-def _sees(scene: Scene, joints_rad: Array) -> bool:
+def _sees(scene: CellLayout, joints_rad: Array) -> bool:
     """Tell whether no part of the arm is between the camera and the board's corners."""
     flange = forward(MODELS[ROBOT], joints_rad)
     in_hand = scene.mount == "eye-in-hand"
@@ -161,7 +161,7 @@ def _sees(scene: Scene, joints_rad: Array) -> bool:
     return bool((gap > limit).all())
 
 
-def _roomy(scene: Scene, start: Array, rng: np.random.Generator) -> bool:
+def _roomy(scene: CellLayout, start: Array, rng: np.random.Generator) -> bool:
     """Tell whether enough varied views are reachable without changing the arm branch."""
     found = find_candidates(scene, replace(view_range(scene), doubt=0.0), _TRIED_VIEWS, rng, start)
     if len(found) == 0:

@@ -16,7 +16,7 @@ import numpy as np
 from calibrate.geometry import perturb
 from recordings.schema.messages import CameraModel
 from station.cell.config import PoseGuess, StationConfig, matrix4, vector6
-from station.cell.scene import guess_matrix, require_kept_clear, scene_of
+from station.cell.layout import guess_matrix, layout_of, require_kept_clear
 from station.devices.cell import Cell
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.camera import RenderedCamera
@@ -79,8 +79,8 @@ def without_devices(config: StationConfig, host: str) -> StationConfig:
 def truth_within(config: StationConfig, seed: int) -> CellTruth:
     """Draw a true cell that agrees with the configuration; its arm starts where the board is seen."""
     require_kept_clear(config)
-    scene = scene_of(config)
-    assert config.camera_guess is not None and config.board_guess is not None  # checked by scene_of
+    scene = layout_of(config)
+    assert config.camera_guess is not None and config.board_guess is not None  # checked by layout_of
     rng = np.random.default_rng([22, seed])
     group, _ = candidate_pool(scene, PlanOptions(seed=seed), None, rng)
     middle = np.abs(group.joints_rad - np.median(group.joints_rad, axis=0)).max(axis=1).argmin()

@@ -16,7 +16,7 @@ from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
 from station.cell.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig, matrix4, vector6
 from station.cell.errors import ConfigError
-from station.cell.scene import guess_from
+from station.cell.layout import guess_from
 from station.simulation.cell import CellTruth, NoiseLevel, SceneName
 from station.simulation.placement import (
     Placement,

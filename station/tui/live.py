@@ -13,7 +13,7 @@ from textual.content import Content
 from textual.widgets import ProgressBar, RichLog, Static
 
 from station.cell.config import CaptureConfig
-from station.cell.scene import Scene
+from station.cell.layout import CellLayout
 from station.cell.status import Event, PoseStatus, SessionStatus, StationState, StationStatus
 from station.protocol.states import LATCHED, RUNNING
 from station.tui.frame import Line
@@ -198,7 +198,7 @@ def _advice(advice: str, width: int) -> str:
 _HEAT = ("$dim on $h0", "$foreground on $h1", "$strong on $h2", "$onaccent on $h3", "$onaccent on $h4")
 
 
-def coverage_lines(known: Known, width: int, height: int, scene: Scene | None = None) -> Content:
+def coverage_lines(known: Known, width: int, height: int, scene: CellLayout | None = None) -> Content:
     """The picture as a grid: in how many images each part showed the board, and which poses fill the rest."""
     status = known.shown
     views = status.estimate.image_views
@@ -224,7 +224,7 @@ def coverage_lines(known: Known, width: int, height: int, scene: Scene | None = 
     return lines(*rows[:height])
 
 
-def _empty_words(status: StationStatus, scene: Scene | None) -> Content:
+def _empty_words(status: StationStatus, scene: CellLayout | None) -> Content:
     views = status.estimate.image_views
     empty = np.array(views) == 0
     if not empty.any():

@@ -11,8 +11,8 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
 
-from station.cell.plan import PlannedPose
-from station.cell.scene import Scene
+from station.cell.layout import CellLayout
+from station.cell.pose_plan import PlannedPose
 from station.cell.status import PoseStatus, StationStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
@@ -43,7 +43,7 @@ _STATES: dict[str, tuple[Mark, str]] = {
 }
 
 
-def row_of(pose: PoseStatus, goal_mm: float, scene: Scene | None) -> tuple[Content, ...]:
+def row_of(pose: PoseStatus, goal_mm: float, scene: CellLayout | None) -> tuple[Content, ...]:
     """One line of the table."""
     sigma_mm = pose.estimated_sigma_mm or pose.predicted_sigma_mm
     shown = sigma_mm is not None and sigma_mm <= SIGMA_SHOWN_MM
@@ -85,7 +85,7 @@ def facts_line(status: StationStatus) -> Content:
     return line + dim(f"   {many(left_out, 'pose')} skipped" * bool(left_out))
 
 
-def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: Scene | None) -> Content:
+def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: CellLayout | None) -> Content:
     """One pose in words, with what the table has no room for."""
     view = None if scene is None else view_of(scene, pose)
     seen = "" if pose.corners is None else f"{many(pose.corners, 'corner')} in attempt {pose.attempt}"

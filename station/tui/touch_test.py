@@ -15,7 +15,7 @@ from textual.widgets.option_list import Option
 from calibrate.boards.model import board_points, outer_corners
 from calibrate.files.touch import Touch, touch_text
 from recordings.errors import CodedError
-from station.operate.touch_test import SeenBoard, note_touches, read_touch, see_board
+from station.operate.tip_offsets import SeenBoard, note_touches, read_touch, see_board
 from station.tui.desk import Desk, told
 from station.tui.frame import Question
 from station.tui.installed import state_root

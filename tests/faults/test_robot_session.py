@@ -12,7 +12,7 @@ import pytest
 
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import LimitError
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState as S
 from station.devices.ur import UrRobot
 from station.protocol.verbs import Purpose

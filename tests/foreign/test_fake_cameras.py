@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from recordings.reader import open_recording
 from station.cell.config import ApprovalConfig, StationConfig
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import MotionPreview, StationState, StationStatus
 from station.operate.motion import carry_out, prepared_motion, wait_until_idle
 from station.plan.planner import make_plan

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from recordings.errors import RecordingError
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState
 from station.session.recording import SessionRecording
 from tests.station.quick_plan import quick_plan

@@ -25,7 +25,7 @@ from recordings.schema.messages import (
     Stamps,
 )
 from station.analysis.worker import BoardDetection, sight
-from station.cell.acceptance import StopWay
+from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
 from station.cell.status import DetectionStatus, Event, StationState

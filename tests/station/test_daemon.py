@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.daemon import Daemon
 from station.devices.cell import Cell
 from station.protocol.client import Client

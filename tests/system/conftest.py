@@ -17,7 +17,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client
 from station.simulation.cell import write_truth

@@ -11,12 +11,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from station.cell.acceptance import Acceptance, StopResult, StopWay, read_acceptance
+from station.cell.arm_acceptance import Acceptance, StopResult, StopWay, read_acceptance
 from station.cell.errors import RefusedError
 from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
 from station.devices.ur_state import TraceRecorder
-from station.operate.acceptance import AcceptanceTest
+from station.operate.stop_test import AcceptanceTest
 from station.protocol.client import Client
 from station.protocol.verbs import Stop
 from station.simulation.cell import write_truth

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from recordings.reader import open_recording
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.client import Client, DaemonGoneError
 from station.protocol.stop_client import Outcome, stop

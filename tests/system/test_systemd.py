@@ -20,7 +20,7 @@ import pytest
 import recordings
 from calibrate.files.calibration import read_calibration
 from recordings.reader import open_recording
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.client import Client
 from station.tui.words import STATE_WORDS

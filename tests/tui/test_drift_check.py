@@ -13,7 +13,7 @@ from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
 from calibrate.quality.drift_history import CheckEntry, append_check
 from station.cell.errors import RefusedError
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
 from station.operate.drift_check import POSES, SEED
 from station.protocol import verbs

@@ -8,7 +8,7 @@ import pytest
 
 from calibrate.geometry import pose as pose_of
 from station.cell.config import CaptureConfig, matrix4
-from station.cell.scene import scene_of
+from station.cell.layout import layout_of
 from station.cell.status import ClockStatus, EstimateStatus, Event, PoseStatus, StationState, StationStatus
 from station.tui.live import (
     chips,
@@ -141,7 +141,7 @@ def seeing(x_m: float, y_m: float) -> PoseStatus:
 
 
 def test_a_part_without_images_is_named_with_the_pose_that_will_fill_it() -> None:
-    scene = scene_of(CELL)
+    scene = layout_of(CELL)
     status = session(idle(), poses=(seeing(0.6, 0.0),))
     view = view_of(scene, status.session.poses[0])
     assert view is not None and 0.3 < view[0] < 0.7 and view[1] < 0.01
@@ -162,7 +162,7 @@ def test_the_scene_shows_arm_board_and_table(term: str, monkeypatch: pytest.Monk
     status = msgspec.structs.replace(
         status, robot=msgspec.structs.replace(status.robot, joints_rad=(0.0, -1.6, -1.5, -1.6, 1.5, 0.0))
     )
-    drawn = draw(scene_of(CELL), status, 0, 60, 24).plain
+    drawn = draw(layout_of(CELL), status, 0, 60, 24).plain
     assert "board" in drawn and "table" in drawn
     signs = {letter for letter in drawn if ord(letter) > 0x2500}
     assert all(letter in "▀▄█" for letter in signs) is (term == "linux")

@@ -19,7 +19,7 @@ from textual.widgets import Static
 from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.cell.config_file import load_config
-from station.cell.scene import guess_matrix
+from station.cell.layout import guess_matrix
 from station.operate.draft import STEPS, CellStep, load_draft
 from station.simulation.cell import CellTruth, write_truth
 from station.simulation.launch import SimulatedController, start_controller

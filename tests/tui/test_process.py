@@ -13,7 +13,7 @@ import pytest
 
 from calibrate.files.install import installed_calibration
 from recordings.reader import open_recording
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.plan.planner import make_plan
 from station.simulation.cell import write_truth
 from station.simulation.launch import SimulatedController

@@ -18,7 +18,7 @@ import numpy as np
 from calibrate.files.install import installed_calibration
 from calibrate.geometry import difference
 from station.cell.config_file import load_config
-from station.cell.scene import guess_matrix
+from station.cell.layout import guess_matrix
 from station.simulation.cell import write_truth
 from station.simulation.launch import start_controller, start_gige
 from tests.conftest import check_allow_list

@@ -14,7 +14,7 @@ from calibrate.geometry import Array, transform_points
 from station.cell.collision import body_segments
 from station.cell.config import StationConfig
 from station.cell.errors import StationError
-from station.cell.scene import Scene, board_extent, frustum, scene_of
+from station.cell.layout import CellLayout, board_extent, frustum, layout_of
 from station.cell.status import PoseStatus, StationStatus
 from station.tui.widgets.canvas import Canvas
 
@@ -27,14 +27,14 @@ _SHORT_M = 0.07
 
 
 @lru_cache(maxsize=4)
-def _scene(encoded: bytes) -> Scene | None:
+def _scene(encoded: bytes) -> CellLayout | None:
     try:
-        return scene_of(msgspec.json.decode(encoded, type=StationConfig))
+        return layout_of(msgspec.json.decode(encoded, type=StationConfig))
     except StationError:
         return None
 
 
-def cell_scene(config: StationConfig | None, status: StationStatus) -> Scene | None:
+def cell_scene(config: StationConfig | None, status: StationStatus) -> CellLayout | None:
     """The cell as configured, with camera and board where the images say; None without initial poses."""
     if config is None or (scene := _scene(msgspec.json.encode(config))) is None:
         return None
@@ -44,7 +44,7 @@ def cell_scene(config: StationConfig | None, status: StationStatus) -> Scene | N
     return replace(scene, X=np.array(estimate.camera_pose), Y=np.array(estimate.board_pose))
 
 
-def view_of(scene: Scene, pose: PoseStatus) -> tuple[float, float] | None:
+def view_of(scene: CellLayout, pose: PoseStatus) -> tuple[float, float] | None:
     """Distance (m) and tilt (rad) of the board as this pose sees it."""
     if pose.base_from_flange is None:
         return None
@@ -54,7 +54,7 @@ def view_of(scene: Scene, pose: PoseStatus) -> tuple[float, float] | None:
     return float(np.linalg.norm(middle)), float(np.arccos(min(1.0, abs(seen[2, 2]))))
 
 
-def fields_of(scene: Scene, pose: PoseStatus, rows: int, columns: int) -> Array:
+def fields_of(scene: CellLayout, pose: PoseStatus, rows: int, columns: int) -> Array:
     """(rows, columns) of bool: parts of the picture whose middle the board will cover in this pose."""
     lens, covered = scene.camera, np.zeros((rows, columns), dtype=bool)
     if pose.base_from_flange is None or lens.matrix is None:
@@ -74,13 +74,13 @@ def fields_of(scene: Scene, pose: PoseStatus, rows: int, columns: int) -> Array:
     return np.asarray(np.all(np.array(side) > 0, axis=0) | np.all(np.array(side) < 0, axis=0))
 
 
-def _board_corners(scene: Scene) -> Array:
+def _board_corners(scene: CellLayout) -> Array:
     low, high = board_extent(scene.board)
     return np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
 
 
 def draw(
-    scene: Scene,
+    scene: CellLayout,
     status: StationStatus,
     chosen: int | None,
     width: int,
@@ -159,7 +159,7 @@ Edges = Callable[[Array, list[tuple[int, int]], int, int], None]
 
 
 def _surroundings(
-    scene: Scene, everything: Array, edges: Edges, text: Callable[[Array, str, int], None]
+    scene: CellLayout, everything: Array, edges: Edges, text: Callable[[Array, str, int], None]
 ) -> None:
     """Planes and the workspace's box, as large as what stands on them."""
     low, high = everything.min(axis=0) - 0.15, everything.max(axis=0) + 0.15

@@ -15,7 +15,7 @@ from recordings.reader import open_recording
 from station.analysis.worker import board_box, image_motion
 from station.cell.config import StillnessConfig
 from station.cell.errors import CameraError
-from station.cell.plan import ExpectedView
+from station.cell.pose_plan import ExpectedView
 from station.cell.status import StationState as S
 from station.cell.stillness import StillnessMonitor
 from station.session.capture import GLIMPSE_TRIES, ImageWatch

@@ -20,7 +20,7 @@ from station.cell.limits import (
     sample_path,
     trapezoid,
 )
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 
 REST = np.deg2rad([0.0, -100.0, -100.0, -70.0, 90.0, 0.0])
 FREE = CellGeometry(MODELS["UR10"], LimitsConfig(), watched_m=((0.0, -0.06, 0.087),))

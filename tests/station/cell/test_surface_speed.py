@@ -11,7 +11,7 @@ from calibrate.kinematics import MODELS
 from station.cell.collision import ARM_BODIES, CellGeometry, body_segments
 from station.cell.config import SPEED_CAP_M_S, Capsule, LimitsConfig
 from station.cell.limits import check_plan, point_speed_m_s
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 from station.simulation.controller.kinematics import TABLES, ArmGeometry
 
 PLANS, MOVES = 80, 2

@@ -18,7 +18,7 @@ import pytest
 import typer
 
 from recordings.errors import CodedError, ErrorReport
-from station.cell.plan import plan_sha256
+from station.cell.pose_plan import plan_sha256
 from station.cell.status import MotionPreview
 from station.cli import attended, main
 from station.cli.app import STATION

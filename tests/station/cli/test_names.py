@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 import recordings
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import Event, MotionPreview, PoseStatus, SessionStatus, StationStatus
 from station.cli import control as cli_control
 from station.cli import main

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.station.operate.test_touch_test import Daemon
 
 from calibrate.boards.model import board_points
 from calibrate.files.calibration import read_calibration
@@ -13,7 +14,6 @@ from station.cell.status import StationStatus
 from station.cli import touch_test
 from station.cli.app import STATION
 from tests.codes import raises
-from tests.station.operate.test_touch_test import Daemon
 
 
 @pytest.fixture

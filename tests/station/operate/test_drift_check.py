@@ -10,7 +10,7 @@ import pytest
 
 from calibrate.errors import CalibrationError
 from station.cell.errors import RefusedError
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import MotionPreview, PoseStatus, SessionStatus, StationState, StationStatus
 from station.operate import drift_check
 from station.operate.drift_check import recorded, start_drift_check

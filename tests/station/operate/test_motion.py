@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from station.cell.errors import LimitError, RefusedError, StationError
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import CameraStatus, MotionPreview, RobotStatus, StationState, StationStatus
 from station.operate import motion
 from station.protocol.client import Client

@@ -15,7 +15,7 @@ from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import BoardKind, BoardSpec, Image, Mount, Stamps
 from station.cell.config import matrix4
 from station.cell.config_file import load_config
-from station.cell.scene import scene_of
+from station.cell.layout import layout_of
 from station.operate import draft as drafts
 from station.operate import guided_views
 from station.operate import new_cell as flow
@@ -85,7 +85,7 @@ def test_what_was_written_is_read_back_and_can_be_planned(done: tuple[Draft, obj
     config, content = load_config(path)
     assert config == made
     assert content.count(b"#") >= 6
-    group, _ = candidate_pool(scene_of(config), PlanOptions(), None, np.random.default_rng(0))
+    group, _ = candidate_pool(layout_of(config), PlanOptions(), None, np.random.default_rng(0))
     assert len(group) >= 75
     flow.write_config(draft, path)
     assert (tmp_path / "deep" / "station.yaml.before").read_bytes() == content

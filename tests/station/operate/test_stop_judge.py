@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from recordings.schema.messages import RobotState, Stamps
-from station.cell.acceptance import ArmSubject, Figure, StopTestMove, StopWay
+from station.cell.arm_acceptance import ArmSubject, Figure, StopTestMove, StopWay
 from station.operate.stop_judge import judge
 from station.simulation.controller.programs import Upload
 from station.simulation.controller.state import Journal, Settings

@@ -11,7 +11,7 @@ import pytest
 from calibrate.geometry import perturb
 from calibrate.kinematics import forward
 from station.cell.collision import margins
-from station.cell.scene import cell_geometry, guess_from, scene_of
+from station.cell.layout import cell_geometry, guess_from, layout_of
 from station.plan.planner import make_plan
 from station.plan.visibility import outline, uncertain_pixels
 from station.simulation.scenes import cell_config, make_cell
@@ -73,7 +73,7 @@ def test_solids_of_the_configuration_are_taken_as_they_are():
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_the_pixels_spread_as_drawn_guesses_say(mount):
     truth, config, X, Y = config_of(mount)
-    scene = scene_of(config)
+    scene = layout_of(config)
     flange = forward(scene.geometry.model, truth.start_joints_rad)[None]
     rim = outline(scene.board)
     pixels, sigma_px = uncertain_pixels(scene, flange, rim)

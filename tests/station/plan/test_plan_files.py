@@ -12,7 +12,7 @@ import recordings
 from calibrate.kinematics import MODELS, forward
 from recordings.reader import open_recording
 from station.cell.errors import ConfigError
-from station.cell.plan import ExpectedView, Plan, PlannedPose, plan_sha256
+from station.cell.pose_plan import ExpectedView, Plan, PlannedPose, plan_sha256
 from station.plan.files import load_plan, parse_plan, save_plan, taught_plan
 from tests.codes import raises
 

@@ -21,8 +21,8 @@ from calibrate.geometry import (
 )
 from calibrate.kinematics import MODELS, forward
 from station.cell.config import SPEED_CAP_M_S
+from station.cell.layout import cell_geometry, layout_of
 from station.cell.limits import check_plan
-from station.cell.scene import cell_geometry, scene_of
 from station.plan import planner
 from station.plan.candidates import NOT_IN_PICTURE, find_candidates
 from station.plan.choose import choose, informations, objective_for
@@ -53,7 +53,7 @@ def cell(scene="paper", mount="eye-in-hand", seed=0):
 @cache
 def planned(scene="paper", mount="eye-in-hand", seed=0, count=25):
     truth, config = cell(scene, mount, seed)
-    return plan_scene(scene_of(config), replace(FEW, count=count, seed=1), truth.start_joints_rad)
+    return plan_scene(layout_of(config), replace(FEW, count=count, seed=1), truth.start_joints_rad)
 
 
 @pytest.mark.parametrize("which", CELLS)
@@ -100,7 +100,7 @@ def test_poses_are_varied_and_say_why_they_are_there():
 
 def test_the_board_stays_in_the_picture_along_the_way():
     _, config = cell()
-    scene = scene_of(config)
+    scene = layout_of(config)
     joints = np.array([pose.joints_rad for pose in planned().poses])
     assert blind_share(scene, joints[:-1], joints[1:]).max() < 0.3
     away = joints[:1] + np.array([0, 0, 0, 0, 1.2, 0])
@@ -114,7 +114,7 @@ def test_an_order_takes_the_way_that_keeps_the_board_in_the_picture(monkeypatch)
     times = np.array([[0, 1, 1.01], [1, 0, 1], [1.01, 1, 0.0]])
     monkeypatch.setattr(planner, "time_matrix", lambda *_: times)
     monkeypatch.setattr(planner, "blind_share", lambda *_: np.array([1.0, 0.0, 0.0]))
-    order, unfree = planner._ordered(scene_of(config), np.zeros((3, 6)), None, 0)
+    order, unfree = planner._ordered(layout_of(config), np.zeros((3, 6)), None, 0)
     assert unfree == []
     assert {0, 1} not in ({*order[:2]}, {*order[1:]})
 
@@ -139,7 +139,7 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another():
 
     def again(seed):
         options, start = replace(FEW, seed=seed), truth.start_joints_rad
-        return plan_scene(scene_of(config), options, start, lambda _, done: told.append(done))
+        return plan_scene(layout_of(config), options, start, lambda _, done: told.append(done))
 
     assert again(1) == planned() and told == sorted(told) and told[-1] == 1.0
     assert again(2).poses != planned().poses
@@ -147,7 +147,7 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another():
 
 def test_the_choice_beats_random_poses_of_the_same_pool():
     _, config = cell()
-    scene = scene_of(config)
+    scene = layout_of(config)
     rng = np.random.default_rng(0)
     pool = find_candidates(scene, replace(view_range(scene), doubt=0.0), 200, rng, None)
     each = informations(scene, pool.base_from_flange)
@@ -159,7 +159,7 @@ def test_the_choice_beats_random_poses_of_the_same_pool():
 
 def test_kept_poses_stay_chosen():
     _, config = cell()
-    scene = scene_of(config)
+    scene = layout_of(config)
     rng = np.random.default_rng(0)
     pool = find_candidates(scene, replace(view_range(scene), doubt=0.0), 100, rng, None)
     each = informations(scene, pool.base_from_flange)
@@ -210,7 +210,7 @@ def impossible(name):
 def test_an_impossible_plan_is_explained(name, code, constraint):
     config, start = impossible(name)
     with raises(code, wanted=25) as caught:
-        plan_scene(scene_of(config), FEW, start)
+        plan_scene(layout_of(config), FEW, start)
     assert constraint is None or caught.value.values["constraints"].startswith(constraint)
     assert caught.value.remedy
 
@@ -219,7 +219,7 @@ def test_a_fixed_camera_that_looks_away_from_the_arm_is_explained():
     truth, config = cell("paper", "eye-to-hand", 1)
     away = moved(config, camera_guess=turned(config.camera_guess, [0, np.pi, 0]))
     with raises("out-of-reach"):
-        plan_scene(scene_of(away), FEW, truth.start_joints_rad)
+        plan_scene(layout_of(away), FEW, truth.start_joints_rad)
 
 
 def test_what_planning_needs_is_asked_for():
@@ -257,14 +257,14 @@ def test_every_lens_model_can_be_planned_with(kind, distortion):
     truth, config = cell()
     lens = moved(config.camera.model, distortion=distortion, distortion_model=kind)
     other = moved(config, camera=moved(config.camera, model=lens))
-    plan = plan_scene(scene_of(other), replace(FEW, count=6), truth.start_joints_rad)
+    plan = plan_scene(layout_of(other), replace(FEW, count=6), truth.start_joints_rad)
     assert len(plan.poses) == 6
     assert plan.poses[-1].predicted_sigma_m < 0.01
 
 
 def test_a_plan_without_a_start_and_with_few_poses():
     _, config = cell()
-    plan = plan_scene(scene_of(config), replace(FEW, count=4, view=replace(ViewRange(), doubt=1.0)))
+    plan = plan_scene(layout_of(config), replace(FEW, count=4, view=replace(ViewRange(), doubt=1.0)))
     assert len(plan.poses) == 4
     assert check_plan(plan, None, cell_geometry(config)).problems == ()
 
@@ -272,7 +272,7 @@ def test_a_plan_without_a_start_and_with_few_poses():
 def test_six_poses_for_a_known_lens_tell_more_of_where_the_camera_sits():
     """A drift check asks for them so: the installed calibration knows the lens."""
     truth, config = cell()
-    scene, sigmas_m = scene_of(config), []
+    scene, sigmas_m = layout_of(config), []
     for known in (False, True):
         plan = make_plan(config, start_joints_rad=truth.start_joints_rad, count=6, lens_known=known)
         flange = np.array([pose.base_from_flange for pose in plan.poses])

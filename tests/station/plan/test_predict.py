@@ -12,9 +12,9 @@ from calibrate.handeye.arm import PARAMETERS
 from calibrate.handeye.information import MeasurementNoise
 from calibrate.kinematics import forward
 from station.cell.config import CaptureConfig
+from station.cell.layout import layout_of
 from station.cell.limits import check_path
-from station.cell.plan import PlannedPose
-from station.cell.scene import scene_of
+from station.cell.pose_plan import PlannedPose
 from station.plan.choose import CRITERIA
 from station.plan.planner import PlanOptions, plan_scene
 from station.plan.predict import forecast_arm, forecast_views, next_best, next_best_text, with_forecast
@@ -25,7 +25,7 @@ from station.simulation.scenes import cell_config, make_cell
 def world():
     truth = make_cell("paper", 0, "low", "eye-in-hand")
     config = cell_config(truth)
-    scene = scene_of(config)
+    scene = layout_of(config)
     plan = plan_scene(scene, PlanOptions(pool=600), truth.start_joints_rad)
     return scene, plan, np.array([pose.base_from_flange for pose in plan.poses])
 

@@ -10,7 +10,7 @@ from calibrate.kinematics import MODELS, forward, link_frames
 from recordings.schema.messages import CameraModel
 from station.cell.collision import margins
 from station.cell.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, RobotConfig, StationConfig
-from station.cell.scene import cell_geometry, geometry_from, guess_from
+from station.cell.layout import cell_geometry, geometry_from, guess_from
 
 ARM = MODELS["UR10"]
 TAUGHT = np.array([-0.364, -2.365, -0.459, 0.876, -0.866, -1.122])

@@ -20,7 +20,7 @@ import pytest
 from recordings.reader import open_recording
 from station.cell.config import ApprovalConfig
 from station.cell.errors import RefusedError
-from station.cell.plan import Plan, plan_sha256
+from station.cell.pose_plan import Plan, plan_sha256
 from station.cell.socket_folder import user_name
 from station.cell.status import StationState
 from station.protocol.client import Client

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from station.cell.errors import RefusedError
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import MotionPreview
 from station.protocol.verbs import Purpose
 from station.session.lease import (

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from station.cell.errors import RefusedError
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import VERBS
 from station.server.approval import Peer

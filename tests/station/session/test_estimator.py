@@ -17,7 +17,7 @@ from calibrate.projection import project
 from recordings.reader import open_recording
 from station.analysis.estimation import seen_before
 from station.analysis.worker import BoardDetection, sight
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Skip
 from station.session.queue import PoseQueue

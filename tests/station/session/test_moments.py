@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from station.cell import limits
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Drop, Purpose
 from station.session import run, session

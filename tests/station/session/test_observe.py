@@ -13,7 +13,7 @@ from calibrate.boards.model import board_points
 from recordings.errors import CodedError
 from recordings.schema.messages import BoardKind, BoardSpec, Image
 from station.analysis.worker import BoardDetection
-from station.cell.scene import flange_pose
+from station.cell.layout import flange_pose
 from station.cell.status import DetectionStatus
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose

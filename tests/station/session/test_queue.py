@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import PoseState
 from station.session import queue as module
 from station.session.queue import BUSY, PoseQueue

@@ -16,7 +16,7 @@ from recordings.recorder import Recorder
 from station.analysis.pool import WorkerError, Workers
 from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import LimitError, StationError
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Reorder
 from station.server.control import ControlServer

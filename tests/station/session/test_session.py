@@ -18,7 +18,7 @@ from recordings.manifest import enter_part
 from recordings.reader import open_recording
 from recordings.schema.messages import ArmKinematics
 from station.cell.errors import LimitError, RobotError
-from station.cell.plan import Plan
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Add, Drop, Purpose, Reorder, Retake, Skip
 from tests.codes import raises

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from station.cell.config import SPEED_CAP_M_S
+from station.cell.layout import geometry_from
 from station.cell.limits import check_path, point_speed_m_s, sample_path, with_plan_speeds
-from station.cell.plan import Plan
-from station.cell.scene import geometry_from
+from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from tests.station.session_rig import POSES, TRUTH, Rig
 

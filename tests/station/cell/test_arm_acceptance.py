@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from station.cell.acceptance import (
+from station.cell.arm_acceptance import (
     ACCEPTANCE_NAME,
     Acceptance,
     ArmSubject,

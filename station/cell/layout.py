@@ -1,4 +1,4 @@
-"""Scene: configured camera and board pose with their uncertainty, solids and obstacles."""
+"""CellLayout: configured camera and board pose with their uncertainty, solids and obstacles."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from station.cell.config import (
     vector6,
 )
 from station.cell.errors import ConfigError, LimitError
-from station.cell.plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan, PlannedPose
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
 _DOUBT = 3.0
@@ -46,7 +46,7 @@ _DRAWS = 2000
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class CellLayout:
     """Initial camera and board pose with 1σ, lens, board and geometry of a cell, as planning needs them."""
 
     mount: Mount
@@ -95,7 +95,7 @@ def pose_at(model: RobotModel, name: str, joints_rad: ArrayLike, why: str = "") 
     return PlannedPose(name, vector6(joints), matrix4(forward(model, joints)), why=why)
 
 
-def flange_poses(scene: Scene, plan: Plan) -> Array:
+def flange_poses(scene: CellLayout, plan: Plan) -> Array:
     """Compute base_from_flange (n, 4, 4) of a plan's joints."""
     joints = np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6)
     return np.asarray(forward(scene.geometry.model, joints))
@@ -113,7 +113,7 @@ def printed_corners(board: BoardSpec) -> Array:
     return np.array([(x0, y0, 0.0), (x1, y0, 0.0), (x1, y1, 0.0), (x0, y1, 0.0)])
 
 
-def scene_of(config: StationConfig) -> Scene:
+def layout_of(config: StationConfig) -> CellLayout:
     """Make the scene of a configuration. ConfigError names what is missing."""
     camera, mount_guess, place_guess = config.camera.model, config.camera_guess, config.board_guess
     if camera is None or camera.matrix is None:
@@ -131,7 +131,7 @@ def scene_of(config: StationConfig) -> Scene:
             remedy="Add it, or let `station new` find it.",
             missing=missing,
         )
-    return Scene(
+    return CellLayout(
         config.mount,
         camera,
         config.board,

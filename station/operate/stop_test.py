@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import STOP_GIVEN, Acceptance, ArmSubject, StopResult, StopWay
+from station.cell.arm_acceptance import STOP_GIVEN, Acceptance, ArmSubject, StopResult, StopWay
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview
 from station.operate.motion import prepared_motion

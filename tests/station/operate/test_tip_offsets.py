@@ -19,7 +19,7 @@ from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig, matrix4
 from station.cell.errors import RefusedError
 from station.cell.status import RobotStatus, StationStatus
-from station.operate.touch_test import SeenBoard, read_touch, see_board
+from station.operate.tip_offsets import SeenBoard, read_touch, see_board
 from station.protocol.verbs import Configuration, Observation, Observe
 from station.simulation.scenes import cell_config, make_cell
 from tests.codes import raises

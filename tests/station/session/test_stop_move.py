@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from station.cell.acceptance import Acceptance, StopWay, write_acceptance
+from station.cell.arm_acceptance import Acceptance, StopWay, write_acceptance
 from station.cell.errors import RefusedError
 from station.cell.status import MotionPreview
 from station.cell.status import StationState as S

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from recordings.schema.messages import RobotState
-from station.cell.acceptance import STOP_GIVEN, ArmSubject, Figure, StopResult, StopTestMove, StopWay
+from station.cell.arm_acceptance import STOP_GIVEN, ArmSubject, Figure, StopResult, StopTestMove, StopWay
 from station.cell.status import Event, MotionPreview, StationState, StationStatus
 from station.operate import acceptance
-from station.operate.acceptance import TRIES, AcceptanceTest
+from station.operate.stop_test import TRIES, AcceptanceTest
 from station.protocol.verbs import Go, Prepare, StopTest, Verb
 
 SUBJECT = ArmSubject("real", "UR10e", "1", "5.11", (), "ur_rtde")

@@ -12,7 +12,7 @@ from calibrate.geometry import pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
 from station.cell.collision import segment_distance
 from station.cell.config import Capsule, PoseGuess
-from station.cell.scene import cell_geometry, geometry_of, require_kept_clear
+from station.cell.layout import cell_geometry, geometry_of, require_kept_clear
 from station.simulation.scenes import cell_config, make_cell
 from tests.codes import raises
 

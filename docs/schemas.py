@@ -11,7 +11,6 @@ import msgspec
 from calibrate.batch.run import BatchResult
 from calibrate.cli.contracts import (
     CompareJson,
-    DiffJson,
     DriftCheckJson,
     InstalledJson,
     ListedJson,
@@ -45,7 +44,6 @@ TYPES: dict[str, tuple[str, Any]] = {
     "install": ("calibrate install --json, calibrate rollback --json", InstalledJson),
     "validity": ("calibrate withdraw --json; `validity` of other commands", Validity),
     "follow": ("A line of calibrate follow", Followed),
-    "diff": ("calibrate diff --json", DiffJson),
     "drift-check": ("calibrate drift-check --json", DriftCheckJson),
     "watch": ("A line of `calibrate watch --json`", WatchEventJson),
     "status": ("station status --json", StationStatus),

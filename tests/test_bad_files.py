@@ -100,7 +100,6 @@ PLACES: dict[str, Place] = {
     "acceptance.json": ("acceptance.json", lambda path: _nothing(read_acceptance(path.parent))),
     "draft of a cell": ("new-cell.json", lambda path: _nothing(load_draft(path.parent) != Draft())),
     "calibration": ("cell.yaml", _command(calibrate, "show", "FILE")),
-    "calibration, diff": ("cell.yaml", _command(calibrate, "diff", "FILE", "FILE")),
     "calibration, export": ("cell.yaml", _command(calibrate, "export", "--to", "ros-camera-info", "FILE")),
     "calibration, annotate": ("cell.yaml", _command(calibrate, "annotate", SAMPLE, "FILE", "-o", "NEW")),
     "installed version": (

@@ -24,15 +24,8 @@ COMMANDS = {
         ("calibrate compare session.mcap", "calibrate compare session.mcap --camera cell.yaml"),
         gone=_NO_TIME_OFFSET,
     ),
-    "report": LazyCommand(
-        f"{_SOLVE}:report", ("calibrate report session.mcap -o cell.html",), gone=_GONE_FROM_SOLVE
-    ),
     "show": LazyCommand(
         f"{_FILES}:show", ("calibrate show  # the installed one", "calibrate show cell.yaml")
-    ),
-    "diff": LazyCommand(
-        f"{_FILES}:diff",
-        ("calibrate diff cell.yaml  # and the installed one", "calibrate diff a.yaml b.yaml"),
     ),
     "export": LazyCommand(
         f"{_FILES}:export",
@@ -41,7 +34,8 @@ COMMANDS = {
             "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
         ),
         gone={
-            "json": "Use `calibrate show --json`.",
+            **dict.fromkeys(("json", "arm-json"), "Use `calibrate show --json`."),
+            "arm-urdf": "Give ur-kinematics to ur_description, which makes the URDF.",
             "ros-static-transform": "Use ros-launch, which sends it.",
             **dict.fromkeys(("xacro", "mjcf"), "Use urdf."),
             **dict.fromkeys(
@@ -105,7 +99,9 @@ CALIBRATE = LazyGroup(
     "drift check failed.",
     aliases={"check": "drift-check"},
     gone={
+        "diff": "`calibrate show` shows each; `calibrate install` tells how far it is from the one before.",
         "fleet": "Run `calibrate metrics` on each cell.",
+        "report": "Use `calibrate solve REC --report FILE`.",
         "sweep": "Frame times carry their own bound; `station doctor` shows it.",
     },
 )

@@ -108,15 +108,6 @@ class InstalledJson(msgspec.Struct, frozen=True):
     validity: Validity | None
 
 
-class DiffJson(msgspec.Struct, frozen=True):
-    """`calibrate diff --json`"""
-
-    translation_mm: float
-    rotation_deg: float
-    sigmas: float
-    lens_matrix_px: float | None
-
-
 class DriftPowerJson(msgspec.Struct, frozen=True):
     translation_0_5_mm: float
     rotation_0_1_deg: float

@@ -1,30 +1,28 @@
-"""`calibrate show | diff | export | install | list | rollback`: what is done with a calibration file."""
+"""`calibrate show | export | install | list | rollback`: what is done with a calibration file."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
-import numpy as np
 import typer
-from rich.table import Column, Table
 
-from calibrate.cli.contracts import DiffJson, InstalledJson, ListedJson
+from calibrate.cli.contracts import InstalledJson, ListedJson
 from calibrate.cli.files import CellFacts, read_cell
 from calibrate.cli.output import AsJson, check_target, err, out, print_json
 from calibrate.errors import UsageError
 from calibrate.files import exports
 from calibrate.files import install as installing
-from calibrate.files.calibration import Calibration, Lens, read_calibration, write_output
+from calibrate.files.calibration import Calibration, read_calibration, write_output
 from calibrate.files.exports import FORMATS, FrameNames, follow_command
 from calibrate.files.folders import cameras, current_validity, readable_folder
-from calibrate.files.formatting import override_text, pose_difference, pose_text, summary, verdict_text
+from calibrate.files.formatting import override_text, pose_text, summary, verdict_text
 from calibrate.files.lines import read_lines
 from calibrate.files.validity import Validity, ValidityState, validity_text
-from calibrate.files.versions import LOG, InstalledVersion, LogEntry, installed_versions, read_log
+from calibrate.files.versions import LOG, InstalledVersion, LogEntry, installed_versions
 from recordings.files import MAIN_CAMERA, state_root
 
 Root = Annotated[
@@ -64,54 +62,6 @@ def show(
         print_json(plain if validity is None else plain | {"validity": validity})
     else:
         out.print(summary(calibration, validity))
-
-
-def diff(
-    first: Annotated[Path, typer.Argument(help="A calibration file")],
-    second: Named = None,
-    root: Root = None,
-    camera: CameraName = MAIN_CAMERA,
-    as_json: AsJson = False,
-) -> None:
-    """Compare two calibrations with their uncertainty."""
-    a, (b, validity) = read_calibration(first), named_or_installed(second, root, camera)
-    if a.mount != b.mount:
-        raise UsageError(
-            f"{first} is {a.mount}, the other is {b.mount}: there is nothing to compare.", code="other-mount"
-        )
-    millimetres, degrees, sigmas = pose_difference(a, b)
-    lens_px = _lens_difference_px(a.intrinsics, b.intrinsics)
-    if as_json:
-        print_json(DiffJson(millimetres, degrees, sigmas, lens_px))
-        return
-    names = (Column(str(name), overflow="fold") for name in (first, second or "installed"))
-    table = Table("", *names, box=None)
-    rows: list[tuple[str, Any]] = [
-        ("result", pose_text),
-        ("1σ", lambda c: f"{c.sigma.translation_mm:.3f} mm  {c.sigma.rotation_deg:.4f}°"),
-        ("verdict", verdict_text),
-        ("source", lambda c: c.source),
-        ("solved", lambda c: c.created),
-        ("robot", lambda c: f"{c.robot.model} {c.robot.serial}"),
-        ("camera", lambda c: f"{c.camera.model} {c.camera.serial}"),
-        ("session", lambda c: c.provenance.session),
-    ]
-    for name, say in rows:
-        table.add_row(name, say(a), say(b))
-    if validity is not None:
-        table.add_row("installed", "", validity_text(validity))
-    out.print(table)
-    # Six numbers: 3.55σ are exceeded by chance in 5 % of honest pairs (chi-square, 6 degrees).
-    judged = f"{'more than' if sigmas > 3.55 else 'within'} their uncertainty"
-    lens = "images of different sizes" if lens_px is None else f"camera matrix up to {lens_px:.2f} px"
-    out.print(f"Difference: {millimetres:.3f} mm, {degrees:.4f}°, {sigmas:.1f}σ ({judged}); {lens}")
-
-
-def _lens_difference_px(a: Lens, b: Lens) -> float | None:
-    """Largest difference between the camera matrices; None where their pixels are not the same."""
-    if (a.width, a.height) != (b.width, b.height):
-        return None
-    return float(np.abs(np.array(a.matrix) - np.array(b.matrix)).max())
 
 
 def export(
@@ -285,19 +235,6 @@ def _lines(version: InstalledVersion) -> list[str]:
     held = [validity_text(validity)] if validity is not None and told else []
     override = "" if calibration.override is None else f"; {override_text(calibration.override)}"
     return [made, pose_text(calibration), verdict_text(calibration) + override, *held]
-
-
-def history_rows(root: Path | None, camera: str) -> list[tuple[str, str, str, str]]:
-    """List for the report: version, when and by whom, what was done, change; at last whether it holds."""
-    rows = [
-        (str(entry.generation), f"{entry.wall}, {entry.who}", entry.action, entry.change)
-        for entry in read_log(root, camera)
-    ]
-    if not rows:
-        return []
-    held = current_validity(readable_folder(root, camera))
-    state = held.state.replace("-", " ")
-    return [*rows, (str(held.version), f"{held.since}, {held.who}", state, held.reason.text)]
 
 
 def _plain(camera: str, version: InstalledVersion) -> ListedJson:

@@ -1,4 +1,4 @@
-"""`calibrate solve | compare | report`: from a recording to a calibration."""
+"""`calibrate solve | compare`: from a recording to a calibration."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.cli.contracts import CompareJson, MethodJson, SolveJson, ViewsJson, WarningJson
-from calibrate.cli.installed import Root, history_rows
 from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.cli.output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError, UsageError
 from calibrate.files.calibration import ViewWeight, write_calibration, write_output
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
-from calibrate.files.install import install_line, installed_calibration
-from calibrate.files.touch import Touch
+from calibrate.files.install import install_line
 from calibrate.geometry import rotation_log
 from calibrate.handeye.solution import camera_frames
 from calibrate.job import JobOptions, SolvedRecording
@@ -112,37 +110,13 @@ def solve_json(job: SolvedRecording) -> SolveJson:
     )
 
 
-@takes(job_options)
-def report(
-    recording: Rec,
-    options: JobOptions,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Default: NAME.report.html in this folder")
-    ] = None,
-    verify: Verify = None,
-    root: Root = None,
-    time_limit_s: TimeLimit = TIME_LIMIT_S,
-    memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
-) -> None:
-    """Solve a recording again and write its report: one HTML file.
-
-    With the history of what is installed. It opens in any browser, without a network.
-    """
-    target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
-    check_target(target, "report")
-    with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
-        job = solve_recording(recording, options, progress, verify)
-    _write_report(job, target, options, root)
-    out.print(f"Written: {target}", soft_wrap=True)
-
-
 def _root_of(target: Path) -> Path | None:
     """The state folder of a session's calibration; None: it lies elsewhere."""
     sessions = target.resolve().parent.parent
     return sessions.parent if sessions.name == "sessions" else None
 
 
-def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root: Path | None = None) -> None:
+def _write_report(job: SolvedRecording, target: Path, options: JobOptions) -> None:
     from calibrate.handeye.peers import compare_all  # like matplotlib, slow to load
     from calibrate.report.page import report_page
 
@@ -150,18 +124,7 @@ def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root:
         peers = compare_all(job.views, solver_options(options, job))
     except CalibrationError:  # the report stands without the comparison
         peers = []
-    history = history_rows(root, job.calibration.camera_name)
-    write_output(target, report_page(job, peers, history, _touches(job, root)).encode())
-
-
-def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:
-    """Touch tests of the installed calibration, when it is of this recording."""
-    try:
-        installed = installed_calibration(root, job.calibration.camera_name)
-    except CalibrationError:
-        return []
-    same = installed.provenance.recording_sha256 == job.calibration.provenance.recording_sha256
-    return installed.verification if same else []
+    write_output(target, report_page(job, peers).encode())
 
 
 @takes(picture_options)

@@ -16,7 +16,6 @@ from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override, source_stamp
 from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
-from calibrate.geometry import difference
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import MEASURED
 from calibrate.results import BoardShape
@@ -257,17 +256,6 @@ def _board(board: BoardShape, square_mm: float) -> Iterator[str]:
     bends = [b for b, sigma in zip(board.bend_m, board.sigma[2:], strict=True) if abs(b) > _SAID * sigma]
     if bends:
         yield f"The board is bent by {max(map(abs, bends)) * 1e3:.2f} mm."
-
-
-def pose_difference(first: Calibration, second: Calibration) -> tuple[float, float, float]:
-    """Compute the difference (mm, degrees, sigmas) between two results with the same frames.
-
-    Sigmas: Mahalanobis distance with the sum of both covariances, as if the two were independent.
-    """
-    delta = difference(second.transform.matrix, first.transform.matrix)
-    covariance = np.array(first.covariance) + np.array(second.covariance)
-    sigmas = float(np.sqrt(delta @ np.linalg.pinv(covariance, hermitian=True) @ delta))
-    return float(np.linalg.norm(delta[:3]) * 1e3), float(np.degrees(np.linalg.norm(delta[3:]))), sigmas
 
 
 PEER_HEAD = ("method", "e_t mm", "e_R", "spread mm", "spread °", "px", "σ from ours", "ms", "")

@@ -312,12 +312,17 @@ def objections_beside(calibration: Calibration, root: Path | None = None) -> lis
 
 
 def change_text(before: Calibration | None, after: Calibration) -> str:
-    """Write '0.120 mm, 0.0040° from the one before'; empty without one of the same mounting before."""
+    """Write '0.120 mm, 0.0040° (1.3σ) from the one before'; empty without one of the same mounting before.
+
+    Sigmas: Mahalanobis distance with the sum of both covariances, as if the two were independent.
+    """
     if before is None or before.mount != after.mount:
         return ""
     delta = difference(after.transform.matrix, before.transform.matrix)
-    degrees = float(np.degrees(np.linalg.norm(delta[3:])))
-    return f"{np.linalg.norm(delta[:3]) * 1000:.3f} mm, {degrees:.4f}° from the one before"
+    millimetres, degrees = 1e3 * np.linalg.norm(delta[:3]), np.degrees(np.linalg.norm(delta[3:]))
+    covariance = np.array(before.covariance) + np.array(after.covariance)
+    sigmas = float(np.sqrt(delta @ np.linalg.pinv(covariance, hermitian=True) @ delta))
+    return f"{millimetres:.3f} mm, {degrees:.4f}° ({sigmas:.1f}σ) from the one before"
 
 
 def _installed_before(root: Path | None, camera: str) -> Calibration | None:

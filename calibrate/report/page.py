@@ -25,7 +25,6 @@ from calibrate.files.formatting import (
     shares_text,
     verdict_text,
 )
-from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.geometry import Array, difference
 from calibrate.handeye.reprojection import bent_points
 from calibrate.job import SolvedRecording
@@ -41,13 +40,8 @@ _WIDTHS_PX = ((12, 480), (30, 320), (_PICTURES_LIMIT, 240))
 """Up to so many views, their pictures are so wide: a page stays below a megabyte."""
 
 
-def report_page(
-    job: SolvedRecording,
-    peers: Sequence[PeerResult] = (),
-    history: Sequence[Sequence[str]] = (),
-    touches: Sequence[Touch] = (),
-) -> str:
-    """The whole page. `history`: rows (version, time, action, change); `touches`: touch tests since."""
+def report_page(job: SolvedRecording, peers: Sequence[PeerResult] = ()) -> str:
+    """Make the whole page; `peers`: other methods on the same views."""
     name = job.recording.info.name
     calibration = job.calibration
     result = calibration.result
@@ -56,7 +50,7 @@ def report_page(
     return html.page(
         f"Calibration of {name}",
         [
-            *_verdict(job, touches),
+            *_verdict(job),
             html.folded("Gates", _gates(job), aside=f"{told['gates'].value} passed", printed=True),
             html.folded(
                 "Camera pose",
@@ -64,7 +58,6 @@ def report_page(
                 aside=f"{result.parent_frame}_from_{result.child_frame}",
                 printed=True,
             ),
-            html.folded("Touch tests", _touches(touches), aside=f"{len(touches)} corners", printed=True),
             html.folded(
                 "Residuals", _residuals(job, modelled), aside="reprojection error per view", printed=True
             ),
@@ -74,7 +67,6 @@ def report_page(
             html.folded("All methods on the same views", _methods(peers)),
             html.folded("Intrinsics", _lens(job)),
             html.folded("Views", _views(job, modelled), aside=f"{told['views'].value} {told['views'].about}"),
-            html.folded("Installed versions", _history(history)),
             html.folded("Provenance", _provenance(job), printed=True),
         ],
     )
@@ -87,7 +79,7 @@ _KINDS: dict[str, Literal["good", "reason", "bad"]] = {
 }
 
 
-def _verdict(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[str]:
+def _verdict(job: SolvedRecording) -> Iterator[str]:
     """All that one screen holds: the verdict, and the figures it stands on."""
     calibration = job.calibration
     good, quality = calibration.verdict != "FAIL", calibration.quality
@@ -96,7 +88,7 @@ def _verdict(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[str]:
     yield html.paragraph(rehearsal_text(job))
     expected = error_text(calibration) if good else " ".join(gate.text for gate in quality.failed)
     yield html.verdict(_KINDS[calibration.verdict], verdict_text(calibration), expected)
-    told = figures(calibration, touches).values()
+    told = figures(calibration).values()
     yield html.cards([(figure.value, f"{figure.label} {figure.about}") for figure in told])
     for warning in quality.warnings:
         yield html.paragraph(warning, "warning")
@@ -154,14 +146,6 @@ def _gates(job: SolvedRecording) -> Iterator[str]:
     yield html.table(
         ("", "gate", "result"), [("✓" if gate.passed else "✗", gate.name, gate.text) for gate in job.gates]
     )
-
-
-def _touches(touches: Sequence[Touch]) -> Iterator[str]:
-    if touches:
-        yield html.table(
-            ("", "tip beside the corner, against the prediction", "time", "operator"),
-            [("✓" if agrees(t) else "✗", touch_text(t), t.wall, f"{t.who}, {t.found}") for t in touches],
-        )
 
 
 def _error(job: SolvedRecording) -> Iterator[str]:
@@ -352,11 +336,6 @@ def _views(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
     yield '<div class="views">' + "\n".join(cells) + "</div>"
     if len(job.recording.views()) > _PICTURES_LIMIT:
         yield html.paragraph(f"The first {_PICTURES_LIMIT} are shown.", "note")
-
-
-def _history(history: Sequence[Sequence[str]]) -> Iterator[str]:
-    if history:
-        yield html.table(("version", "time", "action", "change"), history)
 
 
 def _provenance(job: SolvedRecording) -> Iterator[str]:

@@ -61,16 +61,6 @@ def own(calibration: Calibration) -> Array:
     return np.array([calibration.arm_table.base_from_flange(row).matrix for row in POSTURES])
 
 
-def test_the_urdf(calibration: Calibration, tmp_path: Path) -> None:
-    path = tmp_path / "arm.urdf"
-    path.write_bytes(export(calibration, "arm-urdf"))
-    assert np.abs(by_pytransform3d(path, "base", "tool0") - own(calibration)).max() < 1e-9
-    assert calibration.arm_table is not None
-    _, X = calibration.arm_table.installable()
-    camera = by_pytransform3d(path, "base", "camera_optical_frame")
-    assert np.abs(camera - own(calibration) @ X.matrix).max() < 1e-9
-
-
 def test_the_driver_s_kinematics_file_in_the_joints_of_its_description(
     calibration: Calibration, tmp_path: Path
 ) -> None:

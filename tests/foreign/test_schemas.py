@@ -52,7 +52,6 @@ def test_what_the_commands_print(findings: Findings, tmp_path: Path) -> None:
     shown = printed("show", *place)
     assert findings("validity", shown.pop("validity")) == []
     assert findings("calibration", shown) == []
-    assert findings("diff", printed("diff", "c.yaml", *place)) == []
     assert findings("drift-check", printed("drift-check", SAMPLE, *place)) == []
     assert findings("validity", printed("withdraw", "a trial of the schemas", *place)) == []
     assert findings("error", printed("rollback", "99", *place)) == []

@@ -36,8 +36,6 @@ FORMATS: dict[str, Format] = {
     "zivid": Format(".yaml", "Zivid Matrix4x4: the transform, mm", vision.zivid),
     "ur-tool": Format(".txt", "camera as tool (TCP) or feature on the UR pendant", vision.ur_tool),
     "ur-kinematics": Format(".yaml", "the corrected arm for ROS 2's ur_description", models.ur_kinematics),
-    "arm-urdf": Format(".urdf", "URDF of the corrected arm and its camera", models.arm_urdf),
-    "arm-json": Format(".json", "the corrected arm and the X that belongs to it", models.arm_json),
 }
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-import msgspec
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike
@@ -22,7 +21,7 @@ from calibrate.files.exports.frames import (
 )
 from calibrate.files.proof import content_sha256
 from calibrate.geometry import Array, inverse, pose, rotation_exp
-from calibrate.kinematics import MODELS, RobotModel, link_frames
+from calibrate.kinematics import RobotModel, link_frames
 
 
 def urdf(calibration: Calibration, frames: FrameNames) -> str:
@@ -66,7 +65,6 @@ def _origin(matrix: Array) -> str:
 
 
 _LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
-_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
 def link_origins(table: DhTable) -> Array:
@@ -98,8 +96,8 @@ def table_of(calibration: Calibration) -> CorrectedArm:
     return calibration.arm_table
 
 
-def table_origins(calibration: Calibration, frames: FrameNames) -> tuple[Array, str]:
-    """Return the corrected arm's joint origins (6, 4, 4), and a comment with the X that belongs to them."""
+def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
+    """Make the `kinematics_params_file` of ROS 2's ur_description: x y z, roll pitch yaw of each link."""
     arm = table_of(calibration)
     table, X = arm.installable()
     values = _numbers([*X.translation_m, *X.quaternion_xyzw])
@@ -108,51 +106,12 @@ def table_origins(calibration: Calibration, frames: FrameNames) -> tuple[Array, 
         f"{arm.model}: use it only with this camera pose, and this one only with it:\n"
         f"{frames.parent(calibration)} {frames.camera} (x y z, qx qy qz qw) {values}"
     )
-    return link_origins(table), note
-
-
-def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
-    """Make the `kinematics_params_file` of ROS 2's ur_description: x y z, roll pitch yaw of each link."""
-    origins, note = table_origins(calibration, frames)
     names = ("x", "y", "z", "roll", "pitch", "yaw")
     plain: dict[str, Any] = {
         link: dict(zip(names, (*T[:3, 3].tolist(), *roll_pitch_yaw(T[:3, :3])), strict=True))
-        for link, T in zip(_LINKS, origins, strict=True)
+        for link, T in zip(_LINKS, link_origins(table), strict=True)
     }
     # The driver compares this with the hash of the controller's table and warns, rightly, that they differ.
     plain["hash"] = f"calib_station_{content_sha256(plain)[:16]}"
     commented = "".join(f"# {line}\n" for line in note.splitlines())
     return commented + str(yaml.safe_dump({"kinematics": plain}, sort_keys=False))
-
-
-def arm_urdf(calibration: Calibration, frames: FrameNames) -> str:
-    """Make a complete URDF: the arm with corrected joint origins (no shapes), and the camera."""
-    origins, note = table_origins(calibration, frames)
-    arm = table_of(calibration)
-    _, X = arm.installable()
-    limit = MODELS[arm.model].joint_limit_rad
-    links = [frames.base, *(f"{link}_link" for link in _LINKS), frames.flange]
-    parts = [f"<link name={quoteattr(link)}/>" for link in links]
-    for name, parent, child, T in zip(_JOINTS, links, links[1:], origins, strict=False):
-        parts.append(
-            f'<joint name="{name}_joint" type="revolute">\n  <parent link={quoteattr(parent)}/>\n'
-            f"  <child link={quoteattr(child)}/>\n  {_origin(T)}\n"
-            f'  <axis xyz="0 0 1"/>\n'
-            f'  <limit lower="{-limit}" upper="{limit}" effort="0" velocity="0"/>\n</joint>'
-        )
-    parts.append(_joint("wrist_3_link", frames.flange, np.eye(4)))
-    parent = frames.parent(calibration)
-    parts.append(_camera(X.matrix, parent, frames))
-    name = quoteattr(f"{arm.model}_corrected")
-    return f"{_commented(note)}<robot name={name}>\n" + "\n".join(parts) + "\n</robot>\n"
-
-
-def arm_json(calibration: Calibration, frames: FrameNames) -> str:
-    """Make a JSON file of the arm's corrected table and the X that belongs to it, nothing else."""
-    table_origins(calibration, frames)  # raises where no table is offered
-    plain = {
-        "of": comment(calibration, replace(frames, with_table=True)),
-        "mount": calibration.mount,
-        "arm_table": calibration.arm_table,
-    }
-    return msgspec.json.format(msgspec.json.encode(plain)).decode() + "\n"

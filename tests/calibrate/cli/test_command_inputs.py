@@ -55,7 +55,6 @@ def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_
     refused(run("solve", session_file, "-o", "no/such/c.yaml", cwd=tmp_path), 2, "output", "no/such")
     done = run("solve", session_file, "--report", "no/such/r.html", cwd=tmp_path)
     refused(done, 2, "output", "no/such")
-    refused(run("report", session_file, "-o", "no/such/r.html", cwd=tmp_path), 2, "output", "no/such")
     assert not list(tmp_path.glob("*.calibration.yaml")), "said before the solve, not after it"
     (tmp_path / "board.yaml").write_text("kind: chesboard\ncolums: 7\nrows: 6\nsquare_m: 0.025\n")
     named = ("line 1", "kind", "line 2", "colums", "columns")
@@ -199,7 +198,6 @@ def test_what_an_arm_or_a_solve_was_needed_for_is_never_written_over(
     calibration = Path(shutil.copy(real_file, tmp_path / "c.yaml"))
     (tmp_path / "notes.txt").write_text("mine")
     for name in ("s.mcap", "c.yaml", "notes.txt"):
-        refused(run("report", recording, "-o", name, cwd=tmp_path), 2, "target-exists", name)
         told = run("solve", recording, "-o", "new.yaml", "--report", name, cwd=tmp_path)
         refused(told, 2, "target-exists", name)
     same = run("solve", recording, "-o", "new.yaml", "--report", "./new.yaml", cwd=tmp_path)
@@ -211,7 +209,7 @@ def test_what_an_arm_or_a_solve_was_needed_for_is_never_written_over(
     for _ in range(2):
         assert run("export", calibration, "--to", "opencv", "-o", "c.yml", cwd=tmp_path).returncode == 0
     os.mkfifo(tmp_path / "pipe")
-    for command in (("report", recording), ("export", calibration, "--to", "opencv"), ("solve", recording)):
+    for command in (("export", calibration, "--to", "opencv"), ("solve", recording)):
         refused(run(*command, "-o", "pipe", cwd=tmp_path), 2, "output", "pipe")
     assert recording.read_bytes() == session_file.read_bytes()
     assert calibration.read_bytes() == real_file.read_bytes()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import sys
 import types
@@ -38,7 +37,7 @@ from calibrate.files.validity import Validity, ValidityReason, ValidityState, un
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_from_rotvec, rotation_exp
 from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
 from calibrate.job import SolvedRecording
-from calibrate.kinematics import MODELS, base_from_flange, forward, with_near_axes
+from calibrate.kinematics import MODELS, forward, with_near_axes
 from calibrate.load import arm_of_ros
 from tests.calibrate.calling import raises_code
 
@@ -135,24 +134,6 @@ def test_ur_kinematics_is_the_corrected_arm_by_the_driver_s_rule(
         assert np.abs(forward(back, joints) - flange_of_chain(origins, joints)).max() < 1e-9
 
 
-def test_arm_urdf_is_the_corrected_arm_with_its_own_camera(calibration: Calibration) -> None:
-    root = ElementTree.fromstring(export(calibration, "arm-urdf"))
-    joints = {joint.attrib["name"]: joint for joint in root.iter("joint")}
-    turning = [joint for joint in joints.values() if joint.attrib["type"] == "revolute"]
-    check_chain([urdf_origin(joint) for joint in turning], calibration)
-    X = urdf_origin(joints["camera_link_joint"]) @ urdf_origin(joints["camera_optical_frame_joint"])
-    assert np.abs(X - calibration.arm_table.result.matrix).max() < 1e-12
-    assert np.abs(X - calibration.transform.matrix).max() > 1e-3
-
-
-def test_arm_json_holds_table_and_camera_together(calibration: Calibration) -> None:
-    read = json.loads(export(calibration, "arm-json"))["arm_table"]
-    joints = np.array([0.3, -1.2, 1.4, -0.8, 1.1, 0.2])
-    own = calibration.arm_table.base_from_flange(joints).matrix
-    assert np.abs(base_from_flange(read["corrected"], joints) - own).max() < 1e-12
-    assert read["result"]["parent_frame"].startswith("corrected_")
-
-
 def test_a_ros_transform_is_of_the_arm_as_it_is_unless_asked_for_the_table(calibration: Calibration) -> None:
     for frames, X in (
         (FrameNames(), calibration.transform),
@@ -169,16 +150,15 @@ def test_a_ros_transform_is_of_the_arm_as_it_is_unless_asked_for_the_table(calib
     assert refused.value.code == "not-of-table"
 
 
-@pytest.mark.parametrize("name", ["ur-kinematics", "arm-urdf", "arm-json"])
-def test_a_table_that_is_not_offered_is_not_exported(calibration: Calibration, name: str) -> None:
+def test_a_table_that_is_not_offered_is_not_exported(calibration: Calibration) -> None:
     refused = msgspec.structs.replace(
         calibration.arm_table, offered=False, refused="no-joints", corrected=None, result=None
     )
     with pytest.raises(CalibrationError) as caught:
-        export(msgspec.structs.replace(calibration, arm_table=refused), name)
+        export(msgspec.structs.replace(calibration, arm_table=refused), "ur-kinematics")
     assert caught.value.code == "table-not-offered" and caught.value.values["reason"] == "no-joints"
     with pytest.raises(ExportError) as unknown:
-        export(msgspec.structs.replace(calibration, arm_table=None), name)
+        export(msgspec.structs.replace(calibration, arm_table=None), "ur-kinematics")
     assert unknown.value.code == "no-arm-table"
 
 

@@ -88,15 +88,12 @@ def test_an_edited_entry_is_noticed(file: Path) -> None:
         read_calibration(file)
 
 
-def test_they_are_shown_in_the_terminal_and_in_the_report(solved_real: SolvedRecording) -> None:
+def test_they_are_shown_in_the_terminal(solved_real: SolvedRecording) -> None:
     calibration = msgspec.structs.replace(solved_real.calibration, verification=[GOOD, BAD])
     console = Console(record=True, width=150)
     console.print(summary(calibration))
     text = console.export_text()
-    page = report_page(solved_real, touches=[GOOD, BAD])
-    for touch in (GOOD, BAD):
-        assert touch_text(touch) in text and touch_text(touch) in page
-    assert "corner 41" not in report_page(solved_real)
+    assert touch_text(GOOD) in text and touch_text(BAD) in text
 
 
 def test_a_picture_of_a_view_in_doubt_says_so_in_the_report(solved_real: SolvedRecording) -> None:

@@ -44,7 +44,7 @@ from station.cell.layout import CellLayout, layout_of
 from station.cell.limits import allowed_speed, check_plan, sample_path
 from station.cell.pose_plan import Plan
 from station.plan.choose import choose, informations, objective_for
-from station.plan.planner import PlanOptions, candidate_pool, plan_scene
+from station.plan.planner import PlanOptions, candidate_pool, plan_layout
 from station.plan.visibility import ViewRange
 
 CELLS = 200
@@ -120,7 +120,7 @@ def _plan_and_check(cell: RandomCell, result: CellResult, rng: np.random.Generat
     scene = layout_of(cell.config)
     begin, begin_cpu = time.perf_counter(), time.process_time()
     try:
-        plan = plan_scene(scene, PlanOptions(seed=seed, noise=NOISE), cell.start.tolist())
+        plan = plan_layout(scene, PlanOptions(seed=seed, noise=NOISE), cell.start.tolist())
     except LimitError as error:
         result.failures.append(f"cell {seed}: {error}")
         return

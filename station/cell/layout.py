@@ -1,4 +1,4 @@
-"""CellLayout: configured camera and board pose with their uncertainty, solids and obstacles."""
+"""Layout of a cell by its configuration: camera and board pose with uncertainty, solids and obstacles."""
 
 from __future__ import annotations
 
@@ -95,10 +95,10 @@ def pose_at(model: RobotModel, name: str, joints_rad: ArrayLike, why: str = "") 
     return PlannedPose(name, vector6(joints), matrix4(forward(model, joints)), why=why)
 
 
-def flange_poses(scene: CellLayout, plan: Plan) -> Array:
+def flange_poses(layout: CellLayout, plan: Plan) -> Array:
     """Compute base_from_flange (n, 4, 4) of a plan's joints."""
     joints = np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6)
-    return np.asarray(forward(scene.geometry.model, joints))
+    return np.asarray(forward(layout.geometry.model, joints))
 
 
 def board_extent(board: BoardSpec) -> tuple[Array, Array]:
@@ -114,7 +114,7 @@ def printed_corners(board: BoardSpec) -> Array:
 
 
 def layout_of(config: StationConfig) -> CellLayout:
-    """Make the scene of a configuration. ConfigError names what is missing."""
+    """Make the layout of a cell from its configuration. ConfigError names what is missing."""
     camera, mount_guess, place_guess = config.camera.model, config.camera_guess, config.board_guess
     if camera is None or camera.matrix is None:
         raise ConfigError(

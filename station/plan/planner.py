@@ -174,10 +174,10 @@ def make_plan(
     """
     require_kept_clear(config)
     options = PlanOptions(count=count, seed=seed, criterion=criterion, free_intrinsics=not lens_known)
-    return plan_scene(layout_of(config), options, start_joints_rad, progress)
+    return plan_layout(layout_of(config), options, start_joints_rad, progress)
 
 
-def plan_scene(
+def plan_layout(
     layout: CellLayout,
     options: PlanOptions,
     start_joints_rad: Sequence[float] | None = None,

@@ -12,7 +12,7 @@ import pytest
 from recordings.schema.messages import RobotState
 from station.cell.arm_acceptance import STOP_GIVEN, ArmSubject, Figure, StopResult, StopTestMove, StopWay
 from station.cell.status import Event, MotionPreview, StationState, StationStatus
-from station.operate import acceptance
+from station.operate import stop_test
 from station.operate.stop_test import TRIES, AcceptanceTest
 from station.protocol.verbs import Go, Prepare, StopTest, Verb
 
@@ -81,8 +81,8 @@ def bad(monkeypatch: pytest.MonkeyPatch) -> set[StopWay]:
         figure = Figure("rest", 2.0 if move.way in found else 0.0, "s", 1.0, "")
         return ((), "too early") if moment_ns is None else ((figure,), "")
 
-    monkeypatch.setattr(acceptance, "AFTER_S", 0.0)
-    monkeypatch.setattr(acceptance, "judge", judge)
+    monkeypatch.setattr(stop_test, "AFTER_S", 0.0)
+    monkeypatch.setattr(stop_test, "judge", judge)
     return found
 
 

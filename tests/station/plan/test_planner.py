@@ -26,7 +26,7 @@ from station.cell.limits import check_plan
 from station.plan import planner
 from station.plan.candidates import NOT_IN_PICTURE, find_candidates
 from station.plan.choose import choose, informations, objective_for
-from station.plan.planner import PlanOptions, make_plan, plan_scene
+from station.plan.planner import PlanOptions, make_plan, plan_layout
 from station.plan.predict import forecast_views
 from station.plan.visibility import ViewRange, blind_share, lens_radius, view_range, visible
 from station.simulation.scenes import cell_config, make_cell
@@ -53,7 +53,7 @@ def cell(scene="paper", mount="eye-in-hand", seed=0):
 @cache
 def planned(scene="paper", mount="eye-in-hand", seed=0, count=25):
     truth, config = cell(scene, mount, seed)
-    return plan_scene(layout_of(config), replace(FEW, count=count, seed=1), truth.start_joints_rad)
+    return plan_layout(layout_of(config), replace(FEW, count=count, seed=1), truth.start_joints_rad)
 
 
 @pytest.mark.parametrize("which", CELLS)
@@ -139,7 +139,7 @@ def test_the_same_seed_gives_the_same_plan_and_another_seed_another():
 
     def again(seed):
         options, start = replace(FEW, seed=seed), truth.start_joints_rad
-        return plan_scene(layout_of(config), options, start, lambda _, done: told.append(done))
+        return plan_layout(layout_of(config), options, start, lambda _, done: told.append(done))
 
     assert again(1) == planned() and told == sorted(told) and told[-1] == 1.0
     assert again(2).poses != planned().poses
@@ -210,7 +210,7 @@ def impossible(name):
 def test_an_impossible_plan_is_explained(name, code, constraint):
     config, start = impossible(name)
     with raises(code, wanted=25) as caught:
-        plan_scene(layout_of(config), FEW, start)
+        plan_layout(layout_of(config), FEW, start)
     assert constraint is None or caught.value.values["constraints"].startswith(constraint)
     assert caught.value.remedy
 
@@ -219,7 +219,7 @@ def test_a_fixed_camera_that_looks_away_from_the_arm_is_explained():
     truth, config = cell("paper", "eye-to-hand", 1)
     away = moved(config, camera_guess=turned(config.camera_guess, [0, np.pi, 0]))
     with raises("out-of-reach"):
-        plan_scene(layout_of(away), FEW, truth.start_joints_rad)
+        plan_layout(layout_of(away), FEW, truth.start_joints_rad)
 
 
 def test_what_planning_needs_is_asked_for():
@@ -257,14 +257,14 @@ def test_every_lens_model_can_be_planned_with(kind, distortion):
     truth, config = cell()
     lens = moved(config.camera.model, distortion=distortion, distortion_model=kind)
     other = moved(config, camera=moved(config.camera, model=lens))
-    plan = plan_scene(layout_of(other), replace(FEW, count=6), truth.start_joints_rad)
+    plan = plan_layout(layout_of(other), replace(FEW, count=6), truth.start_joints_rad)
     assert len(plan.poses) == 6
     assert plan.poses[-1].predicted_sigma_m < 0.01
 
 
 def test_a_plan_without_a_start_and_with_few_poses():
     _, config = cell()
-    plan = plan_scene(layout_of(config), replace(FEW, count=4, view=replace(ViewRange(), doubt=1.0)))
+    plan = plan_layout(layout_of(config), replace(FEW, count=4, view=replace(ViewRange(), doubt=1.0)))
     assert len(plan.poses) == 4
     assert check_plan(plan, None, cell_geometry(config)).problems == ()
 

@@ -16,7 +16,7 @@ from station.cell.layout import layout_of
 from station.cell.limits import check_path
 from station.cell.pose_plan import PlannedPose
 from station.plan.choose import CRITERIA
-from station.plan.planner import PlanOptions, plan_scene
+from station.plan.planner import PlanOptions, plan_layout
 from station.plan.predict import forecast_arm, forecast_views, next_best, next_best_text, with_forecast
 from station.simulation.scenes import cell_config, make_cell
 
@@ -26,7 +26,7 @@ def world():
     truth = make_cell("paper", 0, "low", "eye-in-hand")
     config = cell_config(truth)
     scene = layout_of(config)
-    plan = plan_scene(scene, PlanOptions(pool=600), truth.start_joints_rad)
+    plan = plan_layout(scene, PlanOptions(pool=600), truth.start_joints_rad)
     return scene, plan, np.array([pose.base_from_flange for pose in plan.poses])
 
 
@@ -93,7 +93,7 @@ def test_poses_for_the_arm_tell_more_of_its_table_than_poses_for_the_camera(aim,
     scene, plan, _ = world()
     truth = make_cell("paper", 0, "low", "eye-in-hand")
     start = truth.start_joints_rad
-    own = plan_scene(scene, PlanOptions(pool=600, criterion=CRITERIA[aim]), start)
+    own = plan_layout(scene, PlanOptions(pool=600, criterion=CRITERIA[aim]), start)
     planned, usual = forecast_arm(scene, own), forecast_arm(scene, plan)
     assert planned.with_table_m < share * usual.with_table_m
     assert planned.if_measured_m <= planned.with_table_m

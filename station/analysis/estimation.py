@@ -41,12 +41,11 @@ def running_estimate(
     """Estimate from the views so far; with too few views or too little motion only advice, no numbers."""
     camera, goal_m = config.camera.model, config.capture.goal_m
     assert camera is not None
-    shown = [image_coverage(camera, [view.pixels]) for view in seen]
+    shown = [count_in_parts(camera, view.pixels, COVERAGE_ROWS, COVERAGE_COLUMNS) > 0 for view in seen]
     blank = EstimateStatus(
         len(seen),
         goal_mm=1000 * goal_m,
-        image_coverage=image_coverage(camera, [view.pixels for view in seen]),
-        image_views=tuple(tuple(int(n) for n in row) for row in np.greater(shown, 0).sum(axis=0)),
+        image_views=tuple(tuple(int(n) for n in row) for row in np.sum(shown, axis=0)),
     )
     if len(seen) < FEWEST_FOR_ESTIMATE:
         return msgspec.structs.replace(blank, advice="too few views yet")
@@ -68,13 +67,6 @@ def running_estimate(
         if sigma_m <= goal_m
         else "continue: every pose still helps",
     )
-
-
-def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[int, ...], ...]:
-    """Count corners in each part of the image, COVERAGE_ROWS × COVERAGE_COLUMNS."""
-    points = np.concatenate([np.zeros((0, 2)), *pixels])
-    counts = count_in_parts(camera, points, COVERAGE_ROWS, COVERAGE_COLUMNS)
-    return tuple(tuple(int(n) for n in row) for row in counts)
 
 
 def solve_quickly(

@@ -169,10 +169,8 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     goal_mm: float | None = None
     enough: bool = False
     advice: str = ""
-    image_coverage: tuple[tuple[int, ...], ...] = ()
-    """Corners seen so far in each part of the image, rows from the top."""
     image_views: tuple[tuple[int, ...], ...] = ()
-    """Images that show the board in each of these parts."""
+    """Images that show the board in each part of the image, rows from the top."""
 
 
 class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):

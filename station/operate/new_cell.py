@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
+import yaml
 
 from calibrate.boards.model import board_points, check_board, usual_markers
 from calibrate.geometry import Array, inverse, transform_points
@@ -43,6 +45,18 @@ _COUNTED = {
     BoardKind.APRIL_GRID: "columns and rows of tags",
 }
 """Boards that the wizard offers, and what their columns and rows count; a single tag is not enough."""
+
+_HEAD = """\
+# A cell, written by `station new`. Lengths in metres, angles in radians.
+# After editing: station doctor --config FILE"""
+_NOTES = {
+    "robot": "an arm of another serial number is refused",
+    "model": "rough, from the guided views: the session's own images give the lens",
+    "speed_m_s": "of any point of arm, tool and camera; code allows no more",
+    "workspace_min_m": "around the guided views",
+    "planes": "the arm stays on the side that the normal points to",
+}
+"""Key → comment in the written configuration."""
 
 
 def next_step(draft: Draft) -> CellStep:
@@ -190,55 +204,21 @@ def _guess(T: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
 
 def config_text(config: StationConfig) -> str:
     """Write the configuration as YAML with comments, for people to read and edit."""
-
-    def flow(value: object) -> str:
-        return msgspec.json.encode(value).decode().replace('"', "").replace(",", ", ").replace(":", ": ")
-
-    model, limits = config.camera.model, config.limits
-    assert model is not None and config.camera_guess is not None and config.board_guess is not None
-    where = ("flange", "base") if config.mount == "eye-in-hand" else ("base", "flange")
-    frames = {"camera_guess": f"{where[0]}_from_camera", "board_guess": f"{where[1]}_from_board"}
+    plain: dict[str, Any] = {"format": config.format, "name": config.name, "mount": config.mount}
+    plain |= msgspec.to_builtins(config)
+    plain["limits"] = {"speed_m_s": config.limits.speed_m_s} | plain["limits"]
+    parents = ("flange", "base") if config.mount == "eye-in-hand" else ("base", "flange")
+    notes = _NOTES | {
+        "camera_guess": f"{parents[0]}_from_camera, from the guided views, 1 sigma below",
+        "board_guess": f"{parents[1]}_from_board, from the guided views, 1 sigma below",
+        "board": _COUNTED[config.board.kind],
+    }
+    text = yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=200)
     lines = [
-        "# A cell, written by `station new`. Lengths in metres, angles in radians.",
-        "# After editing: station doctor --config FILE",
-        "format: station-config/1",
-        f"name: {config.name}",
-        f"mount: {config.mount}",
-        "robot:",
-        f"  model: {config.robot.model}",
-        f"  host: {config.robot.host}",
-        f"  serial: '{config.robot.serial}'   # another arm is refused",
-        "camera:",
-        f"  driver: {config.camera.driver}",
-        f"  device: '{config.camera.device}'",
-        f"  exposure_us: {config.camera.exposure_us}",
-        "  model:   # rough, from the guided views: the session's own images give the lens",
-        f"    {{width: {model.width}, height: {model.height}, matrix: {flow(model.matrix)}}}",
-        "  model_is_rough: true",
-        f"board: {flow(msgspec.to_builtins(config.board))}   # {_COUNTED[config.board.kind]}",
+        f"{line}   # {notes[key]}" if (key := line.partition(":")[0].strip()) in notes else line
+        for line in text.splitlines()
     ]
-    for name in ("camera_guess", "board_guess"):
-        guess: PoseGuess = getattr(config, name)
-        lines += [
-            f"{name}:   # {frames[name]}, from the guided views, 1 sigma below",
-            f"  translation_m: {flow(guess.translation_m)}",
-            f"  rotation_xyzw: {flow(guess.rotation_xyzw)}",
-            f"  sigma_m: {guess.sigma_m}",
-            f"  sigma_rad: {guess.sigma_rad}",
-        ]
-    lines += [
-        "limits:",
-        f"  speed_m_s: {limits.speed_m_s}   # of any point of arm, tool and camera; code allows no more",
-        f"  workspace_min_m: {flow(limits.workspace_min_m)}   # around the guided views",
-        f"  workspace_max_m: {flow(limits.workspace_max_m)}",
-        "  planes:   # the arm stays on the side that the normal points to",
-        *(
-            f"    - {{name: {plane.name}, point_m: {flow(plane.point_m)}, normal: {flow(plane.normal)}}}"
-            for plane in limits.planes
-        ),
-        f"working_distance_m: {config.working_distance_m}",
-    ]
-    return "\n".join([*lines, ""])
+    return "\n".join([_HEAD, *lines, ""])
 
 
 def write_config(draft: Draft, path: Path) -> StationConfig:

@@ -57,6 +57,20 @@ def _sampled(
     return duration, np.asarray(free), np.asarray(hopeless)
 
 
+def ordered(
+    geometry: CellGeometry, joints: Array, start: Array | None, seed: int
+) -> tuple[list[int], list[int]]:
+    """Find a short order of joints (n, 6). The second list holds the indices of poses without a free path."""
+    times, lead = time_matrix(geometry, joints), np.zeros(len(joints))
+    if start is not None:
+        lead = move_times(geometry, np.repeat(start[None], len(joints), axis=0), joints)
+    order = short_order(times, lead, seed)
+    if lead[order[0]] == BLOCKED:
+        return order, [order[0]]
+    free = np.isfinite(times).sum(axis=1)
+    return order, [min(legs, key=lambda m: free[m]) for legs in pairwise(order) if times[legs] == BLOCKED]
+
+
 def time_matrix(geometry: CellGeometry, joints_rad: Array) -> Array:
     """Compute durations (n, n) of moves between all poses, symmetric, BLOCKED where not free."""
     n = len(joints_rad)

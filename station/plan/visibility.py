@@ -18,9 +18,6 @@ from station.cell.config import matrix4, vector6
 from station.cell.layout import CellLayout, printed_corners
 from station.cell.pose_plan import ExpectedView, PlannedPose
 
-_ON_THE_WAY = 7
-"""Positions along a move at which visibility is checked."""
-
 
 @dataclass(frozen=True)
 class ViewRange:
@@ -119,15 +116,6 @@ def uncertain_pixels(layout: CellLayout, base_from_flange: Array, points: Array)
     projected = project(layout.camera, seen)
     J = projected.by_point
     return projected.pixels, np.sqrt(np.einsum("nkij,nkjl,nkil->nki", J, variance, J))
-
-
-def blind_share(layout: CellLayout, joints_from: Array, joints_to: Array) -> Array:
-    """Compute the share (n,), 0…1, of moves (n, 6) → (n, 6) during which the board is not wholly seen."""
-    steps = np.linspace(0, 1, _ON_THE_WAY + 2)[1:-1]
-    paths = joints_from[:, None] + steps[:, None] * (joints_to - joints_from)[:, None]
-    flange = forward(layout.geometry.model, paths.reshape(-1, 6))
-    seen = visible(layout.camera, layout.seen(flange, outline(layout.board)), 0.0)
-    return np.asarray(1.0 - seen.reshape(len(joints_from), _ON_THE_WAY).mean(axis=1))
 
 
 def outline(board: BoardSpec) -> Array:

@@ -23,12 +23,11 @@ from calibrate.kinematics import MODELS, forward
 from station.cell.config import SPEED_CAP_M_S
 from station.cell.layout import cell_geometry, layout_of
 from station.cell.limits import check_plan
-from station.plan import planner
 from station.plan.candidates import NOT_IN_PICTURE, find_candidates
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, make_plan, plan_layout
 from station.plan.predict import forecast_views
-from station.plan.visibility import ViewRange, blind_share, lens_radius, view_range, visible
+from station.plan.visibility import ViewRange, lens_radius, view_range, visible
 from station.simulation.scenes import cell_config, make_cell
 from tests.codes import raises
 
@@ -96,27 +95,6 @@ def test_poses_are_varied_and_say_why_they_are_there():
     sigmas = [pose.predicted_sigma_m for pose in plan.poses]
     assert all(b <= a * (1 + 1e-9) for a, b in pairwise(sigmas))
     assert sigmas[-1] < 0.0005
-
-
-def test_the_board_stays_in_the_picture_along_the_way():
-    _, config = cell()
-    scene = layout_of(config)
-    joints = np.array([pose.joints_rad for pose in planned().poses])
-    assert blind_share(scene, joints[:-1], joints[1:]).max() < 0.3
-    away = joints[:1] + np.array([0, 0, 0, 0, 1.2, 0])
-    assert blind_share(scene, joints[:1], away)[0] > 0.5
-    assert blind_share(scene, joints[:1], joints[:1])[0] == 0.0
-
-
-def test_an_order_takes_the_way_that_keeps_the_board_in_the_picture(monkeypatch):
-    """Two ways round are equally long; one of them sees the board."""
-    _, config = cell()
-    times = np.array([[0, 1, 1.01], [1, 0, 1], [1.01, 1, 0.0]])
-    monkeypatch.setattr(planner, "time_matrix", lambda *_: times)
-    monkeypatch.setattr(planner, "blind_share", lambda *_: np.array([1.0, 0.0, 0.0]))
-    order, unfree = planner._ordered(layout_of(config), np.zeros((3, 6)), None, 0)
-    assert unfree == []
-    assert {0, 1} not in ({*order[:2]}, {*order[1:]})
 
 
 def branch_of(joints):

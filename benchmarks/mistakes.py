@@ -25,7 +25,6 @@ from scipy.spatial.transform import Rotation
 from benchmarks.real_sets import DATASETS
 from benchmarks.trials import table
 from calibrate.boards.detect import Detection, detect
-from calibrate.cli.solve import solve_json
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, rotation_log
 from calibrate.handeye.solution import Reading
@@ -93,7 +92,7 @@ def what_is_said(folder: Path, output: Path) -> Said:
     except (CalibrationError, RecordingError) as error:
         hypothesis = str(getattr(error, "hypothesis", "") or "")
         return Said(hypothesis or error.code, hypothesis, (), str(error), answered=False)
-    answer = solve_json(job)
+    answer = job.calibration.quality
     assert answer.session is not None
     hypothesis = answer.session.hypothesis
     if hypothesis == Reading.AS_RECORDED.value:

@@ -9,7 +9,6 @@ from functools import cache
 from importlib import metadata
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from calibrate.boards.model import ambiguity_text
@@ -19,11 +18,9 @@ from calibrate.files.calibration import (
     Calibration,
     CorrectedArm,
     DhTable,
-    Folds,
     FramePose,
     HeldOutViews,
     Lens,
-    Proof,
     Provenance,
     Quality,
     SessionReading,
@@ -36,12 +33,13 @@ from calibrate.files.calibration import (
 from calibrate.files.gate import Gate
 from calibrate.geometry import Transform
 from calibrate.handeye.arm import HELD, PARAMETERS
-from calibrate.handeye.solution import Remark, Solution, TableResult, Verification
+from calibrate.handeye.solution import Solution, TableResult, Verification
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty
 from calibrate.load import LoadedViews
 from calibrate.projection import intrinsics_names
+from calibrate.results import Remark
 from calibrate.views import ViewSet
 from recordings.reader import Recording
 
@@ -85,7 +83,7 @@ def make_calibration(
             used=list(solution.used),
             rejected=sorted((*loaded.without_board, *solution.rejected), key=lambda view: view.index),
             turned=list(solution.turned),
-            weights=[ViewWeight(i, round(w, 4)) for i, w in solution.weights.items() if w < 0.9999],
+            weights=[ViewWeight(i, round(w, 4)) for i, w in solution.weights.items()],
         ),
         quality=_quality(solution, gates, loaded, intrinsics, lens_known),
         provenance=Provenance(
@@ -171,12 +169,12 @@ def _quality(
     intrinsics: Intrinsics | None,
     lens_known: LensUncertainty | None,
 ) -> Quality:
-    noise, folds, arm, board = solution.noise, solution.cross_validation, solution.arm, solution.board
+    noise, arm = solution.noise, solution.arm
     remarks = _remarks(solution, loaded, intrinsics)
     reading = solution.session.reading.value
     return Quality(
         gates=list(gates),
-        certificate=msgspec.convert(solution.certificate, Proof, from_attributes=True),
+        certificate=solution.certificate,
         holdout=solution.holdout,
         rms_px=solution.rms_px,
         views=[_view_quality(index, solution) for index in solution.used],
@@ -194,11 +192,8 @@ def _quality(
         },
         error_shares=solution.error_shares,
         weakest=solution.observability.weakest_text,
-        board_scale=None if board is None else 1.0 + board.scale,
-        board=board,
-        cross_validation=None
-        if folds is None
-        else Folds(folds.rms_m * 1e3, folds.rms_rad * _DEG, folds.claimed_m * 1e3, folds.folds),
+        board=solution.board,
+        cross_validation=solution.cross_validation,
         session=SessionReading(reading, next((r.text for r in solution.warnings if r.code == reading), "")),
         arm=None
         if arm is None

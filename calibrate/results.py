@@ -1,4 +1,4 @@
-"""Results of the solver that the calibration file keeps as they are; their fields are keys of the file."""
+"""Results that solver, calibration file and `--json` share; their fields are keys of the file."""
 # ruff: noqa: N815  (e_t and e_R are written as the paper writes them)
 
 from __future__ import annotations
@@ -8,6 +8,14 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Remark:
+    """Warning about a solution: a code for programs and a sentence for people."""
+
+    code: str
+    text: str
 
 
 class RejectedView(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -40,6 +48,40 @@ class HoldoutScore(msgspec.Struct, frozen=True, omit_defaults=True):
     """Pose numbers (earlier, later) of the held-out pairs."""
     fitted_views: int
     note: str = ""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Proof that the quadratic objective has no better X: a lower bound from the dual of the SDP relaxation.
+
+    It proves the optimum of `problem` on the inlier pairs, not the final maximum-likelihood X;
+    `distance_sigma` tells how far the two are apart.
+    """
+
+    certified: bool
+    relative_gap: float
+    """(objective - lower_bound) / max(objective, floor)"""
+    objective: float
+    distance_sigma: float | None = None
+    """Distance between the certified X and the final X in sigmas, in the direction where it is largest."""
+    problem: str = ""
+    lower_bound: float = 0.0
+    floor: float = 0.0
+    """Absolute floor of the denominator, 1e-8 times the trace of the form."""
+    restarts: int = 0
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Errors at the middle of the board of views predicted from the others; only views that count fully."""
+
+    rms_mm: float
+    rms_deg: float
+    claimed_mm: float
+    """Value of `rms_mm` that the stated uncertainties predict."""
+    folds: int
+    limit: float = 0.0
+    """Limit of `rms_mm` over `claimed_mm`; above it the stated uncertainties are too small."""
 
 
 class BoardShape(msgspec.Struct, frozen=True):

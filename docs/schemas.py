@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from calibrate.batch.run import BatchResult
 from calibrate.cli.contracts import (
@@ -62,7 +63,9 @@ def schemas() -> Iterator[tuple[str, bytes]]:
     """(file name, content) of each."""
     for name, (title, kind) in TYPES.items():
         (schema,), definitions = msgspec.json.schema_components(
-            (kind,), schema_hook=lambda _: {"type": "string"}, ref_template="#/$defs/{name}"
+            (kind,),
+            schema_hook=_other,
+            ref_template="#/$defs/{name}",
         )
         whole = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -74,6 +77,11 @@ def schemas() -> Iterator[tuple[str, bytes]]:
             f"{name}.json",
             msgspec.json.format(msgspec.json.encode(whole, order="sorted"), indent=1) + b"\n",
         )
+
+
+def _other(kind: type) -> dict[str, str]:
+    """Say how NumPy's arrays and paths are printed."""
+    return {"type": "array" if kind is np.ndarray else "string"}
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 from msgspec import inspect as kinds
 
 TYPES: dict[str, tuple[str, Any]] = runpy.run_path(str(Path(__file__).with_name("schemas.py")))["TYPES"]
@@ -89,7 +90,7 @@ def _named(kind: kinds.Type) -> str:
         case kinds.TupleType():
             return f"{len(kind.item_types)} × {_named(kind.item_types[0])}"
         case kinds.CustomType():
-            return "path"
+            return "numbers" if kind.cls is np.ndarray else "path"
         case kinds.DictType():
             return f"keys to {_named(kind.value_type)}"
     return type(kind).__name__.removesuffix("Type").lower().replace("none", "null")

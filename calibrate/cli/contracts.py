@@ -1,5 +1,4 @@
 """Objects that the commands print with `--json`; docs/schemas/ is made from these types."""
-# ruff: noqa: N815  (e_R is written as the paper writes it)
 
 from __future__ import annotations
 
@@ -10,29 +9,16 @@ import msgspec
 from calibrate.files.calibration import (
     Arm,
     CorrectedArm,
-    Folds,
     FramePose,
     Lens,
-    Proof,
     SessionReading,
     Sigma,
-    ViewWeight,
+    Views,
 )
 from calibrate.files.gate import Gate
 from calibrate.files.validity import Validity
-from calibrate.results import BoardShape, HoldoutScore, RejectedView
-from recordings.schema.messages import Matrix4, Mount
-
-
-class ViewsJson(msgspec.Struct, frozen=True):
-    used: list[int]
-    rejected: list[RejectedView]
-    weights: list[ViewWeight]
-
-
-class WarningJson(msgspec.Struct, frozen=True):
-    code: str
-    text: str
+from calibrate.results import BoardShape, Certificate, CrossValidation, HoldoutScore, PeerResult, Remark
+from recordings.schema.messages import Mount
 
 
 class SolveJson(msgspec.Struct, frozen=True):
@@ -42,14 +28,14 @@ class SolveJson(msgspec.Struct, frozen=True):
     result: FramePose
     sigma: Sigma
     covariance: tuple[tuple[float, ...], ...]
-    views: ViewsJson
+    views: Views
     intrinsics: Lens
     holdout: HoldoutScore | None
-    certificate: Proof
+    certificate: Certificate
     gates: list[Gate]
     verdict: Literal["pass", "fail"]
-    warnings: list[WarningJson]
-    cross_validation: Folds | None
+    warnings: list[Remark]
+    cross_validation: CrossValidation | None
     board: BoardShape | None
     session: SessionReading | None
     arm: Arm | None
@@ -57,31 +43,12 @@ class SolveJson(msgspec.Struct, frozen=True):
     solve_ms: float
 
 
-class MethodJson(msgspec.Struct, frozen=True):
-    name: str
-    matrix: Matrix4 | None
-    """None where the method failed (see `note`)."""
-    e_t_m: float | None
-    e_R: float | None
-    board_spread_m: float | None
-    board_spread_rad: float | None
-    reprojection_px: float | None
-    distance_sigma: float | None
-    """Distance from the result of `solve`, in its own standard uncertainties."""
-    time_ms: float
-    note: str
-    on_box: tuple[str, ...]
-    """Components of X on the box of the paper's equation 22; such an X is wrong."""
-    rigid: bool
-    """False where the method's raw matrix is not a rigid transform."""
-
-
 class CompareJson(msgspec.Struct, frozen=True):
     """`calibrate compare --json`"""
 
     mount: Mount
     views: list[int]
-    methods: list[MethodJson]
+    methods: list[PeerResult]
 
 
 class ListedJson(msgspec.Struct, frozen=True):

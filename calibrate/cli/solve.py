@@ -12,11 +12,11 @@ import typer
 from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
-from calibrate.cli.contracts import CompareJson, MethodJson, SolveJson, ViewsJson, WarningJson
+from calibrate.cli.contracts import CompareJson, SolveJson
 from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.cli.output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError, UsageError
-from calibrate.files.calibration import ViewWeight, write_calibration, write_output
+from calibrate.files.calibration import write_calibration, write_output
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
 from calibrate.files.install import install_line
 from calibrate.geometry import rotation_log
@@ -80,34 +80,16 @@ def solve(
 
 
 def solve_json(job: SolvedRecording) -> SolveJson:
-    """Build the object that `calibrate solve --json` prints."""
-    found, quality = job.calibration, job.calibration.quality
-    return SolveJson(
-        mount=found.mount,
-        result=found.result,
-        sigma=found.sigma,
-        covariance=found.covariance,
-        views=ViewsJson(
-            found.views.used,
-            found.views.rejected,
-            [ViewWeight(index, weight) for index, weight in job.solution.weights.items()],
-        ),
-        intrinsics=found.intrinsics,
-        holdout=quality.holdout,
-        certificate=quality.certificate,
-        gates=quality.gates,
-        verdict="pass" if job.passed else "fail",
-        warnings=[
-            WarningJson(code, text)
-            for code, text in zip(quality.warning_codes, quality.warnings, strict=True)
-        ],
-        cross_validation=quality.cross_validation,
-        board=quality.board,
-        session=quality.session,
-        arm=quality.arm,
-        arm_table=found.arm_table,
-        solve_ms=sum(job.stage_ms.values()),
-    )
+    """Build the object that `calibrate solve --json` prints: the file's structs, side by side."""
+    found = job.calibration
+    known = msgspec.structs.asdict(found.quality) | msgspec.structs.asdict(found)
+    known |= {
+        "board": found.quality.board,
+        "verdict": "pass" if job.passed else "fail",
+        "warnings": found.quality.remarks,
+        "solve_ms": sum(job.stage_ms.values()),
+    }
+    return SolveJson(**{name: known[name] for name in SolveJson.__struct_fields__})
 
 
 def _root_of(target: Path) -> Path | None:
@@ -141,8 +123,8 @@ def compare(recording: Rec, options: JobOptions, as_json: AsJson = False) -> Non
         results = compare_all(prepared.views, solver_options(options, prepared))
     if as_json:
         views = [view.index for view in prepared.views]
-        plain = msgspec.to_builtins(results, enc_hook=lambda array: array.tolist())
-        print_json(CompareJson(prepared.views.mount, views, msgspec.convert(plain, list[MethodJson])))
+        answer = CompareJson(prepared.views.mount, views, results)
+        print_json(msgspec.to_builtins(answer, enc_hook=np.ndarray.tolist))
         return
     table = Table(*PEER_HEAD, box=None)
     for peer in results:

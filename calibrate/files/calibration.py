@@ -21,7 +21,7 @@ from calibrate.files.proof import check_result, content_sha256, proven_plain, re
 from calibrate.files.touch import Touch
 from calibrate.geometry import Transform
 from calibrate.kinematics import RobotModel, base_from_flange
-from calibrate.results import BoardShape, HoldoutScore, RejectedView
+from calibrate.results import BoardShape, Certificate, CrossValidation, HoldoutScore, RejectedView, Remark
 from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
 from recordings.schema.messages import (
     BoardSpec,
@@ -86,12 +86,12 @@ class ViewWeight(msgspec.Struct, frozen=True):
     weight: float
 
 
-class Views(msgspec.Struct, frozen=True, omit_defaults=True):
+class Views(msgspec.Struct, frozen=True):
     used: list[int]
     rejected: list[RejectedView] = []
     turned: list[int] = []
     weights: list[ViewWeight] = []
-    """Only the views whose weight is below 1."""
+    """0: rejected; 1 counts fully. Files of earlier versions omit views of weight 1."""
 
 
 class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -103,20 +103,10 @@ class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
     rms_px: float | None
     found: Literal["from these pictures", "given"]
     sigma: dict[str, float] = {}
-    held: list[str] = []
-    """No effect; accepted in files of earlier versions."""
 
     @property
     def model(self) -> CameraModel:
         return CameraModel(self.width, self.height, self.matrix, self.distortion, self.distortion_model)
-
-
-class Proof(msgspec.Struct, frozen=True):
-    certified: bool
-    relative_gap: float
-    objective: float
-    distance_sigma: float | None
-    problem: str
 
 
 class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -124,15 +114,6 @@ class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
     rms_px: float | None = None
     robot_mm: float | None = None
     robot_deg: float | None = None
-
-
-class Folds(msgspec.Struct, frozen=True):
-    """Cross-validation: errors of left-out views against those predicted for them."""
-
-    rms_mm: float
-    rms_deg: float
-    claimed_mm: float
-    folds: int
 
 
 class SessionReading(msgspec.Struct, frozen=True):
@@ -229,7 +210,7 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
 
 class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     gates: list[Gate]
-    certificate: Proof
+    certificate: Certificate
     holdout: HoldoutScore | None = None
     rms_px: float | None = None
     views: list[ViewQuality] = []
@@ -243,17 +224,18 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     """corner_px, robot_mm, robot_deg"""
     error_shares: dict[str, float] = {}
     weakest: str = ""
-    board_scale: float | None = None
-    """True over stated size."""
     board: BoardShape | None = None
-    cross_validation: Folds | None = None
+    cross_validation: CrossValidation | None = None
     session: SessionReading | None = None
     arm: Arm | None = None
-    robot_systematics: str = ""
-    """No effect; accepted in files from before version 0.2; see `arm`."""
     warnings: list[str] = []
     warning_codes: list[str] = []
     """Code of each of `warnings`."""
+
+    @property
+    def remarks(self) -> list[Remark]:
+        """The warnings with their codes."""
+        return [Remark(code, text) for code, text in zip(self.warning_codes, self.warnings, strict=True)]
 
     @property
     def failed(self) -> list[Gate]:

@@ -12,10 +12,10 @@ from calibrate.geometry import Array, difference, skew
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.estimate import FULL, CellFit, estimate
 from calibrate.handeye.linear import Linear
-from calibrate.handeye.solution import CrossValidation, Finding
+from calibrate.handeye.solution import Finding
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.projection import intrinsics_vector
-from calibrate.results import RejectedView
+from calibrate.results import CrossValidation, RejectedView
 from calibrate.views import Places, implied_flange
 
 _LOOSER = 0.01
@@ -155,11 +155,11 @@ def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
     freedom = 3 * len(full)
     limit = float(np.sqrt(special.fdtri(freedom, max(freedom - 6, 1), 1 - _CALLED_TOO_SMALL)))
     return CrossValidation(
-        float(np.sqrt((distance**2).mean())),
-        float(np.sqrt((missed[:, 3:] ** 2).sum(axis=1).mean())),
-        float(np.sqrt(expected.mean())),
-        limit,
-        FOLDS,
+        rms_mm=1e3 * float(np.sqrt((distance**2).mean())),
+        rms_deg=float(np.degrees(np.sqrt((missed[:, 3:] ** 2).sum(axis=1).mean()))),
+        claimed_mm=1e3 * float(np.sqrt(expected.mean())),
+        folds=FOLDS,
+        limit=limit,
     )
 
 

@@ -14,11 +14,10 @@ import numpy as np
 
 from calibrate.errors import require_choice
 from calibrate.geometry import Array, Transform
-from calibrate.handeye.axxb.certificate import Certificate
 from calibrate.handeye.metrics import Observability
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.kinematics import RobotModel
-from calibrate.results import BoardShape, HoldoutScore, RejectedView
+from calibrate.results import BoardShape, Certificate, CrossValidation, HoldoutScore, RejectedView, Remark
 from calibrate.views import BoardView
 from recordings.schema.messages import CameraModel, Mount
 
@@ -59,14 +58,6 @@ class SolveOptions:
         require_choice("profile", self.profile, get_args(Profile))
 
 
-@dataclass(frozen=True)
-class Remark:
-    """Warning about a solution: a code for programs and a sentence for people."""
-
-    code: str
-    text: str
-
-
 _EXPLAINED = 4.0
 """Sigmas of its own tolerance by which a stated value may differ from the views."""
 
@@ -84,19 +75,6 @@ class Finding:
     def unexplained_m(self) -> float:
         """The part of `pull_m` that the stated value's tolerance does not explain."""
         return float(self.pull_m * np.maximum(0.0, 1.0 - _EXPLAINED / np.maximum(self.sigmas, 1e-9)))
-
-
-@dataclass(frozen=True, eq=False)
-class CrossValidation:
-    """Errors at the middle of the board of views predicted from the others; only views that count fully."""
-
-    rms_m: float
-    rms_rad: float
-    claimed_m: float
-    """Value of `rms_m` that the stated uncertainties predict."""
-    limit: float
-    """Limit of `rms_m` over `claimed_m`; above it the stated uncertainties are too small."""
-    folds: int
 
 
 @dataclass(frozen=True)

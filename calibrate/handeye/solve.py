@@ -11,7 +11,7 @@ from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.arm import FLEX, PARAMETERS, RELATIVE_SIGMA
 from calibrate.handeye.arm_result import table_result
-from calibrate.handeye.axxb.certificate import TOLERANCE, Certificate, certify
+from calibrate.handeye.axxb.certificate import TOLERANCE, certify
 from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective, pair_covariance
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
@@ -50,14 +50,13 @@ from calibrate.handeye.solution import (
     Explanation,
     NoiseScales,
     Reading,
-    Remark,
     Solution,
     SolveOptions,
     board_frames,
     camera_frames,
 )
 from calibrate.projection import intrinsics_names
-from calibrate.results import BoardShape, HoldoutScore
+from calibrate.results import BoardShape, Certificate, HoldoutScore, Remark
 from calibrate.views import ViewSet, array_of
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
@@ -113,7 +112,7 @@ def _doubtful(solution: Solution) -> bool:
     folds, noise = solution.cross_validation, solution.noise
     findings = (solution.lens_finding, solution.board_finding)
     return bool(
-        (folds is not None and folds.rms_m > folds.limit * folds.claimed_m)
+        (folds is not None and folds.rms_mm > folds.limit * folds.claimed_mm)
         or any(finding is not None and finding.unexplained_m > 0 for finding in findings)
         or (noise is not None and (noise.robot_m > _NOISY_M or noise.robot_rad > _NOISY_RAD))
     )

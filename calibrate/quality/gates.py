@@ -151,8 +151,8 @@ def _measured(solution: Solution, inputs: GateInputs) -> Iterator[tuple[str, flo
     if solution.holdout is not None and distance_m:
         yield "holdout_share", solution.holdout.e_t_m, "", ""
     if folds is not None:
-        figures = f"({folds.rms_m * 1e3:.2f} mm, claimed {folds.claimed_m * 1e3:.2f} mm)"
-        yield "cross_validation", folds.rms_m / folds.claimed_m / folds.limit, figures, ""
+        figures = f"({folds.rms_mm:.2f} mm, claimed {folds.claimed_mm:.2f} mm)"
+        yield "cross_validation", folds.rms_mm / folds.claimed_mm / folds.limit, figures, ""
     remedy = f"Least known: {seen.weakest_text}. Add rotations about that direction."
     yield "predicted_error_m", predicted_m, f"at {(distance_m or 0.0) * 1e3:.0f} mm", remedy
     yield "coverage", inputs.coverage, "", ""

@@ -18,8 +18,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from calibrate.cli.contracts import SolveJson
-from calibrate.files.calibration import Sigma, read_calibration
+from calibrate.files.calibration import Calibration, Sigma, read_calibration
 from calibrate.files.formatting import arm_sentences
 from calibrate.geometry import difference
 from calibrate.results import HoldoutScore
@@ -177,14 +176,14 @@ def _run(
         recording=str(recording),
         calibration=str(calibration),
         report=str(report),
-        holdout=solved.holdout,
-        gates_passed=all(gate.passed for gate in solved.gates),
+        holdout=solved.quality.holdout,
+        gates_passed=all(gate.passed for gate in solved.quality.gates),
         approved_again=outcome.session.approved_again,
         arm=DemoArmJson(
             offered=arm is not None and arm.offered,
             with_table_mm=None if arm is None else arm.with_table_mm,
             without_table_mm=None if arm is None else arm.without_table_mm,
-            sentences=[*arm_sentences(read_calibration(calibration))],
+            sentences=[*arm_sentences(solved)],
         ),
     )
 
@@ -219,7 +218,7 @@ def unfinished(outcome: StationStatus) -> DemoError:
     return DemoError(f"Stopped after {count}{saved}: {why}", remedy="Run it again.")
 
 
-def _solve(recording: Path, calibration: Path, report: Path) -> SolveJson:
+def _solve(recording: Path, calibration: Path, report: Path) -> Calibration:
     """`calibrate solve` in a process of its own, as an operator's laptop would run it."""
     command = [sys.executable, "-m", "calibrate.cli", "solve", str(recording), "--json"]
     command += ["--output", str(calibration), "--report", str(report)]
@@ -234,7 +233,7 @@ def _solve(recording: Path, calibration: Path, report: Path) -> SolveJson:
             said = done.stderr.decode(errors="replace").strip()
             raise DemoError(said or f"`calibrate solve` ended with {done.returncode}.") from None
         raise DemoError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
-    return msgspec.json.decode(done.stdout, type=SolveJson)
+    return read_calibration(calibration)
 
 
 def truth_error(recording: Path, found: Matrix4) -> tuple[float, float]:

@@ -10,7 +10,6 @@ from calibrate.files.calibration import (
     Calibration,
     FramePose,
     Lens,
-    Proof,
     Provenance,
     Quality,
     Sigma,
@@ -18,6 +17,7 @@ from calibrate.files.calibration import (
 )
 from calibrate.geometry import Array, Transform, inverse, perturb, transform_points
 from calibrate.projection import project_at
+from calibrate.results import Certificate
 from calibrate.views import BoardView
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig
@@ -62,7 +62,7 @@ def calibration_of(
         views=Views(list(range(25))),
         quality=Quality(
             [],
-            Proof(True, 0.0, 0.0, None, ""),
+            Certificate(True, 0.0, 0.0, None, ""),
             noise={
                 "corner_px": CORNER_PX,
                 "robot_mm": 1e3 * ROBOT_M,

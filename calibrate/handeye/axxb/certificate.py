@@ -21,31 +21,11 @@ from scipy import sparse
 
 from calibrate.geometry import Array, project_to_rotation
 from calibrate.handeye.axxb.objective import QuadraticObjective
+from calibrate.results import Certificate
 
 TOLERANCE = 1e-6
 FLOOR = 1e-8
 """Share of the form's trace below which an objective counts as zero in the relative gap."""
-
-
-@dataclass(frozen=True)
-class Certificate:
-    """Proof that the quadratic objective has no better X: a lower bound from the dual of the SDP relaxation.
-
-    It proves the optimum of `problem` on the inlier pairs, not the final maximum-likelihood X;
-    `distance_sigma` tells how far the two are apart.
-    """
-
-    certified: bool
-    relative_gap: float
-    """(objective - lower_bound) / max(objective, floor)"""
-    objective: float
-    lower_bound: float
-    floor: float
-    """Absolute floor of the denominator, 1e-8 times the trace of the form."""
-    distance_sigma: float | None = None
-    """Distance between the certified X and the final X in sigmas, in the direction where it is largest."""
-    problem: str = ""
-    restarts: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,10 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibrate.geometry import Array, pose, project_to_rotation
-from calibrate.handeye.axxb.certificate import Certificate, certify
+from calibrate.handeye.axxb.certificate import certify
 from calibrate.handeye.axxb.evolution import EvolutionSettings, evolve
 from calibrate.handeye.axxb.objective import GENERATORS, QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pairs import Pairs
+from calibrate.results import Certificate
 
 SETTINGS = EvolutionSettings(population=30, generations=40)
 MAX_RESTARTS = 6

@@ -44,7 +44,7 @@ def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) 
         "matrix",
     }
     assert set(answer["sigma"]) == {"translation_mm", "rotation_deg"}
-    assert set(answer["views"]) == {"used", "rejected", "weights"}
+    assert set(answer["views"]) == {"used", "rejected", "turned", "weights"}
     assert [view["index"] for view in answer["views"]["weights"]] == answer["views"]["used"]
     assert {"width", "height", "matrix", "distortion", "rms_px"} < set(answer["intrinsics"])
     assert answer["holdout"] is None or set(answer["holdout"]) == {"e_t_m", "e_R"}
@@ -52,7 +52,7 @@ def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) 
     assert all(set(gate) == GATE_KEYS for gate in answer["gates"])
     assert answer["verdict"] == ("pass" if all(gate["passed"] for gate in answer["gates"]) else "fail")
     assert all(set(warning) == {"code", "text"} for warning in answer["warnings"])
-    assert set(answer["cross_validation"]) == {"rms_mm", "rms_deg", "claimed_mm", "folds"}
+    assert set(answer["cross_validation"]) == {"rms_mm", "rms_deg", "claimed_mm", "folds", "limit"}
     assert set(answer["board"]) == {"scale", "anisotropy", "bend_m", "sigma"}
     assert answer["session"]["hypothesis"] == "as-recorded"
     assert answer["arm"] is None or set(answer["arm"]) == {"applied", "log_bayes", "size_mm", "table"}

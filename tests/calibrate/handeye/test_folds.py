@@ -90,7 +90,7 @@ def test_sound_claims_are_confirmed(mount):
         solution = solve_views(cell.views, CV)
         cv = solution.cross_validation
         assert cv.folds == 5
-        assert 0.5 < cv.rms_m / cv.claimed_m < cv.limit
+        assert 0.5 < cv.rms_mm / cv.claimed_mm < cv.limit
         assert all(g.passed for g in judge(solution, GateInputs()) if g.name == "cross_validation")
 
 
@@ -105,9 +105,9 @@ def test_a_claim_that_is_too_small_closes_the_gate(fit, monkeypatch):
     honest = cross_validate(fit, 0)
     monkeypatch.setattr(diagnosis, "estimate", boasting)
     boasted = cross_validate(fit, 0)
-    assert boasted.claimed_m == pytest.approx(honest.claimed_m / 3, rel=0.01)
-    assert honest.rms_m < honest.limit * honest.claimed_m
-    assert boasted.rms_m > boasted.limit * boasted.claimed_m
+    assert boasted.claimed_mm == pytest.approx(honest.claimed_mm / 3, rel=0.01)
+    assert honest.rms_mm < honest.limit * honest.claimed_mm
+    assert boasted.rms_mm > boasted.limit * boasted.claimed_mm
     solution = replace(solve_views(fit.views, replace(CV, folds=False)), cross_validation=boasted)
     assert "cross_validation" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
 

@@ -13,17 +13,15 @@ import pytest
 from calibrate.errors import UsageError
 from calibrate.files.gate import Gate
 from calibrate.handeye.solution import (
-    CrossValidation,
     Explanation,
     Finding,
     NoiseScales,
     Reading,
-    Remark,
     Solution,
 )
 from calibrate.job import SolvedRecording
 from calibrate.quality.gates import GateInputs, GateLimits, judge, read_limits
-from calibrate.results import HoldoutScore
+from calibrate.results import CrossValidation, HoldoutScore, Remark
 from tests.calibrate.calling import raises_code
 
 GOOD = GateInputs(0.6, 0.001)
@@ -46,7 +44,7 @@ def solution(solved_real: SolvedRecording) -> Solution:
         noise=noise,
         weights=dict.fromkeys(found.used, 1.0),
         session=Explanation(Reading.AS_RECORDED, 0.0),
-        cross_validation=CrossValidation(0.0005, 0.001, 0.0004, 1.5, 5),
+        cross_validation=CrossValidation(0.5, 0.06, 0.4, 5, 1.5),
         lens_finding=Finding(2.0, 0.0001),
         board_finding=Finding(2.0, 0.0001),
         predicted_error_m=0.0005,
@@ -78,7 +76,7 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
         "axis_spread": replace(solution, observability=replace(seen, axis_spread=0.01)),
         "session": replace(solution, session=other, warnings=(Remark(other.reading.value, "Move them."),)),
         "weight": replace(solution, weights=dict.fromkeys(solution.used, 0.79)),
-        "cross_validation": replace(solution, cross_validation=replace(folds, rms_m=0.00061)),
+        "cross_validation": replace(solution, cross_validation=replace(folds, rms_mm=0.61)),
         "lens_pull": replace(solution, lens_finding=Finding(8.0, 0.0011)),
         "board_pull": replace(solution, board_finding=Finding(8.0, 0.0011)),
         "view_rms_px": replace(solution, residual_px={3: 9.0}),

@@ -22,12 +22,13 @@ from station.devices.rtde import (
     PacketReader,
     PacketType,
     Recipe,
+    RuntimeState,
     join_names,
     packet,
     split_names,
 )
 from station.devices.ur import library_installed
-from station.simulation.controller.programs import Upload
+from station.simulation.controller.programs import UploadReader
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
@@ -179,8 +180,8 @@ def rtde() -> Iterator[Callable[..., RtdeClient]]:
         client.close()
 
 
-class SessionContext:
-    """A robot without sockets: time goes on only by `run`, registers are written by hand."""
+class SteppedRobot:
+    """A robot without sockets: time goes on only by `run`."""
 
     def __init__(self, **settings: Any) -> None:
         self.robot = SimulatedRobot(Settings(**settings), Journal())
@@ -200,65 +201,49 @@ class SessionContext:
             self.run(self.robot.dt_s)
         return (self.robot.ticks - start) * self.robot.dt_s
 
-    def start_script(self, text: str) -> None:
-        self.robot.upload(Upload("rtde_control", text))
-        self.run(0.1)
+    def run_late(self, cycles: int) -> None:
+        """The process was held up: these cycles run at once."""
+        for i in range(cycles):
+            self.robot.tick(10**12 + i, late=True)
 
-    def write(self, command: int, doubles: list[float] | None = None, asynchronous: int = 0) -> None:
-        """A command packet, as a client sends it."""
-        numbers = doubles or []
-        names = ("input_int_register_0", "input_int_register_1")
-        names += tuple(f"input_double_register_{i}" for i in range(len(numbers)))
-        self.robot.receive_inputs(names, (command, asynchronous, *numbers))
+    def start(self, body: str) -> None:
+        """A program plays in its first cycles."""
+        self.upload(f"def prog():\n{body}\nend\n")
+        self.run_until(lambda: self.plays)
 
-    def command(self, command: int, doubles: list[float] | None = None, asynchronous: int = 0) -> float:
-        """The client's handshake: waits for ready, sends, waits for done, clears. Seconds until done."""
-        self.run_until(lambda: self.state == 1)
-        self.write(command, doubles, asynchronous)
-        took = self.run_until(lambda: self.state == 2, limit_s=60.0)
-        self.write(0)
-        return took
+    def upload(self, text: str) -> None:
+        for upload in UploadReader().feed(text.encode()):
+            self.robot.upload(upload)
 
-    @property
-    def state(self) -> int:
-        return int(self.robot.outputs.get("output_int_register_0"))
+    def end(self) -> str:
+        """Why the program ended, once it has."""
+        self.run_until(lambda: self.robot.runtime_state == RuntimeState.STOPPED)
+        return str(self.robot.journal.entries(0)[-1]["reason"])
 
     @property
-    def answer(self) -> int:
-        return int(self.robot.outputs.get("output_int_register_1"))
+    def plays(self) -> bool:
+        return self.robot.runtime_state == RuntimeState.PLAYING
 
     @property
-    def word(self) -> int:
-        return int(self.robot.outputs.get("output_int_register_2"))
-
-    def results(self, count: int = 6) -> list[float]:
-        return [self.robot.outputs.get(f"output_double_register_{i}") for i in range(count)]
+    def speed_rad_s(self) -> float:
+        return max(map(abs, self.robot.arm.command_speed))
 
     def output(self, name: str) -> float:
         return self.robot.outputs.get(name)
 
 
 @pytest.fixture
-def context() -> Callable[..., SessionContext]:
-    return SessionContext
-
-
-@pytest.fixture(scope="session")
-def rtde_script() -> str:
-    """The control script that the unmodified wheel uploads to a UR10."""
-    if not library_installed():
-        pytest.skip("ur_rtde is not installed")
-    running = start_controller("UR10")
-    try:
-        code = "control = rtde_control.RTDEControlInterface(host)\nresult = admin.ask('program')"
-        return str(run_wheel(running, code)["text"])
-    finally:
-        running.stop()
+def stepped() -> Callable[..., SteppedRobot]:
+    return SteppedRobot
 
 
 @pytest.fixture
-def script(context: Callable[..., SessionContext], rtde_script: str) -> SessionContext:
-    """A UR10 on which ur_rtde's control script runs."""
-    made = context()
-    made.start_script(rtde_script)
-    return made
+def started() -> Callable[..., SteppedRobot]:
+    """`started(body, **settings)`: a robot on which a program with this body plays."""
+
+    def start(body: str, **settings: Any) -> SteppedRobot:
+        made = SteppedRobot(**settings)
+        made.start(body)
+        return made
+
+    return start

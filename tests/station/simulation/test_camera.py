@@ -86,9 +86,13 @@ async def test_frames_are_numbered_over_the_wrap_and_stamped_by_the_cameras_own_
     assert abs(middle_ns - true_middle_ns) / 1e9 < bound_s < 0.02
 
 
-async def test_preview_is_smaller_and_never_counts_as_a_frame(camera: RenderedCamera) -> None:
+async def test_preview_is_smaller_and_never_counts_as_a_frame_and_unknown_faults_are_refused(
+    camera: RenderedCamera,
+) -> None:
     preview = await camera.preview()
     assert preview is not None and preview.pixels.shape == (512, 640)
+    with raises("camera-refused"):
+        await camera.inject("gremlins")
     assert (await camera.capture()).sequence == 0
 
 
@@ -126,11 +130,6 @@ async def test_a_closed_camera_is_refused_and_can_be_opened_again(camera: Render
         await camera.capture()
     await camera.open()
     assert (await camera.capture()).pixels.mean() > 10
-
-
-async def test_an_unknown_fault_is_refused(camera: RenderedCamera) -> None:
-    with raises("camera-refused"):
-        await camera.inject("gremlins")
 
 
 async def test_while_it_starts_nothing_is_said_of_its_clock(

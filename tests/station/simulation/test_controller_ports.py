@@ -5,6 +5,9 @@ from __future__ import annotations
 import socket
 import struct
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +15,7 @@ import numpy as np
 import pytest
 
 from station.devices.rtde import PacketType, packet
+from station.simulation.launch import SimulatedController, start_controller
 from tests.codes import raises
 from tests.patience import wait_until
 
@@ -19,48 +23,55 @@ pytestmark = pytest.mark.process
 HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
 
 
-@pytest.mark.parametrize(("model", "version"), [("UR10", (3, 15, 8, 106339)), ("UR10e", (5, 11, 1, 108318))])
-def test_versions(controller, rtde, model, version) -> None:
-    client = rtde(controller(model))
-    assert client.request(PacketType.PROTOCOL_VERSION, b"\x00\x02") == b"\x01"
-    assert client.request(PacketType.PROTOCOL_VERSION, b"\x00\x01") == b"\x00"
-    assert struct.unpack(">4I", client.request(PacketType.CONTROLLER_VERSION)) == version
+@pytest.fixture(scope="module")
+def arm() -> Iterator[Callable[[str], SimulatedController]]:
+    """One controller a model for all tests of this module: nothing here moves an arm or starts a program."""
+    with ExitStack() as ends:
+        yield cache(lambda model: ends.enter_context(start_controller(model)))
 
 
 @pytest.mark.parametrize(
-    ("model", "rate", "asked", "step"),
+    ("model", "asked_hz", "step_s", "version"),
     [
-        ("UR10", 125, 125.0, 0.008),
-        ("UR10e", 500, 500.0, 0.002),
-        ("UR10e", 500, 125.0, 0.008),
-        ("UR5", 125, 10, 0.096),
+        ("UR10", 125.0, 0.008, (3, 15, 8, 106339)),
+        ("UR10", 10, 0.096, (3, 15, 8, 106339)),
+        ("UR10e", 500.0, 0.002, (5, 11, 1, 108318)),
+        ("UR10e", 125.0, 0.008, (5, 11, 1, 108318)),
     ],
 )
-def test_every_sample_comes_at_the_rate_that_was_asked_for(
-    controller, rtde, model, rate, asked, step
+def test_versions_and_samples_at_the_rate_that_was_asked_for(
+    arm, rtde, model, asked_hz, step_s, version
 ) -> None:
-    client = rtde(controller(model))
-    client.start("timestamp", "actual_q", frequency_hz=asked)
+    client = rtde(arm(model))
+    assert client.request(PacketType.PROTOCOL_VERSION, b"\x00\x01") == b"\x00"
+    assert struct.unpack(">4I", client.request(PacketType.CONTROLLER_VERSION)) == version
+    client.start("timestamp", "actual_q", frequency_hz=asked_hz)
     stamps = [client.sample()["timestamp"] for _ in range(8)]
-    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([step] * 7, abs=1e-9)
+    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([step_s] * 7, abs=1e-9)
 
 
-def test_types_are_the_documented_ones(controller, rtde) -> None:
-    client = rtde(controller("UR10"))
-    reply = client.request(
-        PacketType.OUTPUT_SETUP,
-        struct.pack(">d", 125.0)
-        + b"timestamp,actual_q,robot_mode,runtime_state,joint_mode,actual_digital_input_bits,"
-        b"payload_cog,output_int_register_19,",
-    )
-    assert reply[1:] == b"DOUBLE,VECTOR6D,INT32,UINT32,VECTOR6INT32,UINT64,VECTOR3D,INT32"
+@pytest.mark.parametrize(
+    ("model", "names", "types"),
+    [
+        (
+            "UR10",
+            b"timestamp,actual_q,robot_mode,runtime_state,joint_mode,actual_digital_input_bits,payload_cog",
+            b"DOUBLE,VECTOR6D,INT32,UINT32,VECTOR6INT32,UINT64,VECTOR3D",
+        ),
+        ("UR10", b"timestamp,ft_raw_wrench,nonsense", b"DOUBLE,NOT_FOUND,NOT_FOUND"),
+        ("UR10e", b"timestamp,ft_raw_wrench,nonsense", b"DOUBLE,VECTOR6D,NOT_FOUND"),
+    ],
+)
+def test_types_are_those_that_a_controller_of_that_series_has(arm, rtde, model, names, types) -> None:
+    client = rtde(arm(model))
+    assert client.request(PacketType.OUTPUT_SETUP, struct.pack(">d", 125.0) + names)[1:] == types
+    starts = b"NOT_FOUND" not in types
+    assert client.request(PacketType.START) == bytes([starts]), "nothing to send was agreed"
 
 
 @pytest.mark.parametrize(("model", "extra", "size"), [("UR10", "", 1132), ("UR10e", "ft_raw_wrench", 1180)])
-def test_ur_rtdes_default_recipe_has_its_size(controller, rtde, model, extra, size) -> None:
+def test_ur_rtdes_default_recipe_has_its_size(arm, rtde, model, extra, size) -> None:
     """57 variables on CB3, 58 on e-Series: packet lengths as seen on the wire."""
-    running = controller(model)
-    client = rtde(running)
     names = f"""timestamp target_q target_qd target_qdd target_current target_moment actual_q actual_qd
         actual_current joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose
         target_TCP_speed actual_digital_input_bits joint_temperatures actual_execution_time robot_mode
@@ -70,41 +81,26 @@ def test_ur_rtdes_default_recipe_has_its_size(controller, rtde, model, extra, si
         standard_analog_output0 standard_analog_output1 robot_status_bits safety_status_bits {extra} payload
         payload_cog payload_inertia output_int_register_2""".split()
     names += [f"output_{kind}_register_{i}" for kind in ("int", "double") for i in range(12, 20)]
+    client = rtde(arm(model))
     client.start(*names)
     kind, payload = client.receive()
     assert kind == PacketType.DATA and len(payload) + 3 == size
-    control = rtde(running)
-    control.start(
-        "timestamp", "robot_status_bits", "safety_status_bits", "runtime_state",
-        *(f"output_int_register_{i}" for i in range(3)), *(f"output_double_register_{i}" for i in range(6)),
-    )  # fmt: skip
-    assert len(control.receive()[1]) + 3 == 84
 
 
-def test_unknown_names_and_wrong_generation_are_not_found(controller, rtde) -> None:
-    client = rtde(controller("UR10"))
-    ask = struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench,nonsense"
-    assert client.request(PacketType.OUTPUT_SETUP, ask)[1:] == b"DOUBLE,NOT_FOUND,NOT_FOUND"
-    assert client.request(PacketType.START) == b"\x00", "nothing to send was agreed"
-    other = rtde(controller("UR10e"))
-    assert other.request(PacketType.OUTPUT_SETUP, ask)[1:] == b"DOUBLE,VECTOR6D,NOT_FOUND"
-
-
-def test_inputs_are_claimed_until_the_link_ends(controller, rtde, admin) -> None:
-    running = controller("UR10")
-    first, second = rtde(running), rtde(running)
+def test_inputs_are_claimed_until_the_link_ends(arm, rtde, admin) -> None:
+    running = arm("UR10")
+    first, second, ask = rtde(running), rtde(running), admin(running)
     assert first.inputs("input_int_register_0", "input_double_register_0").id == 1
     assert first.inputs("input_int_register_0").id == 2, "one client may use a register in many recipes"
     with raises("rtde-variables"):
         second.inputs("input_int_register_0", "input_int_register_1")
     first.close()
-    ask = admin(running)
-    wait_until(lambda: ask.ask("state")["connections"]["rtde"] == 1)
+    wait_until(lambda: "input_int_register_0" not in ask.ask("state")["claims"])
     assert second.inputs("input_int_register_0").id == 1
 
 
-def test_nothing_is_sent_before_start_and_after_pause(controller, rtde) -> None:
-    client = rtde(controller("UR10e"), timeout_s=0.15)
+def test_nothing_is_sent_after_pause(arm, rtde) -> None:
+    client = rtde(arm("UR10e"), timeout_s=0.15)
     client.start("timestamp")
     client.sample()
     client.send(packet(PacketType.PAUSE))
@@ -113,8 +109,8 @@ def test_nothing_is_sent_before_start_and_after_pause(controller, rtde) -> None:
             client.receive()
 
 
-def test_no_bytes_on_any_port_stop_the_controller(controller, rtde, admin) -> None:
-    running = controller("UR10e")
+def test_no_bytes_on_any_port_stop_the_controller(arm, rtde, admin) -> None:
+    running = arm("UR10e")
     ask, good = admin(running), rtde(running)
     good.start("timestamp")
     rng = np.random.default_rng(7)
@@ -134,8 +130,18 @@ def test_no_bytes_on_any_port_stop_the_controller(controller, rtde, admin) -> No
     assert ask.ask("state")["target_joints_rad"] == pytest.approx(HOME)
 
 
-def test_hundreds_of_links_leave_nothing_behind(controller, rtde, admin) -> None:
-    running = controller("UR10e")
+@pytest.mark.parametrize("junk", [b"\x00\x01\x00", b"\x00\x04U\x07", b"\x00\x03?", b"\x00\x04Vx"])
+def test_junk_ends_that_link_and_no_other(arm, rtde, junk) -> None:
+    good, bad = rtde(arm("UR10")), rtde(arm("UR10"))
+    good.start("timestamp")
+    bad.send(junk)
+    with pytest.raises(ConnectionError):
+        bad.receive()
+    assert good.sample()["timestamp"] > 0
+
+
+def test_hundreds_of_links_leave_nothing_behind(arm, rtde, admin) -> None:
+    running = arm("UR10e")
     ask = admin(running)
     folder = Path(f"/proc/{running.process.pid}")
 
@@ -165,19 +171,8 @@ def test_hundreds_of_links_leave_nothing_behind(controller, rtde, admin) -> None
     assert memory_kib() - memory < 3000
 
 
-@pytest.mark.parametrize("junk", [b"\x00\x01\x00", b"\x00\x04U\x07", b"\x00\x03?", b"\x00\x04Vx"])
-def test_junk_ends_that_link_and_no_other(controller, rtde, junk) -> None:
-    running = controller("UR10")
-    good, bad = rtde(running), rtde(running)
-    good.start("timestamp")
-    bad.send(junk)
-    with pytest.raises(ConnectionError):
-        bad.receive()
-    assert good.sample()["timestamp"] > 0
-
-
-def test_a_client_that_does_not_read_loses_packets_and_slows_nobody(controller, rtde, admin) -> None:
-    running = controller("UR10e")
+def test_a_client_that_does_not_read_loses_packets_and_slows_nobody(arm, rtde, admin) -> None:
+    running = arm("UR10e")
     ask = admin(running)
     deaf, good = rtde(running), rtde(running)
     names = ["timestamp", *[f"output_double_register_{i}" for i in range(48)] * 4]
@@ -189,10 +184,9 @@ def test_a_client_that_does_not_read_loses_packets_and_slows_nobody(controller, 
 
 
 @pytest.mark.parametrize(("model", "size"), [("UR10", 1116), ("UR10e", 1220)])
-def test_the_real_time_port_states_every_cycle(controller, model: str, size: int) -> None:
+def test_the_real_time_port_states_every_cycle(arm, model: str, size: int) -> None:
     """Size and places by their table: the time is the first number, the actual joints the 32nd."""
-    running = controller(model)
-    with socket.create_connection((running.host, 30003), 3) as link, link.makefile("rb") as stream:
+    with socket.create_connection((arm(model).host, 30003), 3) as link, link.makefile("rb") as stream:
         messages = [stream.read(size) for _ in range(20)]
     assert all(struct.unpack_from(">i", message) == (size,) for message in messages)
     times = [struct.unpack_from(">d", message, 4)[0] for message in messages]

@@ -43,17 +43,17 @@ def differ(of: str, *columns: tuple[float, ...]) -> dict[str, tuple[float, ...]]
     return {f"{of}_{name}": column for name, column in zip(names, columns, strict=True)}
 
 
-def test_the_true_flange_has_the_true_lengths_and_the_miss(context) -> None:
+def test_the_true_flange_has_the_true_lengths_and_the_miss(stepped) -> None:
     deltas = ((0, 1e-3, 0, 0, 0, 0), (0, 0, 0, 2e-3, 0, 0), (1e-3, 0, 0, 0, 0, 0), (0, 0, 2e-3, 0, 0, 0))
-    made = context(**differ("dh_delta", *deltas))
+    made = stepped(**differ("dh_delta", *deltas))
     miss = (1e-4, -2e-4, 3e-4, 1e-3, 2e-3, -1e-3)
     expected = perturb(station_forward(MODELS["UR10"].calibrated(*deltas), Q), np.array(miss))
     found = np.array(made.robot.true_flange(Q, miss)).reshape(3, 4)
     assert np.allclose(found, expected[:3], atol=1e-12)
 
 
-def test_reported_poses_know_nothing_of_the_truth(context) -> None:
-    made = context(robot_sigma_m=1e-3, robot_sigma_rad=1e-2, dh_delta_a_m=(0.0, 0.01, 0, 0, 0, 0))
+def test_reported_poses_know_nothing_of_the_truth(stepped) -> None:
+    made = stepped(robot_sigma_m=1e-3, robot_sigma_rad=1e-2, dh_delta_a_m=(0.0, 0.01, 0, 0, 0, 0))
     made.run(0.1)
     reported = made.robot.outputs.vector("actual_TCP_pose")[:3]
     nominal = station_forward(MODELS["UR10"], made.robot.arm.actual)[:3, 3]
@@ -64,14 +64,14 @@ def test_reported_poses_know_nothing_of_the_truth(context) -> None:
 
 
 @pytest.mark.parametrize("true", [True, False])
-def test_a_factory_calibration_is_what_poses_follow_and_is_stated_or_not(context, true) -> None:
+def test_a_factory_calibration_is_what_poses_follow_and_is_stated_or_not(stepped, true) -> None:
     far = (
         (0.0, 5e-4, 0, 0, 0, 0),
         (0, 0.6, -0.2, -0.4, 0, 0),
         (0, 1e-4, 2e-4, 0, 0, 0),
         (0, 1e-3, 0, 0, 0, 0),
     )
-    made = context(**differ("factory", *far), states_factory=true, dh_delta_a_m=(0.0, 1e-3, 0, 0, 0, 0))
+    made = stepped(**differ("factory", *far), states_factory=true, dh_delta_a_m=(0.0, 1e-3, 0, 0, 0, 0))
     made.run(0.1)
     own = MODELS["UR10"].calibrated(*far)
     reported = made.robot.outputs.vector("actual_TCP_pose")[:3]
@@ -89,13 +89,13 @@ def test_a_factory_calibration_is_what_poses_follow_and_is_stated_or_not(context
     assert np.abs(np.subtract(forward(made.robot.table, joints), goal)).max() < 1e-6
 
 
-def test_the_misses_have_the_sigma_they_were_asked_for_and_repeat_with_the_seed(context) -> None:
+def test_the_misses_have_the_sigma_they_were_asked_for_and_repeat_with_the_seed(stepped) -> None:
     draws = np.array(
-        [context(robot_sigma_m=1e-3, robot_sigma_rad=2e-3, seed=s).robot.arm.miss for s in range(400)]
+        [stepped(robot_sigma_m=1e-3, robot_sigma_rad=2e-3, seed=s).robot.arm.miss for s in range(400)]
     )
     assert draws[:, :3].std() == pytest.approx(1e-3, rel=0.15)
     assert draws[:, 3:].std() == pytest.approx(2e-3, rel=0.15)
     assert (
-        context(robot_sigma_m=1e-3, seed=5).robot.arm.miss
-        == context(robot_sigma_m=1e-3, seed=5).robot.arm.miss
+        stepped(robot_sigma_m=1e-3, seed=5).robot.arm.miss
+        == stepped(robot_sigma_m=1e-3, seed=5).robot.arm.miss
     )

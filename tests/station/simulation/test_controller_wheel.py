@@ -126,19 +126,6 @@ def test_speed_slider_by_the_wheel_and_on_the_pendant(controller: Start, wheel: 
     assert result["zero"][0] < 1e-6 and result["zero"][1] == 0
 
 
-def test_a_custom_script_runs_and_ends(controller: Start, wheel: Wheel) -> None:
-    running = controller("UR10")
-    result = wheel(
-        running,
-        """
-        control = rtde_control.RTDEControlInterface(host)
-        result["sent"] = control.sendCustomScriptFunction("beep", 'textmsg("beep")\\n')
-        result["uploads"] = [e["verb"] for e in admin.ask("log")["entries"] if e["source"] == "upload"]
-        """,
-    )
-    assert result["sent"] is True and "beep" in result["uploads"]
-
-
 def test_the_log_has_every_command(controller: Start, wheel: Wheel) -> None:
     result = wheel(
         controller("UR10e"),

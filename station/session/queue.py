@@ -98,7 +98,13 @@ class PoseQueue:
         kept = {i: pose for i, pose in self._poses.items() if guided or not pose.guided}
         left_out = {i for i in kept if self._status[i].state == "skipped"}
         plan = msgspec.structs.replace(self._plan, poses=tuple(kept.values()))
-        again = PoseQueue(plan, [_fresh(index, pose) for index, pose in kept.items()])
+        fresh = (
+            msgspec.structs.replace(
+                _fresh(index, pose), predicted_sigma_mm=self._status[index].predicted_sigma_mm
+            )
+            for index, pose in kept.items()
+        )
+        again = PoseQueue(plan, list(fresh))
         for index in left_out:
             again.skip(index)
         return again
@@ -163,6 +169,9 @@ class PoseQueue:
             raise _refused("pose-tried", index, "was already tried", "Skip it instead.")
         if len(self._poses) == 1:
             raise _refused("last-pose", index, "is the last one", "Finish the session instead.")
+        places = list(self._poses)
+        for behind in places[places.index(index) :]:  # their predicted errors counted on this pose
+            self._status[behind] = msgspec.structs.replace(self._status[behind], predicted_sigma_mm=None)
         del self._poses[index], self._status[index]
         self._changed()
 

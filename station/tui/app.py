@@ -31,13 +31,14 @@ from station.protocol import verbs
 from station.protocol.client import Client
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose
+from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
 from station.tui.desk import Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion, Help
 from station.tui.frame import SESSION
-from station.tui.installed import LOOK_S, Marks, Result, marks, read_past, read_result, state_root
-from station.tui.live import LiveScreen, LogScreen
-from station.tui.plan import PlanScreen
+from station.tui.installed import LOOK_S, Marks, Result, marks, read_result, read_sessions, state_root
+from station.tui.log_screen import LogScreen
+from station.tui.plan_screen import PlanScreen
 from station.tui.result import InstallScreen, SolveScreen, VerifyScreen
 from station.tui.results import (
     check_drift,
@@ -52,7 +53,7 @@ from station.tui.results import (
 from station.tui.screen import Ask, StationScreen
 from station.tui.sessions import SessionsScreen, SessionWish
 from station.tui.task import DIGITS
-from station.tui.touch_test import run_touch_test
+from station.tui.touch_corners import run_touch_test
 from station.tui.widgets.graphics import detect
 from station.tui.widgets.preview import PreviewPane
 
@@ -63,6 +64,7 @@ UNANSWERED = 5
 TERMINAL_SILENT = "Terminal silent {:.0f} s. The arm was stopped, control released."
 PREVIEW_PERIOD_S = 0.25
 SETTLED_S = 2.0
+ACKNOWLEDGE = "Leave STOPPED or FAULT after looking"
 DECELERATES = "It decelerates at once, and the session pauses."
 ResultWork = Callable[[Desk, Result, Calibration], Awaitable[str | None]]
 
@@ -76,7 +78,7 @@ def freeze_startup() -> None:
 SCREENS: tuple[type[StationScreen], ...] = (
     ConnectScreen,
     PlanScreen,
-    LiveScreen,
+    CaptureScreen,
     SolveScreen,
     VerifyScreen,
     InstallScreen,
@@ -102,75 +104,21 @@ class StationApp(KnowingApp):
     _marks: tuple[str, Marks] = ("", frozenset())
     _looking = False
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("f12", "stop", "STOP", show=False, priority=True, id="stop", tooltip="Stop the arm now"),
-        Binding(
-            "f1", "help", "Help", show=False, id="help", tooltip="What this screen is for, and all its keys"
-        ),
-        Binding(
-            "f5",
-            "start('run')",
-            "Run",
-            id="run",
-            group=SESSION,
-            tooltip="Check the path, show the motion, and ask",
-        ),
-        Binding(
-            "f6",
-            "ask('pause')",
-            "Pause",
-            id="pause",
-            group=SESSION,
-            tooltip="Stop after this pose; nothing is lost",
-        ),
-        Binding(
-            "f7",
-            "finish",
-            "Finish",
-            id="finish",
-            group=SESSION,
-            tooltip="Finish the recording with the poses so far",
-        ),
-        Binding(
-            "f8",
-            "acknowledge",
-            "Acknowledge",
-            show=False,
-            priority=True,
-            id="acknowledge",
-            tooltip="Leave STOPPED or FAULT after looking",
-        ),
-        Binding(
-            "f9",
-            "solve_newest",
-            "Solve",
-            id="solve",
-            group=SESSION,
-            tooltip="Solve the session just recorded",
-        ),
-        Binding(
-            "f3",
-            "freedrive",
-            "Freedrive",
-            id="freedrive",
-            group=SESSION,
-            tooltip="Freedrive: move the arm by hand",
-        ),
-        Binding(
-            "f2",
-            "ask('record')",
-            "Image",
-            id="record",
-            group=SESSION,
-            tooltip="Capture an image here (freedrive)",
-        ),
-        Binding("f4", "release", "Release", show=False, id="release", tooltip="Release control of the arm"),
+        Binding("f12", "stop", "STOP", show=False, priority=True, tooltip="Stop the arm now"),
+        Binding("f1", "help", "Help", show=False, tooltip="What this screen is for, and all its keys"),
+        Binding("f5", "run", "Run", group=SESSION, tooltip="Check the path, show the motion, and ask"),
+        Binding("f6", "ask('pause')", "Pause", group=SESSION, tooltip="Stop after this pose"),
+        Binding("f7", "finish", "Finish", group=SESSION, tooltip="Finish with the poses so far"),
+        Binding("f8", "acknowledge", "Acknowledge", show=False, priority=True, tooltip=ACKNOWLEDGE),
+        Binding("f9", "solve_newest", "Solve", group=SESSION, tooltip="Solve the session just recorded"),
+        Binding("f3", "freedrive", "Freedrive", group=SESSION, tooltip="Freedrive: move the arm by hand"),
+        Binding("f2", "ask('record')", "Image", group=SESSION, tooltip="Capture an image here (freedrive)"),
+        Binding("f4", "release", "Release", show=False, tooltip="Release control of the arm"),
         *(
-            Binding(DIGITS[s.MODE], f"open('{s.MODE}')", s.MODE.title(), show=False, id=s.MODE, tooltip=s.TIP)
+            Binding(DIGITS[s.MODE], f"open('{s.MODE}')", s.MODE.title(), show=False, tooltip=s.TIP)
             for s in SCREENS
         ),
-        Binding(
-            "ctrl+q", "leave", "Quit", show=False, id="quit", tooltip="Close this screen; the daemon goes on"
-        ),
+        Binding("ctrl+q", "leave", "Quit", show=False, tooltip="Close this screen; the daemon goes on"),
     ]
 
     def __init__(self, client: Client) -> None:
@@ -258,8 +206,8 @@ class StationApp(KnowingApp):
         if sessions is None:
             self._marks = ("", frozenset())  # why was said; what was known stays until the next look
             return
-        past = await asyncio.to_thread(read_past, root, self.desk.client.camera, sessions)
-        self.known = replace(self.known, past=past)
+        kept = await asyncio.to_thread(read_sessions, root, self.desk.client.camera, sessions)
+        self.known = replace(self.known, sessions=kept)
 
     def watch_result_path(self) -> None:
         self.action_look_at_results()
@@ -373,10 +321,10 @@ class StationApp(KnowingApp):
         await self.desk.stop()
 
     @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_start(self, purpose: str) -> None:
-        """`run` goes on with a session that is paused."""
+    async def action_run(self) -> None:
+        """Start the plan, or go on with a session that is paused."""
         paused = self.known.live is not None and self.known.live.state is StationState.PAUSED
-        wanted = Purpose.RESUME if purpose == Purpose.RUN and paused else Purpose(purpose)
+        wanted = Purpose.RESUME if paused else Purpose.RUN
         begun = prepared_motion(
             self.desk.client, verbs.Prepare(wanted), self.approves, plans_here=self.plans_here
         )

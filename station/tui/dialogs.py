@@ -27,7 +27,7 @@ from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
 from station.tui.frame import Frame, Question
 from station.tui.task import Action, Known
-from station.tui.widgets.scene import cell_scene, draw
+from station.tui.widgets.cell_drawing import cell_scene, draw
 from station.tui.words import duration, limit_bar, lines
 
 TERMINATE_S = 5.0

@@ -222,19 +222,11 @@ class Kept:
     """The verdict of the drift check that it was recorded for."""
 
 
-@dataclass(frozen=True)
-class Past:
-    """All sessions, newest first, and drift checks of what is installed now, oldest first."""
-
-    sessions: tuple[Kept, ...] = ()
-    drift: tuple[CheckEntry, ...] = ()
-
-
-def read_past(root: Path | None, camera: str, sessions: list[SessionSummary]) -> Past:
-    """Read what became of each session, for a thread."""
+def read_sessions(root: Path | None, camera: str, sessions: list[SessionSummary]) -> tuple[Kept, ...]:
+    """Read what became of each session, newest first; for a thread."""
     installed = Installed() if root is None else read_installed(root, camera)
     judged = {} if root is None else {check.recording: check for check in read_checks(root, camera)}
-    kept = [
+    return tuple(
         Kept(
             session,
             readable(Path(session.calibration)) if session.calibration else None,
@@ -242,5 +234,4 @@ def read_past(root: Path | None, camera: str, sessions: list[SessionSummary]) ->
             judged.get(session.name),
         )
         for session in sessions
-    ]
-    return Past(tuple(kept), () if root is None else tuple(drift_history(root, camera)))
+    )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import numpy as np
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, Vertical
+from textual.containers import Horizontal, Vertical, VerticalScroll
 from textual.content import Content
 from textual.widgets import DataTable, Static
 
@@ -29,12 +30,17 @@ from station.tui.drift import drift_lines
 from station.tui.installed import Result, local
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.words import UNKNOWN, Mark, dim, facts, limit_bar, lines, mark, shortened, signed
+from station.tui.words import Mark, dim, facts, limit_bar, lines, mark, shortened, signed
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter shows older ones."
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
 SIGNS: dict[str, str] = {"PASS": "✓", "PASS WITH A REASON": "▲", "FAIL": "✗"}
 BAR_CELLS, NAME_CELLS = 14, 25
+INSTALL = "Make this the cell's calibration; b undoes it"
+TOUCH_TEST = "Bring the tip onto corners of the board"
+EXPORT = "Write it for ROS, OpenCV, URDF … beside the recording"
+UNDO = "Back to the calibration before; the first one is taken out of use"
+DISCARD = "Delete this result; the recording stays"
 
 
 def verdict_lines(result: Result) -> Content:
@@ -50,29 +56,26 @@ def verdict_lines(result: Result) -> Content:
         state = ended.how.upper()
     else:
         state = "ready to install" if result.verdict == "PASS" else "installs only with a reason"
-    rows = [Content.styled(f"{SIGNS[result.verdict]} {result.verdict}, {state}", "bold")]
     said = failed[0].text.partition(" FAIL")[0] if failed else error_text(calibration)
-    rows.append(Content.styled(f"  {said}", "bold"))
+    rows = [Content.styled(f"{SIGNS[result.verdict]} {result.verdict}, {state}\n{said}", "bold")]
     if result.installed and (validity := result.state.validity) is not None:
         doubted = validity.state is not ValidityState.VALID
-        rows.append(Content.styled(f"  {validity_text(validity)}", "bold $warn" if doubted else ""))
-    rows += [Content(f"  {why}") for why in _against(result, calibration)]
+        rows.append(Content.styled(validity_text(validity), "bold $warn" if doubted else ""))
+    rows += map(Content, _against(result, calibration))
     if ended is not None:
-        rows.append(
-            Content(f"  It was installed before, and {ended.how} by {ended.by}. i installs it again.")
-        )
+        rows.append(Content(f"It was installed before, and {ended.how} by {ended.by}. i installs it again."))
     shown = figures(calibration, calibration.verification)
     counted = {key: f"{f.value} {f.label} {f.about}" for key, f in shown.items()}
     narrow = sum(gate.narrow for gate in quality.gates)
-    told = [
+    told = (
         counted["gates"] + f", {narrow} narrowly" * bool(narrow),
         counted["views"],
         counted.get("touch", "no touch test"),
         f"session {calibration.provenance.session}",
-    ]
+    )
     if calibration.source != "real":
-        told.append(f"{calibration.source.upper()}: never for a real cell")
-    return lines(*rows, Content(f"  {'. '.join(told)}."))
+        rows.append(Content.styled(f"{calibration.source.upper()}: never for a real cell.", "$sim"))
+    return lines(*rows, Content(f"{'. '.join(told)}."))
 
 
 def _against(result: Result, calibration: Calibration) -> list[str]:
@@ -103,18 +106,7 @@ def gate_row(gate: Gate) -> tuple[Content, ...]:
     )
 
 
-def card(calibration: Calibration, key: str, missing: str = "") -> Content:
-    """A figure, and below it what it is; `missing`: words where there is none."""
-    if (figure := figures(calibration).get(key)) is None:
-        return dim(f"{UNKNOWN} {missing}")
-    return Content.assemble((figure.value, "bold $strong"), (f"\n{figure.label} {figure.about}", "$dim"))
-
-
-def proof_card(calibration: Calibration) -> Content:
-    return card(calibration, "held_out", "no views were held out")
-
-
-def change_card(result: Result, calibration: Calibration) -> Content:
+def change_lines(result: Result, calibration: Calibration) -> Content:
     """Draw what installing would change."""
     installed = result.state.now
     if result.installed:
@@ -153,25 +145,21 @@ def pose_table(result: Result, calibration: Calibration) -> Content:
     return lines(*rows, *map(Content, arm_sentences(calibration)))
 
 
-def residual_lines(calibration: Calibration, width: int, height: int) -> Content:
-    """Reprojection error per view against the limit; rejected views with their reason first."""
+def residual_lines(calibration: Calibration) -> Content:
+    """Draw the reprojection error of each view; rejected views with their reason come first."""
     rms = {v.index: v.rms_px for v in calibration.quality.views if v.rms_px is not None}
     limit = next((g.limit for g in calibration.quality.gates if g.name == "view_rms_px"), None)
-    scale = limit or max(rms.values(), default=1.0)
     rows = [mark("look", f"view {r.index + 1} rejected: {r.reason}") for r in calibration.views.rejected]
-    cells = max(8, width - 18)
     # A limit far above every view would leave nothing to be seen.
-    shown = max([4 * max(rms.values(), default=0.0)], default=scale)
-    reach = min(scale, shown) or 1.0
+    reach = min(limit or math.inf, 4 * max(rms.values(), default=0.0)) or 1.0
     rows.append(dim(f"bars to {reach:.2g} px" + (f", limit {limit:g} px" if limit else "")))
     weights = {v.index: v.weight for v in calibration.views.weights}
     for index, value in sorted(rms.items()):
         doubt = weights.get(index, 1.0) < 0.5
         colour = "$bad" if limit and value > limit else "$warn" if doubt else "$accent"
-        row = dim(f"{index + 1:>3} ") + limit_bar(value, reach, cells, colour, 1.0)
-        rows.append(
-            row + Content.assemble((f" {value:.3f} px", "$foreground"), (" suspect" * doubt, "$warn"))
-        )
+        bar = limit_bar(value, reach, BAR_CELLS, colour, 1.0)
+        suspect = mark("look", " suspect") if doubt else Content()
+        rows.append(dim(f"{index + 1:>3} ") + bar + Content(f" {value:.3f} px ") + suspect)
     return lines(*rows)
 
 
@@ -180,33 +168,11 @@ class ResultScreen(StationScreen):
 
     LOOK = "look_at_results"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding(
-            "i",
-            "app.on_result('install')",
-            "Install",
-            tooltip="Make this the cell's calibration; b undoes it",
-        ),
-        Binding(
-            "h",
-            "app.on_result('touch test')",
-            "Touch test",
-            tooltip="Bring the tip onto corners of the board",
-        ),
-        Binding(
-            "e",
-            "app.on_result('export')",
-            "Export",
-            tooltip="Write it for ROS, OpenCV, URDF … beside the recording",
-        ),
-        Binding(
-            "b",
-            "app.on_result('undo')",
-            "Undo",
-            tooltip="Back to the calibration before; the first one is taken out of use",
-        ),
-        Binding(
-            "x", "app.on_result('discard')", "Discard", tooltip="Delete this result; the recording stays"
-        ),
+        Binding("i", "app.on_result('install')", "Install", tooltip=INSTALL),
+        Binding("h", "app.on_result('touch test')", "Touch test", tooltip=TOUCH_TEST),
+        Binding("e", "app.on_result('export')", "Export", tooltip=EXPORT),
+        Binding("b", "app.on_result('undo')", "Undo", tooltip=UNDO),
+        Binding("x", "app.on_result('discard')", "Discard", tooltip=DISCARD),
     ]
 
     _drawn: object = ()
@@ -262,27 +228,19 @@ class SolveScreen(ResultScreen):
     )
 
     def evidence(self) -> ComposeResult:
-        with Horizontal(id="cards"):
-            yield _panel("Accuracy", lambda r, c, w, h: card(c, "error"), id="accuracy")
-            yield _panel("Proof", lambda r, c, w, h: proof_card(c), id="proof")
-            yield _panel("Change", lambda r, c, w, h: change_card(r, c), id="change")
         with Horizontal(id="solve"):
-            with Vertical(id="solve-left"):
-                with Box("Quality gates", id="gates-box", below="Enter tells why"):
-                    yield Rows("gate", "value", "", "limit", "", id="gates")
-                yield _panel("Camera pose", lambda r, c, w, h: pose_table(r, c), id="answer")
-            yield _panel(
-                "Reprojection error per view",
-                lambda r, c, w, h: residual_lines(c, w, h),
-                id="residuals",
-                below="reprojection error",
-            )
+            with Box("Quality gates", id="gates-box", below="Enter tells why"):
+                yield Rows("gate", "value", "", "limit", "", id="gates")
+            with VerticalScroll(id="residuals-box", classes="panel"):
+                yield Static(id="residuals")
 
     def tell(self, calibration: Calibration) -> None:
         self._gates = sorted(calibration.quality.gates, key=lambda gate: (gate.passed, not gate.narrow))
         self.query_one(Rows).show([gate_row(gate) for gate in self._gates])
         passed = sum(gate.passed for gate in self._gates)
         self.query_one("#gates-box").border_title = f"Quality gates  {passed} of {len(self._gates)} passed"
+        self.query_one("#residuals-box").border_title = "Reprojection error per view"
+        self.query_one("#residuals", Static).update(residual_lines(calibration))
 
     def on_data_table_row_selected(self, event: DataTable.RowSelected) -> None:
         self.notify(self._gates[event.cursor_row].text, timeout=10, markup=False)
@@ -334,7 +292,10 @@ def touch_lines(calibration: Calibration) -> Content:
 
 def held_out_lines(calibration: Calibration) -> Content:
     folds = calibration.quality.cross_validation
-    rows = [proof_card(calibration)]
+    held_out = figures(calibration).get("held_out")
+    rows = [dim("no views were held out")]
+    if held_out is not None:
+        rows = [facts(("", held_out.value, f"{held_out.label} {held_out.about}"))]
     if folds is not None:
         rows.append(
             facts(
@@ -363,14 +324,8 @@ class InstallScreen(ResultScreen):
 
 
 def install_lines(result: Result, calibration: Calibration) -> Content:
-    rows = [change_card(result, calibration)]
-    rows += [mark("look", objection) for objection in result.objections if not result.installed]
-    if calibration.source != "real":
-        rows.append(
-            Content.styled(f"{calibration.source.upper()}: for this {calibration.source} cell only.", "$sim")
-        )
-    rows.append(dim("Every program that reads this cell's calibration gets it at once."))
-    return lines(*rows)
+    told = dim("Every program that reads this cell's calibration gets it at once.")
+    return lines(change_lines(result, calibration), told)
 
 
 def log_lines(entries: Sequence[LogEntry], height: int) -> Content:

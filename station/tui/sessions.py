@@ -6,23 +6,20 @@ from typing import ClassVar, Literal
 
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.message import Message
 from textual.widgets import Static
 
-from calibrate.files.formatting import figures
 from station.cell.session_folder import SessionSummary
 from station.operate.drift_check import POSES
-from station.tui.drift import drift_lines
-from station.tui.installed import Kept, Past
-from station.tui.screen import Box, Panel, Rows, StationScreen
+from station.tui.installed import Kept
+from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.words import UNKNOWN, facts, lines, mark, size
+from station.tui.words import UNKNOWN, facts, mark, size
 
 DRIFT = f"Drift check: capture {POSES} poses in place of the loaded plan (asks)"
 NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
-COLUMNS = ("session", "what became of it", "verdict", "predicted", "held-out", "views")
+COLUMNS = ("session", "what became of it", "verdict", "predicted", "held-out", "views", "size")
 
 
 SessionWork = Literal["solve", "show", "check", "recover"]
@@ -53,67 +50,34 @@ class SessionsScreen(StationScreen):
         Binding("c", "act('recover')", "Recover", tooltip="Rebuild an unfinished recording"),
     ]
 
-    _past = Past()
+    _sessions: tuple[Kept, ...] | None = None
     """What the table shows."""
 
     def body(self) -> ComposeResult:
         yield Static(NO_SESSION, id="sessions-none")
-        with Horizontal(id="sessions"):
-            with Box("Sessions", id="sessions-box"):
-                yield Rows(*COLUMNS, id="sessions-table")
-            with Vertical(id="sessions-right"):
-                yield Panel(
-                    "Drift of the installed calibration", self._drift, id="drift", below="mm over time"
-                )
-                yield Panel("Highlighted", self._highlighted, id="highlighted")
+        with Box("Sessions", id="sessions"):
+            yield Rows(*COLUMNS, id="sessions-table")
 
     def show(self, known: Known) -> None:
         super().show(known)
-        past = known.past
-        if past is None or past is self._past:
+        sessions = known.sessions
+        if sessions is None or sessions is self._sessions:
             return
-        at = self._highlighted_one()
-        self._past = past
-        self.query_one("#sessions-none").display = not past.sessions
-        self.query_one("#sessions").display = bool(past.sessions)
-        self.table.show([_row(kept) for kept in past.sessions])
-        names = [kept.session.name for kept in past.sessions]
+        at = self._highlighted()
+        self._sessions = sessions
+        self.query_one("#sessions-none").display = not sessions
+        self.query_one("#sessions").display = bool(sessions)
+        self.table.show([_row(kept) for kept in sessions])
+        names = [kept.session.name for kept in sessions]
         self.table.move_cursor(row=names.index(at.session.name) if at and at.session.name in names else 0)
-        self.draw_panels(known)
 
-    def _highlighted_one(self) -> Kept | None:
-        sessions, line = self._past.sessions, self.table.cursor_row
-        return sessions[line] if line < len(sessions) else None
-
-    def _drift(self, known: Known, width: int, height: int) -> Content:
-        return drift_lines(self._past.drift, width, height)
-
-    def _highlighted(self, known: Known, width: int, height: int) -> Content:
-        if (kept := self._highlighted_one()) is None:
-            return Content()
-        session, found = kept.session, kept.calibration
-        state = mark("done", "finished") if session.sealed else mark("look", "UNFINISHED: c recovers it")
-        rows = [
-            Content.styled(session.name, "bold $strong")
-            + Content.styled(f"  {session.source.upper()}" if session.source != "real" else "", "$sim"),
-            facts(("", str(session.views), "views"), ("", size(session.bytes), "")) + Content("   ") + state,
-        ]
-        if found is not None:
-            rows += [
-                Content(
-                    f"{found.robot.model} {found.robot.serial}, {found.camera.model} {found.camera.serial}"
-                ),
-                mark(
-                    "failed" if found.quality.failed else "done",
-                    f"{figures(found)['gates'].value} gates passed",
-                ),
-            ]
-        keys = "Enter result  " * bool(session.calibration) + "F9 solve  k drift check on it"
-        return lines(*rows, Content(""), Content.styled(keys, "$accent"))
+    def _highlighted(self) -> Kept | None:
+        line = self.table.cursor_row
+        return self._sessions[line] if self._sessions and line < len(self._sessions) else None
 
     def action_act(self, what: SessionWork) -> None:
         """Do what a key says with the highlighted session."""
-        if (kept := self._highlighted_one()) is None:
+        if (kept := self._highlighted()) is None:
             self.notify(NO_SESSION)
             return
         session = kept.session
@@ -153,4 +117,5 @@ def _row(kept: Kept) -> tuple[Content, ...]:
         facts(("", f"{predicted:>6}", "mm")),
         facts(("", f"{held:>5}", "mm")),
         Content.styled(f"{session.views:>4}", "$foreground"),
+        Content.styled(size(session.bytes), "$foreground"),
     )

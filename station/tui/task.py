@@ -10,7 +10,7 @@ from station.cell.status import StationState, StationStatus
 from station.operate.ending import Way, after_solve
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Check
-from station.tui.installed import Past, Result
+from station.tui.installed import Kept, Result
 from station.tui.words import Mark, duration, many
 
 STEPS = ("connect", "plan", "capture", "solve", "verify", "install")
@@ -70,8 +70,8 @@ class Known:
     """Why there is no daemon; empty: there is one, or none was asked yet."""
     configuration: StationConfig | None = None
     """Facts of the cell; None until the daemon told them."""
-    past: Past | None = None
-    """What was recorded below the daemon's root; None: not looked yet."""
+    sessions: tuple[Kept, ...] | None = None
+    """Recorded sessions below the daemon's root, newest first; None: not read yet."""
 
     @property
     def live(self) -> StationStatus | None:
@@ -141,8 +141,8 @@ def _plan(status: StationStatus) -> Step:
     poses = status.session.poses
     if not poses:
         return Step("plan", "todo", "no plan yet")
-    ends = [pose.predicted_sigma_mm for pose in poses if pose.predicted_sigma_mm is not None]
-    expected = f", ± {ends[-1]:.2f} mm" if ends else ""
+    end_mm = poses[-1].predicted_sigma_mm
+    expected = "" if end_mm is None else f", ± {end_mm:.2f} mm"
     return Step("plan", "done", f"{many(len(poses), 'pose')}{expected}", str(len(poses)))
 
 

@@ -78,6 +78,7 @@ async def test_the_result_says_when_it_is_the_installed_one(link: FakeLink, root
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
         await app.show_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
+        await pilot.press("6")
         await until(pilot, lambda: "ready to install" in text_of(app, "#verdict"))
         assert "Nothing is installed" in text_of(app, "#change")
         put(root, "s-1")

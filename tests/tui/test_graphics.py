@@ -216,7 +216,7 @@ def test_the_terminal_is_asked(terminal: int, parts: tuple[bytes, ...], sharp: b
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [(SWITCH, "blocks"), ("SSH_TTY", "/dev/pts/3"), ("TERM", "linux"), ("TEXTUAL_THEME", "ansi-dark")],
+    [(SWITCH, "blocks"), ("SSH_TTY", "/dev/pts/3"), ("TERM", "linux"), ("TEXTUAL_THEME", "terminal")],
 )
 def test_where_half_blocks_are_wanted_it_is_not_even_asked(
     terminal: int, name: str, value: str, monkeypatch: pytest.MonkeyPatch

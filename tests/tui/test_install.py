@@ -23,7 +23,7 @@ from calibrate.files.versions import installed_versions, note_installed
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.tui.dialogs import ChooseFormat, Confirm, Reason
 from station.tui.installed import Installed, Result, local
-from station.tui.result import card, verdict_lines
+from station.tui.result import held_out_lines, verdict_lines
 from station.tui.results import before_next
 from station.tui.task import next_action
 from tests.station.calibrated_cell import calibration_of
@@ -71,7 +71,7 @@ def test_terminal_and_screen_say_the_same_figures() -> None:
     assert {"error", "gates", "views", "touch"} <= set(told)
     for name, figure in told.items():
         assert figure.value in said.getvalue()
-        assert figure.value in (card(DOUBTED, name).plain if name == "held_out" else screen)
+        assert figure.value in (held_out_lines(DOUBTED).plain if name == "held_out" else screen)
 
 
 async def press_on_result(pilot: Pilot[None], calibration: Path, *keys: str) -> None:

@@ -12,6 +12,8 @@ from calibrate.geometry import pose as pose_of
 from station.cell.status import PoseStatus
 from station.protocol import verbs
 from station.tui.desk import busy_words
+from station.tui.plan_screen import facts_line
+from station.tui.task import Known, steps
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 
@@ -103,3 +105,14 @@ async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> No
             pilot, lambda: table.row_count == 25 and str(table.get_row_at(7)[-2]) == "failed: too dark"
         )
         assert [str(table.get_row_at(row)[0])[-1] for row in (6, 7)] == ["○", "✗"]  # never cut away
+
+
+def test_the_error_at_the_end_is_that_of_the_last_pose_alone() -> None:
+    poses = [PoseStatus(index=i, name=f"p{i}", predicted_sigma_mm=0.2 + i) for i in range(3)]
+    status = idle()
+    for last_known, shown in ((True, True), (False, False)):
+        poses[-1] = msgspec.structs.replace(poses[-1], predicted_sigma_mm=2.2 if last_known else None)
+        session = msgspec.structs.replace(status.session, poses=tuple(poses))
+        changed = msgspec.structs.replace(status, session=session)
+        assert ("±" in facts_line(changed).plain) is shown
+        assert ("±" in steps(Known(changed))[1].text) is shown

@@ -9,8 +9,8 @@ from textual.widgets import DataTable
 from station.cell.status import Event, StationState
 from station.protocol.client import Client, DaemonGoneError
 from station.tui import desk
+from station.tui.capture_screen import CaptureScreen
 from station.tui.desk import STOP_UNHEARD
-from station.tui.live import LiveScreen
 from station.tui.task import SILENT
 from station.tui.widgets.preview import OLD, PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
@@ -129,11 +129,11 @@ async def test_news_that_arrive_while_the_screen_closes_do_no_harm(
     app = app_on(link)
     heard: list[bool] = []
 
-    def on_unmount(screen: LiveScreen) -> None:
+    def on_unmount(screen: CaptureScreen) -> None:
         app.desk.hear(5.0)
         heard.append(True)
 
-    monkeypatch.setattr(LiveScreen, "on_unmount", on_unmount, raising=False)
+    monkeypatch.setattr(CaptureScreen, "on_unmount", on_unmount, raising=False)
     async with app.run_test() as pilot:
-        await until(pilot, lambda: isinstance(app.screen, LiveScreen) and app.screen.is_mounted)
+        await until(pilot, lambda: isinstance(app.screen, CaptureScreen) and app.screen.is_mounted)
     assert heard

@@ -10,10 +10,10 @@ from station.cell.status import StationState
 from station.protocol.verbs import Check
 from station.tui import connect
 from station.tui.app import StationApp
+from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
 from station.tui.dialogs import Help
-from station.tui.live import LiveScreen
-from station.tui.plan import NO_PLAN, PlanScreen
+from station.tui.plan_screen import NO_PLAN, PlanScreen
 from station.tui.themes import chosen_theme
 from station.tui.widgets.preview import PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
@@ -52,7 +52,7 @@ async def test_what_was_missing_is_looked_for_on_every_screen(
         await pilot.press("3")
         link.answers["doctor"] = THERE
         await until(pilot, lambda: pilot.app.known.missing is None)
-        assert isinstance(pilot.app.screen, LiveScreen)
+        assert isinstance(pilot.app.screen, CaptureScreen)
 
 
 async def test_before_the_first_session_too(link: FakeLink) -> None:
@@ -68,7 +68,7 @@ async def test_later_the_live_screen_comes_first(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await pilot.pause()
         await pilot.pause()
-        assert isinstance(pilot.app.screen, LiveScreen)
+        assert isinstance(pilot.app.screen, CaptureScreen)
 
 
 async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
@@ -136,7 +136,7 @@ async def test_the_highlighted_pose_is_told_in_full(link: FakeLink) -> None:
         await until(pilot, lambda: text_of(pilot.app, "#plan-detail") == NO_PLAN)
 
 
-@pytest.mark.parametrize(("theme", "marks"), [("ansi-dark", "░▒▓█"), ("station-dark", "▀")])
+@pytest.mark.parametrize(("theme", "marks"), [("terminal", "░▒▓█"), ("station-dark", "▀")])
 async def test_the_picture_needs_no_grey_background_on_a_console(
     link: FakeLink, theme: str, marks: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -155,7 +155,7 @@ def test_every_key_has_a_tooltip() -> None:
             assert binding.tooltip, (owner, binding)
 
 
-@pytest.mark.parametrize("theme", ["station-dark", "station-light", "ansi-dark"])
+@pytest.mark.parametrize("theme", ["station-dark", "station-light", "terminal"])
 async def test_the_state_is_a_word_in_every_theme(
     link: FakeLink, theme: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,7 +170,7 @@ async def test_the_state_is_a_word_in_every_theme(
 def test_a_console_with_16_colours_gets_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TEXTUAL_THEME", raising=False)
     monkeypatch.setenv("TERM", "linux")
-    assert chosen_theme() == "ansi-dark"
+    assert chosen_theme() == "terminal"
     monkeypatch.setenv("TERM", "xterm-256color")
     assert chosen_theme() == "station-dark"
     monkeypatch.setenv("TEXTUAL_THEME", "no such theme")

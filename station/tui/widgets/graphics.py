@@ -30,7 +30,7 @@ from rich.style import Style
 from textual.geometry import Size
 from textual.strip import Strip
 
-from station.tui.themes import ANSI_THEMES, chosen_theme
+from station.tui.themes import TERMINAL, chosen_theme
 
 SWITCH = "STATION_PICTURES"
 """`blocks`: never; `sharp`: over ssh too, where STOP's key and every picture share one line."""
@@ -56,7 +56,7 @@ def detect() -> Graphics | None:
     """Ask the terminal what it draws; None: half blocks. Only before the screen reads its keys."""
     wish = os.environ.get(SWITCH, "")
     remote = "SSH_TTY" in os.environ or "SSH_CONNECTION" in os.environ
-    if wish == "blocks" or (remote and wish != "sharp") or chosen_theme() in ANSI_THEMES:
+    if wish == "blocks" or (remote and wish != "sharp") or chosen_theme() == TERMINAL:
         return None
     keys, glass = sys.__stdin__, sys.__stdout__
     if keys is None or glass is None or not keys.isatty() or cell_pixels() is None:

@@ -43,6 +43,9 @@ def test_an_error_stays_expected_after_the_same_poses_in_another_order() -> None
     before = [status.predicted_sigma_mm for status in queue.statuses]
     queue.reorder((2, 0, 1, 3))
     assert [s.predicted_sigma_mm for s in queue.statuses] == [None, None, before[2], before[3]]
+    queue.drop(1)  # the third one
+    for now in (queue, queue.anew()):
+        assert [s.predicted_sigma_mm for s in now.statuses] == [None, None, None]
 
 
 @pytest.mark.parametrize("state", sorted(BUSY))

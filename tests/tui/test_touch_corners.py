@@ -14,7 +14,7 @@ from textual.widgets import Input, OptionList, Static
 from calibrate.boards.model import board_points, outer_corners
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install, installed_calibration
-from station.tui.touch_test import TouchCorners
+from station.tui.touch_corners import TouchCorners
 from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 
 

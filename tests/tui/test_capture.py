@@ -9,26 +9,15 @@ import pytest
 from calibrate.geometry import pose as pose_of
 from station.cell.config import CaptureConfig, matrix4
 from station.cell.layout import layout_of
-from station.cell.status import ClockStatus, EstimateStatus, Event, PoseStatus, StationState, StationStatus
-from station.tui.live import (
-    chips,
-    counted_line,
-    coverage_lines,
-    device_lines,
-    error_lines,
-    event_text,
-    pose_line,
-    stopped_text,
-)
+from station.cell.status import ClockStatus, EstimateStatus, PoseStatus, StationState, StationStatus
+from station.tui.capture_panels import coverage_lines, device_lines, error_lines
+from station.tui.progress import chips, counted_line, pose_line
+from station.tui.stopped import stopped_text
 from station.tui.task import Known
 from station.tui.widgets.canvas import Canvas, Series, curve
-from station.tui.widgets.scene import draw, fields_of, view_of
+from station.tui.widgets.cell_drawing import draw, view_of
 from station.tui.words import limit_bar
 from tests.tui.conftest import CELL, FakeLink, idle, opened, until
-
-SEALED = Event(
-    0, "info", "sealed with 25 of 26 poses: /var/lib/station/sessions/20260131-101500-cell/session.mcap"
-)
 
 
 def session(status: StationStatus, **changes: object) -> StationStatus:
@@ -140,19 +129,16 @@ def seeing(x_m: float, y_m: float) -> PoseStatus:
     return PoseStatus(index=3, name="p4", base_from_flange=matrix4(pose_of(down, np.array([x_m, y_m, 0.5]))))
 
 
-def test_a_part_without_images_is_named_with_the_pose_that_will_fill_it() -> None:
-    scene = layout_of(CELL)
-    status = session(idle(), poses=(seeing(0.6, 0.0),))
-    view = view_of(scene, status.session.poses[0])
+def test_the_parts_of_the_image_without_the_board_are_counted() -> None:
+    views = ((1,) * 6, (1, 2, 3, 0, 0, 1))
+    for image_views, said in ((views, "2 of 12 parts empty"), ((views[0],) * 2, "in every part")):
+        known = Known(msgspec.structs.replace(idle(), estimate=EstimateStatus(3, image_views=image_views)))
+        assert said in coverage_lines(known, 60, 12).plain
+
+
+def test_distance_and_tilt_of_the_board_are_those_that_a_pose_sees() -> None:
+    view = view_of(layout_of(CELL), seeing(0.6, 0.0))
     assert view is not None and 0.3 < view[0] < 0.7 and view[1] < 0.01
-    fields = fields_of(scene, status.session.poses[0], 4, 6)
-    assert 0 < fields.sum() < fields.size
-    empty = tuple(tuple(0 if hit else 3 for hit in row) for row in fields.tolist())
-    known = Known(msgspec.structs.replace(status, estimate=EstimateStatus(3, image_views=empty)))
-    said = coverage_lines(known, 60, 12, scene).plain
-    assert f"{fields.sum()} of 24 parts empty: pose 4 will show it there" in said
-    full = msgspec.structs.replace(status, estimate=EstimateStatus(3, image_views=((1,) * 6,) * 4))
-    assert "in every part" in coverage_lines(Known(full), 60, 12, scene).plain
 
 
 @pytest.mark.parametrize("term", ["xterm-256color", "linux"])
@@ -184,17 +170,3 @@ def test_a_bar_reaches_its_limit_where_the_stroke_stands(value: float, reach: in
     bar = limit_bar(value, 1.0, 20, "$ok", 0.5).plain
     assert len(bar) == 20 and bar[10] == "┃"
     assert bar.count("━") == reach
-
-
-@pytest.mark.parametrize(
-    ("width", "end"),
-    [
-        (80, "25 of 26 poses: …/20260131-101500-cell/session.mcap"),
-        (160, "25 of 26 poses: /var/lib/station/sessions/20260131-101500-cell/session.mcap"),
-        (0, "25 of 26 poses: /var/lib/station/sessions/20260131-101500-cell/session.mcap"),
-    ],
-)
-def test_a_path_that_does_not_fit_keeps_its_end(width: int, end: str) -> None:
-    line = event_text(SEALED, width).plain
-    assert line.endswith(end)
-    assert not width or len(line) <= width

@@ -19,20 +19,21 @@ from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
 from station.tui.frame import Line
 from station.tui.screen import Ask, Box, Panel, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.widgets.scene import LEGEND, cell_scene, draw, view_of
+from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw, view_of
 from station.tui.words import MARKS, UNKNOWN, Mark, degrees, dim, facts, limit_bar, lines, many, mark, mm
 
 COLUMNS = ("#", "error after", "", "distance", "tilt", "state", "reason")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
+NEW = "Plan 25 poses from the configured initial poses (seconds)"
 NEW_FOR_ARM = "Plan 25 poses that also tell the errors of the arm's table, board and lens"
 POSE_VERBS = {"retake": Retake, "skip": Skip, "drop": Drop}
 MOVE = Binding.Group("order", compact=True)
 SIGMA_SHOWN_MM = 100.0
 """The first poses alone determine nothing: a number in metres would only puzzle."""
 BAR_CELLS = 7
-TURN_DEG, ZOOM = 15.0, 1.25
+TURN_DEG = 15.0
 _SEEN = re.compile(r"^\d+ mm, tilt \d+°, |board ")
 """Part of the reason that the columns beside it say already."""
 _STATES: dict[str, tuple[Mark, str]] = {
@@ -75,12 +76,12 @@ def facts_line(status: StationStatus) -> Content:
     poses = status.session.poses
     if not poses:
         return dim(NO_PLAN)
-    ends = [pose.predicted_sigma_mm for pose in poses if pose.predicted_sigma_mm is not None]
+    end_mm = poses[-1].predicted_sigma_mm
     line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose"))
-    if ends:
-        line += Content("   ") + facts(("expected at the end", f"± {ends[-1]:.2f}", "mm (1σ)"))
+    if end_mm is not None:
+        line += Content("   ") + facts(("expected at the end", f"± {end_mm:.2f}", "mm (1σ)"))
         if (goal := status.estimate.goal_mm) is not None:
-            line += Content("   ") + mark("done" if ends[-1] <= goal else "look", f"goal {goal:g} mm")
+            line += Content("   ") + mark("done" if end_mm <= goal else "look", f"goal {goal:g} mm")
     left_out = sum(pose.state == "skipped" for pose in poses)
     return line + dim(f"   {many(left_out, 'pose')} skipped" * bool(left_out))
 
@@ -111,9 +112,7 @@ class PlanScreen(StationScreen):
         "pose, against the goal."
     )
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding(
-            "n", "make('camera')", "New", tooltip="Plan 25 poses from the configured initial poses (seconds)"
-        ),
+        Binding("n", "make('camera')", "New", tooltip=NEW),
         Binding("m", "make('both')", "New+arm", tooltip=NEW_FOR_ARM),
         Binding("r", "pose('retake')", "Retake", tooltip=RETAKE),
         Binding("s", "pose('skip')", "Skip", tooltip=SKIP),
@@ -123,13 +122,11 @@ class PlanScreen(StationScreen):
         Binding("ctrl+down", "shift(1)", "Order", group=MOVE, tooltip="Visit this pose later"),
         Binding("left_square_bracket", "turn(-1)", "Turn", show=False, tooltip="Turn the view of the cell"),
         Binding("right_square_bracket", "turn(1)", "Turn", show=False, tooltip="Turn it the other way"),
-        Binding("plus,equals_sign", "zoom(1)", "Zoom", show=False, tooltip="See the cell larger"),
-        Binding("minus", "zoom(-1)", "Zoom", show=False, tooltip="See the cell smaller"),
     ]
 
     def __init__(self) -> None:
         super().__init__()
-        self._turn_deg, self._zoom = -60.0, 1.0
+        self._turn_deg = -60.0
 
     def body(self) -> ComposeResult:
         yield Line(lambda known, _: facts_line(known.shown), id="plan-facts")
@@ -139,8 +136,7 @@ class PlanScreen(StationScreen):
                     yield Rows(*COLUMNS, id="plan-table")
                 yield Panel("Why", self._why, id="plan-detail")
             with Vertical(id="plan-right"):
-                yield Panel("The cell", self._cell, id="plan-cell", below="\\[ ] turn  + − zoom")
-                yield Panel("From above", self._above, id="plan-above", below=LEGEND)
+                yield Panel("The cell", self._cell, id="plan-cell", below=LEGEND)
 
     def show(self, known: Known) -> None:
         super().show(known)
@@ -161,28 +157,15 @@ class PlanScreen(StationScreen):
         return detail_of(poses[line], before, cell_scene(known.configuration, status))
 
     def _cell(self, known: Known, width: int, height: int) -> Content:
-        return self._drawn(known, width, height, self._turn_deg, 22.0, self._zoom)
-
-    def _above(self, known: Known, width: int, height: int) -> Content:
-        return self._drawn(known, width, height, -90.0, 90.0, 1.0)
-
-    def _drawn(
-        self, known: Known, width: int, height: int, turn_deg: float, lift_deg: float, zoom: float
-    ) -> Content:
         status = known.shown
         scene = cell_scene(known.configuration, status)
         if scene is None:
-            words = "To draw the cell, the configuration needs initial camera and board poses."
-            return dim(words)
+            return dim("To draw the cell, the configuration needs initial camera and board poses.")
         chosen = self.table.cursor_row if status.session.poses else None
-        return draw(scene, status, chosen, width, height, turn_deg=turn_deg, lift_deg=lift_deg, zoom=zoom)
+        return draw(scene, status, chosen, width, height, turn_deg=self._turn_deg)
 
     def action_turn(self, by: int) -> None:
         self._turn_deg += by * TURN_DEG
-        self.draw_panels(self.known)
-
-    def action_zoom(self, by: int) -> None:
-        self._zoom = min(4.0, max(0.5, self._zoom * ZOOM**by))
         self.draw_panels(self.known)
 
     def _selected(self) -> int | None:

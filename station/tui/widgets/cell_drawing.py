@@ -22,6 +22,8 @@ STYLES = ("$line", "$bad", "$accent", "$ok", "$strong", "bold $strong", "bold $w
 FLOOR, KEEP_OUT, PLANNED, SAVED, ARM, BOARD, CHOSEN = range(1, 8)
 """Ranks: the higher is drawn over the lower."""
 LEGEND = "saved green  planned blue  chosen amber  keep-out red"
+_LIFT_DEG = 22.0
+"""Height of the eye above the floor."""
 _SHORT_M = 0.07
 """Length of a frustum that is not the chosen one."""
 
@@ -54,26 +56,6 @@ def view_of(scene: CellLayout, pose: PoseStatus) -> tuple[float, float] | None:
     return float(np.linalg.norm(middle)), float(np.arccos(min(1.0, abs(seen[2, 2]))))
 
 
-def fields_of(scene: CellLayout, pose: PoseStatus, rows: int, columns: int) -> Array:
-    """(rows, columns) of bool: parts of the picture whose middle the board will cover in this pose."""
-    lens, covered = scene.camera, np.zeros((rows, columns), dtype=bool)
-    if pose.base_from_flange is None or lens.matrix is None:
-        return covered
-    points = _board_corners(scene)[[0, 1, 3, 2]]
-    seen = scene.seen(np.array(pose.base_from_flange), points)
-    if (seen[:, 2] <= 0).any():
-        return covered
-    pixels = (seen / seen[:, 2:]) @ np.array(lens.matrix).T
-    y, x = np.meshgrid(
-        (np.arange(rows) + 0.5) * lens.height / rows,
-        (np.arange(columns) + 0.5) * lens.width / columns,
-        indexing="ij",
-    )
-    edges = np.roll(pixels, -1, axis=0) - pixels
-    side = [e[0] * (y - p[1]) - e[1] * (x - p[0]) for p, e in zip(pixels, edges, strict=True)]
-    return np.asarray(np.all(np.array(side) > 0, axis=0) | np.all(np.array(side) < 0, axis=0))
-
-
 def _board_corners(scene: CellLayout) -> Array:
     low, high = board_extent(scene.board)
     return np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
@@ -87,15 +69,13 @@ def draw(
     height: int,
     *,
     turn_deg: float = -60.0,
-    lift_deg: float = 22.0,
-    zoom: float = 1.0,
 ) -> Content:
     """The scene as text. `chosen`: place in `session.poses`.
 
-    `turn_deg`: of the eye about the base's z axis, `lift_deg`: above the floor.
+    `turn_deg`: of the eye about the base's z axis.
     """
     canvas = Canvas(width, height)
-    turn, lift = np.radians([turn_deg, lift_deg])
+    turn, lift = np.radians([turn_deg, _LIFT_DEG])
     right = np.array([-np.sin(turn), np.cos(turn), 0.0])
     up = np.array([-np.cos(turn) * np.sin(lift), -np.sin(turn) * np.sin(lift), np.cos(lift)])
     poses = [(i, p) for i, p in enumerate(status.session.poses) if p.base_from_flange is not None]
@@ -111,11 +91,8 @@ def draw(
     everything = np.concatenate(ground)
     flat = np.stack([everything @ right, everything @ up], axis=1)
     low, high = flat.min(axis=0), flat.max(axis=0)
-    scale = (
-        zoom
-        * 0.86
-        * min(canvas.width / max(high[0] - low[0], 0.2), canvas.height / max(high[1] - low[1], 0.2))
-    )
+    across, tall = np.maximum(high - low, 0.2)
+    scale = 0.86 * min(canvas.width / across, canvas.height / tall)
     middle = (low + high) / 2
 
     def place(points: Array) -> Array:

@@ -1,0 +1,145 @@
+"""Panels of the capture screen: image quality, expected error, coverage of the image, devices."""
+
+from __future__ import annotations
+
+from textual.content import Content
+
+from station.cell.config import CaptureConfig
+from station.cell.status import StationStatus
+from station.tui.task import Known
+from station.tui.widgets.canvas import Series, curve
+from station.tui.words import UNKNOWN, degrees, dim, facts, lines, mark, mm
+
+BURNT = 0.01
+"""Share of saturated pixels above which the image counts as too bright."""
+
+
+def quality_line(status: StationStatus) -> Content:
+    """The board in the newest image: each with a mark, a value and, where it is poor, a word."""
+    seen = status.detection
+    if not seen.found:
+        advice = f"  {seen.advice}" if seen.advice else ""
+        return mark("look", seen.reason or "no board in view") + dim(advice)
+    burnt = seen.saturated > BURNT
+    judged = (
+        ("corners", f"{seen.corners}/{seen.expected}", seen.corners == seen.expected),
+        ("sharp", f"{seen.sharpness:.2f}", burnt or not seen.advice),
+        ("saturated", f"{100 * seen.saturated:.1f} %", not burnt),
+    )
+    parts = [
+        mark("done" if good else "look") + " " + facts((name, value, "")) for name, value, good in judged
+    ]
+    if seen.tilt_rad is not None:
+        parts.append(facts(("tilt", degrees(seen.tilt_rad, 0), "")))
+    if seen.distance_m is not None:
+        parts.append(facts(("at", mm(seen.distance_m, 0), "")))
+    parts.append(facts(("fills", f"{100 * seen.coverage:.0f} %", "")))
+    line = Content("  ").join(parts)
+    return line + Content.styled(f"   {seen.advice}", "$warn") if seen.advice else line
+
+
+def error_lines(known: Known, width: int, height: int) -> Content:
+    """The expected error as it falls towards its goal: measured solid, planned dotted."""
+    status = known.shown
+    estimate, poses = status.estimate, status.session.poses
+    goal = estimate.goal_mm
+    now = estimate.sigma_translation_mm
+    head = facts(("", f"± {now:.2f}" if now is not None else f"± {UNKNOWN}", "mm"))
+    if goal:
+        head += Content.assemble(("   goal ", "$dim"), (f"± {goal:.2f}", "$warn"))
+    if estimate.enough:
+        head += Content("   ") + mark("done", "reached")
+    measured = [(i + 1.0, p.estimated_sigma_mm) for i, p in enumerate(poses) if p.estimated_sigma_mm]
+    planned = [
+        (i + 1.0, p.predicted_sigma_mm)
+        for i, p in enumerate(poses)
+        if p.predicted_sigma_mm and p.predicted_sigma_mm < 100 * (goal or 0.5)
+    ]
+    end_mm = poses[-1].predicted_sigma_mm if poses else None
+    end = "" if end_mm is None else f"by the plan ± {end_mm:.2f} mm"
+    rows = [head]
+    if end and height > 6:
+        rows.append(dim(f"{end} after {len(poses)} poses" + _advice(estimate.advice, width)))
+    rows.append(
+        curve(
+            [Series(planned, "$faint", dash=2), Series(measured, "$accent")],
+            goal,
+            width,
+            height - len(rows),
+            ends=f"pose 1|{len(poses)}" if height > 6 else "",
+        )
+    )
+    return lines(*rows)
+
+
+def _advice(advice: str, width: int) -> str:
+    return f". {advice}" if advice and len(advice) < width - 36 else ""
+
+
+_HEAT = ("$dim on $h0", "$foreground on $h1", "$strong on $h2", "$onaccent on $h3", "$onaccent on $h4")
+
+
+def coverage_lines(known: Known, width: int, height: int) -> Content:
+    """Draw the image as a grid: in how many images each part showed the board."""
+    status = known.shown
+    views = status.estimate.image_views
+    if not views:
+        return dim("no image of the board yet")
+    columns = len(views[0])
+    cell = max(3, min(9, (width - 2) // columns - 1))
+    most = max(1, max(max(row) for row in views))
+    tall = 2 if height >= 2 * len(views) + 1 else 1
+    rows: list[Content] = []
+    for row in views:
+        words = [("empty" if cell > 5 else "--") if not count else str(count) for count in row]
+        heat = [0 if not count else 1 + min(3, 4 * count // (most + 1)) for count in row]
+        shown = [
+            Content.styled(word.center(cell), _HEAT[h] if h else "$warn on $h0")
+            for word, h in zip(words, heat, strict=True)
+        ]
+        rows.append(Content(" ").join(shown))
+        if tall == 2:
+            rows.append(Content(" ").join(Content.styled(" " * cell, _HEAT[h]) for h in heat))
+    if len(rows) < height:
+        empty = sum(not count for row in views for count in row)
+        said = f"{empty} of {len(views) * columns} parts empty"
+        rows.append(mark("look", said) if empty else mark("done", "the board was seen in every part"))
+    return lines(*rows[:height])
+
+
+def device_lines(known: Known, width: int, height: int) -> Content:
+    """Name each device with its rate."""
+    status = known.shown
+    robot, camera, recorder, bounds = status.robot, status.camera, status.recorder, status.clock
+    if status.playback:
+        return dim("robot not live   camera not live")
+    parts = [
+        _device("robot", robot.connected, f"{robot.rate_hz:.0f} Hz"),
+        _device(
+            "camera",
+            camera.connected,
+            f"{camera.fps:.0f} fps" + f", {camera.dropped} lost" * bool(camera.dropped),
+        ),
+    ]
+    if status.trigger.present:
+        pulses, frames = status.trigger.pulses, status.trigger.frames
+        parts.append(_device("trigger", pulses == frames, f"{pulses} = {frames}"))
+    if recorder.recording or recorder.error:
+        parts.append(_device("record", not recorder.error, f"sync {recorder.sync_ms:.0f} ms"))
+    else:
+        parts.append(mark("todo", "not recording"))
+    known_ms = [ms for ms in (bounds.camera_bound_ms, bounds.controller_bound_ms) if ms is not None]
+    if known_ms:
+        capture = CaptureConfig() if known.configuration is None else known.configuration.capture
+        parts.append(
+            _device(
+                "clocks",
+                sum(known_ms) <= 1000 * capture.time_bound_s,
+                f"± {sum(known_ms):.1f} ms {bounds.camera_source or ''}".rstrip(),
+            )
+        )
+    return Content("   ").join(parts)
+
+
+def _device(name: str, good: bool, text: str) -> Content:
+    return mark("done" if good else "failed", name) + dim(f" {text}")

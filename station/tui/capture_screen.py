@@ -1,0 +1,69 @@
+"""Capture: what the operator watches while the arm works."""
+
+from __future__ import annotations
+
+from textual.app import ComposeResult
+from textual.containers import Horizontal, Vertical
+from textual.widgets import ProgressBar
+
+from station.protocol.states import LATCHED, RUNNING
+from station.tui.capture_panels import coverage_lines, device_lines, error_lines, quality_line
+from station.tui.frame import Line
+from station.tui.log_screen import newest_events
+from station.tui.progress import LEGEND, progress_lines
+from station.tui.screen import Box, Panel, StationScreen
+from station.tui.stopped import Stopped
+from station.tui.task import Known
+from station.tui.widgets.preview import PreviewPane
+
+
+class CaptureScreen(StationScreen):
+    """The camera's picture as large as it can be; progress, error, coverage and devices beside it."""
+
+    MODE, TIP = "capture", "The running capture"
+    HELP = (
+        "The running capture. F5 asks before the arm moves; F12 stops it at once, on every screen. Poses: "
+        f"{LEGEND}."
+    )
+
+    def body(self) -> ComposeResult:
+        with Horizontal(id="live"):
+            with Vertical(id="live-left"):
+                with Box("Camera", id="picture", below="+ found corners"):
+                    yield PreviewPane(id="preview")
+                    yield Line(lambda known, _: quality_line(known.shown), id="quality")
+                yield Panel("What happened", newest_events, id="events", below="8 all")
+            with Vertical(id="live-right"):
+                with Box("Poses", id="progress"):
+                    yield ProgressBar(id="bar-of-poses", show_eta=False, show_percentage=False)
+                    yield Panel("", progress_lines, id="poses")
+                yield Panel("Expected error of the camera's position (1σ)", error_lines, id="error")
+                title = "Where in the image the board was seen"
+                yield Panel(title, coverage_lines, id="coverage", below="images per part")
+                yield Panel("Devices", device_lines, id="devices")
+        yield Stopped(id="stopped")
+
+    def show(self, known: Known) -> None:
+        super().show(known)
+        self.draw_panels(known)
+        self.query_one(Stopped).show(known)
+        status = known.status
+        if status is None:
+            return
+        session = status.session
+        title = "Poses"
+        if session.place is not None and status.state in RUNNING:
+            number = session.poses[session.place].index + 1
+            title = f"Pose {number} ({session.place + 1} of {len(session.poses)})"
+        self.query_one("#progress").border_title = f"{title}: OLD" if known.old else title
+        self.query_one("#picture").border_title = (
+            f"Camera  {status.camera.model}"
+            if status.camera.connected or status.playback
+            else "Camera: not connected"
+        )
+        bar = self.query_one(ProgressBar)
+        saved, total = float(sum(pose.counts for pose in session.poses)), float(len(session.poses) or 1)
+        if (bar.progress, bar.total) != (saved, total):
+            bar.update(total=total, progress=saved)
+        self.query_one("#quality", Line).show(known)
+        self.query_one("#live").set_class(status.state in LATCHED, "-dimmed")

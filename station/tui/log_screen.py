@@ -1,0 +1,51 @@
+"""The event log: all that the daemon told, and its newest lines for the capture screen."""
+
+from __future__ import annotations
+
+from textual.app import ComposeResult
+from textual.content import Content
+from textual.widgets import RichLog
+
+from station.cell.status import Event
+from station.tui.screen import StationScreen
+from station.tui.task import Known
+from station.tui.words import clock, lines, rich_text
+
+_LEVELS = {"debug": "$dim", "info": "", "warning": "$warn", "error": "bold $bad"}
+_SIGNS = {"debug": "", "info": "", "warning": "▲ ", "error": "✗ "}
+
+
+def event_text(event: Event) -> Content:
+    pose = "" if event.pose_index is None else f"pose {event.pose_index + 1} "
+    said = _SIGNS[event.level] + pose + event.text
+    return Content.assemble((clock(event.wall_ns), "$faint"), "  ", (said, _LEVELS[event.level]))
+
+
+def newest_events(known: Known, width: int, height: int) -> Content:
+    """The newest events, as many as fit."""
+    shown = reversed(known.shown.events[-max(1, height) :])
+    return lines(*(event_text(event) for event in shown))
+
+
+class LogScreen(StationScreen):
+    """All events, newest last, to scroll through."""
+
+    MODE, TIP = "log", "Event log"
+    HELP = "All events the daemon still holds; the same lines are in the journal and in the recording."
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._last: Event | None = None
+
+    def body(self) -> ComposeResult:
+        yield RichLog(id="log", wrap=True, max_lines=2000)
+
+    def show(self, known: Known) -> None:
+        super().show(known)
+        status = known.status
+        events = () if status is None else status.events
+        start = events.index(self._last) + 1 if self._last in events else 0
+        log = self.query_one("#log", RichLog)
+        for event in events[start:]:
+            log.write(rich_text(event_text(event), self.app.theme_variables))
+            self._last = event

@@ -1,0 +1,101 @@
+"""Progress of a capture: the steps of the pose under way, and a chip for every pose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from textual.content import Content
+
+from station.cell.status import PoseStatus, SessionStatus, StationState, StationStatus
+from station.protocol.states import RUNNING
+from station.tui.task import Known
+from station.tui.words import dim, duration, facts, lines, mark
+
+_STEPS = {"moving": "move", "settling": "settle", "capturing": "capture", "writing": "save"}
+CHIPS: dict[str, tuple[str, str]] = {
+    "done": ("✓", "$ok on $okbg"),
+    "planned": ("·", "$dim"),
+    "skipped": ("-", "$dim"),
+    "failed": ("✗", "bold $bad on $badbg"),
+}
+LEGEND = "✓ saved  ! saved, look  ▶ now  · to come  - skipped  ✗ failed"
+
+
+def pose_line(status: StationStatus) -> Content:
+    """Steps of the pose under way, or what comes next at rest."""
+    session = status.session
+    pose = pose_under_way(status)
+    if pose is None:
+        return counted_line(session)
+    if pose.state == "failed":
+        return mark("failed", f"{pose.name}: {pose.reason}")
+    at = list(_STEPS).index(pose.state) if pose.state in _STEPS else (4 if pose.state == "done" else -1)
+    parts = []
+    for i, word in enumerate(_STEPS.values()):
+        if i == at:
+            parts.append(Content.styled(f" ▶ {word} ", "bold $strong on $accentbg"))
+        else:
+            parts.append(mark("done" if i < at else "todo", word))
+    return Content.styled(" ─ ", "$line").join(parts)
+
+
+def pose_under_way(status: StationStatus) -> PoseStatus | None:
+    """Return the pose that the arm works at; None at rest."""
+    session = status.session
+    if session.place is None:
+        return None
+    pose = session.poses[session.place]
+    resting = status.state in (StationState.IDLE, StationState.PAUSED)
+    return None if pose.state == "done" and resting else pose
+
+
+def counted_line(session: SessionStatus) -> Content:
+    """Progress of a session while no pose is under way, and what comes next."""
+    if not session.poses:
+        return dim("No plan yet: 2, then n makes one.")
+    if not session.name:
+        return dim("Not begun: F5 shows the motion and asks first.")
+    again = sum(pose.kept for pose in session.poses)
+    if session.calibration:
+        return mark("done", "finished and solved: 4 shows the result")
+    if session.recording:
+        return mark("done", "finished: k on 7 judges it" if session.check else "finished: F9 solves it")
+    return dim(f"{again} to be captured again" if again else "resting")
+
+
+def progress_lines(known: Known, width: int, height: int) -> Content:
+    """Draw how many are saved, the steps of this pose, a chip a pose."""
+    status = known.shown
+    session, pose = status.session, pose_under_way(status)
+    saved = sum(pose.counts for pose in session.poses)
+    left = (
+        ()
+        if session.remaining_s is None or status.state not in RUNNING
+        else (("", duration(session.remaining_s), "left"),)
+    )
+    head = facts(("", str(saved), f"of {len(session.poses)} saved"), *left)
+    if status.playback:
+        head += Content.styled("   played, no arm moves", "$sim")
+    why = "" if pose is None else f"{pose.name}: {pose.why}" if pose.why else pose.name
+    return lines(head, pose_line(status), dim(why), *chips(session, width, max(1, height - 3)))
+
+
+def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:
+    """A chip a pose, in the order of driving; of a long plan the rows around the one under way."""
+    each = 4 if len(session.poses) < 100 else 5
+    per_row = max(1, (width + 1) // (each + 1))
+    made = [_chip(pose, pose.index == session.current, each) for pose in session.poses]
+    whole = [made[i : i + per_row] for i in range(0, len(made), per_row)]
+    first = max(0, min((session.place or 0) // per_row - 1, len(whole) - rows))
+    for row in whole[first : first + rows]:
+        yield Content(" ").join(row)
+
+
+def _chip(pose: PoseStatus, current: bool, cells: int) -> Content:
+    number = f"{pose.index + 1:>{cells - 2}}"
+    if current and pose.state in _STEPS:
+        return Content.styled(f"{number}▶ ", "bold $strong on $accentbg")
+    if pose.kept or (pose.state == "done" and pose.attempt > 1):
+        return Content.styled(f"{number}! ", "$warn on $warnbg")
+    sign, style = CHIPS.get(pose.state, ("▶", "bold $strong on $accentbg"))
+    return Content.styled(f"{number}{sign} ", style)

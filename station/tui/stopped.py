@@ -1,0 +1,68 @@
+"""The card over the capture while STOP or a fault is latched: what happened, and the way on."""
+
+from __future__ import annotations
+
+from textual.content import Content
+from textual.widgets import Static
+
+from station.cell.status import StationStatus
+from station.protocol.states import LATCHED
+from station.tui.progress import pose_under_way
+from station.tui.task import Known
+from station.tui.words import UNKNOWN, lines, mark
+
+STOPPED_BY = {
+    "protective-stop": "The robot stopped itself (protective stop): it probably touched something.",
+    "emergency-stop": "An emergency stop is pressed.",
+    "safeguard-stop": "A guard or a scanner stopped the arm.",
+}
+"""By the cause of a stop that a person clears at the pendant."""
+
+
+class Stopped(Static):
+    """Over the capture while STOP or a fault is latched: what happened, and the way on in three steps."""
+
+    def show(self, known: Known) -> None:
+        status = known.live
+        latched = status is not None and status.state in LATCHED and not known.old
+        self.display = latched
+        if status is None or not latched:
+            return
+        self.border_title = f"■ {status.state.value.upper()}"
+        self.border_subtitle = "latched until F8"
+        self.update(stopped_text(status))
+
+
+def stopped_text(status: StationStatus) -> Content:
+    session, robot = status.session, status.robot
+    on_way = pose_under_way(status)
+    again = (
+        f" Pose {on_way.index + 1} was on its way and is captured again."
+        if on_way and on_way.state != "done"
+        else ""
+    )
+    saved = (
+        f"{session.captured} of {len(session.poses)} poses are saved.{again}"
+        if session.poses
+        else "No session was running."
+    )
+    pendant = mark("look", robot.held) if robot.held else mark("done", "nothing to clear there")
+    safety = Content.assemble(("safety ", "$dim"), (robot.safety or UNKNOWN, "bold $strong"))
+    told = "The arm was told to stop. " if status.cause == "stop" else ""
+    return lines(
+        Content.styled(STOPPED_BY.get(status.cause, told + status.reason), "bold $strong"),
+        Content(""),
+        Content(saved),
+        Content(""),
+        Content.assemble(
+            (" 1  ", "bold $strong"),
+            ("Look at the cell. ", "bold"),
+            "Is anybody in reach? Did the arm touch anything?",
+        ),
+        Content.assemble((" 2  ", "bold $strong"), ("At the pendant: ", "bold"), safety, "  ", pendant),
+        Content.assemble(
+            (" 3  ", "bold $strong"),
+            (" F8  Acknowledge ", "bold $onaccent on $warn"),
+            ("  Nothing moves by it; F5 then asks again.", "$dim"),
+        ),
+    )

@@ -14,7 +14,7 @@ from calibrate.boards.model import board_points, outer_corners
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install, installed_calibration
 from station.tui.touch_corners import TouchCorners
-from tests.station.operate.test_touch_test import TIP, Daemon
+from tests.station.operate.test_tip_offsets import TIP, Daemon
 from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 
 

@@ -35,6 +35,7 @@ SHOWN: dict[str, str] = {
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
     "watch": r"^\| (repeated|any) .* of ",
     "drift": r"planned \| [38] \|",
+    "late_news": r"^\| all",
     "stop_latency": r"^\| both \| (first|bytes).* 200 \||no heartbeat \| rest",
 }
 """The rows of each benchmark that the page shows, as a pattern; in the page's order."""

@@ -12,10 +12,6 @@ from recordings.schema.messages import ClockReading, FrameTime, TimeSource
 READINGS_KEPT = 200
 UNKNOWN_READOUT_S = 0.05
 """Longest time from the end of an exposure to its first packet, where nothing else limits it."""
-PTP_ERROR_S = 50e-6
-"""Two clocks of a working PTP network agree to better than this."""
-TAI_OFFSETS_S = (37, 0)
-"""PTP counts TAI, since 2017 ahead of UTC by 37 s; masters without leap seconds count UTC."""
 
 
 class _Reading(NamedTuple):
@@ -24,7 +20,6 @@ class _Reading(NamedTuple):
     """Host monotonic minus device time, at the middle of the round trip."""
     half_s: float
     """Half the round trip: the offset is wrong by this at most."""
-    raw: ClockReading
 
 
 class DeviceClock:
@@ -44,7 +39,7 @@ class DeviceClock:
         half_ns = (reading.answered_monotonic_ns - reading.asked_monotonic_ns) / 2
         # Difference of integers first: stamps of 1.7e18 ns have no room in a float.
         offset_ns = float(reading.asked_monotonic_ns - reading.device_ns) + half_ns
-        new = _Reading(reading.device_ns / 1e9, offset_ns, half_ns / 1e9, reading)
+        new = _Reading(reading.device_ns / 1e9, offset_ns, half_ns / 1e9)
         if self._readings and _apart(self._readings[-1], new):
             self._readings.clear()
         self._readings.append(new)
@@ -61,17 +56,9 @@ class DeviceClock:
 
     @property
     def fit(self) -> ClockFit | None:
-        """By PTP where the readings bear it out, else by the round trips; None before the first reading."""
+        """By the round trips; None before the first reading."""
         readings = list(self._readings)
-        if not readings:
-            return None
-        return _synchronized(readings) or _by_round_trips(readings)
-
-    @property
-    def synchronized(self) -> bool:
-        """`fit` is by PTP."""
-        readings = list(self._readings)
-        return bool(readings) and _synchronized(readings) is not None
+        return _by_round_trips(readings) if readings else None
 
 
 def _apart(earlier: _Reading, later: _Reading) -> bool:
@@ -100,31 +87,6 @@ def _drift(readings: list[_Reading]) -> tuple[float, float]:
     if doubt >= UNFITTED_DRIFT:
         return 0.0, UNFITTED_DRIFT
     return (late.offset_ns - early.offset_ns) / 1e9 / apart_s, doubt
-
-
-def _synchronized(readings: list[_Reading]) -> ClockFit | None:
-    """The camera's clock is the host's wall clock, plus TAI's whole seconds; None where a reading denies it.
-
-    A camera may follow a master that this computer does not: only what every round trip bears out counts. All
-    that they leave open is the bound.
-    """
-    if not all(r.raw.synchronized and r.raw.host_wall_ns for r in readings):
-        return None
-    spans = []
-    for _, _, _, raw in readings:
-        ahead_ns = raw.device_ns - raw.host_wall_ns
-        trip_ns = raw.answered_monotonic_ns - raw.asked_monotonic_ns
-        spans.append((ahead_ns / 1e9 - PTP_ERROR_S, (ahead_ns + trip_ns) / 1e9 + PTP_ERROR_S))
-    low_s, high_s = max(low for low, _ in spans), min(high for _, high in spans)
-    for whole_s in TAI_OFFSETS_S:
-        if low_s <= whole_s <= high_s:
-            newest = readings[-1].raw
-            # Steps of the wall clock would move device and wall together, not the monotonic clock.
-            wall_ahead_ns = newest.host_wall_ns - newest.answered_monotonic_ns
-            offset_ns = -float(wall_ahead_ns + whole_s * 1_000_000_000)
-            bound_s = max(high_s - whole_s, whole_s - low_s)
-            return ClockFit(readings[-1].device_s, offset_ns, 0.0, 0.0, bound_s)
-    return None
 
 
 def by_clock(start_device_ns: int, exposure_us: float, fit: ClockFit, source: TimeSource) -> FrameTime:

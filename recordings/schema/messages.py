@@ -147,9 +147,10 @@ class Stamps(msgspec.Struct, frozen=True, omit_defaults=True):
 TimeSource = Literal["ptp", "chunk", "latched", "trigger", "arrival"]
 """Sources of a frame's time, best first.
 
-ptp: the camera's clock follows this computer's (IEEE 1588). chunk: stamp and exposure came with the frame,
-and its clock is read by round trips. latched: the same clock, with the stamp of the transport. trigger: the
-pulse of the trigger box and a measured delay. arrival: it came after its exposure, and after its trigger.
+ptp: the camera's clock followed this computer's (IEEE 1588), in old recordings. chunk: stamp and exposure
+came with the frame, and its clock is read by round trips. latched: the same clock, with the stamp of the
+transport. trigger: the pulse of the trigger box and a measured delay. arrival: it came after its exposure,
+and after its trigger.
 """
 
 

@@ -81,17 +81,17 @@ REAL_DRIVERS = ("aravis", "webcam")
 
 
 class CameraConfig(Section, frozen=True):
-    GONE: ClassVar = frozenset({"playback_pace", "time_offset"})
+    GONE: ClassVar = frozenset({"playback_pace", "ptp", "time_offset"})
 
     name: str = MAIN_CAMERA
     """Name among the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""
     driver: Literal["aravis", "webcam", "playback", "rendered"] = "aravis"
     device: str = ""
     """aravis: serial, IP address or name. webcam: its number or device file. playback: the recording."""
-    trigger: Literal["software", "hardware", "free-running"] = "software"
+    trigger: Literal["software", "hardware"] = "software"
     pixel_format: str = "Mono8"
     frame_rate_hz: float | None = None
-    """Frame rate when free-running; None: the camera's own"""
+    """Frame rate of a webcam; None: its own"""
     exposure_us: Positive = 10_000.0
     gain_db: float = 0.0
     gain: float | None = None
@@ -111,8 +111,6 @@ class CameraConfig(Section, frozen=True):
     invert_trigger_line: bool = False
     exposure_line: str = ""
     """Output that is active during exposure; empty: none"""
-    ptp: bool = False
-    """Synchronise the camera's clock to the network's master (IEEE 1588)"""
     model: CameraModel | None = None
     """Known intrinsics; None: estimated from the session's images."""
     model_is_rough: bool = False
@@ -120,8 +118,9 @@ class CameraConfig(Section, frozen=True):
 
 
 class TriggerConfig(Section, frozen=True):
+    GONE: ClassVar = frozenset({"mode"})
+
     port: str
-    mode: Literal["box", "rts", "dtr"] = "box"
     pulse_us: Annotated[int, msgspec.Meta(gt=0)] = 1000
     light_level: float | None = None
 

@@ -8,7 +8,6 @@ from functools import partial
 
 import msgspec
 
-from recordings.schema.frame_time import by_arrival, by_clock
 from recordings.schema.messages import CameraIdentity, Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
@@ -40,7 +39,6 @@ class AravisCamera:
                 remedy="Add `trigger: {port: /dev/ttyACM0}`, or choose camera.trigger: software.",
             )
         self._config = config
-        self._free_running = config.trigger == "free-running"
         self._trigger = trigger
         self._device: GenicamDevice | None = None
         self._worker = DeviceThread("aravis")
@@ -82,7 +80,7 @@ class AravisCamera:
     async def _one(self, timeout_s: float, *, sequenced: bool) -> Image:
         await self._worker.run(self._prepare)
         pulse: TriggerPulse | None = None
-        asked_ns = None if self._free_running else time.monotonic_ns()
+        asked_ns = time.monotonic_ns()
         if self._config.trigger == "hardware":
             assert self._trigger is not None
             pulse = await self._trigger.fire()
@@ -137,20 +135,16 @@ class AravisCamera:
 
     def _prepare(self) -> tuple[float, float]:
         device = self._live()
-        if not self._free_running and (extra := device.drain()):
+        if extra := device.drain():
             raise self.counter.surplus(extra)
         device.latch(self._clock.readings)
         return device.check_settings()
 
     def _take(self, timeout_s: float) -> Image:
         device = self._live()
-        if self._free_running:
-            self.counter.restart()
-            picture = device.fresh_frame(timeout_s, partial(self._began_since, time.monotonic_ns()))
-        else:
-            if self._config.trigger == "software":
-                device.trigger()
-            picture = device.frame(timeout_s)
+        if self._config.trigger == "software":
+            device.trigger()
+        picture = device.frame(timeout_s)
         if picture is None:
             raise CameraError(
                 f"the camera sent no image within {timeout_s:g} s of its trigger",
@@ -159,11 +153,3 @@ class AravisCamera:
                 limit_s=timeout_s,
             )
         return picture
-
-    def _began_since(self, asked_ns: int, picture: Image) -> bool:
-        """Tell whether a free-running frame's exposure began after `asked_ns` (host monotonic)."""
-        fit, exposure_us = self._clock.readings.fit, picture.exposure_us
-        told = by_arrival(picture.stamps.host_monotonic_ns, exposure_us)
-        if fit is not None and picture.stamps.device_ns:
-            told = by_clock(picture.stamps.device_ns, exposure_us, fit, "latched")
-        return told.host_monotonic_ns - exposure_us * 500 - told.bound_s * 1e9 >= asked_ns

@@ -26,7 +26,7 @@ from station.devices.genicam_settings import (
 from station.devices.pixels import bits_per_pixel, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
 BUFFERS = 12
 FRAME_RETENTION_S = 0.5
@@ -70,7 +70,6 @@ class GenicamDevice:
         self._stream: Any = None
         self._applied: Applied | None = None
         self._parser: Any = None
-        self._ptp_status = ""
         self._latched_ns: int | None = None
         self._controls = False
         self._lost = False
@@ -122,7 +121,6 @@ class GenicamDevice:
         with self._explained("setting up the camera"):
             self._applied = apply_settings(self._aravis, self._camera, self._config)
             self._parser = self._camera.create_chunk_parser() if self._applied.chunks else None
-            self._ptp_status = self._find_ptp_status()
         with self._explained("starting the camera"):
             before = _threads()
             self._stream = self._camera.create_stream(None, None)
@@ -177,21 +175,6 @@ class GenicamDevice:
         """Those of `genicam_settings.CHUNKS` that come with every frame."""
         return frozenset() if self._applied is None else self._applied.chunks
 
-    def _find_ptp_status(self) -> str:
-        """Find the feature that reports the state of IEEE 1588; empty where it is off or missing."""
-        for switch, status in (("PtpEnable", "PtpStatus"), ("GevIEEE1588", "GevIEEE1588Status")):
-            if all(self._camera.is_feature_available(name) for name in (switch, status)):
-                return status if self._camera.get_boolean(switch) else ""
-        return ""
-
-    def _synchronized(self) -> bool:
-        """True when the camera reports that it is an IEEE 1588 slave, or master."""
-        if not self._ptp_status:
-            return False
-        if self._ptp_status == "PtpStatus" and self._camera.is_feature_available("PtpDataSetLatch"):
-            self._camera.execute_command("PtpDataSetLatch")
-        return self._camera.get_string(self._ptp_status) in ("Slave", "Master")
-
     def latch(self, clock: DeviceClock) -> None:
         """Add a reading of the camera's clock to `clock`, where the camera supports latching it."""
         for command, value in (
@@ -209,14 +192,13 @@ class GenicamDevice:
                 while device_ns == self._latched_ns and time.monotonic_ns() < asked_ns + _LATCH_WAIT_S * 1e9:
                     device_ns = self._to_ns(self._camera.get_integer(value))
                 answered_ns, wall_ns = time.monotonic_ns(), time.time_ns()
-                synchronized = self._synchronized()
             if device_ns != self._latched_ns:
                 self._latched_ns = device_ns
-                clock.add(ClockReading(asked_ns, answered_ns, device_ns, wall_ns, synchronized))
+                clock.add(ClockReading(asked_ns, answered_ns, device_ns, wall_ns))
             return
 
     def _to_ns(self, ticks: int) -> int:
-        """Convert ticks to ns by the present tick rate, which IEEE 1588 changes to 1 GHz."""
+        """Convert ticks to ns."""
         feature = "GevTimestampTickFrequency"
         rate_hz = self._camera.get_integer(feature) if self._camera.is_feature_available(feature) else 0
         return ticks if rate_hz in (0, 1_000_000_000) else round(ticks * 1e9 / rate_hz)
@@ -262,21 +244,6 @@ class GenicamDevice:
             return self._picture(buffer)
         finally:
             self._stream.push_buffer(buffer)
-
-    def fresh_frame(self, timeout_s: float, began_since: Callable[[Image], bool]) -> Image | None:
-        """Wait for the next complete free-running frame for which `began_since` is true; None in time-out."""
-        self.drain()
-        end_s = time.monotonic() + timeout_s
-        while (left_s := end_s - time.monotonic()) > 0:
-            try:
-                picture = self.frame(left_s)
-            except CameraError:
-                if self.lost:
-                    raise
-                continue
-            if picture is not None and began_since(picture):
-                return picture
-        return None
 
     def _picture(self, buffer: Any) -> Image:
         applied = self._require_applied()
@@ -330,9 +297,11 @@ class GenicamDevice:
     def _calm_down(self) -> None:
         """Lengthen the gaps between packets after a frame that lost some, unless they are configured."""
         camera, config = self._camera, self._config
-        if config.packet_delay_us is not None or config.trigger == "free-running":
-            return
-        if not camera.is_gv_device() or not camera.is_feature_available("GevSCPD"):
+        if (
+            config.packet_delay_us is not None
+            or not camera.is_gv_device()
+            or not camera.is_feature_available("GevSCPD")
+        ):
             return
         with suppress(self._glib.Error):  # beyond the camera's range: keep the present gap
             size = camera.gv_get_packet_size()

@@ -188,7 +188,7 @@ class FrameClock:
             return FrameTiming(self._newest.source, self._newest.bound_s, fit, self._impossible)
         if fit is None:
             return FrameTiming("arrival", UNKNOWN_READOUT_S / 2) if self._opened else None
-        return FrameTiming("ptp" if self.readings.synchronized else "latched", fit.bound_s, fit)
+        return FrameTiming("latched", fit.bound_s, fit)
 
     def timed(
         self,
@@ -200,7 +200,7 @@ class FrameClock:
     ) -> Image:
         """Return the image with its time and the clock readings since the previous image.
 
-        `asked_ns`: host time just before its trigger; None: free-running. `pulse`: of the trigger box.
+        `asked_ns`: host time just before its trigger; None: not triggered. `pulse`: of the trigger box.
         `chunk`: stamp and exposure came with the frame.
         """
         arrival_ns, fit = image.stamps.host_monotonic_ns, self.readings.fit
@@ -210,8 +210,6 @@ class FrameClock:
             self._newest = by_trigger(*fired, self._delay_us, image.exposure_us, arrival_ns)
         if fit is not None and image.stamps.device_ns:
             source: TimeSource = "chunk" if chunk else "latched"
-            if self.readings.synchronized:
-                source = "ptp"
             told = by_clock(image.stamps.device_ns, image.exposure_us, fit, source)
             if _possible(told, image, asked_ns):
                 self._newest = told

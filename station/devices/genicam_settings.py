@@ -53,20 +53,9 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
         if camera.is_feature_available("GevSCPD"):
             camera.gv_set_packet_delay(round(1000 * (config.packet_delay_us or 0.0)))
     camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
-    if config.trigger == "free-running":
-        if config.frame_rate_hz is not None:
-            camera.set_frame_rate(config.frame_rate_hz)
-    else:
-        _set_trigger(camera, config)
+    _set_trigger(camera, config)
     if config.exposure_line:
         _set_line(camera, config.exposure_line, {"LineMode": "Output", "LineSource": "ExposureActive"})
-    if config.ptp:
-        for feature in ("PtpEnable", "GevIEEE1588"):
-            if camera.is_feature_available(feature):
-                camera.set_boolean(feature, True)
-                break
-        else:
-            raise _cannot("follow IEEE 1588", "camera.ptp")
     return Applied(region, gain, _knows_db(camera), _set_chunks(aravis, camera))
 
 
@@ -171,7 +160,7 @@ def read_settings(camera: Any) -> dict[str, object]:
         "gain_unit": gain_unit(camera),
         "packet_size": camera.gv_get_packet_size() if camera.is_gv_device() else None,
     }
-    for name in ("TriggerSource", "TriggerActivation", "DeviceFirmwareVersion", "PtpStatus"):
+    for name in ("TriggerSource", "TriggerActivation", "DeviceFirmwareVersion"):
         if camera.is_feature_available(name):
             told[name] = camera.get_string(name)
     if camera.is_gv_device() and camera.is_feature_available("GevSCPD"):

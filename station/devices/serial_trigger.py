@@ -1,4 +1,4 @@
-"""Serial trigger box, and a mode that pulses RTS or DTR of any USB-serial adapter.
+"""Serial trigger box.
 
 The only module that uses `serial`. All waiting happens in one worker thread.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import termios
 import time
-from collections.abc import Callable
 from functools import reduce
 from typing import Any
 
@@ -68,11 +67,10 @@ def _checked(line: bytes) -> str | None:
 
 
 class SerialTrigger:
-    """Trigger box behind `devices.base.Trigger`. `open_port`: for tests of lines that a pty does not have."""
+    """Trigger box behind `devices.base.Trigger`."""
 
-    def __init__(self, config: TriggerConfig, open_port: Callable[[str], Any] | None = None) -> None:
+    def __init__(self, config: TriggerConfig) -> None:
         self._config = config
-        self._open_port = open_port or _open_port
         self._port: Any = None
         self._worker = DeviceThread("trigger")
         self._lines = LineReader()
@@ -95,7 +93,7 @@ class SerialTrigger:
         return await self._worker.run(self._connect)
 
     async def fire(self) -> TriggerPulse:
-        return await self._worker.run(self._fire if self._config.mode == "box" else self._pulse_line)
+        return await self._worker.run(self._fire)
 
     async def close(self) -> None:
         self._opened = False
@@ -105,7 +103,7 @@ class SerialTrigger:
         self._disconnect()
         self._opened = True
         try:
-            self._port = self._open_port(self._config.port)
+            self._port = _open_port(self._config.port)
         except (OSError, ValueError) as error:
             raise TriggerError(
                 f"trigger port {self._config.port} cannot be opened ({error})",
@@ -114,8 +112,6 @@ class SerialTrigger:
             ) from error
         self._lines = LineReader()
         self._count = self._first_count = 0
-        if self._config.mode != "box":
-            return f"{self._config.mode.upper()} of {self._config.port}"
         try:
             identity = self._handshake()
             if (level := self._config.light_level) is not None:  # 0 = off, 1 = full
@@ -222,23 +218,6 @@ class SerialTrigger:
                 f"trigger box lost: {self._config.port} is gone ({error})", code="trigger-lost"
             ) from error
         raise _BoxSilentError(f"no answer to '{request}' within {timeout_s:g} s on {self._config.port}")
-
-    def _pulse_line(self) -> TriggerPulse:
-        port = self._require_port()
-        line = self._config.mode
-        try:
-            fired_ns = time.monotonic_ns()
-            setattr(port, line, True)
-            half_ns = (time.monotonic_ns() - fired_ns) // 2
-            time.sleep(self._config.pulse_us / 1e6)
-            setattr(port, line, False)
-        except (OSError, termios.error) as error:
-            self._disconnect()
-            raise TriggerError(
-                f"the adapter on {self._config.port} is gone ({error})", code="trigger-lost"
-            ) from error
-        self._count += 1
-        return TriggerPulse(self._count, fired_ns + half_ns, half_ns / 1e9)
 
     def _require_port(self) -> Any:
         if self._port is None:

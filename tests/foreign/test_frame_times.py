@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import socket
-import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -65,21 +64,6 @@ async def test_a_stamp_that_cannot_be_is_not_believed(lonely_network: None, stam
         assert image.time is not None and image.time.source == "arrival"
         assert abs(error_s(emulated, image)) <= image.time.bound_s
         assert camera.timing is not None and camera.timing.impossible == 1
-
-
-async def test_a_camera_locked_by_ptp_to_this_computer_needs_no_fit(lonely_network: None) -> None:
-    emulated = emulator()
-    emulated.ptp_ns = lambda: time.time_ns() + 37_000_000_000  # TAI, as PTP counts
-    emulated.set_register(description.PTP_STATUS, description.PTP_STATES["Slave"])
-    async with opened(emulated, ptp=True) as camera:
-        image = await camera.capture()
-        assert image.time is not None and image.time.source == "ptp"
-        assert abs(error_s(emulated, image)) <= image.time.bound_s + 0.001
-        emulated.ptp_ns = lambda: time.time_ns() + 37_040_000_000  # its master is another than ours
-        await camera.close()
-        await camera.open()
-        image = await camera.capture()
-        assert image.time is not None and image.time.source == "chunk"
 
 
 @pytest.mark.parametrize("first", [0, 1, 65_530, 2**40])

@@ -34,7 +34,7 @@ _STREAM_PORT, _STREAM_ADDRESS = 0xD00, 0xD18
 _CAPABILITIES = (
     0x4000_0000 | 0x8_0000 | 0b111
 )  # serial number, IEEE 1588, resend, write memory, concatenation
-_PTP_ENABLE, _EXTENDED_IDS, _FIRE_TEST, _LATCH = 0x8_0000, 0x4000_0000, 0x8000_0000, 2
+_EXTENDED_IDS, _FIRE_TEST, _LATCH = 0x4000_0000, 0x8000_0000, 2
 _LEADER, _TRAILER, _PAYLOAD, _EXTENDED = 1, 2, 3, 0x80
 _IP_UDP = 28
 _CHUNK_LAYOUT = 1
@@ -75,8 +75,6 @@ class EmulatedCamera:
             self.ids = itertools.count()
         self.device_ns: Callable[[int], int] = lambda host_ns: host_ns + 7_000_000_000_000
         """The free-running clock at a host monotonic time, ns"""
-        self.ptp_ns: Callable[[], int] = time.time_ns
-        """The clock while IEEE 1588 is on, ns"""
         self.mangle: Callable[[Packets], Iterable[bytes]] = lambda packets: packets
         """Lose, reorder or copy a frame's packets as they are sent first."""
         self.stamp_error_ns = 0
@@ -155,14 +153,8 @@ class EmulatedCamera:
         """A client has the control privilege, and its heartbeat is not overdue."""
         return self._controller is not None
 
-    @property
-    def ptp(self) -> bool:
-        return bool(self.register(at.GVCP_CONFIGURATION) & _PTP_ENABLE)
-
     def _ticks(self, host_ns: int) -> int:
-        """The clock as stamps and latch show it; with IEEE 1588 on it is nanoseconds of now."""
-        if self.ptp:
-            return self.ptp_ns()
+        """The clock as stamps and latch show it."""
         return self.device_ns(host_ns) * self._tick_hz // 1_000_000_000
 
     def _fill(self, extended_ids: bool) -> None:
@@ -170,7 +162,7 @@ class EmulatedCamera:
         for address, value in (
             (0x000, 0x0002_0000), (0x004, 0x8000_0001), (0x008, 0x0000_0200), (0x010, 0b111), (0x014, 0b001),
             (0x034, 0xFF00_0000), (0x600, 1), (0x904, 1), (0x92C, 0x4000_0000), (_CAPABILITY, _CAPABILITIES),
-            (_HEARTBEAT, 3000), (at.PTP_STATUS, at.PTP_STATES["Disabled"]), (at.PACKET_SIZE, 1400),
+            (_HEARTBEAT, 3000), (at.PACKET_SIZE, 1400),
             (at.GVSP_CONFIGURATION, _EXTENDED_IDS * extended_ids),
             (at.WIDTH, width), (at.HEIGHT, height), (at.SENSOR_WIDTH, width), (at.SENSOR_HEIGHT, height),
             (at.PIXEL_FORMAT, at.PIXEL_FORMATS["Mono8"]), (at.ACQUISITION_MODE, 2), (at.EXPOSURE_AUTO, 2),
@@ -277,10 +269,6 @@ class EmulatedCamera:
                     self._trigger()
             case at.CHUNK_ENABLE:
                 self._chunks[self._selected_chunk()] = bool(value)
-            case at.GVCP_CONFIGURATION:
-                state = "Slave" if self.ptp else "Disabled"
-                self.set_register(at.PTP_STATUS, at.PTP_STATES[state])
-                self.set_register(at.TICK_HZ, 1_000_000_000 if self.ptp else self._tick_hz, 8)
             case at.ACQUISITION:
                 self._triggered.clear()
 
@@ -346,8 +334,7 @@ class EmulatedCamera:
         self._ended.wait(max(0.0, exposure_us * 1e-6 - (time.monotonic_ns() - start_ns) / 1e9))
         self.exposed_ns.append((start_ns, start_ns + round(exposure_us * 1e3)))
         self._ended.wait(self.readout_s)
-        rate = 1_000_000_000 if self.ptp else self._tick_hz
-        ticks += self.stamp_error_ns * rate // 1_000_000_000
+        ticks += self.stamp_error_ns * self._tick_hz // 1_000_000_000
         frame_id = next(self.ids)
         self.frames += 1
         packets = self._packets(frame_id, ticks, encode(np.ascontiguousarray(grey), self._format()))

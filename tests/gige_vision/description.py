@@ -17,10 +17,10 @@ XML_AT = 0x0010_0000
     TRIGGER_SOFTWARE, PAYLOAD_SIZE, CHUNK_MODE, CHUNK_SELECTOR, CHUNK_ENABLE, LINE_SELECTOR, LINE_MODE,
     LINE_SOURCE, LINE_INVERTER, FRAME_RATE_ENABLE, LOCKED, ACQUISITION_MODE, GAIN_SELECTOR,
 ) = range(OWN, OWN + 27 * 4, 4)  # fmt: skip
-EXPOSURE, GAIN, FRAME_RATE, TRIGGER_DELAY, PTP_OFFSET = range(OWN + 0x100, OWN + 0x100 + 5 * 8, 8)
-"""Eight bytes each: IEEE doubles, and the last a signed integer (ns)"""
+EXPOSURE, GAIN, FRAME_RATE, TRIGGER_DELAY = range(OWN + 0x100, OWN + 0x100 + 4 * 8, 8)
+"""IEEE doubles of eight bytes each"""
 TICK_HZ, TIMESTAMP_CONTROL, TIMESTAMP = 0x93C, 0x944, 0x948
-GVCP_CONFIGURATION, GVSP_CONFIGURATION, PTP_STATUS = 0x954, 0x960, 0x96C
+GVSP_CONFIGURATION = 0x960
 PACKET_SIZE, PACKET_DELAY = 0xD04, 0xD08
 
 PIXEL_FORMATS = {
@@ -33,8 +33,6 @@ CHUNKS = {"Image": 0x0001, "Timestamp": 0xA001, "ExposureTime": 0xA002, "FrameID
 TRIGGER_SOURCES = {"Software": 0, "Line1": 1, "Line2": 2, "Line3": 3, "Line0": 4}
 _LINES = {f"Line{number}": number for number in range(4)}
 _AUTO = {"Off": 0, "Once": 1, "Continuous": 2}
-_PORT = ["Initializing", "Faulty", "Disabled", "Listening", "PreMaster", "Master", "Passive", "Uncalibrated"]
-PTP_STATES = {name: number for number, name in enumerate([*_PORT, "Slave"], 1)}
 
 
 def genicam_xml(serial: str) -> str:
@@ -82,12 +80,6 @@ def genicam_xml(serial: str) -> str:
         _command("GevTimestampControlLatch", TIMESTAMP_CONTROL, 2),
         _integer("GevTimestampValue", TIMESTAMP, access="RO", length=8),
         _integer("GevTimestampTickFrequency", TICK_HZ, access="RO", length=8),
-        _masked("PtpEnable", GVCP_CONFIGURATION, "<Bit>12</Bit>", "Boolean"),
-        _enumeration("PtpStatus", PTP_STATUS, PTP_STATES, access="RO"),
-        _command("PtpDataSetLatch", OWN + 0x200, 1),
-        _integer("PtpOffsetFromMaster", PTP_OFFSET, access="RO", length=8, sign="Signed"),
-        _masked("GevIEEE1588", GVCP_CONFIGURATION, "<Bit>12</Bit>", "Boolean"),
-        _enumeration("GevIEEE1588Status", PTP_STATUS, PTP_STATES, access="RO"),
         _masked("GevGVSPExtendedIDMode", GVSP_CONFIGURATION, "<Bit>1</Bit>", "Enumeration",
                 _entries({"Off": 0, "On": 1})),
         _masked("GevSCPSPacketSize", PACKET_SIZE, "<LSB>31</LSB><MSB>16</MSB>", "Integer",

@@ -192,19 +192,6 @@ def test_hardware_trigger_needs_a_box() -> None:
         AravisCamera(CameraConfig(trigger="hardware"))
 
 
-async def test_frames_that_come_by_themselves_are_taken_in_order(server: SimulatedGige) -> None:
-    config = CameraConfig(
-        device="127.0.0.1", trigger="free-running", frame_rate_hz=75.0, packet_size=8996, gain_db=2.0
-    )
-    async with Opened(config) as camera:
-        pictures = [await camera.capture() for _ in range(5)]
-        assert camera.counter.missing == 0
-    numbers = [number_of(p) for p in pictures]
-    assert numbers == sorted(set(numbers)), "never an older frame"
-    assert [p.sequence for p in pictures] == list(range(5))
-    assert {p.gain_db for p in pictures} == {2.0}
-
-
 async def test_without_pygobject_the_operator_is_told_what_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -72,15 +72,6 @@ def test_a_clock_that_ticks_slower_is_told_in_nanoseconds(device: Any, rate_hz: 
     assert shown_ns(device, Clockwork(rate_hz)) == [5_000 * ticks_ns]
 
 
-def test_a_camera_that_is_gone_is_not_waited_for(device: Any) -> None:
-    device._stream = SimpleNamespace(
-        try_pop_buffer=lambda: None, timeout_pop_buffer=lambda microseconds: None
-    )
-    device._lost = True
-    with raises("camera-gone"):
-        device.fresh_frame(60.0, lambda picture: True)
-
-
 class Device:
     """In place of `GenicamDevice`."""
 
@@ -230,9 +221,7 @@ LIBRARY = SimpleNamespace(
 )
 
 
-@pytest.mark.parametrize(
-    ("trigger", "line"), [("software", ("Software",)), ("hardware", ("Line2",)), ("free-running", None)]
-)
+@pytest.mark.parametrize(("trigger", "line"), [("software", ("Software",)), ("hardware", ("Line2",))])
 def test_the_whole_sensor_is_set_with_the_right_trigger_and_automatics_off(trigger: Any, line: Any) -> None:
     camera = Settable(1000.0, 0.0, REGION)
     config = CameraConfig(trigger=trigger, trigger_line="Line2")

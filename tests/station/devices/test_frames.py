@@ -1,4 +1,4 @@
-"""When a picture was exposed, and how surely; what is lost of free-running pictures. By hand."""
+"""When a picture was exposed, and how surely. By hand."""
 
 from __future__ import annotations
 
@@ -77,41 +77,6 @@ def test_without_a_clock_the_pulse_of_the_trigger_box_tells() -> None:
     pulse = TriggerPulse(1, 501_000 * MS, 0.001)
     rough = FrameClock(trigger_delay_us=2000.0).timed(frame(0, 501_035), asked_ns=500_999 * MS, pulse=pulse)
     assert rough.time == FrameTime(501_012 * MS, pytest.approx(0.014), "trigger"), "it may wait 13 ms more"
-
-
-WALL_NS = 1_750_000_000_000_000_000
-
-
-def ptp_reading(second: int, ahead_ns: int, *, locked: bool = True) -> ClockReading:
-    """A round trip of 400 µs, answered `second` s after the start; the camera is ahead of the wall clock."""
-    asked_ns, there_ns = second * 10**9, 100_000 + 20_000 * (second % 5)
-    return ClockReading(
-        asked_ns,
-        asked_ns + 400_000,
-        WALL_NS + asked_ns + there_ns + ahead_ns,
-        WALL_NS + asked_ns + 400_000,
-        locked,
-    )
-
-
-@pytest.mark.parametrize("whole_s", [0, 37])
-def test_ptp_is_believed_where_every_round_trip_bears_it_out(whole_s: int) -> None:
-    clock = DeviceClock(ptp_reading(k, whole_s * 10**9) for k in range(10))
-    fit = clock.fit
-    assert clock.synchronized and fit is not None and fit.drift == 0 and fit.bound_s < 0.0004
-    start_ns = 12_345_678_901
-    told = by_clock(WALL_NS + start_ns + whole_s * 10**9, 0.0, fit, "ptp")
-    assert abs(told.host_monotonic_ns - start_ns) < 1000, "PTP stamps of 1.7e18 ns lose no more than 1 µs"
-
-
-def test_a_camera_that_follows_another_master_is_placed_by_round_trips() -> None:
-    for readings in (
-        [ptp_reading(k, 3_000_000) for k in range(10)],  # 3 ms from this computer's clock
-        [ptp_reading(k, 100_000 * k) for k in range(10)],  # runs away from it
-        [ptp_reading(k, 0, locked=k != 4) for k in range(10)],  # lost its master
-    ):
-        clock = DeviceClock(readings)
-        assert not clock.synchronized and clock.fit is not None and clock.fit.bound_s > 0.0001
 
 
 def test_readings_too_slow_to_tell_a_drift_tell_none() -> None:

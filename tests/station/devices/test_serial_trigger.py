@@ -94,39 +94,6 @@ async def test_a_pulse_width_the_box_cannot_do_is_refused(box: SimulatedTriggerB
     await device.close()
 
 
-class Adapter:
-    """A USB-serial adapter's lines; ptys have none."""
-
-    def __init__(self) -> None:
-        self.edges: list[tuple[str, bool, float]] = []
-        self.pulled = False
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name in ("rts", "dtr"):
-            if self.pulled:
-                raise OSError(5, "Input/output error")
-            self.edges.append((name, bool(value), time.monotonic()))
-        else:
-            super().__setattr__(name, value)
-
-    def close(self) -> None: ...
-
-
-@pytest.mark.parametrize("mode", ["rts", "dtr"])
-async def test_a_plain_adapter_pulses_its_line(mode: str) -> None:
-    adapter = Adapter()
-    config = TriggerConfig(port="/dev/ttyUSB0", mode=mode, pulse_us=20_000)  # type: ignore[arg-type]
-    device = SerialTrigger(config, open_port=lambda path: adapter)
-    assert await device.open() == f"{mode.upper()} of /dev/ttyUSB0"
-    assert [(await device.fire()).count for _ in range(2)] == [1, 2]
-    assert [(name, level) for name, level, _ in adapter.edges] == [(mode, True), (mode, False)] * 2
-    assert adapter.edges[1][2] - adapter.edges[0][2] >= 0.02
-    adapter.pulled = True
-    with raises("trigger-lost"):
-        await device.fire()
-    await device.close()
-
-
 def test_checksum_of_a_known_sentence() -> None:
     assert checksum("GPGLL,5300.97914,N,00259.98174,E,125926,A") == "28"  # NMEA 0183's usual example
 

@@ -10,6 +10,7 @@ from recordings.errors import CodedError
 class CalibrationError(CodedError):
     """No calibration, or none that may be used."""
 
+    package = "calibrate"
     code = "calibration"
     hypothesis: str = ""
     """The cause as a word for programs, where it is known."""

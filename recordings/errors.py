@@ -5,9 +5,17 @@
 
 from __future__ import annotations
 
+import math
+import re
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from string import Formatter
+from typing import Any, Self
+
+from recordings.plain_text import bytes_text
 
 Value = str | float | int | bool | None
 
@@ -34,20 +42,40 @@ class ErrorReport:
 
 
 class CodedError(Exception):
-    """An error that a person can act on: code, values and remedy beside what happened.
+    """An error that a person can act on: `RefusedError("slider-low", fraction=0.2)`.
+
+    The class says who is to act and is what callers catch. The code finds text and remedy in `errors.toml` of
+    the class's package, a class's own code may be left out. The values fill both and are what programs read.
+
+    Sites that were not converted yet give the text itself, `code` and `remedy`: a first argument that has not
+    the shape of a code, or `code=` beside it, tells the two apart. The last conversion deletes `_is_code`.
 
     `exit_code`: 1 failed, 2 usage or configuration, 3 done with loss, 4 a quality gate failed.
     """
 
+    package = "recordings"
+    """Package whose `errors.toml` words the errors of this class."""
     code = "failed"
     """Default for errors of this class."""
     exit_code = 1
 
-    def __init__(self, text: str, *, code: str = "", remedy: str = "", **values: Value) -> None:
-        super().__init__(text)
-        self.text, self.remedy, self.values = text, remedy, values
-        if code:
-            self.code = code
+    def __init__(
+        self, said: str = "", /, *, code: str = "", remedy: str = "", **values: Value | Path
+    ) -> None:
+        super().__init__(said)
+        self.values = {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
+        if code or remedy or not _is_code(said or self.code):
+            self.text, self.remedy, self.code = said, remedy, code or self.code
+        else:
+            self.code = said or self.code
+            self.text, self.remedy = worded(self.package, self.code, self.values)
+
+    @classmethod
+    def from_data(cls, data: ErrorData) -> Self:
+        """Make an error again that another process reported, in that process's words."""
+        error = cls(data.code, **data.values)  # type: ignore[arg-type]  # no more without `code=`
+        error.text, error.remedy = data.text, data.remedy
+        return error
 
     def __str__(self) -> str:
         return f"{self.text.rstrip('.')}. {self.remedy}" if self.remedy else self.text
@@ -55,6 +83,59 @@ class CodedError(Exception):
     @property
     def data(self) -> ErrorData:
         return ErrorData(self.code, self.text, self.remedy, dict(self.values))
+
+
+def _is_code(said: str) -> bool:
+    return re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", said) is not None
+
+
+def worded(package: str, code: str, values: Mapping[str, Value]) -> tuple[str, str]:
+    """Text and remedy of a code. What table or values lack never hides the error: it shows in the text."""
+    entry = error_table(package).get(code, {})
+    if "text" not in entry:
+        return ", ".join([code, *(f"{name} {value}" for name, value in values.items())]), ""
+    return _filled(entry["text"], values), _filled(entry.get("remedy", ""), values)
+
+
+def _filled(template: str, values: Mapping[str, Value]) -> str:
+    try:
+        return _Sentence().vformat(template, (), values)
+    except ValueError:  # no template at all: a brace too many
+        return template
+
+
+@cache
+def error_table(package: str) -> dict[str, dict[str, Any]]:
+    """Errors of a package: code → `text`, `remedy` and `values` that neither of the two shows."""
+    import tomllib  # with the first error: programs that only use the camera import this module
+    from importlib.resources import files
+
+    try:
+        return tomllib.loads((files(package) / "errors.toml").read_text("utf-8"))
+    except (OSError, ImportError, ValueError):
+        return {}
+
+
+_UNITS = {" mm": 1e3, "°": 180 / math.pi, " ms": 1e3}
+"""Ends of a format that show a value of metres, radians or seconds in another unit."""
+
+
+class _Sentence(Formatter):
+    """`str.format` by names, with units: `{turn_rad:.1f°}`, `{size_bytes:bytes}`; a misfit shows."""
+
+    def get_field(self, name: str, _: Any, values: Any) -> tuple[Any, str]:
+        return values.get(name, f"{{{name}}}"), name
+
+    def format_field(self, value: Any, form: str) -> str:
+        unit = next((unit for unit in _UNITS if form.endswith(unit)), "")
+        try:
+            if form == "bytes":
+                return bytes_text(value)
+            return (
+                format(value * _UNITS[unit], form.removesuffix(unit)) + unit if unit else format(value, form)
+            )
+        except (TypeError, ValueError):
+            return str(value)
 
 
 class RecordingError(CodedError):
@@ -93,17 +174,15 @@ class ImportSourceError(RecordingError):
     code = "import-source"
 
 
-def disk_error(doing: str, path: Path, error: OSError, remedy: str = "") -> RecordingError:
-    """The operating system's refusal to `doing` this path, as an error; value `errno`."""
+def disk_error(doing: str, path: Path, error: OSError, advice: str = "") -> RecordingError:
+    """The operating system's refusal to `doing` this path, as an error."""
     reason = error.strerror or str(error)
-    return RecordingError(f"Cannot {doing} {path}: {reason}", code="disk", remedy=remedy, errno=error.errno)
+    return RecordingError("disk", doing=doing, path=path, reason=reason, errno=error.errno, advice=advice)
 
 
 def exists_error(path: Path) -> RecordingError:
     """Nothing that is there is ever written over."""
-    return RecordingError(
-        f"{path} exists already", code="exists", remedy="Choose another name or move it away."
-    )
+    return RecordingError("exists", path=path)
 
 
 def recover_line(path: Path) -> str:

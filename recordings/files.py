@@ -10,6 +10,7 @@ import stat
 from pathlib import Path
 
 from recordings.errors import RecordingError, disk_error, exists_error
+from recordings.plain_text import bytes_text
 
 MAIN_CAMERA = "main"
 """The camera of a cell that has one, and of folders from before cameras had names."""
@@ -91,7 +92,7 @@ def open_file(path: Path) -> int:
         return open_regular(path)
     except OSError as error:
         if error.errno == errno.EINVAL:
-            raise RecordingError(f"{path} is not a file", code="no-file") from error
+            raise RecordingError("no-file", path=path) from error
         raise disk_error("open", path, error) from error
 
 
@@ -100,9 +101,7 @@ def lock(descriptor: int, path: Path) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise RecordingError(
-            f"{path} is in use by another process", code="in-use", remedy="Wait until it has finished."
-        ) from error
+        raise RecordingError("in-use", path=path) from error
 
 
 def discard_leftover(path: Path) -> None:
@@ -130,9 +129,7 @@ def sync_folder(folder: Path) -> None:
 def rename_new(source: Path, target: Path) -> None:
     """Renames within one folder, durably, and never over something that is there. Raises RecordingError."""
     if os.path.lexists(target):
-        raise RecordingError(
-            f"{target} appeared meanwhile; the new recording is kept as {source}", code="exists"
-        )
+        raise RecordingError("appeared-meanwhile", path=target, kept_as=source)
     source.rename(target)
     sync_folder(target.parent)
 
@@ -170,21 +167,11 @@ def require_free_space(folder: Path, reserve_bytes: int) -> int:
 
     free = shutil.disk_usage(folder).free
     if free < reserve_bytes:
+        wanted = reserve_bytes - free
         raise RecordingError(
-            f"Free space at {folder}: {bytes_text(free)} (reserve {bytes_text(reserve_bytes)})",
-            code="disk-full",
-            remedy=f"Free {bytes_text(reserve_bytes - free)} and go on.",
-            free_bytes=free,
-            limit_bytes=reserve_bytes,
+            "disk-full", folder=folder, free_bytes=free, limit_bytes=reserve_bytes, wanted_bytes=wanted
         )
     return free
-
-
-def bytes_text(count: int) -> str:
-    """Write a size for people: 4.0 GB, 120 MB."""
-    if count < 1_000_000:
-        return f"{count / 1e3:.0f} kB"
-    return f"{count / 1e9:.1f} GB" if count >= 1_000_000_000 else f"{count / 1e6:.0f} MB"
 
 
 def usable_cores() -> int:

@@ -1,4 +1,4 @@
-"""Text that somebody else wrote, made harmless for a terminal.
+"""Text as a terminal may get it: what somebody else wrote made harmless, and sizes for people.
 
 A file, a recording, a camera or a robot may hold characters that a terminal takes for orders: colours, a
 moved cursor, a new window title, lines that overwrite what stood there, letters in another order.
@@ -34,3 +34,10 @@ def printed(problem: Exception) -> str:
     """An error as all commands print it: without a full stop at its end."""
     said = plain_text(str(problem))
     return said[:-1] if said.endswith(".") and not said.endswith((" .", "/.", "..")) else said
+
+
+def bytes_text(count: int) -> str:
+    """Write a size for people: 4.0 GB, 120 MB."""
+    if count < 1_000_000:
+        return f"{count / 1e3:.0f} kB"
+    return f"{count / 1e9:.1f} GB" if count >= 1_000_000_000 else f"{count / 1e6:.0f} MB"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import typer
 
+from recordings.errors import error_table
 from tests.test_examples import PROGRAMS
 
 ROOT = Path(__file__).parents[1]
@@ -38,6 +39,9 @@ def suggested() -> Iterator[tuple[str, str]]:
                     continue
                 for command in _COMMAND.findall(text):
                     yield f"{path.relative_to(ROOT)}:{node.lineno}", command
+        for code, entry in error_table(package).items():
+            for command in _COMMAND.findall(re.sub("{.*?}", "X", f"{entry['text']} {entry.get('remedy')}")):
+                yield f"{package}/errors.toml [{code}]", command
 
 
 def missing_options(command: str) -> list[str]:

@@ -145,7 +145,7 @@ def _group_options() -> list[Any]:
 
 def _refuse_gone(word: str, gone: Mapping[str, str]) -> None:
     if word in gone:
-        raise GoneError(f"`{word}` is gone.", remedy=gone[word], word=word)
+        raise GoneError(word=word, instead=gone[word])
 
 
 def _renamed(word: str, old_options: Mapping[str, str]) -> str:

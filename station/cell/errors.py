@@ -8,6 +8,7 @@ from recordings.errors import CodedError
 class StationError(CodedError):
     """A person, a device or a file of the station is in the way."""
 
+    package = "station"
     code = "station"
 
 

@@ -9,7 +9,7 @@ from calibrate.boards.model import describe_board
 from calibrate.errors import CalibrationError
 from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState, validity_text
-from recordings.files import bytes_text
+from recordings.plain_text import bytes_text
 from station.cell.errors import CameraError, RobotError
 from station.cell.process import GRANT_REAL_TIME, in_real_time
 from station.cell.status import StationState

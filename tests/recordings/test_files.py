@@ -86,7 +86,7 @@ def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, make_info()) as writer:
         path.write_text("somebody else's")
-        with refused("exists"):
+        with refused("appeared-meanwhile"):
             writer.finish()
     assert path.read_text() == "somebody else's"
     assert writer.part_path.exists()

@@ -206,6 +206,7 @@ def config_text(config: StationConfig) -> str:
     """Write the configuration as YAML with comments, for people to read and edit."""
     plain: dict[str, Any] = {"format": config.format, "name": config.name, "mount": config.mount}
     plain |= msgspec.to_builtins(config)
+    plain["robot"] = {"model": config.robot.model} | plain["robot"]
     plain["limits"] = {"speed_m_s": config.limits.speed_m_s} | plain["limits"]
     parents = ("flange", "base") if config.mount == "eye-in-hand" else ("base", "flange")
     notes = _NOTES | {

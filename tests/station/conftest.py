@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import pytest
 
 from recordings.errors import RecordingError
+from recordings.schema.messages import Image
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState
 from station.session.recording import SessionRecording
 from tests.station.quick_plan import quick_plan
-from tests.station.session_rig import POSES, TRUTH, HeldDisk, NewRig, Rig, memory_config
+from tests.station.session_rig import POSES, TRUTH, CameraInMemory, HeldDisk, NewRig, Rig, memory_config
 
 
 @pytest.fixture(scope="session")
@@ -52,6 +54,19 @@ async def bare_rig(new_rig: NewRig) -> Rig:
     await rig.until(StationState.IDLE)
     rig.session.take_lease(1, "anna")
     return rig
+
+
+@pytest.fixture
+def held_camera(monkeypatch: pytest.MonkeyPatch) -> asyncio.Event:
+    """A camera whose images come once the event is set."""
+    given, capture = asyncio.Event(), CameraInMemory.capture
+
+    async def held(camera: CameraInMemory, timeout_s: float = 5.0) -> Image:
+        await given.wait()
+        return await capture(camera, timeout_s)
+
+    monkeypatch.setattr(CameraInMemory, "capture", held)
+    return given
 
 
 @pytest.fixture

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
@@ -34,41 +32,30 @@ async def guided(bare_rig: Rig) -> Rig:
     return bare_rig
 
 
-@asynccontextmanager
-async def picture_under_way(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[None]:
-    """A hand-guided picture that comes at the end of the block."""
-    comes, capture = asyncio.Event(), rig.camera.capture
-
-    async def slow(timeout_s: float = 5.0) -> Any:
-        await comes.wait()
-        return await capture(timeout_s)
-
-    monkeypatch.setattr(rig.camera, "capture", slow)
-    taking = asyncio.ensure_future(rig.session.record(1))
-    await rig.until(S.CAPTURING)
-    yield
-    comes.set()
-    await taking
-
-
-async def test_finish_during_a_hand_guided_picture_takes_it_and_seals(
-    guided: Rig, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("by", "state", "poses"),
+    [("finish", S.IDLE, ["done"]), ("pause", S.PAUSED, ["done"]), ("stop", S.STOPPED, ["planned"])],
+)
+async def test_what_ends_freedrive_waits_for_its_image_unless_it_is_stop(
+    guided: Rig, held_camera: asyncio.Event, by: str, state: S, poses: list[str]
 ) -> None:
-    async with picture_under_way(guided, monkeypatch):
-        finishing = asyncio.ensure_future(guided.session.finish(1))
+    taking = asyncio.ensure_future(guided.session.record(1))
+    await guided.until(S.CAPTURING)
+    ending: asyncio.Future[None] | None = None
+    if by == "finish":
+        ending = asyncio.ensure_future(guided.session.finish(1))
         await asyncio.sleep(0.02)
-        assert not finishing.done()
-    await finishing
-    assert guided.state is S.IDLE and guided.pose_states == ["done"]
-    assert guided.session.store.status.session.recording
-
-
-async def test_pause_during_a_hand_guided_picture_ends_free_drive(
-    guided: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async with picture_under_way(guided, monkeypatch):
+        assert not ending.done()
+    elif by == "pause":
         guided.session.pause("bert")
-    assert guided.state is S.PAUSED and guided.pose_states == ["done"]
+    else:
+        await guided.session.stop("bert")
+    held_camera.set()
+    await taking
+    if ending is not None:
+        await ending
+    assert guided.state is state and guided.pose_states == poses
+    assert bool(guided.session.store.status.session.recording) == (by == "finish")
 
 
 async def test_free_drive_switched_on_twice_watches_once(guided: Rig) -> None:

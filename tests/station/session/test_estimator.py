@@ -19,9 +19,7 @@ from station.analysis.estimation import seen_before
 from station.analysis.worker import BoardDetection, sight
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
-from station.protocol.verbs import Purpose, Skip
-from station.session.queue import PoseQueue
-from tests.codes import raises
+from station.protocol.verbs import Purpose
 from tests.patience import until
 from tests.station.quick_plan import quick_plan
 from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, crash, memory_config, sealed
@@ -75,10 +73,6 @@ def _pause_after(rig: Rig, poses: int) -> None:
         rig.session.context.requests.pause_by = "anna"
 
 
-def queue_of(rig: Rig) -> PoseQueue:
-    return rig.session.context.require_queue()
-
-
 class WorkerThatLooksBack(WorkerInThisProcess):
     """Finds in the pictures on the disk what it found in them when they were taken."""
 
@@ -129,11 +123,3 @@ async def test_nothing_moves_by_poses_that_the_disk_did_not_take(
     await until(lambda: "No space left" in half_way.session.store.status.reason)
     assert half_way.state is S.PAUSED
     assert half_way.arm.log.count("move") == moves
-
-
-async def test_it_is_void_when_the_poses_change_meanwhile(half_way: Rig) -> None:
-    summary = await half_way.session.prepare(1, Purpose.RESUME)
-    await half_way.session.edit(Skip, 1, lambda queue: queue.skip(BEFORE + 1))
-    with raises("approval-used"):
-        await half_way.session.go(1, summary.token)
-    assert "p09" in [status.name for status in queue_of(half_way).statuses]

@@ -9,7 +9,7 @@ import pytest
 
 from recordings.errors import MissingSegmentError, RecordingError
 from recordings.reader import open_recording
-from station.cell.errors import RobotError, SafetyStopError
+from station.cell.errors import SafetyStopError
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
 from station.session.recording import SessionRecording
@@ -65,37 +65,27 @@ async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
         await rig.session.prepare(1, Purpose.RESUME)
 
 
-async def test_a_tcp_changed_on_the_pendant_is_a_fault(rig: Rig) -> None:
-    await rig.go_until_the_second_move()
-    rig.arm.slow = False
-    rig.arm.trouble = RobotError("TCP mix-up: the TCP offset on the pendant was changed")
-    rig.arm.arrive.set()
-    await rig.until(S.FAULT)
-    assert "TCP" in rig.session.store.status.reason
-    assert rig.pose_states.count("done") == 1
-
-
-async def test_a_disk_that_fails_is_a_fault_and_never_a_pose(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("method", "error", "cause"),
+    [
+        ("sync", RecordingError("no space left on the device: free 4 GB"), "recording"),
+        ("require_space", RecordingError("only 0.1 GB are free"), "recording"),
+        ("require_space", ZeroDivisionError("a defect"), "internal"),
+    ],
+)
+async def test_a_disk_that_fails_is_a_fault_and_never_a_pose_and_so_is_a_defect(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, method: str, error: Exception, cause: str
 ) -> None:
-    async def full(self: SessionRecording) -> None:
-        raise RecordingError("no space left on the device: free 4 GB")
+    def fails(self: SessionRecording) -> None:
+        raise error
 
-    monkeypatch.setattr(SessionRecording, "sync", full)
+    monkeypatch.setattr(SessionRecording, method, fails)
     await rig.give_go()
     await rig.until(S.FAULT)
-    assert "free 4 GB" in rig.session.store.status.reason
-    assert "done" not in rig.pose_states
-
-
-async def test_a_full_disk_is_noticed_before_the_pose(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    def none_left(self: SessionRecording) -> None:
-        raise RecordingError("only 0.1 GB are free")
-
-    monkeypatch.setattr(SessionRecording, "require_space", none_left)
-    await rig.give_go()
-    await rig.until(S.FAULT)
-    assert "move" not in rig.arm.log
+    assert rig.cause == cause and str(error) in rig.session.store.status.reason
+    await until(lambda: rig.arm.log[-1:] == ["end control"])
+    assert "stop" in rig.arm.log and "done" not in rig.pose_states
+    assert ("move" in rig.arm.log) == (method == "sync")
 
 
 async def test_a_full_disk_is_told_before_anybody_is_asked(rig: Rig) -> None:

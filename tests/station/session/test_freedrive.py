@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import Any
 
 import pytest
 
@@ -17,7 +16,6 @@ from station.protocol.verbs import Drop, Purpose
 from station.session import freedrive
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
-from station.session.threads import DISK
 from tests.codes import raises
 from tests.patience import until
 from tests.station.session_rig import POSES, Rig, sealed
@@ -47,12 +45,14 @@ async def test_a_dropped_pose_does_not_take_the_name_of_the_next_picture(rig: Ri
     assert names[-2:] == [f"hand-{POSES + 1:02d}", f"hand-{POSES + 2:02d}"]
 
 
-async def test_auto_record_takes_a_new_place_once(bare_rig: Rig) -> None:
+async def test_auto_record_takes_a_new_place_once_and_outlives_a_moment_without_news(bare_rig: Rig) -> None:
     bare_rig.arm.rest()
     await bare_rig.session.switch_free_drive(1, True, auto=True)
     await until(lambda: bare_rig.session.store.status.session.captured == 1)
-    await asyncio.sleep(0.3)
+    bare_rig.arm.lost = True  # for two rounds of its watch
+    await asyncio.sleep(0.25)
     assert bare_rig.session.store.status.session.captured == 1
+    bare_rig.arm.lost = False
     bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
     bare_rig.arm.rest()
     await until(lambda: bare_rig.session.store.status.session.captured == 2)
@@ -72,18 +72,6 @@ async def test_auto_record_waits_for_an_arm_that_is_still_guided(
     rig.arm.rest()
     monkeypatch.setattr(StillnessMonitor, "at_rest", True)
     await until(lambda: rig.session.store.status.session.captured == 1)
-
-
-async def test_auto_record_outlives_a_moment_without_news(bare_rig: Rig) -> None:
-    bare_rig.arm.rest()
-    await bare_rig.session.switch_free_drive(1, True, auto=True)
-    await until(lambda: bare_rig.session.store.status.session.captured == 1)
-    bare_rig.arm.lost = True
-    bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
-    await asyncio.sleep(0.25)  # two rounds of its watch
-    bare_rig.arm.lost = False
-    bare_rig.arm.rest()
-    await until(lambda: bare_rig.session.store.status.session.captured == 2)
 
 
 @pytest.mark.parametrize("broken", [TriggerError("the trigger box is gone"), ZeroDivisionError("a defect")])
@@ -139,15 +127,9 @@ async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pyt
 
 
 async def test_free_drive_does_not_begin_beside_a_picture_that_a_lost_lease_left(
-    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
+    bare_rig: Rig, held_camera: asyncio.Event
 ) -> None:
-    rig, comes, capture = bare_rig, asyncio.Event(), bare_rig.camera.capture
-
-    async def slow(timeout_s: float = 5.0) -> Image:
-        await comes.wait()
-        return await capture(timeout_s)
-
-    monkeypatch.setattr(rig.camera, "capture", slow)
+    rig = bare_rig
     await rig.session.switch_free_drive(1, True, auto=False)
     taking = asyncio.ensure_future(rig.session.record(1))
     await rig.until(S.CAPTURING)
@@ -155,7 +137,7 @@ async def test_free_drive_does_not_begin_beside_a_picture_that_a_lost_lease_left
     rig.session.take_lease(1, "anna")
     with raises("still-ending"):
         await rig.session.switch_free_drive(1, True, auto=False)
-    comes.set()
+    held_camera.set()
     await taking
     await rig.session.switch_free_drive(1, True, auto=False)
     assert rig.state is S.FREE_DRIVE
@@ -187,23 +169,3 @@ async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
     if not fails:
         await rig.session.finish(1)  # in idle it was refused, and so was every plan
         assert rig.state is S.IDLE
-
-
-async def test_stop_that_is_acknowledged_before_the_recording_is_there_leaves_a_way_on(
-    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rig, disk, run = bare_rig, asyncio.Event(), DISK.run
-
-    async def slow(*work: Any, **named: Any) -> Any:
-        await disk.wait()
-        return await run(*work, **named)
-
-    monkeypatch.setattr(DISK, "run", slow)
-    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
-    await rig.until(S.FREE_DRIVE)
-    await rig.session.stop("bert")
-    await rig.session.acknowledge("anna")
-    disk.set()
-    with pytest.raises(RefusedError):
-        await beginning
-    assert rig.state is S.PAUSED and rig.session.context.recording is not None

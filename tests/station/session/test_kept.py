@@ -92,8 +92,10 @@ async def test_an_arm_that_stands_at_its_pose_is_not_moved(rig: Rig) -> None:
     await rig.session.go(1, summary.token)
     poses = rig.session.store
     await until(lambda: rig.state is S.PAUSED and poses.status.session.poses[0].attempt == 2)
-    assert rig.pose_states[0] == "done"
+    assert rig.pose_states[0] == "done" and summary.purpose == "retake pose 1"
     assert rig.arm.log.count("move") == 1
+    await rig.session.finish(1)
+    assert sealed(rig).views()[0].attempt == 2
 
 
 @pytest.mark.parametrize("trouble", [(), ("frame lost",)])

@@ -11,7 +11,7 @@ import pytest
 
 from calibrate.boards.model import board_points
 from recordings.errors import CodedError
-from recordings.schema.messages import BoardKind, BoardSpec, Image
+from recordings.schema.messages import BoardKind, BoardSpec
 from station.analysis.worker import BoardDetection
 from station.cell.layout import flange_pose
 from station.cell.status import DetectionStatus
@@ -83,23 +83,16 @@ async def test_a_session_has_the_camera_for_itself(rig: Rig) -> None:
 
 
 async def test_a_crowd_that_asks_delays_a_session_by_one_picture(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
+    rig: Rig, held_camera: asyncio.Event
 ) -> None:
     rig.arm.rest()
     summary = await rig.session.prepare(1, Purpose.RUN)
-    capture, go_on = rig.camera.capture, asyncio.Event()
-
-    async def slow(timeout_s: float = 5.0) -> Image:
-        await go_on.wait()
-        return await capture(timeout_s)
-
-    monkeypatch.setattr(rig.camera, "capture", slow)
     crowd = [asyncio.create_task(rig.session.previews.observe(TAG)) for _ in range(20)]
     await asyncio.sleep(0)
     rig.arm.slow = True
     await rig.session.go(1, summary.token)
     await rig.until(S.MOVING)
-    go_on.set()
+    held_camera.set()
     answers: list[Any] = await asyncio.gather(*crowd, return_exceptions=True)
     assert {getattr(answer, "code", "") for answer in answers} == {"wrong-state"}
     assert rig.camera.taken == 1 and all(isinstance(answer, CodedError) for answer in answers)

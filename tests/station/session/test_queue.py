@@ -58,35 +58,22 @@ def test_a_pose_that_is_being_taken_is_left_alone(state: PoseState) -> None:
     assert queue.status(1).state == state
 
 
-def test_a_pose_that_counts_is_retaken_but_never_left_out() -> None:
+def test_an_image_counts_until_another_takes_its_place() -> None:
     queue = queue_of()
     queue.mark(1, "done")
     with raises("pose-taken"):
         queue.skip(1)
     queue.retake(1)
-    assert queue.open == (0, 1, 2, 3)
-
-
-def test_its_picture_counts_until_another_takes_its_place() -> None:
-    queue = queue_of()
-    queue.mark(1, "done")
+    assert (queue.done, queue.status(1).kept, queue.open) == (1, True, (0, 1, 2, 3))
+    queue.skip(1)  # only its retake: the recording has the image
+    assert (queue.status(1).state, queue.open) == ("done", (0, 2, 3))
     queue.retake(1)
-    assert (queue.done, queue.status(1).kept) == (1, True)
     queue.mark(1, "moving")
     assert PoseQueue(queue.plan, queue.statuses).done == 1  # after a crash on the way
     queue.mark(1, "failed", "too dark")
     assert queue.done == 1
     queue.mark(1, "done")
     assert (queue.done, queue.status(1).kept) == (1, False)
-
-
-def test_what_is_not_taken_again_after_all_keeps_its_picture() -> None:
-    """The recording has it: left out would be a lie."""
-    queue = queue_of()
-    queue.mark(1, "done")
-    queue.retake(1)
-    queue.skip(1)
-    assert (queue.status(1).state, queue.open) == ("done", (0, 2, 3))
 
 
 def test_a_pose_that_was_tried_is_not_forgotten_and_the_last_one_stays() -> None:
@@ -102,7 +89,7 @@ def test_a_pose_that_was_tried_is_not_forgotten_and_the_last_one_stays() -> None
         queue_of(1).drop(0)
 
 
-def test_numbers_are_never_given_twice() -> None:
+def test_numbers_and_names_are_never_given_twice_and_there_is_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
     queue = queue_of(2)
     assert queue.add(pose("a")) == 2
     queue.drop(2)
@@ -110,17 +97,11 @@ def test_numbers_are_never_given_twice() -> None:
     assert [status.index for status in queue.statuses] == [0, 1, 3]
     with raises("no-such-pose"):
         queue.status(2)
-
-
-def test_names_are_told_apart_and_there_is_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    queue = queue_of(2)
     with raises("pose-name"):
         queue.add(pose("p1"))
     monkeypatch.setattr(module, "POSE_LIMIT", 3)
-    queue.add(pose("a"))
     with raises("too-many-poses"):
-        queue.add(pose("b"))
-    assert len(queue.statuses) == 3
+        queue.add(pose("c"))
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2], [0, 1, 2, 2], [0, 1, 2, 3, 4], [4, 3, 2, 1]])

@@ -15,7 +15,7 @@ import pytest
 from recordings.recorder import Recorder
 from station.analysis.pool import WorkerError, Workers
 from station.analysis.worker import start_worker, warm_up
-from station.cell.errors import LimitError, StationError
+from station.cell.errors import StationError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Reorder
@@ -43,21 +43,6 @@ class Gate:
         return await self._call(function, *args, timeout_s=timeout_s)
 
 
-async def test_an_unforeseen_error_stops_the_arm_and_is_a_fault(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(self: SessionRecording) -> None:
-        raise ZeroDivisionError("a defect")
-
-    monkeypatch.setattr(SessionRecording, "require_space", broken)
-    await rig.give_go()
-    await rig.until(S.FAULT)
-    assert rig.cause == "internal"
-    assert "stop" in rig.arm.log
-    await until(lambda: rig.arm.log[-1:] == ["end control"])
-    assert "move" not in rig.arm.log
-
-
 async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: Rig) -> None:
     def fails() -> None:
         raise ZeroDivisionError("a defect")
@@ -69,11 +54,15 @@ async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: 
     assert rig.state is S.STOPPED and "stop" in rig.arm.log
 
 
+@pytest.mark.parametrize("offered", [False, True], ids=["while the path is checked", "after the offer"])
 @pytest.mark.parametrize("change", ["stop", "edit", "release", "prepare"])
-async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, change: str) -> None:
+async def test_what_changes_leaves_no_approval(rig: Rig, change: str, offered: bool) -> None:
     gate = Gate(rig)
     preparing = asyncio.ensure_future(rig.session.prepare(1, Purpose.RUN))
     await gate.entered.wait()
+    if offered:
+        gate.open.set()
+        await preparing
     if change == "stop":
         await rig.session.stop("bert")
         await rig.session.acknowledge("anna")
@@ -86,9 +75,9 @@ async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, chan
         later = asyncio.ensure_future(rig.session.prepare(1, Purpose.RUN))
         await asyncio.sleep(0)
     gate.open.set()
-    with raises("changed"):
-        await preparing
-    if change == "prepare":
+    with raises("approval-used" if offered else "changed"):
+        await rig.session.go(1, (await preparing).token)
+    if change == "prepare" and not offered:
         assert (await later).poses == POSES
     else:
         assert rig.session.store.status.go is None
@@ -244,23 +233,6 @@ async def test_a_disk_that_hangs_does_not_hang_the_station(rig: Rig, monkeypatch
     await until(went_on.is_set)
 
 
-@pytest.mark.parametrize(
-    "speeds",
-    [
-        {"joint_speed_rad_s": -0.5},
-        {"joint_speed_rad_s": 1e-300},
-        {"joint_acceleration_rad_s2": 0.0},
-        {"joint_acceleration_rad_s2": 1e-300},
-    ],
-)
-async def test_speeds_that_are_none_are_refused_before_a_go(
-    rig: Rig, small_plan: Plan, speeds: dict[str, float]
-) -> None:
-    rig.session.load_plan(1, msgspec.structs.replace(small_plan, **speeds))
-    with raises("plan", LimitError):
-        await rig.session.prepare(1, Purpose.RUN)
-
-
 async def test_a_call_that_hangs_costs_its_own_answer_only() -> None:
     workers = Workers(start_worker, warm_up)
     try:
@@ -300,27 +272,6 @@ async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> 
             with pytest.raises(StationError):
                 await anna.request("go", token="made up")
     await control.close()
-
-
-async def test_stop_while_a_hand_guided_pose_is_taken_leaves_it_to_be_skipped(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    await rig.session.switch_free_drive(1, True, False)
-    taken = asyncio.Event()
-    capture = rig.camera.capture
-
-    async def slow_capture(timeout_s: float = 5.0) -> Any:
-        await taken.wait()
-        return await capture(timeout_s)
-
-    monkeypatch.setattr(rig.camera, "capture", slow_capture)
-    recording = asyncio.ensure_future(rig.session.record(1))
-    await rig.until(S.CAPTURING)
-    await rig.session.stop("bert")
-    taken.set()
-    await recording
-    assert rig.state is S.STOPPED
-    assert rig.pose_states == ["planned"] * (POSES + 1)
 
 
 async def test_an_arm_that_still_brakes_was_not_moved_by_anybody(

@@ -67,11 +67,6 @@ def late(machine: Machine, ms: Annotated[float, Meta(ge=0, le=60_000)]) -> None:
     machine.clock.hold_until_ns = time.monotonic_ns() + int(ms * 1e6)
 
 
-def delay(machine: Machine, ms: Annotated[float, Meta(ge=0, le=10_000)]) -> None:
-    """Every data packet leaves this much later from now on (0 = none): a slow network."""
-    machine.rtde.delay_s = ms / 1000
-
-
 def lose(machine: Machine, packets: Count) -> None:
     """The next cycles' data packets are never sent."""
     machine.lose_packets = packets

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import struct
 from operator import itemgetter
 from typing import Any
@@ -36,8 +35,6 @@ class RtdeServer:
         """Links live, no data is sent."""
         self.frozen = False
         """The same packet again and again."""
-        self.delay_s = 0.0
-        """Data packets leave this much later, in order."""
         self.sent = 0
         self.skipped = 0
 
@@ -65,7 +62,6 @@ class RtdeConnection(Connection):
         self._every = 1
         self._playing = False
         self._last = b""
-        self._busy_until_s = 0.0
         self._handlers = {
             PacketType.PROTOCOL_VERSION: self._protocol_version,
             PacketType.CONTROLLER_VERSION: self._controller_version,
@@ -146,20 +142,10 @@ class RtdeConnection(Connection):
         if not (server.frozen and self._last):
             assert self._output is not None
             self._last = self._output.pack(self._elements(self._robot.outputs.elements)[:-1])
-        loop = asyncio.get_running_loop()
-        due_s = loop.time() + server.delay_s
-        if due_s > self._busy_until_s and server.delay_s == 0:
-            self._write(self._last)
-        else:  # never overtakes what was sent before it
-            self._busy_until_s = max(due_s, self._busy_until_s + 1e-6)
-            loop.call_at(self._busy_until_s, self._write, self._last)
-
-    def _write(self, data: bytes) -> None:
-        """Skips the packet when the client does not read, like the real one; never queues."""
         if self.transport.is_closing():
             return
-        if self.transport.get_write_buffer_size():
-            self._server.skipped += 1
+        if self.transport.get_write_buffer_size():  # the client does not read: nothing is queued
+            server.skipped += 1
             return
-        self.transport.write(data)
-        self._server.sent += 1
+        self.transport.write(self._last)
+        server.sent += 1

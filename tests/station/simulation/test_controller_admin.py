@@ -66,8 +66,8 @@ def test_the_admin_port_explains_itself_and_survives_nonsense(controller, admin)
     for nonsense, words in (
         ({"cmd": "explode"}, "lists the names"),
         ({"cmd": "slider", "fraction": 3}, "$.fraction"),
-        ({"cmd": "delay", "ms": float("nan")}, "lists the names"),
-        ({"cmd": "delay", "ms": -1}, "$.ms"),
+        ({"cmd": "late", "ms": float("nan")}, "lists the names"),
+        ({"cmd": "late", "ms": -1}, "$.ms"),
         ({"cmd": "jog", "joints_rad": HOME, "speed_rad_s": 0}, "$.speed_rad_s"),
         ({"cmd": "tcp", "pose": "here"}, "$.pose"),
         ({"cmd": "jog"}, "`joints_rad`"),

@@ -109,7 +109,7 @@ def test_a_reboot_resets_links_closes_ports_and_starts_at_time_zero(controller, 
     assert state["timestamp_s"] == pytest.approx(since_zero_ns / 1e9, abs=1e-6)
 
 
-def test_lost_and_delayed_packets(controller, rtde, admin) -> None:
+def test_lost_packets(controller, rtde, admin) -> None:
     running = controller("UR10")
     ask = admin(running)
     client = rtde(running)
@@ -119,18 +119,6 @@ def test_lost_and_delayed_packets(controller, rtde, admin) -> None:
     stamps += [client.sample()["timestamp"] for _ in range(20)]
     steps = [b - a for a, b in pairwise(stamps)]
     assert sorted(round(s / 0.008) for s in steps)[-1] == 6
-
-    def age_s() -> float:
-        zero_ns = ask.ask("state")["controller_zero_monotonic_ns"]
-        ages = [
-            (time.monotonic_ns() - zero_ns) / 1e9 - stamp
-            for stamp in (client.sample()["timestamp"] for _ in range(25))
-        ]
-        return min(ages[10:])
-
-    before = age_s()
-    ask.ask("delay", ms=40)
-    assert age_s() - before == pytest.approx(0.04, abs=0.015)
 
 
 def test_late_cycles_come_all_and_in_order(controller, rtde, admin) -> None:

@@ -27,7 +27,7 @@ from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from station.plan.choose import Objective, choose
 from station.plan.planner import make_plan
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 
 TRIALS = 400
 SETS, POOL = 20, 200

@@ -30,9 +30,9 @@ from recordings.schema.messages import (
     View,
 )
 from recordings.writer import RecordingWriter
-from station.simulation.cell import CellTruth
+from station.simulation.cells import make_cell
 from station.simulation.renderer import Light, render, scaled
-from station.simulation.scenes import make_cell
+from station.simulation.truth import CellTruth
 
 REPEATS = 15
 _TILT_DEG, _AWAY_M = 25.0, 0.45

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from calibrate.kinematics import MODELS, forward
 from station.simulation.camera_process import CameraProcess
-from station.simulation.cell import CellTruth, read_truth
+from station.simulation.cells import make_cell
 from station.simulation.gige import serve
 from station.simulation.launch import SimulatedGige, start_gige
 from station.simulation.renderer import render
-from station.simulation.scenes import make_cell
+from station.simulation.truth import CellTruth, read_truth
 
 
 def start_numbered(truth: Path | None = None, serial: str = "KJ0042") -> SimulatedGige:

@@ -38,8 +38,8 @@ from station.operate.motion import carry_out, wait_until_idle
 from station.plan.choose import Aim
 from station.protocol.client import Client
 from station.protocol.verbs import MakePlan, Purpose
-from station.simulation.cell import CellTruth
 from station.simulation.netns import is_isolated, isolated_command
+from station.simulation.truth import CellTruth
 
 SOLVE_TIMEOUT_S = 300.0
 _GATE_FAILED = 4

@@ -35,7 +35,7 @@ from station.plan.predict import ArmForecast, forecast_arm, with_forecast
 from station.plan.preview import save_picture
 
 SceneName = Literal["paper", "blog", "paper-binned"]
-"""Of `station.simulation.cell`, which is loaded only where it is wanted."""
+"""Of `station.simulation.truth`, which is loaded only where it is wanted."""
 _ASK_S = 3.0
 """A daemon that serves answers within milliseconds, on a busy computer within a second."""
 _NOTHING_KNOWN_M = 0.05
@@ -140,7 +140,7 @@ def _cell(
     if config is not None:
         return load_config(config)[0], standing
     # Simulation is loaded only where it is wanted.
-    from station.simulation.scenes import cell_config, make_cell
+    from station.simulation.cells import cell_config, make_cell
 
     truth = make_cell(scene, 0, "low", "eye-in-hand")
     return cell_config(truth), standing or list(truth.start_joints_rad)

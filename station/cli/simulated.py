@@ -8,7 +8,7 @@ import typer
 
 from recordings.schema.messages import Mount
 from station.cell.config import ControlPath
-from station.simulation.cell import NoiseLevel, SceneName
+from station.simulation.truth import NoiseLevel, SceneName
 
 Seed = Annotated[int, typer.Option(help="Simulated: seed of camera pose, board pose, intrinsics, noise")]
 Scene = Annotated[SceneName, typer.Option(help="Simulated; paper-binned: 640×512 pixels")]

@@ -17,8 +17,8 @@ from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.base import Trigger
 from station.devices.frames import RETAKE, CameraCounts, FrameClock, FrameCounter, FrameTiming, TriggerPulse
-from station.simulation.cell import CellTruth
 from station.simulation.launch import Json
+from station.simulation.truth import CellTruth
 
 START_TIMEOUT_S = 20.0
 _ANSWER_S = 5.0

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from calibrate.geometry import Array, inverse, pose_from_rotvec
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.errors import RobotError
-from station.simulation.cell import CellTruth
 from station.simulation.launch import AdminClient, Json
 from station.simulation.renderer import Light, render, scaled
+from station.simulation.truth import CellTruth
 
 TRIGGER_LATENCY_NS = 150_000
 READOUT_NS = 13_300_000

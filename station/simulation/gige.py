@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from station.cell.errors import CameraError, RobotError
 from station.devices.pixels import encode
 from station.simulation.camera_process import CameraProcess
-from station.simulation.cell import read_truth
-from station.simulation.scenes import make_cell
+from station.simulation.cells import make_cell
+from station.simulation.truth import read_truth
 
 LIBRARY = "libaravis-0.8.so.0"
 CONTROL_PORT = 3956

@@ -13,9 +13,9 @@ from recordings.schema.messages import Mount
 from station.cell.config import ControlPath, StationConfig, TriggerConfig
 from station.devices.base import Camera, Trigger
 from station.devices.cell import Cell
-from station.simulation.cell import CellTruth, NoiseLevel, SceneName, write_truth
+from station.simulation.cells import make_cell
 from station.simulation.launch import start_controller
-from station.simulation.scenes import make_cell
+from station.simulation.truth import CellTruth, NoiseLevel, SceneName, write_truth
 
 GIGE_PACKET_BYTES = 8996
 TRUTH = "truth.json"
@@ -47,7 +47,7 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
     `folder`: for truth and logs.
     """
     from station.devices.ur import UrRobot
-    from station.simulation.scenes import cell_config
+    from station.simulation.cells import cell_config
 
     truth = make_cell(options.scene, options.seed, options.noise, options.mount)
     truth = msgspec.structs.replace(truth, robot_model=options.robot)

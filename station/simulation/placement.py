@@ -86,9 +86,9 @@ def place_moving_camera(
         Y = base_from_camera @ seen_from(board, rng.uniform(0.47, 0.53), tilt)
         if _lowest_corner_m(board, Y) < 0.005:
             continue
-        scene = _exact_scene("eye-in-hand", camera, board, X, Y)
-        start = _comfortable_start(scene, base_from_camera @ inverse(X), rng)
-        if start is not None and _sees(scene, start) and _roomy(scene, start, rng):
+        layout = _exact_layout("eye-in-hand", camera, board, X, Y)
+        start = _comfortable_start(layout, base_from_camera @ inverse(X), rng)
+        if start is not None and _sees(layout, start) and _roomy(layout, start, rng):
             return Placement(X, Y, start)
     raise ConfigError("no place found for the camera", code="no-placement", remedy="Take another seed.")
 
@@ -107,9 +107,9 @@ def place_fixed_camera(board: BoardSpec, camera: CameraModel, rng: np.random.Gen
         X = flange @ Y @ inverse(seen_from(board, rng.uniform(0.48, 0.55), look))
         if X[2, 3] < 0.1 or np.hypot(X[0, 3], X[1, 3]) < 0.4:
             continue
-        scene = _exact_scene("eye-to-hand", camera, board, X, Y)
-        start = _comfortable_start(scene, flange, rng)
-        if start is not None and _sees(scene, start) and _roomy(scene, start, rng):
+        layout = _exact_layout("eye-to-hand", camera, board, X, Y)
+        start = _comfortable_start(layout, flange, rng)
+        if start is not None and _sees(layout, start) and _roomy(layout, start, rng):
             return Placement(X, Y, start)
     raise ConfigError("no place found beside the cell", code="no-placement", remedy="Take another seed.")
 
@@ -128,18 +128,18 @@ def _shell_point(rng: np.random.Generator) -> Array:
     return np.array([radius * np.cos(around), radius * np.sin(around), rng.uniform(0.45, 0.9)])
 
 
-def _exact_scene(mount: Mount, camera: CameraModel, board: BoardSpec, X: Array, Y: Array) -> CellLayout:
+def _exact_layout(mount: Mount, camera: CameraModel, board: BoardSpec, X: Array, Y: Array) -> CellLayout:
     # 1σ of 20 mm for what is fixed in the cell leaves room for the rough poses of the configuration.
     camera_sigma_m, board_sigma_m = (0.0, 0.02) if mount == "eye-in-hand" else (0.02, 0.0)
     guesses = guess_from(X, camera_sigma_m, 0.0), guess_from(Y, board_sigma_m, 0.0)
     return layout_of(cell_description(mount, camera, board, *guesses))
 
 
-def _comfortable_start(scene: CellLayout, base_from_flange: Array, rng: np.random.Generator) -> Array | None:
+def _comfortable_start(layout: CellLayout, base_from_flange: Array, rng: np.random.Generator) -> Array | None:
     solutions = inverse_all(MODELS[ROBOT], base_from_flange)
     if len(solutions) == 0:
         return None
-    gaps, _ = margins(scene.geometry, solutions)
+    gaps, _ = margins(layout.geometry, solutions)
     free = gaps.min(axis=1) > _START_MARGIN_M
     free &= singularity_measure(MODELS[ROBOT], solutions) > _START_SINGULARITY
     free &= forward(MODELS[ROBOT], solutions)[:, 2, 3] > 0.15
@@ -147,23 +147,23 @@ def _comfortable_start(scene: CellLayout, base_from_flange: Array, rng: np.rando
     return None if len(good) == 0 else np.asarray(solutions[rng.choice(good)])
 
 
-def _sees(scene: CellLayout, joints_rad: Array) -> bool:
+def _sees(layout: CellLayout, joints_rad: Array) -> bool:
     """Tell whether no part of the arm is between the camera and the board's corners."""
     flange = forward(MODELS[ROBOT], joints_rad)
-    in_hand = scene.mount == "eye-in-hand"
-    base_from_board = scene.Y if in_hand else flange @ scene.Y
-    eye = (flange @ scene.X if in_hand else scene.X)[:3, 3]
-    corners = transform_points(base_from_board, board_points(scene.board))
-    starts, ends, radii = body_segments(scene.geometry, joints_rad[None])
+    in_hand = layout.mount == "eye-in-hand"
+    base_from_board = layout.Y if in_hand else flange @ layout.Y
+    eye = (flange @ layout.X if in_hand else layout.X)[:3, 3]
+    corners = transform_points(base_from_board, board_points(layout.board))
+    starts, ends, radii = body_segments(layout.geometry, joints_rad[None])
     arm = slice(0, 7)
     gap = segment_distance(eye[None, None], corners[:, None], starts[:, arm], ends[:, arm])
     limit = radii[arm] + 0.005 if in_hand else np.minimum(radii[arm], 0.03)
     return bool((gap > limit).all())
 
 
-def _roomy(scene: CellLayout, start: Array, rng: np.random.Generator) -> bool:
+def _roomy(layout: CellLayout, start: Array, rng: np.random.Generator) -> bool:
     """Tell whether enough varied views are reachable without changing the arm branch."""
-    found = find_candidates(scene, replace(view_range(scene), doubt=0.0), _TRIED_VIEWS, rng, start)
+    found = find_candidates(layout, replace(view_range(layout), doubt=0.0), _TRIED_VIEWS, rng, start)
     if len(found) == 0:
         return False
     near = np.abs(found.joints_rad - start).max(axis=1) < 2.6

@@ -20,8 +20,8 @@ from station.cell.layout import guess_matrix, layout_of, require_kept_clear
 from station.devices.cell import Cell
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import CellTruth
 from station.simulation.launch_cell import start_cell
+from station.simulation.truth import CellTruth
 
 FOLDER = "rehearsal"
 """Subfolder of the state folder, which keeps rehearsals apart from real data."""
@@ -79,10 +79,10 @@ def without_devices(config: StationConfig, host: str) -> StationConfig:
 def truth_within(config: StationConfig, seed: int) -> CellTruth:
     """Draw a true cell that agrees with the configuration; its arm starts where the board is seen."""
     require_kept_clear(config)
-    scene = layout_of(config)
+    layout = layout_of(config)
     assert config.camera_guess is not None and config.board_guess is not None  # checked by layout_of
     rng = np.random.default_rng([22, seed])
-    group, _ = candidate_pool(scene, PlanOptions(seed=seed), None, rng)
+    group, _ = candidate_pool(layout, PlanOptions(seed=seed), None, rng)
     middle = np.abs(group.joints_rad - np.median(group.joints_rad, axis=0)).max(axis=1).argmin()
     camera = config.camera
     return CellTruth(
@@ -91,7 +91,7 @@ def truth_within(config: StationConfig, seed: int) -> CellTruth:
         mount=config.mount,
         robot_model=config.robot.model,
         board=config.board,
-        camera=_lens_within(scene.camera, camera.model_is_rough, rng),
+        camera=_lens_within(layout.camera, camera.model_is_rough, rng),
         camera_mount=matrix4(_within(config.camera_guess, rng)),
         board_place=matrix4(_within(config.board_guess, rng)),
         start_joints_rad=vector6(group.joints_rad[middle]),

@@ -19,9 +19,9 @@ from station.cell.errors import RobotError
 from station.devices.news import Delay
 from station.devices.ur import UrRobot
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import write_truth
+from station.simulation.cells import make_cell
 from station.simulation.launch import AdminClient, SimulatedController
-from station.simulation.scenes import make_cell
+from station.simulation.truth import write_truth
 from tests.conftest import AT_REST_RAD_S, asked, check_allow_list, rests_short_of_its_goal
 from tests.patience import PATIENCE_S, until
 

@@ -6,7 +6,7 @@ import pytest
 
 from station.analysis.worker import image_motion
 from station.simulation.camera import RenderedCamera
-from station.simulation.scenes import make_cell
+from station.simulation.cells import make_cell
 
 pytestmark = pytest.mark.process
 

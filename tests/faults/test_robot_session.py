@@ -16,8 +16,8 @@ from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState as S
 from station.devices.ur import UrRobot
 from station.protocol.verbs import Purpose
-from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
+from station.simulation.truth import write_truth
 from tests.codes import raises
 from tests.conftest import asked
 from tests.patience import until

@@ -17,7 +17,7 @@ from calibrate.files.calibration import Calibration, FramePose
 from calibrate.files.exports import export
 from calibrate.geometry import Array, Transform, pose, rotation_exp
 from recordings.schema.messages import CameraIdentity, RobotIdentity
-from station.simulation.scenes import make_cell
+from station.simulation.cells import make_cell
 from tests.calibrate.files.test_exports import offered_arm
 from tests.foreign.judges import FOLDER, missing
 from tests.station.calibrated_cell import calibration_of

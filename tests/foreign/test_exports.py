@@ -19,7 +19,7 @@ from calibrate.files.calibration import Calibration, FramePose, Lens
 from calibrate.files.exports import FORMATS, FrameNames, export
 from calibrate.geometry import Transform
 from recordings.schema.messages import CameraIdentity, RobotIdentity
-from station.simulation.scenes import make_cell
+from station.simulation.cells import make_cell
 from tests.calibrate.files.test_exports import offered_arm
 from tests.foreign.export_readers import READERS
 from tests.foreign.judges import FOLDER, missing

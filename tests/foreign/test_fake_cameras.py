@@ -30,9 +30,9 @@ from station.plan.planner import make_plan
 from station.protocol.client import Client
 from station.protocol.verbs import Check, Doctor, Finish, LoadPlan, Purpose, Stop
 from station.simulation.camera_process import CameraProcess
-from station.simulation.cell import write_truth
+from station.simulation.cells import cell_config, make_cell
 from station.simulation.launch import SimulatedController, start_controller
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.truth import write_truth
 from tests.foreign.test_gige_vision import loss
 from tests.gige_vision.camera import EmulatedCamera, Picture
 from tests.system.conftest import AT_REST_RAD_S, status_when

@@ -21,7 +21,7 @@ from calibrate.results import Certificate
 from calibrate.views import BoardView
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig
-from station.simulation.cell import CellTruth
+from station.simulation.truth import CellTruth
 
 SIGMA_M, SIGMA_RAD = 5e-5, 1e-4
 POINTER = PointerConfig((0.0, 0.0, 0.20))

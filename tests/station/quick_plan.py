@@ -6,7 +6,7 @@ from station.cell.config import StationConfig
 from station.cell.layout import layout_of
 from station.cell.pose_plan import Plan
 from station.plan.planner import PlanOptions, plan_layout
-from station.simulation.cell import CellTruth
+from station.simulation.truth import CellTruth
 
 POOL = 200
 

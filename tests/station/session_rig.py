@@ -37,7 +37,7 @@ from station.devices.ur import control_trouble
 from station.devices.ur_condition import condition
 from station.protocol.verbs import Purpose
 from station.session import Session
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 from tests.patience import until
 
 TRUTH = make_cell("paper-binned")

@@ -24,8 +24,8 @@ from station.devices.cell import Cell
 from station.devices.ur import UrRobot
 from station.session import recording as session_recording
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import read_truth
-from station.simulation.scenes import cell_config
+from station.simulation.cells import cell_config
+from station.simulation.truth import read_truth
 
 
 class HangingCamera(RenderedCamera):

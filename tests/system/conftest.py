@@ -20,9 +20,9 @@ import pytest
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client
-from station.simulation.cell import write_truth
+from station.simulation.cells import cell_config, make_cell
 from station.simulation.launch import AdminClient, SimulatedController
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.truth import write_truth
 from tests.conftest import AT_REST_RAD_S, CONTROL_PATHS, rests_short_of_its_goal
 from tests.patience import PATIENCE_S, until
 from tests.station.quick_plan import quick_plan

@@ -19,8 +19,8 @@ from station.devices.ur_state import TraceRecorder
 from station.operate.stop_test import AcceptanceTest
 from station.protocol.client import Client
 from station.protocol.verbs import Stop
-from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
+from station.simulation.truth import write_truth
 from tests.system.conftest import AT_REST_RAD_S, TRUTH, SystemRig, both_paths, status_when
 
 pytestmark = pytest.mark.process

@@ -13,7 +13,7 @@ from station.cli.demo import approve_simulated, simulated_daemon
 from station.operate.motion import carry_out, wait_until_idle
 from station.protocol.client import Client
 from station.protocol.verbs import Purpose
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 from tests.station.quick_plan import quick_plan
 
 POSES = 3

@@ -26,8 +26,8 @@ from station.operate.motion import carry_out, wait_until_idle
 from station.operate.new_cell import write_config
 from station.protocol.client import Client
 from station.protocol.verbs import GetPlan, MakePlan, Purpose
-from station.simulation.cell import read_truth
-from station.simulation.scenes import make_cell
+from station.simulation.cells import make_cell
+from station.simulation.truth import read_truth
 from tests.command_line import call
 from tests.patience import PATIENCE_S
 from tests.station.operate.guided_views import draft_of

@@ -13,7 +13,7 @@ import pytest
 
 from calibrate.geometry import difference
 from recordings.reader import open_recording
-from station.simulation.cell import CellTruth, read_truth
+from station.simulation.truth import CellTruth, read_truth
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "samples" / "paper-640.mcap"
 

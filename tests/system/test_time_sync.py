@@ -21,9 +21,9 @@ from recordings.schema.messages import Image
 from station.cell.config import RobotConfig
 from station.devices.ur import UrRobot
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import CellTruth, write_truth
+from station.simulation.cells import make_cell
 from station.simulation.launch import AdminClient, start_controller
-from station.simulation.scenes import make_cell
+from station.simulation.truth import CellTruth, write_truth
 
 pytestmark = pytest.mark.process
 SETTLE_S = 2.0

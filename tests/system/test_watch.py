@@ -25,7 +25,7 @@ from station.devices.ur import UrRobot
 from station.protocol.client import Client
 from station.protocol.verbs import Observe
 from station.simulation.camera import RenderedCamera
-from station.simulation.scenes import cell_config
+from station.simulation.cells import cell_config
 from tests.conftest import asked
 from tests.station.calibrated_cell import calibration_of
 from tests.system.conftest import TRUTH, SystemRig, status_when

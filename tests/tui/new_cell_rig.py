@@ -7,7 +7,7 @@ from station.cell.config import CameraConfig
 from station.cli.new import RealHardware
 from station.operate.draft import CameraChoice, CameraReader
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import CellTruth
+from station.simulation.truth import CellTruth
 
 CAMERA = CameraChoice("aravis", "SIM00001", "MER-131-75GM SIM00001")
 

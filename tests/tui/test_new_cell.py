@@ -21,10 +21,10 @@ from recordings.schema.messages import BoardKind, BoardSpec
 from station.cell.config_file import load_config
 from station.cell.layout import guess_matrix
 from station.operate.draft import STEPS, CellStep, load_draft
-from station.simulation.cell import CellTruth, write_truth
+from station.simulation.cells import make_cell
 from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.netns import isolated_command
-from station.simulation.scenes import make_cell
+from station.simulation.truth import CellTruth, write_truth
 from station.tui.new_cell import NewCell
 from tests.conftest import check_allow_list
 from tests.station.operate.guided_views import guided_joints

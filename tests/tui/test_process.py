@@ -15,9 +15,9 @@ from calibrate.files.install import installed_calibration
 from recordings.reader import open_recording
 from station.cell.pose_plan import Plan
 from station.plan.planner import make_plan
-from station.simulation.cell import write_truth
+from station.simulation.cells import cell_config
 from station.simulation.launch import SimulatedController
-from station.simulation.scenes import cell_config
+from station.simulation.truth import write_truth
 from tests.patience import until
 from tests.system.conftest import TRUTH, SystemRig, short_folder, short_plan
 from tests.tui.terminal import ScreenProcess

@@ -19,8 +19,8 @@ from calibrate.files.install import installed_calibration
 from calibrate.geometry import difference
 from station.cell.config_file import load_config
 from station.cell.layout import guess_matrix
-from station.simulation.cell import write_truth
 from station.simulation.launch import start_controller, start_gige
+from station.simulation.truth import write_truth
 from tests.conftest import check_allow_list
 from tests.station.operate.guided_views import guided_joints
 from tests.tui.terminal import ScreenProcess

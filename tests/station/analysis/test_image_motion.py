@@ -21,8 +21,8 @@ from station.cell.stillness import StillnessMonitor
 from station.session.capture import GLIMPSE_TRIES, ImageWatch
 from station.session.queue import PoseQueue
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import write_truth
 from station.simulation.launch import SimulatedController
+from station.simulation.truth import write_truth
 from tests.patience import until
 from tests.station.session_rig import POSES, TRUTH, Rig
 

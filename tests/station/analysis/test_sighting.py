@@ -12,9 +12,9 @@ from recordings.reader import open_recording
 from station.analysis.estimation import seen_before
 from station.analysis.worker import sight
 from station.cell.config import PAPER_BOARD
+from station.simulation.cells import make_cell
 from station.simulation.placement import seen_from
 from station.simulation.renderer import Light, render, scaled
-from station.simulation.scenes import make_cell
 
 
 def test_a_picture_too_bright_says_what_to_set_on_the_screen() -> None:

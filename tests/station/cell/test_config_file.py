@@ -13,7 +13,7 @@ from station.cell.config_file import ConfigReport, examine_config, load_config
 from station.cell.errors import ConfigError
 from station.cli import main
 from station.daemon import configured_cell
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
 from tests.command_line import call
 

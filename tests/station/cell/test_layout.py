@@ -13,7 +13,7 @@ from recordings.schema.messages import BoardKind, BoardSpec, Mount
 from station.cell.collision import segment_distance
 from station.cell.config import Capsule, PoseGuess
 from station.cell.layout import cell_geometry, geometry_of, require_kept_clear
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
 
 BOARD = BoardSpec(BoardKind.CHESSBOARD, 4, 3, 0.02)

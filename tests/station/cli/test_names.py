@@ -20,7 +20,7 @@ from station.cli import session as cli_session
 from station.cli.attended import SessionProgress, ask_person
 from station.plan.files import save_plan
 from station.protocol.verbs import Check
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 from tests.command_line import call
 
 NAMES = ("[red]x[/]", "[/]", "a :bug: [bold]", "end\\")

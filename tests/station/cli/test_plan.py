@@ -11,7 +11,7 @@ import pytest
 
 from station.cli import main
 from station.plan.files import load_plan, save_plan
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 from tests.command_line import call
 
 run = partial(call, main, "plan")

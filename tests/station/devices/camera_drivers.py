@@ -23,8 +23,8 @@ from station.devices.playback import PlaybackCamera, PlaybackRobot
 from station.devices.serial_trigger import SerialTrigger
 from station.devices.webcam import WebcamCamera
 from station.simulation.camera import RenderedCamera
+from station.simulation.cells import make_cell
 from station.simulation.launch import SimulatedController
-from station.simulation.scenes import make_cell
 from station.simulation.trigger import SimulatedTriggerBox
 from tests.gige_vision.camera import EmulatedCamera
 from tests.station.devices.test_playback import record

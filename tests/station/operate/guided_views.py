@@ -11,7 +11,7 @@ from calibrate.projection import project
 from recordings.schema.messages import RobotIdentity
 from station.cell.config import matrix4, vector6
 from station.operate.draft import CameraChoice, Draft, GuidedView
-from station.simulation.cell import CellTruth
+from station.simulation.truth import CellTruth
 
 NEARER_M = (0.0, 0.02, -0.05, 0.06, 0.0)
 TILTS = ((0.0, 0.0, 0.0), (0.45, 0.0, 0.1), (-0.2, 0.45, 0.0), (-0.3, -0.35, 0.3), (0.2, -0.4, -0.6))

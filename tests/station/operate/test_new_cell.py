@@ -21,8 +21,8 @@ from station.operate import guided_views
 from station.operate import new_cell as flow
 from station.operate.draft import CellStep, Draft
 from station.plan.planner import PlanOptions, candidate_pool
+from station.simulation.cells import make_cell
 from station.simulation.renderer import Light, render
-from station.simulation.scenes import make_cell
 from tests.codes import raises
 from tests.station.operate.guided_views import draft_of
 

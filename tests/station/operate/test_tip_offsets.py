@@ -21,7 +21,7 @@ from station.cell.errors import RefusedError
 from station.cell.status import RobotStatus, StationStatus
 from station.operate.tip_offsets import SeenBoard, read_touch, see_board
 from station.protocol.verbs import Configuration, Observation, Observe
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
 from tests.station.calibrated_cell import POINTER, ROBOT_M, ROBOT_RAD, calibration_of, seen_from
 

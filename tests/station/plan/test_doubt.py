@@ -14,7 +14,7 @@ from station.cell.collision import margins
 from station.cell.layout import cell_geometry, guess_from, layout_of
 from station.plan.planner import make_plan
 from station.plan.visibility import outline, uncertain_pixels
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
 
 

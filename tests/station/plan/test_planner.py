@@ -28,7 +28,7 @@ from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, make_plan, plan_layout
 from station.plan.predict import forecast_views
 from station.plan.visibility import ViewRange, lens_radius, view_range, visible
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
 
 CELLS = [

@@ -18,7 +18,7 @@ from station.cell.pose_plan import PlannedPose
 from station.plan.choose import CRITERIA
 from station.plan.planner import PlanOptions, plan_layout
 from station.plan.predict import forecast_arm, forecast_views, next_best, next_best_text, with_forecast
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.cells import cell_config, make_cell
 
 
 @cache

@@ -16,7 +16,7 @@ from station.devices.discovery import FoundCamera, UsbCamera
 from station.devices.frames import FrameTiming
 from station.protocol.verbs import Check
 from station.session.checklist import checklist
-from station.simulation.scenes import make_cell
+from station.simulation.cells import make_cell
 from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import Rig
 

@@ -14,9 +14,9 @@ from calibrate.boards.detect import detect
 from calibrate.geometry import inverse
 from recordings.schema.messages import Image
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import CellTruth, write_truth
+from station.simulation.cells import make_cell
 from station.simulation.launch import AdminClient, SimulatedController
-from station.simulation.scenes import make_cell
+from station.simulation.truth import CellTruth, write_truth
 from tests.codes import raises
 
 pytestmark = pytest.mark.process

@@ -12,9 +12,9 @@ from calibrate.geometry import inverse, is_rigid, rotation_angle, transform_poin
 from calibrate.kinematics import MODELS, forward
 from station.cell.config import BLOG_BOARD, PAPER_BOARD
 from station.plan.planner import make_plan
-from station.simulation.cell import CellTruth, read_truth, write_truth
+from station.simulation.cells import cell_config, make_cell
 from station.simulation.placement import board_centre
-from station.simulation.scenes import cell_config, make_cell
+from station.simulation.truth import CellTruth, read_truth, write_truth
 from tests.codes import raises
 
 

@@ -13,11 +13,11 @@ import pytest
 from calibrate.boards.detect import detect
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
-from station.simulation.cell import write_truth
+from station.simulation.cells import make_cell
 from station.simulation.gige import DESCRIPTION
 from station.simulation.launch import SimulatedController, start_gige
 from station.simulation.netns import is_isolated, isolated_command
-from station.simulation.scenes import make_cell
+from station.simulation.truth import write_truth
 from tests.codes import raises
 from tests.numbered_gige import start_numbered
 

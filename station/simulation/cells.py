@@ -17,7 +17,6 @@ from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, V
 from station.cell.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig, matrix4, vector6
 from station.cell.errors import ConfigError
 from station.cell.layout import guess_from
-from station.simulation.cell import CellTruth, NoiseLevel, SceneName
 from station.simulation.placement import (
     Placement,
     board_centre,
@@ -26,6 +25,7 @@ from station.simulation.placement import (
     place_moving_camera,
 )
 from station.simulation.renderer import scaled
+from station.simulation.truth import CellTruth, NoiseLevel, SceneName
 
 PAPER_X = (
     (1.0000, -0.0032, -0.0026, -0.0013),
@@ -39,7 +39,7 @@ _GUESS_M, _GUESS_RAD = 0.004, 0.02
 """1σ per axis of the errors of the configured initial poses"""
 
 
-class _PublishedScene(NamedTuple):
+class _PublishedCell(NamedTuple):
     board: BoardSpec
     camera: CameraModel
     mount: Array
@@ -69,16 +69,16 @@ def make_cell(
     scene: SceneName = "paper", seed: int = 0, noise: NoiseLevel = "low", mount: Mount = "eye-in-hand"
 ) -> CellTruth:
     """Make the truth of a cell; equal arguments give the same cell. ConfigError for an unknown name."""
-    scenes = {"paper": _paper_scene, "blog": _blog_scene, "paper-binned": _paper_binned_scene}
-    if scene not in scenes or noise not in _NOISE or mount not in ("eye-in-hand", "eye-to-hand"):
+    published_cells = {"paper": _paper, "blog": _blog, "paper-binned": _paper_binned}
+    if scene not in published_cells or noise not in _NOISE or mount not in ("eye-in-hand", "eye-to-hand"):
         raise ConfigError(
             f"no simulated cell '{scene}' with noise '{noise}' and mount '{mount}'",
             code="unknown-cell",
-            remedy=f"Scenes are {', '.join(scenes)}, noise levels {', '.join(_NOISE)}, "
+            remedy=f"Scenes are {', '.join(published_cells)}, noise levels {', '.join(_NOISE)}, "
             "mounts eye-in-hand and eye-to-hand.",
         )
     rng = np.random.default_rng([2026, seed])
-    published = scenes[scene]()
+    published = published_cells[scene]()
     camera = published.camera if seed == 0 else _other_lens(published.camera, rng)
     placed = _place(published, camera, seed, mount, rng)
     truth = CellTruth(
@@ -95,7 +95,7 @@ def make_cell(
     return _with_noise(truth, _NOISE[noise], rng)
 
 
-def _paper_scene() -> _PublishedScene:
+def _paper() -> _PublishedCell:
     focal_px = 8.0 / 0.0048
     camera = CameraModel(
         width=1280,
@@ -104,17 +104,17 @@ def _paper_scene() -> _PublishedScene:
         distortion=(-0.092, 0.118, 0.0004, -0.0003, 0.0),
     )
     rows = np.array(PAPER_X)
-    return _PublishedScene(PAPER_BOARD, camera, pose(project_to_rotation(rows[:, :3]), rows[:, 3]))
+    return _PublishedCell(PAPER_BOARD, camera, pose(project_to_rotation(rows[:, :3]), rows[:, 3]))
 
 
-def _paper_binned_scene() -> _PublishedScene:
-    """Make the paper's scene with 2 × 2 binning, for small recordings."""
-    paper = _paper_scene()
+def _paper_binned() -> _PublishedCell:
+    """Make the paper's cell with 2 × 2 binning, for small recordings."""
+    paper = _paper()
     return paper._replace(camera=scaled(paper.camera, 0.5))
 
 
-def _blog_scene() -> _PublishedScene:
-    """Make the blog's scene: X is its `Hand-Eye` frame, RPY(0, −15, 0)° at (0.1, 0, 0) m on the flange.
+def _blog() -> _PublishedCell:
+    """Make the blog's cell: X is its `Hand-Eye` frame, RPY(0, −15, 0)° at (0.1, 0, 0) m on the flange.
 
     RobWork's camera looks along −z of `Hand-Eye-Sim`, which is `Hand-Eye` rolled by 180°. The blog's own
     answer is `Hand-Eye` itself, so that its z is the optical axis; `camera` is taken as that frame.
@@ -125,13 +125,13 @@ def _blog_scene() -> _PublishedScene:
         height=720,
         matrix=((float(focal_px), 0.0, 480.0), (0.0, float(focal_px), 360.0), (0.0, 0.0, 1.0)),
     )
-    return _PublishedScene(
+    return _PublishedCell(
         BLOG_BOARD, camera, pose(rotation_exp([0.0, np.deg2rad(-15.0), 0.0]), [0.1, 0.0, 0.0])
     )
 
 
 def _place(
-    published: _PublishedScene, camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator
+    published: _PublishedCell, camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator
 ) -> Placement:
     if mount == "eye-to-hand":
         return place_fixed_camera(published.board, camera, rng)

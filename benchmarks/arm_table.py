@@ -163,7 +163,10 @@ def planned(
     gains = view_information(truth.mount, LENS, flange, truth.X, truth.Y, POINTS, noise, motion)
     board = BoardTolerance(truth.told.board, _BENT_M)
     prior = prior_information(LENS, True, board, TABLE_MM, LensPrior.given(LENS, lens_sigma(truth.told)))
-    room = Workspace.of(truth.mount, ARM, sample_workspace(ARM, pool), truth.X, truth.Y, _AHEAD_M)
+    room_q = sample_workspace(ARM, pool)
+    room = Workspace.of(
+        truth.mount, forward(ARM, room_q), by_parameters(ARM, room_q), truth.X, truth.Y, _AHEAD_M
+    )
     objective = Objective(criterion, _AHEAD_M, prior, None, room.among(len(prior)))
     best = choose(gains, count, objective, rng, sweeps=2)
     return np.asarray(pool[best])
@@ -253,7 +256,7 @@ def measure(
     plain = solved(views, told, model_arm=False)
     with_table = solved(views, told, folds=True)
     arm = with_table.arm
-    assert arm is not None and arm.result is not None
+    assert arm is not None and arm.result is not None and arm.uncorrected is not None
     result = arm.result
     corrected = partial(forward, result.corrected)
     for name, judge_ in (("everywhere", everywhere), ("near", near)):
@@ -261,12 +264,12 @@ def measure(
             ("park", park, nominal),
             ("plain", plain.matrix, nominal),
             ("bare", with_table.matrix, nominal),
-            ("compromise", result.for_uncorrected, nominal),
+            ("compromise", arm.uncorrected.X, nominal),
             ("table", with_table.matrix, corrected),
         ):
             found[f"{name} {way}"] = judge_.error_mm(X, flange)
     found["claimed"] = 1e3 * result.with_table_m
-    found["claimed without"] = 1e3 * result.without_table_m
+    found["claimed without"] = 1e3 * arm.uncorrected.error_m
     for way, solution in (("plain", plain), ("table", with_table)):
         delta = difference(solution.matrix, truth.X)
         found[f"X {way}"] = 1e3 * float(np.linalg.norm(delta[:3]))

@@ -62,9 +62,10 @@ def make_calibration(
     info = recording.info
     arm = None if solution.arm is None else solution.arm.result
     X, covariance = solution.parent_from_child, solution.covariance
-    if arm is not None and solution.arm is not None and solution.arm.detected:
-        # Without its table that X is worse than one that knows nothing of it.
-        X, covariance = Transform(X.parent, X.child, arm.for_uncorrected), arm.uncorrected_covariance
+    if solution.arm is not None and solution.arm.uncorrected is not None and solution.arm.detected:
+        # Beside uncorrected flanges that X is worse than one that knows nothing of the arm's errors.
+        as_it_is = solution.arm.uncorrected
+        X, covariance = Transform(X.parent, X.child, as_it_is.X), as_it_is.covariance
     return Calibration(
         format=FORMAT,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -102,7 +103,7 @@ def make_calibration(
 
 
 def _arm_table(solution: Solution, arm: TableResult, verified: Verification | None) -> CorrectedArm:
-    assert solution.arm is not None
+    assert solution.arm is not None and solution.arm.uncorrected is not None
     X, held_out = solution.parent_from_child, None
     if arm.held_out_m is not None:
         without, with_table = 1e3 * np.sqrt(np.nanmean(arm.held_out_m**2, axis=1))
@@ -121,7 +122,7 @@ def _arm_table(solution: Solution, arm: TableResult, verified: Verification | No
         held=HELD,
         covariance=tuple(tuple(row) for row in arm.covariance.tolist()),
         with_table_mm=1e3 * arm.with_table_m,
-        without_table_mm=1e3 * arm.without_table_m,
+        without_table_mm=1e3 * solution.arm.uncorrected.error_m,
         if_measured_mm={name: 1e3 * value for name, value in arm.if_measured_m.items()},
         held_out=held_out,
         verified=later,

@@ -235,3 +235,21 @@ def interpolate(first: Array, second: Array, fraction: float) -> Array:
 def random_rotation(rng: np.random.Generator) -> Array:
     """Draw a rotation (3, 3), uniform on SO(3)."""
     return matrix_from_quaternion(rng.normal(size=4))
+
+
+def left_jacobian(v: Array) -> Any:
+    """Compute the (..., 3, 3) of Exp(v + δ) ≈ Exp(J δ) Exp(v) for rotation vectors (..., 3)."""
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    small, S = angle < 1e-4, skew(v)
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, (1 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1 / 6, (safe - np.sin(safe)) / safe**3)
+    return np.eye(3) + first * S + second * (S @ S)
+
+
+def inverse_left_jacobian(v: Array) -> Any:
+    """Compute ∂Log(Exp(δ) Exp(v))/∂δ at 0, (..., 3) → (..., 3, 3)."""
+    half = np.maximum(np.linalg.norm(v, axis=-1)[..., None, None] / 2, 1e-6)
+    c = np.where(half < 5e-5, 1 / 12, (1 - half / np.tan(half)) / (4 * half * half))
+    S = skew(v)
+    return np.eye(3) - S / 2 + c * (S @ S)

@@ -51,7 +51,7 @@ class BoardView:
     pixels: Array
     """(k, 2) the same corners in the image."""
     joints_rad: Array | None = None
-    """(6,) or None where no joints were recorded."""
+    """(k,) of `JOINTS`, or None where no joints were recorded."""
     camera_from_board: Array | None = None
     """(4, 4) PnP, once intrinsics are known."""
 
@@ -60,13 +60,23 @@ class BoardView:
             if (given := getattr(self, name)) is not None:
                 taken = array_of(given, shape, f"{name} of view {self.index + 1} ({self.name})")
                 object.__setattr__(self, name, taken)
+        if self.joints_rad is not None and len(self.joints_rad) not in JOINTS:
+            raise BadViewsError(
+                f"View {self.index + 1} ({self.name}) has {len(self.joints_rad)} joints.",
+                code="shape",
+                remedy=f"Give {JOINTS[0]} to {JOINTS[-1]}.",
+                given=f"({len(self.joints_rad)},)",
+                wanted=f"({JOINTS[0]},) to ({JOINTS[-1]},)",
+            )
 
 
+JOINTS = range(5, 8)
+"""How many joints an arm may have."""
 _SHAPES = {
     "base_from_flange": (4, 4),
     "board_points": (-1, 3),
     "pixels": (-1, 2),
-    "joints_rad": (6,),
+    "joints_rad": (-1,),
     "camera_from_board": (4, 4),
 }
 

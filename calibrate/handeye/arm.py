@@ -1,4 +1,7 @@
-"""Errors of the arm's Denavit-Hartenberg table and of a bracket that bends, to be estimated.
+"""Systematic errors of the arm and of a bracket that bends, to be estimated.
+
+The arm is a Universal Robots table where the recorded flanges follow one, else a chain learned from the
+recorded joints (`calibrate.chain`): then each link but the last has a shift and a turn as its error.
 
 Of the 24 errors of a table, eight look exactly like a change of X or of the board's pose: six of the first
 and the last joint, and two of the three shifts along the parallel axes of joints 2, 3 and 4. These eight
@@ -12,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calibrate.chain import Chain, LearnedChain, learn_chain, read_otherwise, wrong_row
 from calibrate.geometry import Array, difference, skew
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, link_frames, with_near_axes
 from calibrate.views import ViewSet
@@ -42,30 +46,86 @@ _SAME_M, _SAME_RAD = 0.02, float(np.radians(2.0))
 
 @dataclass(frozen=True, eq=False)
 class ArmPostures:
-    """Joint angles of the arm in every view, and the kinematic table that they belong to."""
+    """Joint angles of the arm in every view, and the kinematics that they belong to."""
 
-    model: RobotModel
-    """The nominal table, that the recorded flanges follow."""
+    arm: RobotModel | Chain
+    """The nominal table, that the recorded flanges follow, or the chain learned from them."""
     joints_rad: Array
-    """(n, 6)"""
+    """(n, k)"""
     recorded: bool
     """True: measured. False: by inverse kinematics in one branch, which need not be the arm's real one."""
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the errors."""
+        return PARAMETERS if isinstance(self.arm, RobotModel) else link_errors(len(self.arm.axes))
 
-def arm_postures(views: ViewSet) -> ArmPostures | None:
-    """Read the recorded joints, else find one branch of inverse kinematics that reaches all recorded flanges.
+    @property
+    def unit(self) -> Array:
+        """1σ (q,) of each error as a multiple of the common one."""
+        return RELATIVE_SIGMA if isinstance(self.arm, RobotModel) else np.ones(len(self.names))
 
-    None where the robot's model is unknown or its nominal table does not reach the flanges.
+    def motion(self, joints_rad: Array) -> Array:
+        """Compute the motion [δt, δφ] (m, 6, q) of the flange, in base, by each error, at joints (m, k)."""
+        if isinstance(self.arm, RobotModel):
+            return by_parameters(self.arm, joints_rad)
+        return self.arm.by_links(joints_rad)
+
+    def flanges(self, joints_rad: Array) -> Array:
+        """Compute nominal base_from_flange (m, 4, 4)."""
+        return (
+            forward(self.arm, joints_rad)
+            if isinstance(self.arm, RobotModel)
+            else self.arm.forward(joints_rad)
+        )
+
+
+def link_errors(joints: int) -> tuple[str, ...]:
+    """Name the errors of `Chain.by_links`, true minus nominal: shifts in metres, turns in radians."""
+    return tuple(
+        f"link {link} {kind} {axis}"
+        for link in range(1, joints)
+        for kind in ("shift", "turn")
+        for axis in "xyz"
+    )
+
+
+def arm_postures(views: ViewSet) -> tuple[ArmPostures | None, str]:
+    """Read the recorded joints and find their kinematics: the table that the flanges follow, else learned.
+
+    Without joints: one branch of inverse kinematics that reaches all recorded flanges. None where there are
+    no joints and the robot's model is unknown, or neither a table nor a chain explains the flanges. The text
+    says what is unusual about the joints.
     """
-    published = MODELS.get(views.robot_model)
-    if published is None:
-        return None
-    model = published if views.arm is None else with_near_axes(views.arm)
-    joints = _recorded_joints(views, model)
+    flanges, joints = views.base_from_flange, _recorded_joints(views)
+    published, note = MODELS.get(views.robot_model), ""
+    model = None if published is None else with_near_axes(views.arm or published)
     if joints is not None:
-        return ArmPostures(model, joints, True)
-    joints = _joints_of_one_branch(published, views.base_from_flange)
-    return None if joints is None else ArmPostures(model, joints, False)
+        if model is not None and joints.shape[1] == 6 and _agree(forward(model, joints), flanges):
+            return ArmPostures(model, joints, True), ""
+        learned, joints, note = _learned(joints, flanges)
+        if learned.explains:
+            return ArmPostures(learned.chain, joints, True), note
+    if published is None or model is None:
+        return None, note
+    found = _joints_of_one_branch(published, flanges)
+    return (None if found is None else ArmPostures(model, found, False)), note
+
+
+def _learned(joints: Array, flanges: Array) -> tuple[LearnedChain, Array, str]:
+    """Learn a chain: it, the joints as they were read, and what is unusual about them."""
+    learned = learn_chain(joints, flanges)
+    if learned.explains:
+        return learned, joints, ""
+    read = read_otherwise(joints, flanges)
+    if read is not None:
+        return learn_chain(read[0], flanges), read[0], f"The recorded joints fit the poses {read[1]}."
+    shift, turn = learned.rms
+    note = f"The recorded joints do not explain the poses ({1e3 * shift:.1f} mm, {np.degrees(turn):.1f}°). "
+    row = wrong_row(joints, flanges)
+    if row is None:
+        return learned, joints, note + "Check the order and unit of the joints."
+    return learned, joints, note + f"Without the {row + 1}. view they do: look at its joints."
 
 
 def corrected_model(nominal: RobotModel, errors: Array) -> RobotModel:
@@ -92,15 +152,20 @@ def flex_motion(mount: Mount, flange: Array, held: Array) -> Array:
     return np.concatenate([-R @ skew(held[:3, 3]) @ turn, -R @ turn], axis=1)
 
 
-def _recorded_joints(views: ViewSet, model: RobotModel) -> Array | None:
-    if any(view.joints_rad is None for view in views):
+def _recorded_joints(views: ViewSet) -> Array | None:
+    given = [view.joints_rad for view in views if view.joints_rad is not None]
+    if len(given) < len(views) or len({len(joints) for joints in given}) > 1:
         return None
-    joints = np.array([view.joints_rad for view in views], dtype=float)
-    if not np.isfinite(joints).all():
-        return None
-    miss = difference(forward(model, joints), views.base_from_flange)
-    far = (np.linalg.norm(miss[:, :3], axis=1) > _SAME_M) | (np.linalg.norm(miss[:, 3:], axis=1) > _SAME_RAD)
-    return None if far.any() else joints
+    joints = np.array(given, dtype=float)
+    return joints if np.isfinite(joints).all() else None
+
+
+def _agree(computed: Array, recorded: Array) -> bool:
+    miss = difference(computed, recorded)
+    near = (np.linalg.norm(miss[:, :3], axis=1) <= _SAME_M) & (
+        np.linalg.norm(miss[:, 3:], axis=1) <= _SAME_RAD
+    )
+    return bool(near.all())
 
 
 def _joints_of_one_branch(model: RobotModel, flanges: Array) -> Array | None:

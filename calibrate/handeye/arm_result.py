@@ -9,13 +9,20 @@ from numpy.typing import NDArray
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb
-from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA, ArmPostures, corrected_model
+from calibrate.handeye.arm import RELATIVE_SIGMA, ArmPostures, corrected_model
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.estimate import CellFit
-from calibrate.handeye.solution import MEASURED, Solution, TableRefusal, TableResult, Verification
-from calibrate.handeye.workspace import SPREAD, Workspace, sample_workspace
-from calibrate.kinematics import forward
+from calibrate.handeye.solution import (
+    MEASURED,
+    Solution,
+    TableRefusal,
+    TableResult,
+    UncorrectedArm,
+    Verification,
+)
+from calibrate.handeye.workspace import SPREAD, Workspace, sample_range, sample_workspace
+from calibrate.kinematics import RobotModel, forward
 from calibrate.projection import intrinsics_vector
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, ViewSet, observe_views
@@ -24,37 +31,42 @@ _NOMINAL_M = 1e-4
 """Above this rms distance (m) the recorded flanges were not computed with the nominal table."""
 
 
-def table_result(
+def arm_results(
     fit: CellFit, arm: ArmPostures, detected: bool, distance_m: float, missed: Array | None
-) -> TableResult:
-    """Derive the corrected table from a fit, decide whether it is offered, state the error with and without.
+) -> tuple[UncorrectedArm, TableResult | None]:
+    """Derive from a fit the X for the arm as it is, and the corrected table where it follows a known one.
 
     missed: (2, n), as `TableResult.held_out_m`.
     """
     found, state = fit.estimate, fit.estimate.state
-    places = Layout.of(state).table.start + np.arange(len(PARAMETERS))
-    errors = RELATIVE_SIGMA * state.table[: len(PARAMETERS)]
-    covariance = _of_X_and_table(found.covariance, places)
-    joints = sample_workspace(arm.model, arm.joints_rad)
+    places = Layout.of(state).table.start + np.arange(len(arm.names))
+    errors = arm.unit * state.table[: len(arm.names)]
+    covariance = _of_X_and_errors(found.covariance, places, arm.unit)
+    table = arm.arm if isinstance(arm.arm, RobotModel) else None
+    joints = sample_range(arm.joints_rad) if table is None else sample_workspace(table, arm.joints_rad)
 
     def over(q: Array, spread: Array) -> Workspace:
-        return Workspace.of(fit.views.mount, arm.model, q, state.X, state.Y, distance_m, spread)
+        return Workspace.of(
+            fit.views.mount, arm.flanges(q), arm.motion(q), state.X, state.Y, distance_m, spread
+        )
 
     room = over(joints, SPREAD[:1])
     by_errors = (over(joints, SPREAD) + over(arm.joints_rad, SPREAD)).for_uncorrected()
     both = np.concatenate([np.eye(6), by_errors], axis=1)
-    with_table_m = room.rms_m(covariance)
+    corrected_m = room.rms_m(covariance)
     left_m = room.error_m(by_errors @ errors, errors)
-    return TableResult(
-        nominal=arm.model,
+    uncorrected = UncorrectedArm(
+        perturb(state.X, by_errors @ errors), both @ covariance @ both.T, float(np.hypot(corrected_m, left_m))
+    )
+    if table is None:
+        return uncorrected, None
+    return uncorrected, TableResult(
+        nominal=table,
         factory=fit.views.arm is not None,
-        corrected=corrected_model(arm.model, errors),
+        corrected=corrected_model(table, errors),
         covariance=covariance,
         flange_threshold=found.table_threshold,
-        for_uncorrected=perturb(state.X, by_errors @ errors),
-        uncorrected_covariance=both @ covariance @ both.T,
-        with_table_m=with_table_m,
-        without_table_m=float(np.hypot(with_table_m, left_m)),
+        with_table_m=corrected_m,
         if_measured_m=_if_measured(fit, room, places),
         held_out_m=missed,
         refused=_refusal(fit, arm, detected, missed),
@@ -73,8 +85,9 @@ def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") ->
     of the flange). Views from the postures of the fit are left out. Raises BadViewsError where too few are
     left or have joints.
     """
-    arm = None if solution.arm is None else solution.arm.result
-    if arm is None:
+    found = solution.arm
+    arm = None if found is None else found.result
+    if arm is None or found is None or found.uncorrected is None:
         raise BadViewsError(
             "No table of the arm was fitted, so there is none to verify.",
             code="no-arm-table",
@@ -99,7 +112,7 @@ def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") ->
     middle = np.array([*observed.extent[0], 0.0, 1.0])
     missed = []
     for flange, X in (
-        (views.base_from_flange, arm.for_uncorrected),
+        (views.base_from_flange, found.uncorrected.X),
         (forward(arm.corrected, joints), solution.matrix),
     ):
         chain = flange @ X @ C if views.mount == "eye-in-hand" else inverse(flange) @ X @ C
@@ -114,9 +127,9 @@ def _stands_elsewhere(view: BoardView, fitted: Sequence[Array]) -> bool:
     return all(np.abs(view.joints_rad - joints).max() > _ELSEWHERE_RAD for joints in fitted)
 
 
-def _of_X_and_table(covariance: Array, places: NDArray[np.intp]) -> Array:
-    """Extract the covariance (24, 24) of [X, table's errors (metres, radians)] from that of all unknowns."""
-    scale = np.concatenate([np.ones(6), RELATIVE_SIGMA])
+def _of_X_and_errors(covariance: Array, places: NDArray[np.intp], unit: Array) -> Array:
+    """Extract the covariance of [X, the arm's errors (metres, radians)] from that of all unknowns."""
+    scale = np.concatenate([np.ones(6), unit])
     picked = np.concatenate([np.arange(6), places])
     return np.asarray(covariance[np.ix_(picked, picked)] * scale * scale[:, None])
 
@@ -126,9 +139,7 @@ def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | Non
         return "no-evidence"
     if not arm.recorded:
         return "no-joints"
-    off = np.linalg.norm(
-        difference(forward(arm.model, arm.joints_rad), fit.views.base_from_flange)[:, :3], axis=1
-    )
+    off = np.linalg.norm(difference(arm.flanges(arm.joints_rad), fit.views.base_from_flange)[:, :3], axis=1)
     if np.sqrt(np.mean(off**2)) > max(_NOMINAL_M, 3 * float(fit.estimate.scales.robot[0])):
         return "not-nominal"
     if missed is not None and not np.nanmean(missed[1] ** 2) < np.nanmean(missed[0] ** 2):
@@ -148,5 +159,5 @@ def _if_measured(fit: CellFit, room: Workspace, places: NDArray[np.intp]) -> dic
     for name, (which, sigma) in known.items():
         C = found.covariance
         gain = C[:, which] @ np.linalg.inv(C[np.ix_(which, which)] + np.diag(sigma**2))
-        errors[name] = room.rms_m(_of_X_and_table(C - gain @ C[which], places))
+        errors[name] = room.rms_m(_of_X_and_errors(C - gain @ C[which], places, RELATIVE_SIGMA))
     return errors

@@ -8,11 +8,10 @@ flange is Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand). The robot's
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from calibrate.geometry import Array, difference, perturb, skew
+from calibrate.geometry import Array, difference, inverse_left_jacobian, perturb, skew
 from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
 from calibrate.results import SHAPE
 from calibrate.views import Observations, implied_flange
@@ -107,7 +106,7 @@ def flange_derivatives(mount: Mount, X: Array, Y: Array, C: Array, miss: Array) 
         lever = np.einsum("nij,nj->ni", R_near, t_C - arm)
     by_near = _blocks(eye, -skew(lever), zero, eye)
     by_far = _blocks(-R_F, -R_F @ skew(t_far), zero, -R_F)
-    bend = _inverse_left_jacobian(miss[:, 3:])
+    bend = inverse_left_jacobian(miss[:, 3:])
     for J in (by_near, by_far, by_C):
         J[:, 3:] = bend @ J[:, 3:]
     return (by_far, by_near, by_C) if eye_in_hand else (by_near, by_far, by_C)
@@ -116,15 +115,6 @@ def flange_derivatives(mount: Mount, X: Array, Y: Array, C: Array, miss: Array) 
 def _blocks(tt: Array, tr: Array, rt: Array, rr: Array) -> Array:
     top, bottom = np.concatenate([tt, tr], axis=-1), np.concatenate([rt, rr], axis=-1)
     return np.concatenate([top, bottom], axis=-2)
-
-
-def _inverse_left_jacobian(v: Array) -> Any:
-    """Compute ∂Log(Exp(δ) Exp(v))/∂δ at 0, (n, 3) → (n, 3, 3)."""
-    angle = np.linalg.norm(v, axis=1)
-    half = np.maximum(angle / 2, 1e-6)
-    c = np.where(angle < 1e-4, 1 / 12, (1 - half / np.tan(half)) / (4 * half * half))
-    S = skew(v)
-    return np.eye(3) - S / 2 + c[:, None, None] * (S @ S)
 
 
 @dataclass(frozen=True, eq=False)

@@ -194,3 +194,5 @@ class CellFit:
     """Optimum of the quadratic objective over these pairs."""
     arm_failure: str = ""
     """Why systematic errors could not be fitted, where that failed."""
+    joints_note: str = ""
+    """What is unusual about the recorded joints."""

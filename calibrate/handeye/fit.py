@@ -9,7 +9,7 @@ from scipy import special
 
 from calibrate.errors import PosesDisagreeError
 from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
-from calibrate.handeye.arm import RELATIVE_SIGMA, arm_postures, by_parameters, flex_motion
+from calibrate.handeye.arm import arm_postures, flex_motion
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.cell_state import CellState, Layout
@@ -52,14 +52,15 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     state = CellState(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
-    log_bayes, arm, plain, failure = None, arm_postures(views) if with_table else None, found, ""
+    log_bayes, plain, failure = None, found, ""
+    arm, joints_note = arm_postures(views) if with_table else (None, "")
     if with_table and len(views) >= FEWEST_FOR_TABLE:
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
         flex = flex_motion(views.mount, views.base_from_flange, held)
         motion = flex
         if arm is not None:
-            by_table = by_parameters(arm.model, arm.joints_rad) * RELATIVE_SIGMA
-            motion = np.concatenate([by_table, flex], axis=2)
+            by_arm = arm.motion(arm.joints_rad) * arm.unit
+            motion = np.concatenate([by_arm, flex], axis=2)
         try:
             errors_of_table = motion.shape[2] - flex.shape[2]
             found, log_bayes = allow_for_table(
@@ -70,7 +71,9 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
             failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used), seed)
     arm = None if log_bayes is None else arm
-    return CellFit(views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified, failure)
+    return CellFit(
+        views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified, failure, joints_note
+    )
 
 
 _SIZES = np.array([0.03, 0.06, 0.12, 0.25, 0.5, 1.0])

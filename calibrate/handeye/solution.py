@@ -89,7 +89,7 @@ class NoiseScales:
 
 @dataclass(frozen=True, eq=False)
 class TableResult:
-    """X and the arm's table as one result, and the X for an arm that stays uncorrected."""
+    """X and the arm's table as one result."""
 
     nominal: RobotModel
     """The table that the recorded flanges follow."""
@@ -100,14 +100,8 @@ class TableResult:
     """(24, 24) of X, as in `Solution.parent_from_child`, and of the errors in the order of `PARAMETERS`."""
     flange_threshold: float
     """As `Solution.confidence_threshold`, for the error (6,) of a flange computed with the table."""
-    for_uncorrected: Array
-    """(4, 4) the X that serves the uncorrected arm best, over the workspace and where the views are."""
-    uncorrected_covariance: Array
-    """(6, 6)"""
     with_table_m: float
     """1σ of a point over the workspace."""
-    without_table_m: float
-    """The same for the uncorrected arm with `for_uncorrected`."""
     if_measured_m: dict[str, float]
     """`with_table_m` if this (board, intrinsics) were known to `MEASURED`."""
     held_out_m: Array | None
@@ -147,9 +141,21 @@ MEASURED = 2e-4
 """Relative 1σ of a careful measurement."""
 
 
+@dataclass(frozen=True, eq=False)
+class UncorrectedArm:
+    """The X for an arm that stays as it is, with its errors: what its controller's flanges need."""
+
+    X: Array
+    """(4, 4) the best over the workspace and where the views are."""
+    covariance: Array
+    """(6, 6)"""
+    error_m: float
+    """1σ of a point over the workspace, the arm's own errors included."""
+
+
 @dataclass(frozen=True)
 class ArmTable:
-    """Systematic errors of the robot: of the arm's kinematic table, and of a bracket that bends."""
+    """Systematic errors of the robot: of the arm's kinematics, and of a bracket that bends."""
 
     log_bayes: float
     """Log evidence for systematic errors of any size against none."""
@@ -157,10 +163,10 @@ class ArmTable:
     """1σ of the errors, mm and mrad."""
     errors: dict[str, tuple[float, float]]
     """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
-    arm_known: bool = True
-    """False: the arm's model is not known, only the bracket is modelled."""
+    uncorrected: UncorrectedArm | None = None
+    """None where the arm's kinematics are not known: only the bracket is modelled."""
     result: TableResult | None = None
-    """None where the arm's model is not known."""
+    """None where the arm follows no known table."""
 
     @property
     def detected(self) -> bool:

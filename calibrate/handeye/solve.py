@@ -9,8 +9,8 @@ from scipy import special
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, Transform
-from calibrate.handeye.arm import FLEX, PARAMETERS, RELATIVE_SIGMA
-from calibrate.handeye.arm_result import table_result
+from calibrate.handeye.arm import FLEX
+from calibrate.handeye.arm_result import arm_results
 from calibrate.handeye.axxb.certificate import TOLERANCE, certify
 from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective, pair_covariance
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses
@@ -199,16 +199,19 @@ def _board(fit: CellFit, covariance: Array) -> BoardShape:
 def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: float) -> ArmTable | None:
     if fit.log_bayes is None:
         return None
-    names = (*PARAMETERS, *FLEX) if fit.arm is not None else FLEX
-    unit = np.concatenate([RELATIVE_SIGMA, np.ones(len(FLEX))])[-len(names) :]
+    names = FLEX if fit.arm is None else (*fit.arm.names, *FLEX)
+    unit = np.ones(len(names))
+    if fit.arm is not None:
+        unit[: len(fit.arm.unit)] = fit.arm.unit
     value = unit * fit.estimate.state.table
     sigma = unit * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     errors = dict(zip(names, zip(value.tolist(), sigma.tolist(), strict=True), strict=True))
-    found = ArmTable(fit.log_bayes, float(fit.estimate.scales.table[0]), errors, fit.arm is not None)
+    found = ArmTable(fit.log_bayes, float(fit.estimate.scales.table[0]), errors)
     if fit.arm is None:
         return found
     missed = held_out_elsewhere(fit, fit.arm.joints_rad) if found.detected and options.folds else None
-    return replace(found, result=table_result(fit, fit.arm, found.detected, distance_m, missed))
+    uncorrected, table = arm_results(fit, fit.arm, found.detected, distance_m, missed)
+    return replace(found, uncorrected=uncorrected, result=table)
 
 
 def _holdout(fit: CellFit) -> HoldoutScore | None:
@@ -242,7 +245,7 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
     offered = arm is not None and arm.result is not None and arm.result.offered
     systematic = (
         f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm or mrad in the arm's "
-        "kinematic table, or a bracket that bends. "
+        "kinematics, or a bracket that bends. "
     ) + ("Use the corrected table." if offered else "Have the arm calibrated, and stiffen the bracket.")
     as_recorded = session.reading is Reading.AS_RECORDED
     said = (
@@ -255,11 +258,12 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
             "No corners were recorded: board poses count as exact, all error is the robot's.",
         ),
         (
-            arm is not None and not arm.arm_known,
+            arm is not None and arm.uncorrected is None,
             "arm-not-modelled",
-            "The arm's model is unknown: errors of its kinematic table are not in the stated error.",
+            "Neither a known model nor recorded joints: the arm's own errors are not in the stated error.",
         ),
         (arm is not None and arm.detected, "arm-systematics", systematic),
+        (bool(fit.joints_note), "joints", fit.joints_note),
         (
             bool(fit.arm_failure),
             "arm-not-fitted",

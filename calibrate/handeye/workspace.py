@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, pose, random_rotation, skew
-from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA, by_parameters
+from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many
 from recordings.schema.messages import Mount
 
@@ -45,6 +45,12 @@ def sample_workspace(model: RobotModel, like_rad: Array, count: int = 400, seed:
     return np.asarray(found[:count])
 
 
+def sample_range(joints_rad: Array, count: int = 400, seed: int = 0) -> Array:
+    """Draw joints (count, k) uniformly from the range of each joint in `joints_rad` (n, k). Deterministic."""
+    low, high = joints_rad.min(axis=0), joints_rad.max(axis=0)
+    return np.random.default_rng(seed).uniform(low, high, (count, len(low)))
+
+
 def _branch(model: RobotModel, joints_rad: Array) -> int:
     """Return the branch of `inverse_many` that most of the joints (n, 6) are in."""
     owner, solutions, branch = inverse_many(model, forward(model, joints_rad))
@@ -60,7 +66,7 @@ class Workspace:
     by_camera: Array
     """(m, 6) by X"""
     by_table: Array
-    """(m, 18) in the order of `PARAMETERS`."""
+    """(m, q)"""
     by_rigid: Array
     """(m, 6) the motion that counts as no error."""
 
@@ -68,8 +74,8 @@ class Workspace:
     def of(
         cls,
         mount: Mount,
-        model: RobotModel,
-        joints_rad: Array,
+        F: Array,
+        motion: Array,
         X: Array,
         Y: Array,
         distance_m: float,
@@ -77,9 +83,9 @@ class Workspace:
     ) -> Workspace:
         """Linearise at X and Y (4, 4); `distance_m` from the camera (eye-in-hand).
 
+        F: base_from_flange (n, 4, 4); motion: (n, 6, q) of the flange, in base, by each error of the arm.
         spread: (k, 2) directions of the points about the camera's axis, or places about the board's origin.
         """
-        F, motion = forward(model, joints_rad), by_parameters(model, joints_rad)
         R_F = F[:, None, :3, :3]
         in_hand = mount == "eye-in-hand"
         if in_hand:
@@ -113,12 +119,12 @@ class Workspace:
         )
 
     def for_uncorrected(self) -> Array:
-        """Matrix (6, 18): times the table's errors, the change of X that is best for the uncorrected arm."""
+        """Matrix (6, q): times the arm's errors, the change of X that is best for the uncorrected arm."""
         J = np.concatenate([self.by_camera, self.by_rigid], axis=1)
         return np.asarray(np.linalg.lstsq(J, self.by_table, rcond=None)[0][:6])
 
     def quadratic(self) -> Array:
-        """Matrix K (24, 24): a point's mean squared error is trace(K C), C the covariance of [X, errors]."""
+        """Matrix K (6 + q, 6 + q): a point's mean squared error is trace(K C), C that of [X, errors]."""
         J = self._beside_rigid(np.concatenate([self.by_camera, self.by_table], axis=1))
         return np.asarray(3 * J.T @ J / len(J))
 
@@ -130,11 +136,11 @@ class Workspace:
         return K
 
     def rms_m(self, covariance: Array) -> float:
-        """Compute a point's rms error, metres, from a covariance (24, 24) of [X, table's errors]."""
+        """Compute a point's rms error, metres, from a covariance (6 + q, 6 + q) of [X, errors]."""
         return float(np.sqrt(np.trace(self.quadratic() @ covariance)))
 
     def error_m(self, shift: Array, errors: Array) -> float:
-        """Compute a point's rms error, metres, for X wrong by `shift` (6,) and table errors (18,) ignored."""
+        """Compute a point's rms error, metres, for X wrong by `shift` (6,) and errors (q,) ignored."""
         off = self._beside_rigid(self.by_camera @ shift - self.by_table @ errors)
         return float(np.sqrt(3 * (off**2).mean()))
 

@@ -20,7 +20,7 @@ from calibrate.handeye.information import (
 )
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.workspace import Workspace, sample_workspace
-from calibrate.kinematics import with_near_axes
+from calibrate.kinematics import forward, with_near_axes
 from calibrate.projection import intrinsics_names
 from station.cell.layout import CellLayout
 from station.cell.pose_plan import Criterion
@@ -114,7 +114,14 @@ def objective_for(
     if joints_rad is not None and table_mm:
         model = with_near_axes(layout.geometry.model)
         room = sample_workspace(model, joints_rad)
-        over = Workspace.of(layout.mount, model, room, layout.X, layout.Y, layout.working_distance_m)
+        over = Workspace.of(
+            layout.mount,
+            forward(model, room),
+            by_parameters(model, room),
+            layout.X,
+            layout.Y,
+            layout.working_distance_m,
+        )
         K = over.among(len(prior))
     return Objective(criterion, layout.working_distance_m, prior, lens, K)
 

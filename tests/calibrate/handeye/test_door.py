@@ -74,7 +74,7 @@ def test_a_misspelt_choice_is_refused(made):
         lambda: ViewSet.from_poses("eye-in-hand", F, [*C[:-1].tolist(), [1.0]]),
         lambda: ViewSet.from_poses("eye-in-hand", F, None),
         lambda: BoardView(0, "a", F[0], np.zeros((4, 2)), np.zeros((4, 2))),
-        lambda: BoardView(0, "a", F[0], np.zeros((4, 3)), np.zeros((4, 2)), np.zeros(5)),
+        lambda: BoardView(0, "a", F[0], np.zeros((4, 3)), np.zeros((4, 2)), np.zeros(8)),
         lambda: informed(flange=F[:, :3]),
         lambda: informed(X=CELL.X[:3]),
         lambda: informed(points=BOARD[:, :2]),

@@ -17,8 +17,8 @@ from calibrate.batch.cluster import Cluster, cluster_workers
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import BatchWorkers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
-from calibrate.cli.job import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit, takes
 from calibrate.cli.output import AsJson, err, out
+from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit, takes
 from calibrate.errors import UsageError
 from calibrate.job import JobOptions
 from calibrate.load import Progress as LoadProgress

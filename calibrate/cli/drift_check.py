@@ -11,8 +11,8 @@ import typer
 
 from calibrate.cli.contracts import DriftCheckJson, DriftPowerJson
 from calibrate.cli.installed import Root, named_or_installed
-from calibrate.cli.job import Threads
 from calibrate.cli.output import AsJson, detection_progress, out, print_json
+from calibrate.cli.solve_options import Threads
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration, Provenance
 from calibrate.files.folders import current_version, readable_folder

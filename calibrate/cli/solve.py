@@ -13,8 +13,8 @@ from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.cli.contracts import CompareJson, SolveJson
-from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.cli.output import AsJson, check_target, detection_progress, out, print_json
+from calibrate.cli.solve_options import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.errors import CalibrationError, UsageError
 from calibrate.files.calibration import write_calibration, write_output
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary

@@ -22,8 +22,8 @@ from calibrate.boards.model import check_board, describe_board
 from calibrate.cli.contracts import WatchEventJson
 from calibrate.cli.files import read_board
 from calibrate.cli.installed import CameraName, Root, named_or_installed
-from calibrate.cli.job import BoardFile, Threads
 from calibrate.cli.output import err, out, print_json
+from calibrate.cli.solve_options import BoardFile, Threads
 from calibrate.errors import InstallError, UsageError
 from calibrate.files.calibration import Calibration
 from calibrate.files.folders import current_version, readable_folder

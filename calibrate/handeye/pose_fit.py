@@ -13,11 +13,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.geometry import Array, difference, inverse, perturb, pose, project_to_rotation, rotation_log
+from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_log
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.cell_state import Quadratic, flange_derivatives
 from calibrate.handeye.corner_modes import CornerModes
 from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
+from calibrate.handeye.metrics import mean_pose
 from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.reprojection import linearise_corners
 from calibrate.projection import intrinsics_vector
@@ -137,7 +138,7 @@ def central_pose(places: Array) -> Array:
     some = places[:: 1 + len(places) // (4 * _VOTERS)]
     middle = some[int(_reach(some).argmin())]
     near = np.argsort(pose_distances(places, middle[None])[:, 0], kind="stable")[: _quorum(len(places)) + 1]
-    return pose(project_to_rotation(places[near, :3, :3].mean(axis=0)), places[near, :3, 3].mean(axis=0))
+    return mean_pose(places[near])
 
 
 def _quorum(count: int) -> int:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, pose, random_rotation, skew
+from calibrate.geometry import Array, matrix_from_quaternion, pose, skew
 from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many
 from recordings.schema.messages import Mount
@@ -33,7 +33,7 @@ def sample_workspace(model: RobotModel, like_rad: Array, count: int = 400, seed:
     branch = _branch(published, like_rad)
     while len(found) < count:
         n = 4 * count
-        R = np.array([random_rotation(rng) for _ in range(n)])
+        R = matrix_from_quaternion(rng.normal(size=(n, 4)))
         direction = rng.normal(size=(n, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         direction[:, 2] = np.abs(direction[:, 2])

@@ -6,39 +6,22 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
+import pytest
 
-from benchmarks.scene import HIGH, LOW, MID, PAPER_CAMERA, CellNoise, SceneCell, make_cell
+from benchmarks.scene import HIGH as HIGH
+from benchmarks.scene import LOW as LOW
+from benchmarks.scene import MID, PAPER_CAMERA, CellNoise, SceneCell, make_cell
 from calibrate.geometry import Array, difference, perturb, pose, random_rotation
-from calibrate.handeye.solution import Solution
+from calibrate.handeye.axxb.pairs import Pairs, all_pairs
+from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
-from calibrate.views import BoardView, ViewSet
+from calibrate.views import BoardView, ViewSet, implied_flange
 from recordings.schema.messages import CameraModel, Mount
 
-__all__ = [
-    "HIGH",
-    "LENSES",
-    "LOW",
-    "MID",
-    "NONE",
-    "CellNoise",
-    "SceneCell",
-    "changed",
-    "error_mm_deg",
-    "exact_motions",
-    "inside",
-    "make_cell",
-    "nudged",
-    "printed",
-    "real_cell",
-    "seen_through",
-    "sigmas_of",
-    "smooth_bias",
-    "with_flange",
-    "with_focal",
-]
-
 NONE = CellNoise(0.0, 0.0, 0.0)
+QUICK = SolveOptions(holdout=False, folds=False)
+MOUNTS = pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 LENSES = {
     "plumb_bob": msgspec.structs.replace(PAPER_CAMERA, distortion=(-0.12, 0.1, 4e-4, -3e-4, 0.02)),
     "rational_polynomial": msgspec.structs.replace(
@@ -57,6 +40,14 @@ def exact_motions(rng: np.random.Generator, views: int, X: Array) -> tuple[Array
     H = pose(np.array([random_rotation(rng) for _ in range(views)]), rng.normal(size=(views, 3)))
     Y = pose(random_rotation(rng), rng.normal(size=3))
     return H, np.linalg.inv(X) @ np.linalg.inv(H) @ Y
+
+
+def noisy_pairs(seed: int, views: int, sigma: float = 1e-3) -> tuple[Pairs, Array]:
+    """All pairs of views whose mount's poses have noise, and the true X."""
+    rng = np.random.default_rng(seed)
+    X = pose(random_rotation(rng), 0.2 * rng.normal(size=3))
+    H, C = exact_motions(rng, views, X)
+    return all_pairs(perturb(H, sigma * rng.normal(size=(views, 6))), C), X
 
 
 def printed(points: Array, shape: tuple[float, ...]) -> Array:
@@ -130,6 +121,17 @@ def changed(views: ViewSet, places: list[int], **fields) -> ViewSet:  # type: ig
     for i in places:
         out[i] = replace(out[i], **{name: make(out[i]) for name, make in fields.items()})
     return replace(views, views=tuple(out))
+
+
+def slipped(
+    cell: SceneCell, what: str, at: int, slip: Array, noise: CellNoise, rng: np.random.Generator
+) -> tuple[ViewSet, Array, Array]:
+    """Views, X and the board's pose after camera or board slipped before view `at`: other robot poses."""
+    X, Y = (perturb(cell.X, slip), cell.Y) if what == "camera" else (cell.X, perturb(cell.Y, slip))
+    errors = rng.normal(size=(len(cell.C), 6)) * np.repeat([noise.robot_m, noise.robot_rad], 3)
+    later = (np.arange(len(cell.C)) >= at)[:, None, None]
+    flange = perturb(implied_flange(cell.views.mount, X, Y, cell.C), errors)
+    return with_flange(cell.views, np.where(later, flange, cell.views.base_from_flange)), X, Y
 
 
 def error_mm_deg(X: Array, truth: Array) -> tuple[float, float]:

@@ -11,38 +11,39 @@ from calibrate.projection import intrinsics_names
 from calibrate.report import plots
 
 
-def test_result_and_sigmas(solved_real: SolvedRecording) -> None:
-    file, found = solved_real.calibration, solved_real.solution
+def test_figures_are_the_solutions_in_the_units_that_their_names_say(solved_real: SolvedRecording) -> None:
+    file, found, quality = solved_real.calibration, solved_real.solution, solved_real.calibration.quality
+    noise = found.noise
+    assert noise is not None
     np.testing.assert_allclose(file.transform.matrix, found.matrix, atol=1e-12)
     np.testing.assert_allclose(file.covariance, found.covariance)
-    assert file.confidence_threshold == found.confidence_threshold
-    assert file.sigma.translation_mm == pytest.approx(1000 * found.sigma_translation_m)
-    assert file.sigma.rotation_deg == pytest.approx(np.degrees(found.sigma_rotation_rad))
-    # Both are the covariance's own: roots of the traces of its blocks.
-    assert file.sigma.translation_mm == pytest.approx(1000 * np.sqrt(np.trace(found.covariance[:3, :3])))
-    assert file.sigma.rotation_deg == pytest.approx(np.degrees(np.sqrt(np.trace(found.covariance[3:, 3:]))))
-
-
-def test_quality_is_in_millimetres_and_degrees(solved_real: SolvedRecording) -> None:
-    quality, found = solved_real.calibration.quality, solved_real.solution
-    assert quality.gates == list(solved_real.gates)
-    assert quality.rms_px == found.rms_px
-    assert quality.board_spread_mm == pytest.approx(1000 * found.board_spread_m)
-    assert quality.board_spread_deg == pytest.approx(np.degrees(found.board_spread_rad))
-    assert found.predicted_error_m is not None
-    assert quality.predicted_error_mm == pytest.approx(1000 * found.predicted_error_m)
-    assert quality.working_distance_m == found.working_distance_m
-    assert quality.weakest == found.observability.weakest_text
-    assert quality.board == found.board and quality.cross_validation == found.cross_validation
-
-
-def test_noise_and_the_shares_of_the_error(solved_real: SolvedRecording) -> None:
-    quality, found = solved_real.calibration.quality, solved_real.solution
-    assert found.noise is not None
-    assert quality.noise["corner_px"] == found.noise.corner_px
-    assert quality.noise["robot_mm"] == pytest.approx(1000 * found.noise.robot_m)
-    assert quality.noise["robot_deg"] == pytest.approx(np.degrees(found.noise.robot_rad))
-    assert quality.error_shares == found.error_shares
+    # Sigmas are the covariance's own: roots of the traces of its blocks.
+    moved, turned = (np.sqrt(np.trace(found.covariance[part, part])) for part in (slice(3), slice(3, 6)))
+    same = [
+        (file.confidence_threshold, found.confidence_threshold),
+        (quality.gates, list(solved_real.gates)),
+        (quality.rms_px, found.rms_px),
+        (quality.working_distance_m, found.working_distance_m),
+        (quality.weakest, found.observability.weakest_text),
+        (quality.board, found.board),
+        (quality.cross_validation, found.cross_validation),
+        (quality.noise["corner_px"], noise.corner_px),
+        (quality.error_shares, found.error_shares),
+    ]
+    milli = [
+        (file.sigma.translation_mm, moved),
+        (quality.board_spread_mm, found.board_spread_m),
+        (quality.predicted_error_mm, found.predicted_error_m),
+        (quality.noise["robot_mm"], noise.robot_m),
+    ]
+    degrees = [
+        (file.sigma.rotation_deg, turned),
+        (quality.board_spread_deg, found.board_spread_rad),
+        (quality.noise["robot_deg"], noise.robot_rad),
+    ]
+    assert [a for a, _ in same] == [b for _, b in same]
+    assert [a for a, _ in milli] == pytest.approx([1000 * b for _, b in milli])  # type: ignore[operator]
+    assert [a for a, _ in degrees] == pytest.approx([np.degrees(b) for _, b in degrees])
     assert sum(quality.error_shares.values()) == pytest.approx(1.0)
     drawn = plots.error_shares(quality.error_shares)
     assert [name for name in quality.error_shares if name.replace("_", " ") not in drawn] == []

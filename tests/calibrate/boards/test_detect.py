@@ -16,7 +16,6 @@ from calibrate.boards.model import (
     fixes_a_plane,
     looks_same_turns,
 )
-from calibrate.geometry import pose, rotation_exp
 from calibrate.projection import project_at
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.simulation.renderer import Light, render
@@ -103,15 +102,6 @@ def test_partial_charuco_is_used_and_its_points_keep_their_identity() -> None:
     assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.6
 
 
-def test_a_dark_charuco_board_is_found_whole() -> None:
-    for seed in range(3):
-        image, seen = picture(CHARUCO, seed, illumination=0.08)
-        found = detect(image, CHARUCO)
-        assert found.corners >= 0.9 * found.expected
-        truth = project_at(CAMERA, seen, board_points(CHARUCO)[found.indices])
-        assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.3
-
-
 def test_corners_in_a_line_are_refused_and_not_handed_to_the_solver() -> None:
     """One such view would make every pose and lens fit of the recording fail."""
     image, seen = picture(CHARUCO, 6)
@@ -156,15 +146,11 @@ def test_a_tag_that_lies_in_the_picture_is_found(spec: BoardSpec) -> None:
             assert np.abs(found.pixels - truth).max() < 0.5, seed
 
 
-def test_a_tag_of_another_number_is_not_the_board() -> None:
-    image, _ = picture(BoardSpec(BoardKind.APRIL_TAG, square_m=0.12, tag_id=3), 0)
-    assert not detect(image, BoardSpec(BoardKind.APRIL_TAG, square_m=0.12, tag_id=4)).found
-
-
-def test_a_tag_seen_twice_is_not_the_board() -> None:
+def test_a_tag_of_another_number_or_seen_twice_is_not_the_board() -> None:
     spec = BoardSpec(BoardKind.APRIL_TAG, square_m=0.12, tag_id=3)
     image, _ = picture(spec, 0)
     assert detect(image, spec).found
+    assert not detect(image, msgspec.structs.replace(spec, tag_id=4)).found
     assert not detect(np.concatenate([image, image], axis=1), spec).found
 
 
@@ -223,19 +209,6 @@ def test_impossible_boards_are_refused(spec: BoardSpec, code: str) -> None:
     assert refused.value.code == code
 
 
-@pytest.mark.parametrize("tilt_deg", [45, 60])
-def test_strong_tilt_blur_and_low_light(tilt_deg: float) -> None:
-    rng = np.random.default_rng(9)
-    centre = np.append(board_points(PAPER_BOARD)[:, :2].mean(axis=0), 0)
-    R = rotation_exp([np.radians(tilt_deg), 0, 0])
-    seen = pose(R, np.array([0, 0, 0.36]) - R @ centre)
-    light = Light(illumination=0.35, blur_px=1.2, pixel_noise=3.0)
-    found = detect(render(CAMERA, PAPER_BOARD, seen, light, rng), PAPER_BOARD)
-    assert found.found
-    truth = project_at(CAMERA, seen, board_points(PAPER_BOARD))
-    assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.4
-
-
 @pytest.mark.parametrize(
     "spec",
     [BoardSpec(BoardKind.CIRCLES, 7, 5, 0.022), BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 11, 0.011)],
@@ -256,22 +229,23 @@ def test_a_tilted_circle_is_its_own_centre_not_its_ellipses(spec: BoardSpec) -> 
     assert np.sqrt(np.square(misses).mean()) < 0.05
 
 
-def test_charuco_is_found_whole_at_sixty_degrees() -> None:
+@pytest.mark.parametrize(
+    ("spec", "tilt", "distance_m", "light", "share", "rms_px"),
+    [
+        (CHARUCO, (0.2, 0.6), 0.36, Light(pixel_noise=1.5, illumination=0.08), 0.9, 0.3),
+        (CHARUCO, (1.04, 1.05), 0.3, Light(pixel_noise=1.5), 0.9, 0.3),
+        (CHARUCO, (0.2, 0.6), 0.8, Light(pixel_noise=1.5), 0.8, 0.2),
+        (PAPER_BOARD, (0.78, 0.8), 0.36, Light(illumination=0.35, blur_px=1.2, pixel_noise=3.0), 1.0, 0.4),
+        (PAPER_BOARD, (1.04, 1.05), 0.36, Light(illumination=0.35, blur_px=1.2, pixel_noise=3.0), 1.0, 0.4),
+    ],
+    ids=["dark", "60 degrees", "bits of 2 px", "45 degrees blurred", "60 degrees blurred"],
+)
+def test_a_board_that_is_hard_to_see_is_found(
+    spec: BoardSpec, tilt: tuple[float, float], distance_m: float, light: Light, share: float, rms_px: float
+) -> None:
     for seed in range(3):
-        seen = looking(CHARUCO, np.random.default_rng(seed), tilt=(1.04, 1.05), distance_m=0.3)
-        image = render(CAMERA, CHARUCO, seen, Light(pixel_noise=1.5), np.random.default_rng(seed))
-        found = detect(image, CHARUCO)
-        truth = project_at(CAMERA, seen, board_points(CHARUCO)[found.indices])
-        assert found.corners >= 0.9 * found.expected
-        assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.3
-
-
-def test_a_far_charuco_board_is_read_enlarged() -> None:
-    """A bit of a marker is less than 2 px wide here."""
-    for seed in (1, 2):
-        seen = looking(CHARUCO, np.random.default_rng(seed), distance_m=0.85)
-        image = render(CAMERA, CHARUCO, seen, Light(pixel_noise=1.5), np.random.default_rng(seed))
-        found = detect(image, CHARUCO)
-        assert found.corners >= 0.8 * found.expected
-        truth = project_at(CAMERA, seen, board_points(CHARUCO)[found.indices])
-        assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.5
+        seen = looking(spec, np.random.default_rng(seed), tilt, distance_m)
+        found = detect(render(CAMERA, spec, seen, light, np.random.default_rng(seed)), spec)
+        assert found.corners >= share * found.expected
+        truth = project_at(CAMERA, seen, board_points(spec)[found.indices])
+        assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < rms_px

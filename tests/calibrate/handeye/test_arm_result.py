@@ -16,11 +16,12 @@ from calibrate.geometry import Array, difference, inverse, perturb, pose, random
 from calibrate.handeye.arm import HELD, PARAMETERS, by_parameters, corrected_model
 from calibrate.handeye.arm_result import verify_elsewhere
 from calibrate.handeye.solution import Solution, TableResult, UncorrectedArm
-from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.handeye.solve import solve_views
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import MODELS, forward, with_near_axes
 from calibrate.views import BoardView, ViewSet
+from tests.calibrate.cells import MOUNTS, QUICK
 from tests.calibrate.worn_cell import Worn, worn_cell
 
 UR10 = MODELS["UR10"]
@@ -40,7 +41,7 @@ def worn() -> Worn:
 
 @pytest.fixture(scope="module")
 def solved(worn: Worn) -> Solution:
-    return solve_views(worn.views, SolveOptions(holdout=False))
+    return solve_views(worn.views, replace(QUICK, folds=True))
 
 
 def table_of(solution: Solution) -> TableResult:
@@ -108,21 +109,10 @@ def test_the_fit_s_own_poses_verify_nothing(worn: Worn, solved: Solution) -> Non
     assert refused.value.code == "not-elsewhere"
 
 
-def test_without_joints_the_table_is_not_offered(worn: Worn) -> None:
-    bare = replace(worn.views, views=tuple(replace(v, joints_rad=None) for v in worn.views))
-    table = table_of(solve_views(bare, SolveOptions(holdout=False, folds=False)))
-    assert table.refused == "no-joints" and not table.offered
-
-
-def test_a_good_arm_is_offered_nothing() -> None:
-    views = worn_cell(np.random.default_rng(1), 0.0).views
-    assert table_of(solve_views(views, SolveOptions(holdout=False, folds=False))).refused == "no-evidence"
-
-
 def test_a_table_that_fails_elsewhere_is_not_offered(worn: Worn, monkeypatch: pytest.MonkeyPatch) -> None:
     worse = np.tile([[1e-3], [2e-3]], (1, 25))
     monkeypatch.setattr("calibrate.handeye.solve.held_out_elsewhere", lambda fit, joints: worse)
-    assert table_of(solve_views(worn.views, SolveOptions(holdout=False))).refused == "not-better"
+    assert table_of(solve_views(worn.views, replace(QUICK, folds=True))).refused == "not-better"
 
 
 @pytest.mark.parametrize("stated", [True, False])
@@ -133,7 +123,7 @@ def test_flanges_of_a_factory_calibration_need_that_table(worn: Worn, stated: bo
         for v, q in ((v, np.asarray(v.joints_rad)) for v in worn.views)
     ]
     views = replace(worn.views, views=tuple(moved), arm=FACTORY if stated else None)
-    table = table_of(solve_views(views, SolveOptions(holdout=False, folds=False)))
+    table = table_of(solve_views(views, QUICK))
     assert table.factory is stated
     if stated:
         assert table.refused in (None, "no-evidence") and max(np.abs(table.nominal.d_m)) < 0.5
@@ -163,7 +153,7 @@ def test_every_number_of_a_table_is_estimated_or_held_with_a_reason() -> None:
     assert not set(PARAMETERS) & set(HELD) and all(HELD.values())
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 def test_workspace_derivatives_are_those_of_the_points(mount: str) -> None:
     """Error of a point by X and by the table: against moving both, to first order."""
     rng = np.random.default_rng(8)

@@ -1,13 +1,13 @@
 """How the implied flange moves with X, the board's pose and each picture: against differences."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate.geometry import difference, perturb, pose, random_rotation
 from calibrate.handeye.cell_state import flange_derivatives
 from calibrate.views import implied_flange
+from tests.calibrate.cells import MOUNTS
 
 
 def anywhere(rng, count=None):
@@ -16,7 +16,7 @@ def anywhere(rng, count=None):
     return np.array([anywhere(rng) for _ in range(count)])
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 @settings(max_examples=20)
 @given(seed=st.integers(0, 10_000), far=st.sampled_from([1e-9, 0.01, 0.5]))
 def test_derivatives_are_those_of_differences_near_and_far(mount, seed, far):

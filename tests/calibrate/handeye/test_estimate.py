@@ -11,13 +11,15 @@ from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.pairs import all_pairs
 from calibrate.handeye.metrics import distance_in_sigmas
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.handeye.solve import solve_views
 from calibrate.projection import intrinsics_vector
 from tests.calibrate.cells import (
     LENSES,
     LOW,
     MID,
+    MOUNTS,
     NONE,
+    QUICK,
     CellNoise,
     changed,
     error_mm_deg,
@@ -29,9 +31,7 @@ from tests.calibrate.cells import (
     with_focal,
 )
 
-QUICK = SolveOptions(holdout=False, folds=False)
 SAME = replace(QUICK, intrinsics_from_same_pictures=True)
-MOUNTS = pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 
 
 @MOUNTS

@@ -8,12 +8,14 @@ import pytest
 
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Finding, Reading
-from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.handeye.solve import solve_views
 from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import (
     LENSES,
     LOW,
     MID,
+    MOUNTS,
+    QUICK,
     error_mm_deg,
     inside,
     make_cell,
@@ -22,9 +24,7 @@ from tests.calibrate.cells import (
     with_focal,
 )
 
-QUICK = SolveOptions(holdout=False, folds=False)
 MEASURED = replace(QUICK, board=BoardTolerance(5e-4, 1e-4))
-MOUNTS = pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 
 
 def closed(solution):

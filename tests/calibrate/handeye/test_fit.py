@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from calibrate.geometry import inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.geometry import pose, rotation_exp, transform_points
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.quality.gates import GateInputs, judge
-from tests.calibrate.cells import MID, changed, inside, make_cell, with_flange
+from tests.calibrate.cells import MID, MOUNTS, QUICK, changed, inside, make_cell, slipped
 
 OPTIONS = SolveOptions(holdout=True, folds=True)
 SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])
@@ -16,13 +16,7 @@ SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])
 def moved_cell(seed, mount, what, at, views=24, size=1.0):
     """Views, X and the board's pose after the slip before view `at`."""
     rng = np.random.default_rng([8, seed])
-    c = make_cell(rng, views, MID, mount=mount)
-    slip = size * SLIP
-    X, Y = (perturb(c.X, slip), c.Y) if what == "camera" else (c.X, perturb(c.Y, slip))
-    true = Y @ inverse(c.C) @ inverse(X) if mount == "eye-in-hand" else X @ c.C @ inverse(Y)
-    noise = rng.normal(size=(views, 6)) * np.repeat([MID.robot_m, MID.robot_rad], 3)
-    later = (np.arange(views) >= at)[:, None, None]
-    return with_flange(c.views, np.where(later, perturb(true, noise), c.views.base_from_flange)), X, Y
+    return slipped(make_cell(rng, views, MID, mount=mount), what, at, size * SLIP, MID, rng)
 
 
 @pytest.mark.parametrize(
@@ -59,14 +53,11 @@ def test_a_camera_that_moved_near_the_end_never_passes(at):
     assert inside(solution, X) or [g.name for g in judge(solution, GateInputs()) if not g.passed]
 
 
-QUICK = SolveOptions(holdout=False, folds=False)
-
-
 def half_turn(view):
     return pose(rotation_exp([0, 0, np.pi]), [*view.board_points[:, :2].max(axis=0), 0.0])
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 def test_half_turned_boards_are_set_right_and_used(mount):
     cell = make_cell(np.random.default_rng(0), 20, MID, mount=mount)
     views = changed(

@@ -15,7 +15,7 @@ from calibrate.handeye.metrics import HELD_OUT
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.quality.gates import GateInputs, judge
-from tests.calibrate.cells import LOW, MID, make_cell, nudged
+from tests.calibrate.cells import LOW, MID, MOUNTS, make_cell, nudged
 
 VIEWS = 20
 CV = SolveOptions(holdout=False)
@@ -83,7 +83,7 @@ def test_left_out_views_take_no_part_in_the_fold_that_predicts_them(fit, monkeyp
     assert len(same) == diagnosis.FOLDS and sum(same) == 1
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 def test_sound_claims_are_confirmed(mount):
     for seed in range(5):
         cell = make_cell(np.random.default_rng(seed), 15, LOW if seed % 2 else MID, mount=mount)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import inverse, perturb, pose, random_rotation, rotation_exp, transform_points
@@ -12,7 +11,7 @@ from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.projection import intrinsics_vector, project, with_intrinsics_vector
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
-from tests.calibrate.cells import MID, make_cell
+from tests.calibrate.cells import MID, MOUNTS, make_cell
 
 BOARD = board_points(BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025))
 LENS = CameraModel(
@@ -35,7 +34,7 @@ def scene(mount, n=12, seed=3):
     return X, Y, C, E
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 def test_the_predicted_sigma_is_the_one_that_the_solver_states(mount):
     """25 views of a simulated cell: their geometry alone says what the estimate will claim."""
     cell = make_cell(np.random.default_rng(4), 25, MID, mount=mount)
@@ -49,7 +48,7 @@ def test_the_predicted_sigma_is_the_one_that_the_solver_states(mount):
     assert (ratio > 0.7).all() and (ratio < 1.4).all()
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 def test_information_is_that_of_finite_differences(mount):
     """With an exact robot it is JᵀJ/σ², J by differences of the pixels; X, board, lens and shape alike."""
     X, Y, _, E = scene(mount, n=1)

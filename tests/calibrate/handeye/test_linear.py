@@ -12,7 +12,7 @@ from calibrate.handeye.noise_scales import Scales
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.reprojection import corner_residuals
 from calibrate.views import observe_views
-from tests.calibrate.cells import LENSES, MID, CellNoise, changed, make_cell, real_cell
+from tests.calibrate.cells import LENSES, MID, MOUNTS, CellNoise, changed, make_cell, real_cell
 
 ONE_CLASS = np.array([1.0, 1e-300, 1e-300, 1e-300])
 VIEWS = 5
@@ -57,7 +57,7 @@ def differences(observed, state):
     return (*both(np.zeros(count)), *by, size)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 @pytest.mark.parametrize("with_table", [False, True])
 def test_elimination_equals_the_dense_solution(mount, with_table):
     observed, state = setting(mount, with_table)

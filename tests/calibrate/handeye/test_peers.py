@@ -9,7 +9,7 @@ from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs
 from calibrate.handeye.axxb.peer_methods import linear_system, orthonormalised, zhao_minimax
 from calibrate.handeye.peers import compare_all, reprojection_px
 from calibrate.handeye.solve import SolveOptions, solve_views
-from tests.calibrate.cells import LOW, MID, CellNoise, error_mm_deg, make_cell
+from tests.calibrate.cells import LOW, MID, MOUNTS, CellNoise, error_mm_deg, make_cell
 
 NAMES = [
     "Tsai-Lenz", "Park-Martin", "Horaud", "Andreff", "Daniilidis", "Shah", "Li", "Zhao CO", "Zhao CO + SVD",
@@ -17,7 +17,7 @@ NAMES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 def test_all_methods_agree_on_nearly_clean_views(mount):
     cell = make_cell(np.random.default_rng(0), 14, CellNoise(1e-3, 1e-7, 1e-7), mount=mount)
     rows = compare_all(cell.views)

@@ -20,7 +20,7 @@ from calibrate.geometry import (
 )
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.views import ViewSet
-from tests.calibrate.cells import LOW, MID, error_mm_deg, exact_motions, make_cell
+from tests.calibrate.cells import LOW, MID, MOUNTS, error_mm_deg, exact_motions, make_cell
 
 ROOT = Path(__file__).parents[3]
 BOTH = pytest.mark.parametrize("profile", ["robust", "paper"])
@@ -37,7 +37,7 @@ def in_front(H: Array, X: Array, rng: np.random.Generator) -> ViewSet:
     return poses_only(H, C)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 def test_the_blogs_equations_hold_through_the_same_code_for_both_mounts(mount):
     X = pose(rotation_exp([0, np.radians(-15), 0]), [0.1, 0, 0])
     cell = make_cell(np.random.default_rng(0), 12, LOW, scene="blog", mount=mount, X=X)

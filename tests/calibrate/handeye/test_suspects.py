@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from calibrate.handeye.metrics import distance_in_sigmas
-from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.handeye.solve import solve_views
 from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import (
     LOW,
     MID,
+    MOUNTS,
+    QUICK,
     changed,
     error_mm_deg,
     inside,
@@ -21,9 +23,7 @@ from tests.calibrate.cells import (
     with_flange,
 )
 
-QUICK = SolveOptions(holdout=False, folds=False)
 SIGMA = np.repeat([MID.robot_m, MID.robot_rad], 3)
-MOUNTS = pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 
 
 def cell(seed=0, views=20, mount="eye-in-hand"):

@@ -8,14 +8,7 @@ from calibrate.handeye.axxb.certificate import TOLERANCE, _constraints, certify
 from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import all_pairs
-from tests.calibrate.cells import exact_motions
-
-
-def problem(seed: int, views: int, sigma: float):
-    rng = np.random.default_rng(seed)
-    X = pose(random_rotation(rng), 0.2 * rng.normal(size=3))
-    H, C = exact_motions(rng, views, X)
-    return all_pairs(perturb(H, sigma * rng.normal(size=(views, 6))), C), X
+from tests.calibrate.cells import noisy_pairs
 
 
 def test_the_twenty_constraints_hold_on_rotations_and_only_there():
@@ -30,7 +23,7 @@ def test_the_twenty_constraints_hold_on_rotations_and_only_there():
 @given(seed=st.integers(0, 10_000), views=st.integers(3, 12), sigma=st.sampled_from([0.0, 1e-4, 1e-2, 0.1]))
 @settings(max_examples=25)
 def test_any_mount_at_any_noise_is_solved_and_proven(seed, views, sigma):
-    pairs, X = problem(seed, views, sigma)
+    pairs, X = noisy_pairs(seed, views, sigma)
     result = solve_global(pairs, seed=0)
     assert result.certificate.certified
     assert (
@@ -43,7 +36,7 @@ def test_any_mount_at_any_noise_is_solved_and_proven(seed, views, sigma):
 
 @pytest.mark.parametrize("sigma", [0.0, 1e-3])
 def test_a_corrupted_X_is_not_certified(sigma):
-    pairs, _ = problem(1, 10, sigma)
+    pairs, _ = noisy_pairs(1, 10, sigma)
     X = solve_global(pairs, seed=0).X
     for axis in np.eye(3):
         turned = perturb(X, [0, 0, 0, *(1e-4 * axis)])
@@ -53,7 +46,7 @@ def test_a_corrupted_X_is_not_certified(sigma):
 
 
 def test_a_local_minimum_far_away_is_not_certified():
-    pairs, _ = problem(2, 10, 1e-3)
+    pairs, _ = noisy_pairs(2, 10, 1e-3)
     X = solve_global(pairs, seed=0).X
     flipped = X.copy()
     flipped[:3, :3] = X[:3, :3] @ rotation_exp([np.pi, 0, 0])
@@ -70,7 +63,7 @@ def test_one_axis_is_certified_though_other_optima_are_as_good():
 
 
 def test_the_bound_is_below_the_value_everywhere():
-    pairs, _ = problem(4, 6, 0.05)
+    pairs, _ = noisy_pairs(4, 6, 0.05)
     result = solve_global(pairs, seed=0)
     rng = np.random.default_rng(0)
     R = np.array([random_rotation(rng) for _ in range(500)])

@@ -9,14 +9,7 @@ from scipy.spatial.transform import Rotation
 from calibrate.geometry import difference, perturb, pose, random_rotation
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
-from tests.calibrate.cells import exact_motions
-
-
-def noisy_pairs(seed: int, views: int, sigma: float = 1e-3) -> tuple[Pairs, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    X = pose(random_rotation(rng), 0.2 * rng.normal(size=3))
-    H, C = exact_motions(rng, views, X)
-    return all_pairs(perturb(H, sigma * rng.normal(size=(views, 6))), C), X
+from tests.calibrate.cells import exact_motions, noisy_pairs
 
 
 def by_loop(pairs: Pairs, X: np.ndarray, form: str, weight: float) -> float:

@@ -1,12 +1,11 @@
 import numpy as np
-import pytest
 
 from calibrate.geometry import inverse, pose, random_rotation
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses, screw_invariants
-from tests.calibrate.cells import exact_motions, make_cell
+from tests.calibrate.cells import MOUNTS, exact_motions, make_cell
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 def test_pairs_follow_the_published_equations_for_each_mount(mount):
     cell = make_cell(np.random.default_rng(0), 6, mount=mount)
     F, C = cell.views.base_from_flange, cell.views.camera_from_board
@@ -20,7 +19,7 @@ def test_pairs_follow_the_published_equations_for_each_mount(mount):
         np.testing.assert_allclose(pairs.B[n], C[n + 1] @ np.linalg.inv(C[n]), atol=1e-12)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@MOUNTS
 def test_the_true_camera_solves_every_pair(mount):
     cell = make_cell(np.random.default_rng(1), 8, mount=mount)
     pairs = all_pairs(mount_poses(cell.flange, mount), cell.C)

@@ -6,6 +6,7 @@ from recordings.cli.lazy import LazyCommand, LazyGroup
 
 _SOLVE, _FILES = "calibrate.cli.solve", "calibrate.cli.installed"
 _NO_TIME_OFFSET = {"--time-offset": "Poses are taken at rest: leave it out."}
+_ONE_KIND = {"--cell": "A root holds one kind of cell: leave it out."}
 _GONE_FROM_SOLVE = {
     "--accept-move": "The message names what moved and when. Record again.",
     **_NO_TIME_OFFSET,
@@ -50,9 +51,13 @@ COMMANDS = {
             "calibrate install mine.yaml --cell imported --root my-cell  # of your own images",
         ),
     ),
-    "list": LazyCommand(f"{_FILES}:list_installed", ("calibrate list", "calibrate list --root my-cell")),
+    "list": LazyCommand(
+        f"{_FILES}:list_installed", ("calibrate list", "calibrate list --root my-cell"), gone=_ONE_KIND
+    ),
     "rollback": LazyCommand(
-        f"{_FILES}:rollback", ("calibrate rollback --reason 'camera was knocked'", "calibrate rollback 3")
+        f"{_FILES}:rollback",
+        ("calibrate rollback --reason 'camera was knocked'", "calibrate rollback 3"),
+        gone=_ONE_KIND,
     ),
     "withdraw": LazyCommand(f"{_FILES}:withdraw", ("calibrate withdraw 'a pallet hit the camera'",)),
     "metrics": LazyCommand(

@@ -36,12 +36,6 @@ CameraName = Annotated[str, typer.Option("--camera", help="Name of the camera, i
 Named = Annotated[Path | None, typer.Argument(help="A calibration file; default: the installed one")]
 
 
-SameCell = Annotated[
-    installing.Cell | None,
-    typer.Option("--cell", hidden=True, help="Kind of cell, as at install; a root holds one kind"),
-]
-
-
 def named_or_installed(
     file: Path | None, root: Path | None, camera: str = MAIN_CAMERA
 ) -> tuple[Calibration, Validity | None]:
@@ -152,7 +146,6 @@ def rollback(
     root: Root = None,
     camera: CameraName = MAIN_CAMERA,
     reason: Annotated[str, typer.Option(help="Reason, kept in the log")] = "",
-    cell: SameCell = None,
     as_json: AsJson = False,
 ) -> None:
     """Go back to an older installed calibration.
@@ -203,7 +196,6 @@ def _switched(version: InstalledVersion, root: Path | None, as_json: bool) -> No
 def list_installed(
     root: Root = None,
     camera: Annotated[str, typer.Option(help="One camera only (default: all of the cell)")] = "",
-    cell: SameCell = None,
     as_json: AsJson = False,
 ) -> None:
     """List every calibration that was installed here.

@@ -27,14 +27,13 @@ td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 .pass { color: var(--good); font-weight: 700; } .fail { color: var(--bad); font-weight: 700; }
 td:first-child { white-space: nowrap; }
 .note { color: var(--soft); } .warning { color: var(--warn); } code { font-size: 13px; }
-.good, .reason, .bad { break-inside: avoid; } .reason { background: var(--warn); }
+.good, .bad { break-inside: avoid; }
 .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(180px, 1fr)); gap: 12px;
   margin: 16px 0; }
 .cards div { border: 1px solid var(--line); border-radius: 8px; padding: 10px 14px; }
 .cards strong { display: block; font-size: 20px; } .cards span { color: var(--soft); font-size: 13px; }
 details { border-bottom: 1px solid var(--line); } details > *:last-child { margin-bottom: 20px; }
 summary { cursor: pointer; font-size: 16px; font-weight: 600; padding: 7px 0; }
-summary span { color: var(--soft); font-weight: 400; float: right; font-size: 14px; }
 figure { margin: 8px 0; } figure svg { max-width: 100%; height: auto; } figcaption { color: var(--soft); }
 .views { display: grid; grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); gap: 12px; }
 .views img { width: 100%; border-radius: 4px; border: 1px solid var(--line); }
@@ -65,10 +64,8 @@ def page(title: str, sections: Iterable[str]) -> str:
     )
 
 
-def verdict(kind: Literal["good", "reason", "bad"], words: str, *lines: str) -> str:
-    return (
-        f'<div class="verdict {kind}"><strong>{escape(words)}</strong>{"<br>".join(map(escape, lines))}</div>'
-    )
+def verdict(kind: Literal["good", "bad"], words: str, line: str) -> str:
+    return f'<div class="verdict {kind}"><strong>{escape(words)}</strong>{escape(line)}</div>'
 
 
 def stamp(text: str) -> str:
@@ -76,19 +73,13 @@ def stamp(text: str) -> str:
     return f'<div class="stamp">{escape(text)}</div>'
 
 
-def heading(text: str) -> str:
-    return f"<h2>{escape(text)}</h2>"
-
-
-def folded(title: str, parts: Iterable[str], *, aside: str = "", printed: bool = False) -> str:
+def folded(title: str, parts: Iterable[str], *, printed: bool = False) -> str:
     """A section that opens by a click; empty without parts. `printed`: on paper open, others gone."""
     inside = "\n".join(part for part in parts if part)
     if not inside:
         return ""
     kind = "" if printed else ' class="screen"'
-    return (
-        f"<details{kind}><summary>{escape(title)}<span>{escape(aside)}</span></summary>\n{inside}</details>"
-    )
+    return f"<details{kind}><summary>{escape(title)}</summary>\n{inside}</details>"
 
 
 def cards(facts: Iterable[tuple[str, str]]) -> str:

@@ -13,7 +13,6 @@ import socket
 from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 
@@ -31,6 +30,7 @@ from station.protocol.messages import (
 )
 from station.protocol.verbs import VERBS
 from station.server.approval import Peer
+from station.server.dispatch import SessionDispatcher
 
 log = logging.getLogger(__name__)
 UNSENT_LIMIT_BYTES = 4 * 1024 * 1024
@@ -43,24 +43,11 @@ NEW_PER_S = 200
 """Most connections that one user may open within a second."""
 
 
-class Handler(Protocol):
-    """Carries out requests; implemented by `server.dispatch`."""
-
-    def stop_now(self, peer: Peer) -> Awaitable[object] | None:
-        """Begin STOP, from any client; it goes on if the client leaves. May return an awaitable."""
-
-    async def handle(self, peer: Peer, verb: str, args: msgspec.Raw) -> object:
-        """Carry out a verb and return its result; a CodedError becomes the reply's `problem`."""
-
-    def gone(self, peer: Peer) -> None:
-        """Handle the end of a connection; if it had control, the arm must decelerate now."""
-
-
 class ControlServer:
     """Server of the control socket until `close`; `publish` sends changes of the status to watchers."""
 
     def __init__(
-        self, path: Path, handler: Handler, newest: Callable[[], StationStatus] | None = None
+        self, path: Path, handler: SessionDispatcher, newest: Callable[[], StationStatus] | None = None
     ) -> None:
         """`newest`: returns the status for a new watcher; the last one published may be older."""
         self._path, self._handler = path, handler
@@ -182,7 +169,7 @@ class _Connection:
         peer: Peer,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
-        handler: Handler,
+        handler: SessionDispatcher,
         publish: Callable[[], StationStatus],
     ) -> None:
         """`publish`: sends changes of the status to every watcher; returns the newest status."""
@@ -233,9 +220,8 @@ class _Connection:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _answer_stop(self, request_id: int, stopping: Awaitable[object] | None) -> None:
-        if stopping is not None:
-            await stopping
+    async def _answer_stop(self, request_id: int, stopping: Awaitable[object]) -> None:
+        await stopping
         self._publish()
         self.reply(Reply(request_id, True, {}))
 

@@ -1,4 +1,4 @@
-"""Dispatch of the verbs of `station.protocol.verbs` to the session: one method for each verb, by its name."""
+"""What a client may ask of the session: who may, and what each verb of `station.protocol.verbs` calls."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from operator import methodcaller
 
 import msgspec
 
-from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
-from station.cell.session_folder import SessionSummary, list_sessions
+from station.cell.session_folder import list_sessions
 from station.cell.socket_folder import user_name
-from station.cell.status import MotionPreview
 from station.protocol import verbs
 from station.protocol.verbs import VERBS, Verb
 from station.server.approval import ApprovalRule, Peer, Process, process
@@ -22,13 +20,11 @@ from station.session.recording import software
 from station.session.session import Session
 from station.session.threads import ASKED, NAMES
 
-CONNECTION = {"watch", "stop"}
-"""Verbs that `server.control` carries out itself."""
 _WHO_LIMIT = 60
 
 
 class SessionDispatcher:
-    """Implementation of `server.control.Handler` by a session."""
+    """The session as the connections of `server.control` reach it."""
 
     def __init__(self, session: Session, see: Callable[[int], Process | None] = process) -> None:
         self._session, self._see = session, see
@@ -39,7 +35,6 @@ class SessionDispatcher:
         self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
         """User id → name, once looked up."""
-        self._methods = {name: getattr(self, f"_{name}") for name in VERBS.keys() - CONNECTION}
 
     def stop_now(self, peer: Peer) -> Awaitable[object]:
         """Begin STOP at once; return an awaitable for its end."""
@@ -75,8 +70,6 @@ class SessionDispatcher:
 
     async def handle(self, peer: Peer, verb: str, args: msgspec.Raw) -> object:
         """Carry out a verb. RefusedError for wrong arguments, in a wrong state, or without control."""
-        if verb == "watch":
-            return {}
         kind = VERBS[verb]
         try:
             request = msgspec.json.decode(args, type=kind)
@@ -84,8 +77,8 @@ class SessionDispatcher:
             raise RefusedError(f"{verb}: wrong arguments ({error})", code="wrong-arguments") from None
         caller = self._caller(peer)
         self._session.admit(kind, caller.client_id, caller.who)
-        result = await self._methods[verb](caller, request)
-        return msgspec.to_builtins(verbs.Done() if result is None else result)
+        result = await self._carry_out(caller, request)
+        return verbs.Done() if result is None else result
 
     def _caller(self, peer: Peer) -> Peer:
         if peer.client_id not in self._callers:
@@ -94,89 +87,85 @@ class SessionDispatcher:
             peer.began_ticks = seen.began_ticks if seen else None
         return peer
 
-    async def _hello(self, caller: Peer, args: verbs.Hello) -> verbs.Welcome:
-        user = caller.user = await self._name(caller.uid)  # from the kernel; `who` is the client's own claim
-        said = "".join(c for c in args.who if c.isprintable())[:_WHO_LIMIT] or user
+    async def _carry_out(self, caller: Peer, verb: Verb[object]) -> object:
+        """Call what a verb is of; None: it has no result. `_to_the_end`: also if the client disconnects."""
+        session, context, client = self._session, self._session.context, caller.client_id
+        match verb:
+            case verbs.Hello():
+                return await self._welcome(caller, verb.who)
+            case verbs.Release():
+                await self._to_the_end(session.release(client, verb.silent))
+            case verbs.Acknowledge():
+                await session.acknowledge(caller.who)
+            case verbs.GetPlan():
+                queue = context.queue
+                return verbs.LoadedPlan(queue.plan, queue.sha256) if queue else verbs.LoadedPlan()
+            case verbs.LoadPlan():
+                session.load_plan(client, verb.plan)
+                return self._plan_facts()
+            case verbs.MakePlan():
+                await session.make_plan(client, verb.poses, verb.seed, verb.lens_known, verb.aim)
+                return self._plan_facts()
+            case verbs.Prepare():
+                if verb.stop_test is not None:
+                    self._rule.by_person(await self._named(caller), "A stop test")
+                return await session.prepare(client, verb.purpose, verb.index, verb.stop_test)
+            case verbs.Go():
+                approval = await self._approval(caller, verb.plan_sha256)
+                await session.go(client, verb.token, approval, again=verb.headless)
+            case verbs.Pause():
+                session.pause(caller.who)
+            case verbs.Finish():
+                await self._to_the_end(session.finish(client))
+            case verbs.Retake() | verbs.Skip() | verbs.Reorder() | verbs.Add() | verbs.Drop():
+                # The queue's method has the verb's name and arguments.
+                change = methodcaller(verb.verb(), *msgspec.structs.astuple(verb))
+                index: int | None = await session.edit(type(verb), client, change)
+                return None if index is None else verbs.PoseNumber(index)
+            case verbs.Freedrive():
+                await self._to_the_end(session.switch_free_drive(client, verb.on, verb.auto))
+            case verbs.Record():
+                return verbs.PoseNumber(await session.record(client))
+            case verbs.Preview():
+                return await session.previews.preview(verb.width, verb.height)
+            case verbs.Observe():
+                return await session.previews.observe(verb.tag)
+            case verbs.Doctor():
+                return await checklist(context, session.devices.troubles)
+            case verbs.Configuration():
+                return context.cell.config
+            case verbs.Sessions():
+                # In a thread: reading hundreds of files must not delay the arm's heartbeat.
+                return await ASKED.run(list_sessions, context.root)
+        return None
+
+    async def _welcome(self, caller: Peer, who: str) -> verbs.Welcome:
+        user = (await self._named(caller)).user  # from the kernel; `who` is the client's own claim
+        said = "".join(c for c in who if c.isprintable())[:_WHO_LIMIT] or user
         caller.told = said if said.split(" ")[0] == user else f"{user} ({said})"
         context = self._session.context
-        config = context.cell.config
-        rule_days = config.validity.max_age_days
         return verbs.Welcome(
-            self._version, os.getpid(), caller.client_id, str(context.root), config.camera.name, rule_days
+            self._version,
+            os.getpid(),
+            caller.client_id,
+            str(context.root),
+            context.cell.config.camera.name,
+            context.cell.config.validity.max_age_days,
         )
-
-    async def _release(self, caller: Peer, args: verbs.Release) -> None:
-        await self._to_the_end(self._session.release(caller.client_id, args.silent))
-
-    async def _acknowledge(self, caller: Peer, args: verbs.Acknowledge) -> None:
-        await self._session.acknowledge(caller.who)
-
-    async def _plan(self, caller: Peer, args: verbs.GetPlan) -> verbs.LoadedPlan:
-        queue = self._session.context.queue
-        return verbs.LoadedPlan() if queue is None else verbs.LoadedPlan(queue.plan, queue.sha256)
-
-    async def _load_plan(self, caller: Peer, args: verbs.LoadPlan) -> verbs.PlanFacts:
-        self._session.load_plan(caller.client_id, args.plan)
-        return self._plan_facts()
-
-    async def _make_plan(self, caller: Peer, args: verbs.MakePlan) -> verbs.PlanFacts:
-        await self._session.make_plan(caller.client_id, args.poses, args.seed, args.lens_known, args.aim)
-        return self._plan_facts()
 
     def _plan_facts(self) -> verbs.PlanFacts:
         queue = self._session.context.require_queue()
         return verbs.PlanFacts(len(queue.statuses), queue.sha256)
 
-    async def _prepare(self, caller: Peer, args: verbs.Prepare) -> MotionPreview:
-        if args.stop_test is not None:
-            self._rule.by_person(await self._asks(caller), "A stop test")
-        return await self._session.prepare(caller.client_id, args.purpose, args.index, args.stop_test)
-
-    async def _go(self, caller: Peer, args: verbs.Go) -> None:
-        asks, waiting = await self._asks(caller), self._session.approvals.waiting
+    async def _approval(self, caller: Peer, plan_sha256: str) -> str:
+        """Check that this client may approve what is offered; return who did, and how."""
+        asks, waiting = await self._named(caller), self._session.approvals.waiting
         if waiting is not None and waiting.motion.stop_test is not None:
             how = self._rule.by_person(asks, "A stop test")
         else:
-            how = self._rule.approve(asks, args.plan_sha256, waiting.preview.plan_sha256 if waiting else "")
-        approval = f"motion approved by {caller.who}, {how}"
-        await self._session.go(caller.client_id, args.token, approval, again=args.headless)
+            how = self._rule.approve(asks, plan_sha256, waiting.preview.plan_sha256 if waiting else "")
+        return f"motion approved by {caller.who}, {how}"
 
-    async def _asks(self, caller: Peer) -> Peer:
+    async def _named(self, caller: Peer) -> Peer:
         caller.user = await self._name(caller.uid)
         return caller
-
-    async def _pause(self, caller: Peer, args: verbs.Pause) -> None:
-        self._session.pause(caller.who)
-
-    async def _finish(self, caller: Peer, args: verbs.Finish) -> None:
-        await self._to_the_end(self._session.finish(caller.client_id))
-
-    async def _edit(self, caller: Peer, args: Verb[object]) -> verbs.PoseNumber | None:
-        """Change the poses by the queue's method that has the verb's name and arguments."""
-        change = methodcaller(args.verb(), *msgspec.structs.astuple(args))
-        index: int | None = await self._session.edit(type(args), caller.client_id, change)
-        return None if index is None else verbs.PoseNumber(index)
-
-    _retake = _skip = _reorder = _add = _drop = _edit
-
-    async def _free_drive(self, caller: Peer, args: verbs.Freedrive) -> None:
-        await self._to_the_end(self._session.switch_free_drive(caller.client_id, args.on, args.auto))
-
-    async def _record(self, caller: Peer, args: verbs.Record) -> verbs.PoseNumber:
-        return verbs.PoseNumber(await self._session.record(caller.client_id))
-
-    async def _preview(self, caller: Peer, args: verbs.Preview) -> verbs.PreviewImage:
-        return await self._session.previews.preview(args.width, args.height)
-
-    async def _observe(self, caller: Peer, args: verbs.Observe) -> verbs.Observation:
-        return await self._session.previews.observe(args.tag)
-
-    async def _doctor(self, caller: Peer, args: verbs.Doctor) -> list[verbs.Check]:
-        return await checklist(self._session.context, self._session.devices.troubles)
-
-    async def _configuration(self, caller: Peer, args: verbs.Configuration) -> StationConfig:
-        return self._session.context.cell.config
-
-    async def _sessions(self, caller: Peer, args: verbs.Sessions) -> list[SessionSummary]:
-        # In a thread: reading hundreds of files must not delay the arm's heartbeat.
-        return await ASKED.run(list_sessions, self._session.context.root)

@@ -9,7 +9,7 @@ import os
 import socket
 import stat
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,11 @@ from station.protocol.messages import LINE_LIMIT_BYTES, USER_CLIENT_LIMIT, Reply
 from station.protocol.verbs import Go
 from station.server.approval import Peer
 from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer
+from station.server.dispatch import SessionDispatcher
 from tests.patience import PATIENCE_S, until
 
 
-class RecordingHandler:
+class RecordingHandler(SessionDispatcher):
     """Remembers what arrived; `slow` answers when told to."""
 
     def __init__(self) -> None:
@@ -35,8 +36,9 @@ class RecordingHandler:
         self.lost: list[int] = []
         self.release = asyncio.Event()
 
-    def stop_now(self, peer: Peer) -> None:
+    def stop_now(self, peer: Peer) -> Awaitable[object]:
         self.order.append("stop")
+        return asyncio.sleep(0)
 
     async def handle(self, peer: Peer, verb: str, args: msgspec.Raw) -> Any:
         if verb == "make_plan":

@@ -8,7 +8,17 @@ from typing import Literal
 import msgspec
 
 from recordings.errors import Value
-from recordings.schema.messages import Matrix4, Mount, Source, TimeSource, Vector6
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import (
+    CameraIdentity,
+    Matrix4,
+    Mount,
+    RobotIdentity,
+    RobotState,
+    Source,
+    TimeSource,
+    Vector6,
+)
 from station.cell.arm_acceptance import StopTestMove
 
 
@@ -57,23 +67,27 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
         return self.state == "done" or self.kept
 
 
-class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
-    connected: bool = False
-    model: str = ""
-    serial: str = ""
-    controller_version: str = ""
-    host: str = ""
-    rate_hz: float = 0.0
-    age_ms: float = 0.0
-    """Age of the newest state."""
-    safety: str = ""
-    """Safety mode in words: NORMAL, PROTECTIVE STOP, EMERGENCY STOP …"""
-    held: str = ""
-    """Why the arm cannot move (a stop, no power, brakes) and the remedy at the pendant; empty: it can."""
+class ArmCondition(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Condition of an arm in words, by one of its states."""
+
     mode: str = ""
-    remote: bool | None = None
+    """'RUNNING', 'POWER OFF' …"""
+    safety: str = ""
+    """'NORMAL', 'PROTECTIVE STOP' …"""
     program: str = ""
-    """State of the robot's program: stopped, playing, paused"""
+    """State of the robot's program: stopped, playing, paused."""
+    held: str = ""
+    """Why the arm cannot move now, and the remedy at the pendant; empty: it can."""
+
+
+class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    identity: RobotIdentity | None = None
+    """None: never connected."""
+    state: RobotState | None = None
+    """Newest state; None: not connected."""
+    condition: ArmCondition = ArmCondition()
+    rate_hz: float = 0.0
+    remote: bool | None = None
     control: bool = False
     """True while the control process runs."""
     control_path: str = ""
@@ -83,27 +97,72 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     speed_m_s: float = 0.0
     """Present speed of the fastest modelled point."""
     speed_limit_m_s: float = 0.25
-    slider: float = 1.0
-    joints_rad: Vector6 | None = None
-    base_from_flange: Matrix4 | None = None
     still: bool = False
+
+    @property
+    def connected(self) -> bool:
+        return self.state is not None
+
+    @property
+    def model(self) -> str:
+        return "" if self.identity is None else self.identity.model
+
+    @property
+    def joints_rad(self) -> Vector6 | None:
+        return None if self.state is None else self.state.joints_rad
+
+
+class StreamCounts(msgspec.Struct, frozen=True):
+    """Counts of frames damaged or lost on the network since the camera was opened."""
+
+    complete: int = 0
+    incomplete: int = 0
+    """Frames with missing packets"""
+    unbuffered: int = 0
+    """Frames lost for want of a free buffer: the program was too slow"""
+    missing_packets: int = 0
+    resend_requests: int = 0
+    resent_packets: int = 0
+
+
+class CameraCounts(msgspec.Struct, frozen=True):
+    """Counts of a camera's frames, for the status."""
+
+    frames: int = 0
+    """Frames that came, glimpses and previews included"""
+    missing: int = 0
+    """Frames triggered or numbered by the camera that never came complete"""
+    paired: int = 0
+    """Frames that belong to a pulse of the trigger box"""
+    stream: StreamCounts = StreamCounts()
+
+
+class FrameTiming(msgspec.Struct, frozen=True):
+    """Accuracy of a camera's frame times, as shown to people."""
+
+    source: TimeSource
+    bound_s: float
+    """95 % bound of the time of the newest frame, or of a frame taken now"""
+    clock: ClockFit | None = None
+    """The camera's clock against the host's; None where it cannot be read"""
+    impossible: int = 0
+    """Frames with a stamp before their trigger or after their arrival, so not the start of exposure"""
 
 
 class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
-    connected: bool = False
-    model: str = ""
-    serial: str = ""
-    driver: str = ""
-    width: int = 0
-    height: int = 0
-    frames: int = 0
-    dropped: int = 0
-    """Frames that did not come, or came incomplete"""
+    identity: CameraIdentity | None = None
+    """None: not connected."""
+    counts: CameraCounts = CameraCounts()
     fps: float = 0.0
-    lost_packets: int = 0
-    resent_packets: int = 0
-    exposure_us: float = 0.0
-    gain_db: float = 0.0
+    timing: FrameTiming | None = None
+
+    @property
+    def connected(self) -> bool:
+        return self.identity is not None
+
+    @property
+    def model(self) -> str:
+        return "" if self.identity is None else self.identity.model
 
 
 class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -132,19 +191,6 @@ class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     free_bytes: int | None = None
     """Free space on the sessions' disk; None: not known."""
     error: str = ""
-
-
-class ClockStatus(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Offset of each clock against the host's monotonic one, with its 95 % bound."""
-
-    controller_offset_ms: float | None = None
-    controller_bound_ms: float | None = None
-    controller_drift_ppm: float | None = None
-    camera_offset_ms: float | None = None
-    camera_bound_ms: float | None = None
-    camera_drift_ppm: float | None = None
-    camera_source: TimeSource | None = None
-    """Source of frame times; `camera_bound_ms` is their bound."""
 
 
 class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -265,7 +311,8 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     trigger: TriggerStatus = TriggerStatus()
     detection: DetectionStatus = DetectionStatus()
     recorder: RecorderStatus = RecorderStatus()
-    clock: ClockStatus = ClockStatus()
+    clock: ClockFit | None = None
+    """The controller's clock against the host's; the camera's: `camera.timing`."""
     session: SessionStatus = SessionStatus()
     estimate: EstimateStatus = EstimateStatus()
     lease: LeaseStatus = LeaseStatus()

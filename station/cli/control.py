@@ -44,7 +44,9 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
         return
     _print_state(status)
     robot, session = status.robot, status.session
-    words = [f"{robot.model} {robot.safety or 'not connected'}", f"slider {100 * robot.slider:.0f} %"]
+    words = [f"{robot.model} {robot.condition.safety or 'not connected'}"]
+    if robot.state is not None:
+        words.append(f"slider {100 * robot.state.target_speed_fraction:.0f} %")
     if robot.control_path:
         words.append(f"control by {robot.control_path}")
     if robot.not_accepted:
@@ -71,9 +73,11 @@ def camera_words(status: StationStatus) -> str:
     camera, trigger = status.camera, status.trigger
     if not camera.connected:
         return "camera not connected"
-    words = [f"{camera.model} {camera.fps:.1f} fps", f"{camera.dropped} frames dropped"]
-    if camera.lost_packets or camera.resent_packets:
-        words.append(f"{camera.lost_packets} packets lost, {camera.resent_packets} resent")
+    counts = camera.counts
+    words = [f"{camera.model} {camera.fps:.1f} fps", f"{counts.missing} frames dropped"]
+    stream = counts.stream
+    if stream.missing_packets or stream.resent_packets:
+        words.append(f"{stream.missing_packets} packets lost, {stream.resent_packets} resent")
     if trigger.present:
         words.append(f"trigger {trigger.pulses} pulses, {trigger.frames} frames")
     return ", ".join(words)

@@ -11,17 +11,10 @@ import msgspec
 from recordings.schema.messages import CameraIdentity, Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
+from station.cell.status import CameraCounts, FrameTiming, StreamCounts
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import DeviceThread, Trigger
-from station.devices.frames import (
-    RETAKE,
-    CameraCounts,
-    FrameClock,
-    FrameCounter,
-    FrameTiming,
-    StreamCounts,
-    TriggerPulse,
-)
+from station.devices.frames import RETAKE, FrameClock, FrameCounter, TriggerPulse
 from station.devices.genicam_settings import CHUNKS, TIME_CHUNKS
 
 _CLOCK_READINGS = 8

@@ -15,7 +15,8 @@ from recordings.schema.frame_time import DeviceClock
 from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
-from station.devices.frames import RETAKE, StreamCounts
+from station.cell.status import StreamCounts
+from station.devices.frames import RETAKE
 from station.devices.genicam_settings import (
     Applied,
     apply_settings,

@@ -6,13 +6,14 @@ import asyncio
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
 from station.cell.arm_acceptance import StopWay
 from station.cell.errors import StaleStateError
-from station.devices.frames import CameraCounts, FrameTiming, TriggerPulse
+from station.cell.status import ArmCondition, CameraCounts, FrameTiming
+from station.devices.frames import TriggerPulse
 
 T = TypeVar("T")
 
@@ -78,19 +79,6 @@ class ArmNews(Protocol):
 
     def check(self) -> RobotState | None:
         """Return `news`; RobotError where nothing may be captured, as after a safety stop or TCP change."""
-
-
-class ArmCondition(NamedTuple):
-    """Condition of an arm in words, by one of its states."""
-
-    mode: str
-    """'RUNNING', 'POWER OFF' …"""
-    safety: str
-    """'NORMAL', 'PROTECTIVE STOP' …"""
-    program: str
-    """State of the robot's program: stopped, playing, paused."""
-    held: str
-    """Why the arm cannot move now, and the remedy at the pendant; empty: it can."""
 
 
 class Robot(ArmNews, Protocol):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import msgspec
 
-from recordings.schema.clocks import ClockFit
 from recordings.schema.frame_ids import LAST_BLOCK_ID, FrameIds, frames_between
 from recordings.schema.frame_time import (
     UNKNOWN_READOUT_S,
@@ -15,33 +14,9 @@ from recordings.schema.frame_time import (
 )
 from recordings.schema.messages import FrameTime, Image, TimeSource
 from station.cell.errors import CameraError
+from station.cell.status import CameraCounts, FrameTiming, StreamCounts
 
 RETAKE = "Retake this pose."
-
-
-class StreamCounts(msgspec.Struct, frozen=True):
-    """Counts of frames damaged or lost on the network since the camera was opened."""
-
-    complete: int = 0
-    incomplete: int = 0
-    """Frames with missing packets"""
-    unbuffered: int = 0
-    """Frames lost for want of a free buffer: the program was too slow"""
-    missing_packets: int = 0
-    resend_requests: int = 0
-    resent_packets: int = 0
-
-
-class CameraCounts(msgspec.Struct, frozen=True):
-    """Counts of a camera's frames, for the status."""
-
-    frames: int = 0
-    """Frames that came, glimpses and previews included"""
-    missing: int = 0
-    """Frames triggered or numbered by the camera that never came complete"""
-    paired: int = 0
-    """Frames that belong to a pulse of the trigger box"""
-    stream: StreamCounts = StreamCounts()
 
 
 class FrameCounter:
@@ -139,18 +114,6 @@ class FrameCounter:
             remedy=RETAKE,
             frames=frames,
         )
-
-
-class FrameTiming(msgspec.Struct, frozen=True):
-    """Accuracy of a camera's frame times, as shown to people."""
-
-    source: TimeSource
-    bound_s: float
-    """95 % bound of the time of the newest frame, or of a frame taken now"""
-    clock: ClockFit | None = None
-    """The camera's clock against the host's; None where it cannot be read"""
-    impossible: int = 0
-    """Frames with a stamp before their trigger or after their arrival, so not the start of exposure"""
 
 
 class TriggerPulse(msgspec.Struct, frozen=True):

@@ -35,9 +35,8 @@ from station.cell.config import StationConfig, vector6
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.layout import pose_vector
 from station.cell.pose_plan import Plan, PlannedPose
-from station.devices.base import ArmCondition
+from station.cell.status import ArmCondition, CameraCounts, FrameTiming
 from station.devices.cell import Cell
-from station.devices.frames import CameraCounts, FrameTiming
 
 STATE_RATE_HZ = 100.0
 MOVE_S = 0.2

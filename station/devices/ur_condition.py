@@ -6,7 +6,7 @@ from enum import IntEnum
 
 from recordings.schema.messages import RobotState
 from station.cell.errors import RobotError, SafetyStopError
-from station.devices.base import ArmCondition
+from station.cell.status import ArmCondition
 from station.devices.news import APPROVE_AGAIN
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 

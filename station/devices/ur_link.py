@@ -18,7 +18,7 @@ from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.cell.layout import arm_model
 from station.cell.process import waited_share
-from station.devices.base import ArmCondition
+from station.cell.status import ArmCondition
 from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_loopback, largest_gap
 from station.devices.ur_condition import condition, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError

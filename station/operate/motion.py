@@ -41,15 +41,15 @@ async def status_now(socket: Path) -> StationStatus:
 
 async def wait_until_idle(link: Client, *, camera: bool = True) -> StationStatus:
     """Wait until robot and camera are connected; return the status. RefusedError names what is missing."""
-    status, told = StationStatus(), False
+    told = False
     with contextlib.suppress(TimeoutError):
         async with timeout(CONNECT_WAIT_S):
             async for status in link.statuses():
-                told = status.playback or status.robot.joints_rad is not None
+                told = status.playback or status.robot.connected
                 there = status.camera.connected or not camera
                 if status.state is not StationState.DISCONNECTED and there and told:
                     return status
-    missing = "camera" if status.robot.connected and told else "robot"
+    missing = "camera" if told else "robot"
     raise RefusedError(
         f"The {missing} did not come within {CONNECT_WAIT_S:.0f} s.",
         code=f"no-{missing}",

@@ -27,6 +27,7 @@ from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import Vector6
 from station.cell.config import PointerConfig, Vector3
 from station.cell.errors import RefusedError
+from station.cell.layout import flange_pose
 from station.cell.status import StationStatus
 from station.operate.ending import after_touches
 from station.protocol.client import Client
@@ -80,7 +81,8 @@ def read_touch(
     axis; None: as configured, or as on the pendant. Raises RefusedError, BadViewsError.
     """
     tip_m, pointer = pointer_tip(board, pointer_m)
-    if status is None or status.robot.base_from_flange is None:
+    robot = None if status is None else status.robot
+    if robot is None or robot.state is None or robot.identity is None:
         raise RefusedError(
             "The robot's position is not known now.",
             code="no-robot-state",
@@ -91,9 +93,8 @@ def read_touch(
         text = f"The board has corners 0 to {len(points) - 1}, not {corner}."
         raise RefusedError(text, code="no-such-corner", corner=corner, last=len(points) - 1)
     base_from_board = board.now.base_from_board
-    tip = transform_points(
-        inverse(base_from_board), transform_points(np.array(status.robot.base_from_flange), np.array(tip_m))
-    )
+    flange = flange_pose(robot.state, robot.identity.tcp_offset)
+    tip = transform_points(inverse(base_from_board), transform_points(flange, np.array(tip_m)))
     offset_mm = _offset_mm(corner, points[corner], tip)
     at = found_points(board.calibration, board.calibration.board)[corner]
     sigma_mm = 1000 * np.sqrt(np.diag(offset_covariance(board.calibration, board.view, board.now, at, tip_m)))

@@ -9,7 +9,6 @@ import math
 import time
 from collections import deque
 
-import msgspec
 import numpy as np
 
 from recordings.images import Pixels, viewable
@@ -50,7 +49,6 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
         still = await context.stillness.settle(context.cell.robot.check, watch.look)
     _phase(context, index, StationState.CAPTURING, "capturing")
     image = context.require_recording().number(await take_image(context, index))
-    show_frame(context, image)
     state, bound_s = await at_exposure(context, image)
     stamps = Stamps(
         host_monotonic_ns=state.stamps.host_monotonic_ns,
@@ -96,20 +94,6 @@ async def take_image(context: SessionContext, index: int | None = None) -> Image
             last = error
             context.store.problem(error, "warning", index, f"image {number} of at most {tries}: {{}}")
     raise PoseFailedError(f"No good image in {tries} tries: {last}", code="no-image", tries=tries)
-
-
-def show_frame(context: SessionContext, image: Image) -> None:
-    height, width = image.pixels.shape[:2]
-    shown = msgspec.structs.replace(
-        context.store.status.camera,
-        connected=True,
-        frames=image.sequence + 1,
-        width=width,
-        height=height,
-        exposure_us=image.exposure_us,
-        gain_db=image.gain_db,
-    )
-    context.store.update(camera=shown)
 
 
 async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState, float]:

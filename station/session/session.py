@@ -33,11 +33,12 @@ from station.protocol import verbs
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import RunRequests, SessionContext, StatusStore
+from station.session.device_connector import DeviceConnector
 from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
 from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
-from station.session.monitor import DeviceConnector, Previewer
 from station.session.motion import previewed, session_motion
+from station.session.previews import Previewer
 from station.session.queue import PoseQueue
 from station.session.recording import Logbook, SessionRecording
 from station.session.run import Run, close_or_seal, unmark_busy

@@ -15,8 +15,9 @@ from recordings.schema.frame_ids import FrameIds
 from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
+from station.cell.status import CameraCounts, FrameTiming
 from station.devices.base import Trigger
-from station.devices.frames import RETAKE, CameraCounts, FrameClock, FrameCounter, FrameTiming, TriggerPulse
+from station.devices.frames import RETAKE, FrameClock, FrameCounter, TriggerPulse
 from station.simulation.launch import Json
 from station.simulation.truth import CellTruth
 

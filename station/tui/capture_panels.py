@@ -110,7 +110,7 @@ def coverage_lines(known: Known, width: int, height: int) -> Content:
 def device_lines(known: Known, width: int, height: int) -> Content:
     """Name each device with its rate."""
     status = known.shown
-    robot, camera, recorder, bounds = status.robot, status.camera, status.recorder, status.clock
+    robot, camera, recorder, timing = status.robot, status.camera, status.recorder, status.camera.timing
     if status.playback:
         return dim("robot not live   camera not live")
     parts = [
@@ -118,7 +118,7 @@ def device_lines(known: Known, width: int, height: int) -> Content:
         _device(
             "camera",
             camera.connected,
-            f"{camera.fps:.0f} fps" + f", {camera.dropped} lost" * bool(camera.dropped),
+            f"{camera.fps:.0f} fps" + f", {camera.counts.missing} lost" * bool(camera.counts.missing),
         ),
     ]
     if status.trigger.present:
@@ -128,14 +128,14 @@ def device_lines(known: Known, width: int, height: int) -> Content:
         parts.append(_device("record", not recorder.error, f"sync {recorder.sync_ms:.0f} ms"))
     else:
         parts.append(mark("todo", "not recording"))
-    known_ms = [ms for ms in (bounds.camera_bound_ms, bounds.controller_bound_ms) if ms is not None]
+    known_ms = [1000 * clock.bound_s for clock in (timing, status.clock) if clock is not None]
     if known_ms:
         capture = CaptureConfig() if known.configuration is None else known.configuration.capture
         parts.append(
             _device(
                 "clocks",
                 sum(known_ms) <= 1000 * capture.time_bound_s,
-                f"± {sum(known_ms):.1f} ms {bounds.camera_source or ''}".rstrip(),
+                f"± {sum(known_ms):.1f} ms {timing.source if timing else ''}".rstrip(),
             )
         )
     return Content("   ").join(parts)

@@ -155,8 +155,8 @@ def _bar_parts(known: Known, title: str) -> Iterator[Content]:
 
 def _robot_parts(status: StationStatus) -> Iterator[Content]:
     robot = status.robot
-    safe = robot.safety or "not known"
-    style = "bold $strong" if robot.safety == "NORMAL" else "bold $warn"
+    safe = robot.condition.safety or "not known"
+    style = "bold $strong" if robot.condition.safety == "NORMAL" else "bold $warn"
     yield Content.assemble(("  safety ", "$dim"), (safe, style))
     if robot.not_accepted:
         yield Content.styled("  not accepted", "$warn")

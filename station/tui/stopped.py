@@ -46,8 +46,8 @@ def stopped_text(status: StationStatus) -> Content:
         if session.poses
         else "No session was running."
     )
-    pendant = mark("look", robot.held) if robot.held else mark("done", "nothing to clear there")
-    safety = Content.assemble(("safety ", "$dim"), (robot.safety or UNKNOWN, "bold $strong"))
+    pendant = mark("look", held) if (held := robot.condition.held) else mark("done", "nothing to clear there")
+    safety = Content.assemble(("safety ", "$dim"), (robot.condition.safety or UNKNOWN, "bold $strong"))
     told = "The arm was told to stop. " if status.cause == "stop" else ""
     return lines(
         Content.styled(STOPPED_BY.get(status.cause, told + status.reason), "bold $strong"),

@@ -220,7 +220,7 @@ def _without_daemon(known: Known) -> Action:
 
 def _by_state(known: Known, status: StationStatus) -> Action | None:
     """Choose the action where the arm works or is held; None at rest."""
-    state, held = status.state, status.robot.held
+    state, held = status.state, status.robot.condition.held
     if state in LATCHED:
         return Action(
             "F8", "Acknowledge", status.reason or "Look at the cell first; nothing moves.", look=True

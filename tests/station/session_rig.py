@@ -28,10 +28,9 @@ from station.analysis.worker import BoardDetection, sight
 from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
-from station.cell.status import DetectionStatus, Event, StationState
-from station.devices.base import ArmCondition, Robot
+from station.cell.status import ArmCondition, CameraCounts, DetectionStatus, Event, FrameTiming, StationState
+from station.devices.base import Robot
 from station.devices.cell import Cell
-from station.devices.frames import CameraCounts, FrameTiming
 from station.devices.news import Evidence
 from station.devices.ur import control_trouble
 from station.devices.ur_condition import condition

@@ -104,12 +104,12 @@ async def test_nothing_moves_without_emergency_stop_full_slider_and_acknowledged
     assert refused.value.code == "no-emergency-stop"
     hands.holds = True
     rig.admin.ask("slider", fraction=0.5)
-    await status_when(client, lambda s: s.robot.slider < 0.6)
+    await status_when(client, lambda s: s.robot.state and s.robot.state.target_speed_fraction < 0.6)
     with pytest.raises(RefusedError) as refused:
         await test.run()
     assert refused.value.code == "slider-low"
     rig.admin.ask("slider", fraction=1.0)
-    await status_when(client, lambda s: s.robot.slider > 0.99)
+    await status_when(client, lambda s: s.robot.state and s.robot.state.target_speed_fraction > 0.99)
     await client.call(Stop())
     with pytest.raises(RefusedError) as refused:
         await test.run()

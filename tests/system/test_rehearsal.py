@@ -25,7 +25,7 @@ from station.cell.status import MotionPreview, StationState
 from station.operate.motion import carry_out, wait_until_idle
 from station.operate.new_cell import write_config
 from station.protocol.client import Client
-from station.protocol.verbs import GetPlan, MakePlan, Purpose
+from station.protocol.verbs import Configuration, GetPlan, MakePlan, Purpose
 from station.simulation.cells import make_cell
 from station.simulation.truth import read_truth
 from tests.command_line import call
@@ -95,7 +95,8 @@ async def test_nothing_of_the_configuration_is_connected_to(
         async with Client(control) as client:
             status = await wait_until_idle(client)
             assert status.simulated and status.state is StationState.IDLE
-            assert status.robot.host not in (ROBOT, "") and status.robot.speed_limit_m_s == 0.2
+            assert (await client.call(Configuration())).robot.host not in (ROBOT, "")
+            assert status.robot.speed_limit_m_s == 0.2
             await client.call(MakePlan(4, 0), timeout_s=60.0)
             assert len((await client.call(GetPlan())).plan.poses) == 4
             assert client.root == tmp_path / "rehearsal"

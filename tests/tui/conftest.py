@@ -18,10 +18,11 @@ from textual.app import App
 from textual.pilot import Pilot
 from textual.widgets import Static
 
-from recordings.schema.messages import CameraModel
+from recordings.schema.messages import CameraIdentity, CameraModel, RobotIdentity
 from station.cell.config import PAPER_BOARD, PoseGuess
 from station.cell.session_folder import SessionSummary
 from station.cell.status import (
+    ArmCondition,
     CameraStatus,
     MotionPreview,
     PoseStatus,
@@ -35,6 +36,7 @@ from station.protocol.verbs import VERBS, Configuration, Done, Preview, PreviewI
 from station.simulation.placement import cell_description
 from station.tui.app import StationApp
 from tests.patience import PATIENCE_S
+from tests.recordings.small_recording import make_state
 
 SUMMARY = MotionPreview(
     token="t-1",
@@ -141,8 +143,10 @@ def idle(state: StationState = StationState.IDLE, reason: str = "") -> StationSt
         state=state,
         reason=reason,
         simulated=True,
-        robot=RobotStatus(connected=True, model="UR10", safety="NORMAL", remote=True, rate_hz=125.0),
-        camera=CameraStatus(connected=True, model="MER-131-75GM", width=1280, height=1024),
+        robot=RobotStatus(
+            RobotIdentity("UR10"), make_state(0), ArmCondition(safety="NORMAL"), rate_hz=125.0, remote=True
+        ),
+        camera=CameraStatus(CameraIdentity(model="MER-131-75GM")),
         session=SessionStatus(name="s-1", poses=poses, plan_sha256="ab" * 32),
     )
 

@@ -9,7 +9,14 @@ import pytest
 from calibrate.geometry import pose as pose_of
 from station.cell.config import CaptureConfig, matrix4
 from station.cell.layout import layout_of
-from station.cell.status import ClockStatus, EstimateStatus, PoseStatus, StationState, StationStatus
+from station.cell.status import (
+    CameraStatus,
+    EstimateStatus,
+    FrameTiming,
+    PoseStatus,
+    StationState,
+    StationStatus,
+)
 from station.tui.capture_panels import coverage_lines, device_lines, error_lines
 from station.tui.progress import chips, counted_line, pose_line
 from station.tui.stopped import stopped_text
@@ -17,6 +24,7 @@ from station.tui.task import Known
 from station.tui.widgets.canvas import Canvas, Series, curve
 from station.tui.widgets.cell_drawing import draw, view_of
 from station.tui.words import limit_bar
+from tests.recordings.small_recording import make_state
 from tests.tui.conftest import CELL, FakeLink, idle, opened, until
 
 
@@ -82,7 +90,7 @@ async def test_the_pose_under_way_is_told_by_its_number(numbers: tuple[int, ...]
 
 @pytest.mark.parametrize(("limit_s", "marked"), [(0.02, "✗ clocks"), (0.08, "✓ clocks")])
 def test_clocks_are_judged_by_the_limit_of_this_cell(limit_s: float, marked: str) -> None:
-    status = msgspec.structs.replace(idle(), clock=ClockStatus(camera_bound_ms=45.0, camera_source="arrival"))
+    status = msgspec.structs.replace(idle(), camera=CameraStatus(timing=FrameTiming("arrival", 0.045)))
     cell = msgspec.structs.replace(CELL, capture=CaptureConfig(time_bound_s=limit_s))
     assert marked in device_lines(Known(status, configuration=cell), 80, 4).plain
 
@@ -145,9 +153,8 @@ def test_distance_and_tilt_of_the_board_are_those_that_a_pose_sees() -> None:
 def test_the_scene_shows_arm_board_and_table(term: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", term)
     status = session(idle(), poses=(seeing(0.6, 0.0), seeing(0.5, 0.2)))
-    status = msgspec.structs.replace(
-        status, robot=msgspec.structs.replace(status.robot, joints_rad=(0.0, -1.6, -1.5, -1.6, 1.5, 0.0))
-    )
+    standing = msgspec.structs.replace(make_state(0), joints_rad=(0.0, -1.6, -1.5, -1.6, 1.5, 0.0))
+    status = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, state=standing))
     drawn = draw(layout_of(CELL), status, 0, 60, 24).plain
     assert "board" in drawn and "table" in drawn
     signs = {letter for letter in drawn if ord(letter) > 0x2500}

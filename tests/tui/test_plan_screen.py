@@ -14,6 +14,7 @@ from station.protocol import verbs
 from station.tui.desk import busy_words
 from station.tui.plan_screen import facts_line
 from station.tui.task import Known, steps
+from tests.recordings.small_recording import make_state
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 
@@ -63,7 +64,7 @@ async def test_a_pose_added_here_is_called_by_its_number(link: FakeLink) -> None
     status = msgspec.structs.replace(
         status,
         session=msgspec.structs.replace(status.session, poses=status.session.poses[3:]),  # some were dropped
-        robot=msgspec.structs.replace(status.robot, joints_rad=(0.0,) * 6),
+        robot=msgspec.structs.replace(status.robot, state=make_state(0)),
     )
     link.show(status)
     async with app_on(link).run_test(size=(80, 24)) as pilot:

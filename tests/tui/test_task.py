@@ -11,7 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from textual.screen import Screen
 
-from station.cell.status import LeaseStatus, RecorderStatus, RobotStatus, StationState, StationStatus
+from recordings.schema.messages import RobotIdentity
+from station.cell.status import (
+    ArmCondition,
+    LeaseStatus,
+    RecorderStatus,
+    RobotStatus,
+    StationState,
+    StationStatus,
+)
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import Hardware
 from station.protocol.verbs import Check
@@ -20,6 +28,7 @@ from station.tui.frame import StopBlock, bar_line, keys_line, next_line, rail_li
 from station.tui.new_cell import NewCell
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from station.tui.words import shortened
+from tests.recordings.small_recording import make_state
 from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, opened, text_of, until
 
 SIZES = [(80, 24), (120, 36), (160, 48)]
@@ -33,7 +42,9 @@ def resting(state: StationState = StationState.IDLE, **session: object) -> Stati
 
 def held(state: StationState) -> StationStatus:
     status = idle(state)
-    return msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, held=HELD))
+    return msgspec.structs.replace(
+        status, robot=msgspec.structs.replace(status.robot, condition=ArmCondition(held=HELD))
+    )
 
 
 CASES = [
@@ -91,7 +102,7 @@ def test_rail_names_six_steps_and_marks_one_now(known: Known, width: int) -> Non
 def test_the_bar_fits_and_keeps_state_and_simulated_first(
     width: int, model: str, safety: str, state: StationState
 ) -> None:
-    robot = RobotStatus(connected=True, model=model, safety=safety, remote=True)
+    robot = RobotStatus(RobotIdentity(model), make_state(0), ArmCondition(safety=safety), remote=True)
     status = msgspec.structs.replace(
         idle(state),
         robot=robot,
@@ -115,8 +126,8 @@ def test_who_lost_the_daemon_in_a_session_reads_how_many_poses_are_safe() -> Non
 @pytest.mark.parametrize("state", [StationState.IDLE, StationState.DISCONNECTED, StationState.MOVING])
 def test_the_bar_says_not_accepted_on_the_smallest_screen(width: int, state: StationState) -> None:
     robot = RobotStatus(
-        connected=True, model="UR10e", safety="NORMAL", remote=True, speed_limit_m_s=0.25,
-        control_path="script", not_accepted="not accepted: its stops were never tested",
+        RobotIdentity("UR10e"), make_state(0), ArmCondition(safety="NORMAL"), remote=True,
+        speed_limit_m_s=0.25, control_path="script", not_accepted="not accepted: its stops were never tested",
     )  # fmt: skip
     status = msgspec.structs.replace(idle(state), robot=robot, simulated=False)
     assert "not accepted" in bar_line(Known(status), "Connect", width).plain

@@ -11,7 +11,8 @@ from recordings.schema.clocks import UNFITTED_DRIFT
 from recordings.schema.frame_ids import FrameIds, frames_between
 from recordings.schema.frame_time import DeviceClock, by_arrival, by_clock
 from recordings.schema.messages import ClockReading, FrameTime, Image, Stamps
-from station.devices.frames import FrameClock, FrameCounter, FrameTiming, TriggerPulse
+from station.cell.status import FrameTiming
+from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
 from tests.codes import raises
 
 MS = 1_000_000

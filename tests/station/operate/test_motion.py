@@ -9,15 +9,17 @@ from typing import Any, cast
 import msgspec
 import pytest
 
+from recordings.schema.messages import CameraIdentity
 from station.cell.errors import LimitError, RefusedError, StationError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import CameraStatus, MotionPreview, RobotStatus, StationState, StationStatus
 from station.operate import motion
 from station.protocol.client import Client
 from station.protocol.verbs import PLANNED_ELSEWHERE, Done, GetPlan, LoadedPlan, MakePlan, Prepare, Purpose
+from tests.recordings.small_recording import make_state
 
-CAMERA = CameraStatus(connected=True)
-STANDING = RobotStatus(connected=True, joints_rad=(0.0,) * 6)
+CAMERA = CameraStatus(CameraIdentity())
+STANDING = RobotStatus(state=make_state(0))
 
 
 class Telling:
@@ -42,7 +44,7 @@ def idle(**fields: Any) -> StationStatus:
 
 def test_a_cell_is_ready_when_its_devices_are_there_and_the_joints_are_known() -> None:
     ready = idle(robot=STANDING)
-    assert waited(StationStatus(), idle(robot=RobotStatus(connected=True)), ready) is ready
+    assert waited(StationStatus(), idle(), ready) is ready
 
 
 def test_a_playback_needs_no_joints() -> None:
@@ -55,7 +57,7 @@ def test_a_playback_needs_no_joints() -> None:
     [
         (StationStatus(), "no-robot"),
         (StationStatus(state=StationState.IDLE, robot=STANDING), "no-camera"),
-        (idle(robot=RobotStatus(connected=True)), "no-robot"),
+        (idle(), "no-robot"),
     ],
 )
 def test_what_does_not_come_is_named(

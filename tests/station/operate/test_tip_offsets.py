@@ -12,7 +12,7 @@ import pytest
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import write_calibration
-from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, rotation_log, transform_points
 from calibrate.kinematics import MODELS, forward
 from calibrate.quality.board_now import locate_board, offset_covariance
 from recordings.schema.messages import CameraIdentity, RobotIdentity
@@ -23,6 +23,7 @@ from station.operate.tip_offsets import SeenBoard, read_touch, see_board
 from station.protocol.verbs import Configuration, Observation, Observe
 from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
+from tests.recordings.small_recording import make_state
 from tests.station.calibrated_cell import POINTER, ROBOT_M, ROBOT_RAD, calibration_of, seen_from
 
 ROBOT, CAMERA = RobotIdentity(model="UR10", serial="1"), CameraIdentity(serial="2")
@@ -76,7 +77,9 @@ class Daemon:
         """The arm with the tip there in `board`, however the flange is turned."""
         R = rotation_exp([0.4, 2.8, -0.1])
         flange = pose(R, (self.board @ [*place_m, 1.0])[:3] - R @ tip_m)
-        return StationStatus(robot=RobotStatus(base_from_flange=matrix4(flange)))
+        tcp_pose = (*flange[:3, 3], *rotation_log(flange[:3, :3]))  # the pendant's offset is zero
+        state = msgspec.structs.replace(make_state(0), tcp_pose=tcp_pose)
+        return StationStatus(robot=RobotStatus(RobotIdentity(), state))
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])

@@ -12,8 +12,8 @@ from calibrate.files.install import install, set_validity
 from calibrate.files.validity import ValidityReason, ValidityState
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import TimeSource
+from station.cell.status import FrameTiming
 from station.devices.discovery import FoundCamera, UsbCamera
-from station.devices.frames import FrameTiming
 from station.protocol.verbs import Check
 from station.session.checklist import checklist
 from station.simulation.cells import make_cell

@@ -31,7 +31,7 @@ async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(ri
 
 async def test_what_holds_an_arm_at_rest_is_told(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     def held() -> str:
-        return rig.session.store.status.robot.held
+        return rig.session.store.status.robot.condition.held
 
     good = rig.arm.latest
     assert held() == ""
@@ -70,7 +70,7 @@ async def test_the_question_says_that_a_playback_moves_nothing(new_rig: NewRig) 
     rig = await new_rig(source="playback")
     summary = await rig.session.prepare(1, Purpose.RUN)
     assert summary.warnings == ("PLAYBACK of a recording: no arm moves",)
-    assert rig.session.store.status.robot.held == ""
+    assert rig.session.store.status.robot.condition.held == ""
 
 
 async def test_a_drift_check_is_told_as_one_until_the_next_run(rig: Rig) -> None:

@@ -21,7 +21,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Reorder
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
-from station.session import monitor
+from station.session import device_connector, monitor
 from station.session.recording import SessionRecording
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
@@ -304,7 +304,7 @@ async def test_a_device_that_fails_in_an_unforeseen_way_is_named_and_tried_again
         if len(tries) < 3:
             raise OSError("no such bus")
 
-    monkeypatch.setattr(monitor, "RETRY_S", 0.01)
+    monkeypatch.setattr(device_connector, "RETRY_S", 0.01)
     await rig.session.devices._until_open("camera", failing)
     assert len(tries) == 3
     assert any("no such bus" in event.text for event in rig.session.store.status.events)

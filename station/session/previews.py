@@ -1,0 +1,118 @@
+"""Images beside the recording: previews for screens, and looks at a tag between sessions."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import numpy as np
+
+from calibrate.boards.detect import detect
+from calibrate.boards.model import check_board
+from recordings.images import viewable
+from recordings.schema.messages import BoardSpec, Image
+from station.analysis.pool import WorkerError
+from station.analysis.worker import BoardDetection, preview_image, sight
+from station.cell.config import matrix4
+from station.cell.errors import CameraError, RefusedError
+from station.cell.layout import flange_pose
+from station.cell.status import StationState
+from station.cell.stillness import NotStillError
+from station.protocol.verbs import Observation, Observe, PreviewImage
+from station.session.capture import at_exposure
+from station.session.context import SessionContext
+
+PREVIEW_PERIOD_S = 0.2
+SIDES = (16, 1024)
+_OBSERVE_S = 5.0
+
+
+class Previewer:
+    """Preview images, never recorded, at most one per `PREVIEW_PERIOD_S` for all screens together."""
+
+    def __init__(self, context: SessionContext) -> None:
+        self._context = context
+        self._taking = asyncio.Lock()
+        self._picture: Image | None = None
+        self._sighting: BoardDetection | None = None
+        self._taken_s = 0.0
+        self._count = 0
+
+    async def preview(self, width: int, height: int) -> PreviewImage:
+        """Return a JPEG that fits into width × height, px; empty without an image."""
+        async with self._taking:
+            if time.monotonic() - self._taken_s >= PREVIEW_PERIOD_S:
+                await self._take()
+        if self._picture is None:
+            return PreviewImage()
+        low, high = SIDES
+        width, height = min(max(width, low), high), min(max(height, low), high)
+        corners = np.zeros((0, 2)) if self._sighting is None else self._sighting.pixels
+        return await asyncio.to_thread(preview_image, self._picture, corners, width, height, self._count)
+
+    async def observe(self, tag: BoardSpec) -> Observation:
+        """Find the tag's corners in a new image, with the arm's pose at mid-exposure.
+
+        Raises BoardError, RefusedError when a session runs, NotStillError when the arm moves; CameraError,
+        RobotError, WorkerError.
+        """
+        check_board(tag)
+        context, robot = self._context, self._context.cell.robot
+        async with self._taking:  # one at a time, so that a new session waits for one image at most
+            _require_between_sessions(context)
+            await context.arm()
+            if not context.stillness.at_rest:
+                raise NotStillError("The arm moves.", code="arm-moves", remedy="Ask again when it rests.")
+            image = await context.cell.camera.capture(_OBSERVE_S)
+            state, _ = await at_exposure(context, image)
+            _require_between_sessions(context)
+            found = await context.workers.call(
+                detect, viewable(image.pixels, image.pixel_format), tag, False, False, timeout_s=_OBSERVE_S
+            )
+        return Observation(
+            mount=context.cell.config.mount,
+            source=context.cell.source,
+            robot_serial=robot.identity.serial,
+            camera_serial=context.cell.camera.identity.serial,
+            wall_ns=state.stamps.host_wall_ns,
+            rested_s=(state.stamps.host_monotonic_ns - context.stillness.moved_ns) / 1e9,
+            base_from_flange=matrix4(flange_pose(state, robot.identity.tcp_offset)),
+            joints_rad=state.joints_rad,
+            width=image.pixels.shape[1],
+            height=image.pixels.shape[0],
+            tcp_offset=robot.identity.tcp_offset,
+            corners=tuple(found.indices.tolist()),
+            pixels=tuple((float(u), float(v)) for u, v in found.pixels),
+        )
+
+    async def _take(self) -> None:
+        context = self._context
+        self._taken_s = time.monotonic()
+        if context.store.state is StationState.CAPTURING or context.workers.waiting:
+            return  # camera or worker are needed by the capture
+        try:
+            image = await context.cell.camera.preview()
+        except CameraError:
+            image = None
+        if image is None:
+            return
+        config = context.cell.config
+        try:
+            exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None
+            pixels = viewable(image.pixels, image.pixel_format)
+            sighting = await context.workers.call(
+                sight, pixels, config.board, config.camera.model, False, exposure, timeout_s=5.0
+            )
+        except WorkerError:
+            sighting = None
+        self._picture, self._sighting = image, sighting
+        self._count += 1
+        if sighting is not None and context.store.state is not StationState.WRITING:
+            context.store.update(detection=sighting.status)
+
+
+def _require_between_sessions(context: SessionContext) -> None:
+    if (refusal := Observe.refusal(context.store.state)) is not None:
+        raise refusal
+    if context.cell.source == "playback":
+        raise RefusedError("Played-back images are not new.", code="played", remedy="Use `calibrate watch`.")

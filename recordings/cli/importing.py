@@ -95,7 +95,7 @@ def _print_import(facts: ImportJson) -> None:
     if bag := facts.bag:
         print(plain_text(f"images    {bag.image_topic} ({bag.images}), {bag.camera}"))
         print(plain_text(f"poses     {bag.poses_from}, paired by stamp within {bag.bound_ms:.2f} ms"))
-        print(plain_text(f"joints    {bag.joints_from or 'none of a six-axis arm'}"))
+        print(plain_text(f"joints    {bag.joints_from or 'none of an arm of five to seven'}"))
         passed = ", ".join(f"{count} {reason}" for reason, count in bag.passed_over.items() if count)
         print(plain_text(f"stops     {bag.stops}" + (f"; images passed over: {passed}" if passed else "")))
         if bag.other_topics:

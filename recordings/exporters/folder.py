@@ -61,11 +61,10 @@ def _write_folder(recording: Recording, folder: Path) -> None:
     info = recording.info
     (folder / "images").mkdir()
     rows = [_write_image(recording, view, folder) for view in recording.views()]
-    header = HEADER
-    if any(view.joints_rad is not None for view in recording.views()):
-        header = HEADER + JOINTS
-        joints = (view.joints_rad or ("",) * len(JOINTS) for view in recording.views())
-        rows = [[*row, *six] for row, six in zip(rows, joints, strict=True)]
+    joints = [view.joints_rad or () for view in recording.views()]
+    count = max(map(len, joints), default=0)
+    header = HEADER + JOINTS[:count]
+    rows = [[*row, *(of_view or [""] * count)] for row, of_view in zip(rows, joints, strict=True)]
     _write_csv(folder / POSES_FILE, header, rows)
     described = {
         "mount": info.mount,

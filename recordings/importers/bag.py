@@ -27,11 +27,11 @@ from recordings.images import (
     read_header,
 )
 from recordings.importers.bags import Bag, open_bag
-from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset, vector6
-from recordings.importers.messages import Array, ImageMessage, Joints, Progress
-from recordings.importers.selection import Selection, Wanted, select
+from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
+from recordings.importers.messages import ImageMessage, JointMessage, Progress
+from recordings.importers.selection import JointSample, Selection, Wanted, select
 from recordings.importers.stops import Standstill, StandstillLimits, find_stops
-from recordings.schema.messages import CameraModel, Image, Matrix4, RobotState, Stamps, Vector6, View
+from recordings.schema.messages import CameraModel, Image, Joints, Matrix4, RobotState, Stamps, View
 from recordings.writer import RecordingWriter, derived_recording
 
 PAIR_WITHIN_S = 0.05
@@ -155,19 +155,19 @@ def _write(
 ) -> None:
     """`images`: of the stops, in the order of the file."""
     index = {stop.place: number for number, stop in enumerate(stops)}
-    states = _states(bag, chosen)
-    last, waiting = None, next(states, None)
+    samples = _joint_samples(bag, chosen)
+    last, waiting = None, next(samples, None)
     in_file_order = sorted(stops, key=lambda stop: stop.place)
     for done, (stop, image) in enumerate(zip(in_file_order, images, strict=True), 1):
-        while waiting is not None and waiting.stamps.host_wall_ns <= stop.stamp_ns:
-            writer.robot_state(waiting)
-            last, waiting = waiting, next(states, None)
+        while waiting is not None and waiting.stamp_ns <= stop.stamp_ns:
+            _write_state(writer, chosen, waiting)
+            last, waiting = waiting, next(samples, None)
         joints_rad = _joints_at(stop.stamp_ns, last, waiting, pair_within_s)
         _write_view(writer, index[stop.place], stop, image, joints_rad)
         progress(done, len(stops), "importing")
     while waiting is not None:
-        writer.robot_state(waiting)
-        waiting = next(states, None)
+        _write_state(writer, chosen, waiting)
+        waiting = next(samples, None)
 
 
 def _camera(described: Dataset, found: CameraModel | None, width: int, height: int) -> CameraModel:
@@ -179,24 +179,30 @@ def _camera(described: Dataset, found: CameraModel | None, width: int, height: i
     return camera
 
 
-def _states(bag: Bag, chosen: Selection) -> Iterator[RobotState]:
-    """Joints as robot states; the tool's pose is the flange's, for nobody told of a tool."""
+def _joint_samples(bag: Bag, chosen: Selection) -> Iterator[JointSample]:
+    """The arm's joints in the order of its axes, from every message about them."""
     if chosen.joints is None:
         return
     for value in bag.values(chosen.joints.topic):
-        assert isinstance(value, Joints)
-        if (six := chosen.joints.six(value)) is not None:
-            yield _state(value.stamp_ns, six, chosen.track.at(np.array([value.stamp_ns]))[0])
+        assert isinstance(value, JointMessage)
+        if (sample := chosen.joints.sample(value)) is not None:
+            yield sample
 
 
-def _state(stamp_ns: int, six: tuple[Vector6, Vector6], base_from_flange: Array) -> RobotState:
+def _write_state(writer: RecordingWriter, chosen: Selection, sample: JointSample) -> None:
+    """A robot state, of an arm of six joints; the tool's pose is the flange's, for nobody told of a tool."""
+    if len(sample.positions_rad) != 6:
+        return
+    base_from_flange = chosen.track.at(np.array([sample.stamp_ns]))[0]
     x, y, z = base_from_flange[:3, 3].tolist()
     rx, ry, rz = cv2.Rodrigues(base_from_flange[:3, :3])[0].ravel().tolist()
-    return RobotState(
-        stamps=Stamps(host_wall_ns=stamp_ns, controller_s=stamp_ns / 1e9),
-        joints_rad=six[0],
-        joint_speeds_rad_s=six[1],
-        target_joints_rad=six[0],
+    j1, j2, j3, j4, j5, j6 = sample.positions_rad
+    v1, v2, v3, v4, v5, v6 = sample.speeds_rad_s
+    state = RobotState(
+        stamps=Stamps(host_wall_ns=sample.stamp_ns, controller_s=sample.stamp_ns / 1e9),
+        joints_rad=(j1, j2, j3, j4, j5, j6),
+        joint_speeds_rad_s=(v1, v2, v3, v4, v5, v6),
+        target_joints_rad=(j1, j2, j3, j4, j5, j6),
         tcp_pose=(x, y, z, rx, ry, rz),
         robot_mode=0,
         safety_mode=0,
@@ -206,22 +212,23 @@ def _state(stamp_ns: int, six: tuple[Vector6, Vector6], base_from_flange: Array)
         speed_scaling=1.0,
         target_speed_fraction=1.0,
     )
+    writer.robot_state(state)
 
 
 def _joints_at(
-    stamp_ns: int, before: RobotState | None, after: RobotState | None, within_s: float
-) -> Vector6 | None:
+    stamp_ns: int, before: JointSample | None, after: JointSample | None, within_s: float
+) -> Joints | None:
     """Interpolated between the reports around the stamp; None when they are farther from it than allowed."""
-    near = [state for state in (before, after) if state is not None]
-    if not near or any(abs(s.stamps.host_wall_ns - stamp_ns) > within_s * 1e9 for s in near):
+    near = [sample for sample in (before, after) if sample is not None]
+    if not near or any(abs(s.stamp_ns - stamp_ns) > within_s * 1e9 for s in near):
         return None
-    times = [state.stamps.host_wall_ns - stamp_ns for state in near]
-    joints = zip(*[state.joints_rad for state in near], strict=True)
-    return vector6([float(np.interp(0, times, joint)) for joint in joints])
+    times = [sample.stamp_ns - stamp_ns for sample in near]
+    joints = zip(*[sample.positions_rad for sample in near], strict=True)
+    return tuple(float(np.interp(0, times, joint)) for joint in joints)
 
 
 def _write_view(
-    writer: RecordingWriter, index: int, stop: Standstill, message: ImageMessage, joints_rad: Vector6 | None
+    writer: RecordingWriter, index: int, stop: Standstill, message: ImageMessage, joints_rad: Joints | None
 ) -> None:
     pixels, encoded = _pixels(message, stop.place)
     stamps = Stamps(host_wall_ns=stop.stamp_ns, device_ns=stop.stamp_ns)

@@ -26,19 +26,20 @@ from recordings.schema.messages import (
     BoardSpec,
     CameraIdentity,
     CameraModel,
+    Joints,
     Matrix4,
     Mount,
     RobotIdentity,
     SessionInfo,
-    Vector6,
     matrix_from_quaternion,
 )
 
 DATASET_FILE = "dataset.yaml"
 POSES_FILE = "poses.csv"
 HEADER = ["image", "x", "y", "z", "qx", "qy", "qz", "qw"]
-JOINTS = ["j1", "j2", "j3", "j4", "j5", "j6"]
-"""Optional, after the others."""
+JOINTS = ["j1", "j2", "j3", "j4", "j5", "j6", "j7"]
+"""Optional, after the others: as many as the arm has joints."""
+_HEADERS = (HEADER, *(HEADER + JOINTS[:count] for count in (5, 6, 7)))
 _CSV_LIMIT_BYTES = 4 * 1024 * 1024
 _REACH_LIMIT_M = 20.0
 """No arm reaches this far: such numbers are millimetres."""
@@ -82,7 +83,7 @@ class PoseRow:
     image: str
     """Relative to the folder, as written."""
     base_from_flange: Matrix4
-    joints_rad: Vector6 | None = None
+    joints_rad: Joints | None = None
 
 
 def read_dataset(path: Path) -> tuple[Dataset, bytes]:
@@ -178,9 +179,9 @@ def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
     except csv.Error as error:
         raise _wrong_row(path, reader.line_num, str(error)) from error
     header = [cell.strip() for cell in lines[0][1]] if lines else []
-    if header not in (HEADER, HEADER + JOINTS):
+    if header not in _HEADERS:
         found = ",".join(lines[0][1])[:100] if lines else "nothing"
-        needed = f"'{','.join(HEADER)}' (metres, unit quaternion) or with ,{','.join(JOINTS)} (radians)"
+        needed = f"'{','.join(HEADER)}' (metres, unit quaternion), perhaps with ,j1 … j6 (radians)"
         raise _wrong_row(path, 1, f"the header is '{found}', it must be {needed}", "header")
     rows = [_pose_row(path, line, header, [cell.strip() for cell in cells]) for line, cells in lines[1:]]
     if not rows:
@@ -222,13 +223,7 @@ def _pose_row(path: Path, line: int, header: list[str], cells: list[str]) -> Pos
         text = f"the quaternion's length is {length:.4g}, it must be 1 (qx,qy,qz,qw, no rotation vector)"
         raise _wrong_row(path, line, text, "no-unit-quaternion")
     if joints and (turn := max(map(abs, joints))) > _TURN_LIMIT_RAD:
-        text = f"a joint is at {turn:g}: j1 … j6 must be radians, not degrees, from the base to wrist 3"
+        text = f"a joint is at {turn:g}: joints must be radians, not degrees, from the base on"
         raise _wrong_row(path, line, text, "not-radians")
     base_from_flange = matrix_from_quaternion(position, [q / length for q in quaternion])
-    return PoseRow(line, cells[0], base_from_flange, vector6(joints) if joints else None)
-
-
-def vector6(numbers: list[float]) -> Vector6:
-    """Exactly six numbers."""
-    a, b, c, d, e, f = numbers
-    return a, b, c, d, e, f
+    return PoseRow(line, cells[0], base_from_flange, tuple(joints) or None)

@@ -57,7 +57,7 @@ class ImageMessage:
 
 
 @dataclass(frozen=True)
-class Joints:
+class JointMessage:
     stamp_ns: int
     names: tuple[str, ...]
     positions_rad: tuple[float, ...]
@@ -75,7 +75,7 @@ class FrameMessage:
     rotation_xyzw: tuple[float, float, float, float]
 
 
-Value = ImageMessage | CameraModel | Joints | list[FrameMessage]
+Value = ImageMessage | CameraModel | JointMessage | list[FrameMessage]
 
 
 CDR, PROTOBUF, JSON = "cdr", "protobuf", "json"
@@ -171,7 +171,9 @@ def _from_foxglove(schema: str, message: Any, time_ns: int) -> Value:
     if schema == "foxglove.JointStates":
         joints = message.joints
         speeds = tuple(j.velocity for j in joints) if all(j.HasField("velocity") for j in joints) else ()
-        return Joints(stamp_ns, tuple(j.name for j in joints), tuple(j.position for j in joints), speeds)
+        return JointMessage(
+            stamp_ns, tuple(j.name for j in joints), tuple(j.position for j in joints), speeds
+        )
     return [_frame(stamp_ns, frame, "", message.pose.position, message.pose.orientation)]
 
 
@@ -210,7 +212,7 @@ def _from_ros(schema: str, message: Any, time_ns: int) -> Value:
         return intrinsics(*size, k, d, message.distortion_model)
     if schema == "sensor_msgs/msg/JointState":
         speeds = tuple(map(float, message.velocity))
-        return Joints(stamp_ns, tuple(message.name), tuple(map(float, message.position)), speeds)
+        return JointMessage(stamp_ns, tuple(message.name), tuple(map(float, message.position)), speeds)
     return [_frame(stamp_ns, frame, "", message.pose.position, message.pose.orientation)]
 
 

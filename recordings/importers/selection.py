@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from recordings.errors import ImportSourceError
 from recordings.importers.bags import Bag, BagTopic
 from recordings.importers.frames import FrameTree, Track
-from recordings.importers.messages import Array, FrameMessage, Joints, Kind
-from recordings.schema.messages import CameraModel, Vector6
+from recordings.importers.messages import Array, FrameMessage, JointMessage, Kind
+from recordings.schema.messages import CameraModel, Joints
 
 _UR_ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 _FLANGE, _POSE_CHILD = "flange", "flange of the pose topic"
@@ -44,20 +44,33 @@ class Selection:
 class JointSource:
     topic: str
     order: tuple[int, ...]
-    """Places of the six joints, base … wrist 3, in its messages with these names."""
+    """Places of the arm's joints, base first, in its messages with these names."""
     names: tuple[str, ...]
     stamps_ns: NDArray[np.int64]
     fastest_rad_s: Array
     has_speeds: bool
 
-    def six(self, joints: Joints) -> tuple[Vector6, Vector6] | None:
-        """(positions, speeds); None for a message about other joints."""
+    def sample(self, joints: JointMessage) -> JointSample | None:
+        """Its joints in the arm's order; None for a message about other joints."""
         if joints.names != self.names:
             return None
-        q = [joints.positions_rad[place] for place in self.order]
-        speeds = joints.speeds_rad_s
-        v = [speeds[place] for place in self.order] if len(speeds) == len(self.names) else [0.0] * 6
-        return (q[0], q[1], q[2], q[3], q[4], q[5]), (v[0], v[1], v[2], v[3], v[4], v[5])
+        speeds = (
+            joints.speeds_rad_s if len(joints.speeds_rad_s) == len(self.names) else (0.0,) * len(self.names)
+        )
+        return JointSample(
+            joints.stamp_ns,
+            tuple(joints.positions_rad[place] for place in self.order),
+            tuple(speeds[place] for place in self.order),
+        )
+
+
+@dataclass(frozen=True)
+class JointSample:
+    """Joints of the arm at one time, base first."""
+
+    stamp_ns: int
+    positions_rad: Joints
+    speeds_rad_s: Joints
 
 
 def select(bag: Bag, wanted: Wanted) -> Selection:
@@ -138,7 +151,7 @@ def _camera(bag: Bag, image: BagTopic) -> CameraModel | None:
 
 
 def _joints(bag: Bag) -> JointSource | None:
-    """The first topic that tells of six joints; other arms are imported without."""
+    """The first topic that tells of an arm's joints."""
     for topic in _of(bag, Kind.JOINTS):
         order: tuple[int, ...] | None = None
         names: tuple[str, ...] = ()
@@ -146,9 +159,9 @@ def _joints(bag: Bag) -> JointSource | None:
         fastest: list[float] = []
         has_speeds = True
         for value in bag.values(topic.name):
-            assert isinstance(value, Joints)
+            assert isinstance(value, JointMessage)
             if order is None:
-                order, names = six_joints(value.names), value.names
+                order, names = arm_joints(value.names), value.names
             if order is None or value.names != names:
                 continue
             if len(value.speeds_rad_s) == len(names):
@@ -163,11 +176,15 @@ def _joints(bag: Bag) -> JointSource | None:
     return None
 
 
-def six_joints(names: tuple[str, ...]) -> tuple[int, ...] | None:
-    """Places of the arm's joints, base first: by a UR driver's names, or the six that there are by name."""
+def arm_joints(names: tuple[str, ...]) -> tuple[int, ...] | None:
+    """Places of the arm's joints, base first: by a UR driver's names, else five to seven beside fingers."""
     places = [[n for n, name in enumerate(names) if part in name] for part in _UR_ORDER]
     if all(len(found) == 1 for found in places):
         return tuple(found[0] for found in places)
-    if len(names) == 6:
-        return tuple(sorted(range(6), key=lambda n: names[n])) if len(set(names)) == 6 else tuple(range(6))
+    arm = [n for n, name in enumerate(names) if not any(part in name.lower() for part in _HAND)]
+    if 5 <= len(arm) <= 7:
+        return tuple(sorted(arm, key=lambda n: names[n]) if len(set(names)) == len(names) else arm)
     return None
+
+
+_HAND = ("finger", "gripper", "hand_")

@@ -6,7 +6,7 @@ These are the types that every room shares. How they lie in the file is `schema`
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 
@@ -19,6 +19,8 @@ Source = Literal["real", "simulated", "playback", "imported"]
 """Origin of images and poses; anything but `real` never installs on a real cell."""
 
 Vector6 = tuple[float, float, float, float, float, float]
+Joints = Annotated[tuple[float, ...], msgspec.Meta(min_length=5, max_length=7)]
+"""One number a joint, base first; an arm has five to seven."""
 Matrix4 = tuple[tuple[float, ...], ...]
 """4×4, row major"""
 
@@ -234,7 +236,7 @@ class View(msgspec.Struct, frozen=True, omit_defaults=True):
     picture_sequence: int
     base_from_flange: Matrix4
     """Flange pose at mid-exposure."""
-    joints_rad: Vector6 | None = None
+    joints_rad: Joints | None = None
     """Joints at mid-exposure; None where no joints are known (imported)."""
     attempt: int = 1
     """A retake of the same pose supersedes lower attempts."""

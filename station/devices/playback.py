@@ -115,7 +115,7 @@ class PlaybackRobot:
             self.views: list[View] = self._recording.views()
         except RecordingError as error:
             raise RobotError(f"{recording} cannot be played: {error}", code="unreadable-recording") from error
-        if not self.views or any(v.joints_rad is None for v in self.views):
+        if not self.views or any(len(v.joints_rad or ()) != 6 for v in self.views):
             raise RobotError(
                 f"{recording} has no joints for every view: no arm can be played", code="no-joints"
             )
@@ -267,7 +267,7 @@ class PlaybackRobot:
 
 def _joints(view: View) -> Vector6:
     assert view.joints_rad is not None
-    return view.joints_rad
+    return vector6(np.array(view.joints_rad))
 
 
 def playback_cell(recording: Path) -> Cell:

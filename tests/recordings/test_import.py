@@ -80,14 +80,17 @@ def with_joints(folder: Path, *joints: str) -> None:
     """Joints behind the poses, one text a row; the last one for all that follow."""
     header, *rows = (folder / "poses.csv").read_text().split()
     texts = [*joints, *[joints[-1]] * (len(rows) - len(joints))]
-    lines = [f"{header},j1,j2,j3,j4,j5,j6", *(f"{row},{text}" for row, text in zip(rows, texts, strict=True))]
+    names = ",".join(f"j{joint + 1}" for joint in range(texts[0].count(",") + 1))
+    lines = [f"{header},{names}", *(f"{row},{text}" for row, text in zip(rows, texts, strict=True))]
     (folder / "poses.csv").write_text("\n".join(lines) + "\n")
 
 
-def test_joints_behind_the_pose_reach_the_view(folder: Path, tmp_path: Path) -> None:
-    with_joints(folder, "0.1,-1.5,1.5,-1,-1.57,3.2", ",,,,,")
+@pytest.mark.parametrize("count", [5, 6, 7])
+def test_joints_behind_the_pose_reach_the_view(count: int, folder: Path, tmp_path: Path) -> None:
+    joints = (0.1, -1.5, 1.5, -1.0, -1.57, 3.2, 0.7)[:count]
+    with_joints(folder, ",".join(map(str, joints)), "," * (count - 1))
     views = open_recording(import_folder(folder, tmp_path / "r.mcap").path).views()
-    assert views[0].joints_rad == (0.1, -1.5, 1.5, -1.0, -1.57, 3.2)
+    assert views[0].joints_rad == joints
     assert views[1].joints_rad is None, "empty cells: not known for that picture"
     out = export_recording(open_recording(tmp_path / "r.mcap"), tmp_path / "out", "folder")
     again = open_recording(import_folder(out, tmp_path / "again.mcap").path).views()
@@ -187,7 +190,7 @@ BAD: dict[str, Bad] = {
     "outside": pose("images/1.png", "../../secret.png", code="outside"),
     "joints in degrees": joints("10,-90,90,-60,-90,180", "not-radians"),
     "a joint missing": joints("0.1,,1.5,-1,-1.57,3.2"),
-    "five joints": joints("0.1,0.1,1.5,-1,-1.57"),
+    "four joints": joints("0.1,0.1,1.5,-1"),
     "picture missing": image(lambda f: (f / "images/1.png").unlink()),
     "picture is a folder": image(replaced(Path.mkdir)),
     "picture is a pipe": image(replaced(os.mkfifo)),

@@ -19,7 +19,7 @@ from calibrate.files.lines import append_line, read_lines
 from calibrate.quality.movement.monitor import MovementEvent, MovementMonitor
 from calibrate.quality.movement.pictures import CellModel, Picture
 from recordings.files import write_atomically
-from recordings.schema.messages import BoardSpec, Matrix4, Vector6
+from recordings.schema.messages import BoardSpec, Joints, Matrix4
 
 FILE = "watch.jsonl"
 _MOST, _LATEST = 12_000, 3_000
@@ -43,7 +43,7 @@ class WatchEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     name: str = ""
     wall_s: float = 0.0
     base_from_flange: Matrix4 | None = None
-    joints_rad: Vector6 | None = None
+    joints_rad: Joints | None = None
     corners: tuple[int, ...] = ()
     pixels: tuple[tuple[float, float], ...] = ()
     gap: bool = False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from recordings.errors import CodedError
+from recordings.errors import CodedError, Value
 
 
 class CalibrationError(CodedError):
@@ -27,13 +27,7 @@ def require_choice(name: str, given: object, choices: Iterable[str]) -> None:
     """Raise UsageError (`choice`) where `given` is none of the choices."""
     known = list(choices)
     if given not in known:
-        raise UsageError(
-            f"{name} is {given!r}.",
-            code="choice",
-            remedy=f"Write {' or '.join(known)}.",
-            name=name,
-            given=str(given),
-        )
+        raise UsageError("choice", name=name, given=str(given), choices=" or ".join(known))
 
 
 class TooFewViewsError(CalibrationError):
@@ -71,8 +65,8 @@ class PosesDisagreeError(BadViewsError):
 
     code = "poses-disagree"
 
-    def __init__(self, text: str, hypothesis: str = "", **data: str) -> None:
-        super().__init__(text, **data)
+    def __init__(self, said: str = "", /, *, hypothesis: str = "", **values: Value) -> None:
+        super().__init__(said, **values)  # type: ignore[arg-type]
         self.hypothesis = hypothesis
 
 

@@ -88,12 +88,7 @@ def load_views(
             raise _squares_counted(recording, spec, counted, pictures)
         mirrored = sum(detection.cause == "mirrored" for detection in seen.values())
         if mirrored >= max(1, len(missing) / 2):
-            raise MirroredImagesError(
-                f"{recording.path}: {mirrored} of {pictures} images show the board mirrored.",
-                remedy="Switch the camera's mirroring (flip, reverse x) off and record again.",
-                mirrored=mirrored,
-                images=pictures,
-            )
+            raise MirroredImagesError(path=recording.path, mirrored=mirrored, images=pictures)
         raise _too_few(recording, len(views), pictures, missing, fewest)
     if not (model.width and model.height):
         first = next(iter(seen.values()))
@@ -110,9 +105,7 @@ def _calibrated_arm(recording: Recording) -> RobotModel | None:
             return arm_of_ros(content, recording.info.robot.model)
         except ValueError as problem:
             raise BadViewsError(
-                f"{recording.path}: {UR_KINEMATICS_NAME} is no kinematics file of a known arm ({problem}).",
-                code="arm-kinematics",
-                remedy="Name the robot in dataset.yaml, use the file of ur_calibration, or remove it.",
+                "arm-kinematics", path=recording.path, file=UR_KINEMATICS_NAME, reason=str(problem)
             ) from None
     if (content := attached.get(ARM_KINEMATICS_NAME)) is None:
         return None
@@ -121,9 +114,7 @@ def _calibrated_arm(recording: Recording) -> RobotModel | None:
         published = MODELS[stated.model]
     except (msgspec.DecodeError, KeyError) as problem:
         raise BadViewsError(
-            f"{recording.path}: {ARM_KINEMATICS_NAME} is no table of a known arm ({problem}).",
-            code="arm-kinematics",
-            remedy="Export the recording to a folder and import it again without the robot's model.",
+            "arm-kinematics", path=recording.path, file=ARM_KINEMATICS_NAME, reason=str(problem)
         ) from None
     a, d, alpha, theta = stated.a_m, stated.d_m, stated.alpha_rad, stated.theta_rad
     return replace(published, a_m=a, d_m=d, alpha_rad=alpha, theta_rad=theta)
@@ -187,11 +178,10 @@ def without_views(
     chosen = {number - 1 for number in numbers}
     views = loaded.views
     if unknown := chosen - {view.index for view in (*views, *loaded.without_board)}:
-        told = ", ".join(str(index + 1) for index in sorted(unknown))
         raise BadViewsError(
-            f"--without {told}: there is no view of that number.",
-            code="no-such-view",
-            remedy=f"Views count from 1 to {max(view.index for view in loaded.views) + 1}.",
+            "no-such-view",
+            told=", ".join(str(index + 1) for index in sorted(unknown)),
+            views=max(view.index for view in loaded.views) + 1,
         )
     left = tuple(
         RejectedView(view.index, view.name, "excluded (--without)", "by-hand")
@@ -200,9 +190,10 @@ def without_views(
     )
     if len(views) - len(left) < fewest:
         raise TooFewViewsError(
-            f"--without leaves {len(views) - len(left)} of {len(views)} views; at least {fewest} are needed.",
+            counted=f"--without leaves {len(views) - len(left)} of {len(views)} views",
             views=len(views) - len(left),
             needed=fewest,
+            advice="Leave out fewer.",
         )
     kept = views.select([place for place, view in enumerate(views) if view.index not in chosen])
     return replace(loaded, views=kept, without_board=(*loaded.without_board, *left))
@@ -233,8 +224,7 @@ def detect_all(
         except BadImageError as problem:
             return view, problem
         except ValueError as problem:
-            pose = view.index + 1
-            raise BadViewsError(f"View {pose} ({view.name}): {problem}.", pose=pose) from None
+            raise BadViewsError(view=view.index + 1, name=view.name, reason=str(problem)) from None
 
     pool = ThreadPoolExecutor(workers, thread_name_prefix="detect")
     try:
@@ -253,14 +243,12 @@ def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera
     height, width = picture.pixels.shape[:2]
     if camera.width and (width, height) != (camera.width, camera.height):
         raise BadViewsError(
-            f"View {view.index + 1} ({view.name}): the image is {width}×{height}, camera or intrinsics are "
-            f"given for {camera.width}×{camera.height}.",
-            code="image-size",
-            remedy="Check the region of interest, the size in dataset.yaml, or whether these intrinsics "
-            "(--camera, --calibration) belong to these images.",
-            pose=view.index + 1,
+            "image-size",
+            view=view.index + 1,
+            name=view.name,
             width_px=width,
             height_px=height,
+            expected=f"{camera.width}×{camera.height}",
         )
     return detect(viewable(picture.pixels, picture.pixel_format), spec, with_quality=False)
 
@@ -277,30 +265,24 @@ def _image_view(view: View, detection: Detection, spec: BoardSpec) -> BoardView:
 
 
 def _squares_counted(recording: Recording, spec: BoardSpec, counted: int, total: int) -> SquaresCountedError:
-    columns, rows = spec.columns - 1, spec.rows - 1
     return SquaresCountedError(
-        f"{recording.path}: {counted} of {total} images show {columns}×{rows} inner corners where "
-        f"{spec.columns}×{spec.rows} are declared: squares were counted.",
-        remedy=f"Declare columns: {columns}, rows: {rows} (solve again with --board).",
-        columns=columns,
-        rows=rows,
+        path=recording.path,
+        counted=counted,
+        images=total,
+        declared=f"{spec.columns}×{spec.rows}",
+        columns=spec.columns - 1,
+        rows=spec.rows - 1,
     )
 
 
 def _too_few(
     recording: Recording, found: int, total: int, missing: list[RejectedView], fewest: int
 ) -> TooFewViewsError:
+    counted = f"{recording.path}: the board is seen in {found} of {total} images"
+    advice = "Check the board's kind, columns and rows; solve again with --board to try another."
     if total == 0:
-        return TooFewViewsError(
-            f"{recording.path} holds no image with a robot pose.",
-            remedy="Images of a sweep have none: record poses with `station capture`.",
-            views=0,
-            needed=fewest,
-        )
-    text = f"{recording.path}: the board is seen in {found} of {total} images; {fewest} views are needed."
-    if missing:
-        text += f" First reason, view {missing[0].index + 1} ({missing[0].name}): {missing[0].reason}."
-    remedy = "Check the board's kind, columns and rows; solve again with --board to try another."
-    return TooFewViewsError(
-        text, remedy=remedy if total >= fewest else "", views=found, images=total, needed=fewest
-    )
+        counted = f"{recording.path}: no image has a robot pose"
+        advice = "Images of a sweep have none: record poses with `station capture`."
+    elif missing:
+        counted += f" (first reason, view {missing[0].index + 1} ({missing[0].name}): {missing[0].reason})"
+    return TooFewViewsError(counted=counted, views=found, images=total, needed=fewest, advice=advice)

@@ -197,14 +197,7 @@ def picture_coverage(views: ViewSet) -> float:
 def _check_lens_fits(views: ViewSet) -> None:
     median = float(np.median([view_rms_px(v, views.camera, v.camera_from_board) for v in views]))  # type: ignore[arg-type]
     if not median <= _WORST_VIEW_PX:
-        raise BadViewsError(
-            f"The board does not fit the images: median reprojection error {median:.0f} px "
-            f"(limit {_WORST_VIEW_PX:.0f}).",
-            code="lens-misfit",
-            remedy="Solve with --estimate-intrinsics, or correct the board's columns and rows.",
-            median_px=median,
-            limit_px=_WORST_VIEW_PX,
-        )
+        raise BadViewsError("lens-misfit", median_px=median, limit_px=_WORST_VIEW_PX)
 
 
 def _clock_bound_s(recording: Recording, solution: Solution) -> float | None:

@@ -80,9 +80,7 @@ def _pixels(K: Array, xd: Array, yd: Array) -> Array:
 def camera_matrix(camera: CameraModel) -> Array:
     """Return K (3, 3); BadViewsError where it is missing or not a camera matrix."""
     if camera.matrix is None:
-        raise BadViewsError(
-            "The camera's intrinsics are not known.", code="no-intrinsics", remedy="Estimate them first."
-        )
+        raise BadViewsError("no-intrinsics")
     K = np.array(camera.matrix, dtype=float)
     if (
         K.shape != (3, 3)
@@ -91,11 +89,7 @@ def camera_matrix(camera: CameraModel) -> Array:
         or K[1, 0] != 0
         or K[2].tolist() != [0, 0, 1]
     ):
-        raise BadViewsError(
-            f"The camera matrix {camera.matrix} is not one.",
-            code="camera-matrix",
-            remedy="Write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], finite, fx and fy positive, in pixels.",
-        )
+        raise BadViewsError("camera-matrix", matrix=str(camera.matrix))
     return K
 
 
@@ -196,9 +190,7 @@ def distortion(camera: CameraModel) -> Array:
     size = 4 if camera.distortion_model == "equidistant" else (8 if len(values) > 5 else 5)
     if len(values) > size or not np.isfinite(values).all():
         raise BadViewsError(
-            f"The distortion {camera.distortion} does not fit {camera.distortion_model}.",
-            code="distortion",
-            remedy=f"Write at most {size} finite numbers.",
+            "distortion", distortion=str(camera.distortion), model=camera.distortion_model, size=size
         )
     return np.concatenate([values, np.zeros(size - len(values))])
 

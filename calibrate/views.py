@@ -27,9 +27,7 @@ def array_of(values: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
         found = found.reshape([max(size, 0) for size in shape]) if -1 in shape else found
     if found.ndim != len(shape) or any(a not in (-1, b) for a, b in zip(shape, found.shape, strict=True)):
         given, wanted = (str(s).replace("-1", "n") for s in (found.shape, shape))
-        raise BadViewsError(
-            f"{what} has shape {given}.", code="shape", remedy=f"Give {wanted}.", given=given, wanted=wanted
-        )
+        raise BadViewsError("shape", what=what, given=given, wanted=wanted)
     return found
 
 
@@ -62,9 +60,8 @@ class BoardView:
                 object.__setattr__(self, name, taken)
         if self.joints_rad is not None and len(self.joints_rad) not in JOINTS:
             raise BadViewsError(
-                f"View {self.index + 1} ({self.name}) has {len(self.joints_rad)} joints.",
-                code="shape",
-                remedy=f"Give {JOINTS[0]} to {JOINTS[-1]}.",
+                "shape",
+                what=f"joints_rad of view {self.index + 1} ({self.name})",
                 given=f"({len(self.joints_rad)},)",
                 wanted=f"({JOINTS[0]},) to ({JOINTS[-1]},)",
             )
@@ -140,12 +137,11 @@ def require_no_copies(views: ViewSet) -> None:
         if key in first:
             other = first[key]
             raise BadViewsError(
-                f"Views {other.index + 1} ({other.name}) and {view.index + 1} ({view.name}) are one: "
-                "their robot poses and corners agree to the last bit.",
-                code="view-twice",
-                remedy=f"Solve with --without {view.index + 1}, or remove it and import again.",
+                "view-twice",
                 view=view.index + 1,
+                name=view.name,
                 other=other.index + 1,
+                other_name=other.name,
             )
         first[key] = view
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, pose, rotation_exp
+from recordings.errors import Value
 from recordings.schema.messages import (
     LARGEST_FLATNESS_M,
     LARGEST_TOLERANCE,
@@ -38,17 +39,13 @@ def dictionary_id(name: str) -> int:
     """Look up OpenCV's number of a marker dictionary such as DICT_6X6_250; BoardError when there is none."""
     value = getattr(cv2.aruco, name, None)
     if not name.startswith("DICT_") or not isinstance(value, int):
-        raise BoardError(
-            f"board: OpenCV has no dictionary {name!r}.",
-            code="dictionary-unknown",
-            remedy="Write for example DICT_6X6_250.",
-        )
+        raise BoardError("dictionary-unknown", name=name)
     return value
 
 
-def _require(right: bool, code: str, wrong: str, remedy: str) -> None:
+def _require(right: bool, code: str, **values: Value) -> None:
     if not right:
-        raise BoardError(f"board: {wrong}.", code=code, remedy=remedy)
+        raise BoardError(code, **values)  # type: ignore[arg-type]
 
 
 def check_board(spec: BoardSpec) -> None:
@@ -57,41 +54,26 @@ def check_board(spec: BoardSpec) -> None:
     columns, rows, smallest = spec.columns, spec.rows, 1 if april or tag else 2
     if spec.kind is BoardKind.CHESSBOARD:
         smallest = FEWEST_ON_A_SIDE
-    _require(
-        all(smallest <= side <= _LARGEST_SIDE for side in (columns, rows)),
-        "board-columns-rows",
-        f"{columns} × {rows} is impossible (limits {smallest} and {_LARGEST_SIDE})",
-        "Count the inner corners of a chessboard, the squares of a charuco board.",
-    )
-    wrong = f"square_m = {spec.square_m} is no size in metres"
-    _require(1e-4 <= spec.square_m <= 10.0, "board-square", wrong, "Write 25 mm as 0.025.")
+    possible = all(smallest <= side <= _LARGEST_SIDE for side in (columns, rows))
+    limits = {"smallest": smallest, "largest": _LARGEST_SIDE}
+    _require(possible, "board-columns-rows", columns=columns, rows=rows, **limits)
+    _require(1e-4 <= spec.square_m <= 10.0, "board-square", square_m=spec.square_m)
     if (tolerance := spec.square_tolerance) is not None:
-        wrong = f"square_tolerance = {tolerance} is no relative tolerance"
-        _require(0 < tolerance <= LARGEST_TOLERANCE, "board-tolerance", wrong, "Write 0.3 % as 0.003.")
+        _require(0 < tolerance <= LARGEST_TOLERANCE, "board-tolerance", square_tolerance=tolerance)
     if (flatness_m := spec.flatness_m) is not None:
-        wrong = f"flatness_m = {flatness_m} is no flatness in metres"
-        _require(0 < flatness_m <= LARGEST_FLATNESS_M, "board-flatness", wrong, "Write 1 mm as 0.001.")
+        _require(0 < flatness_m <= LARGEST_FLATNESS_M, "board-flatness", flatness_m=flatness_m)
     if charuco or april:
-        smaller = spec.marker_m is not None and 0 < spec.marker_m < spec.square_m
-        wrong = "marker_m, the side of a marker or the gap between tags, is not between 0 and square_m"
-        _require(smaller, "board-marker", wrong, "Measure it and write it in metres.")
+        _require(spec.marker_m is not None and 0 < spec.marker_m < spec.square_m, "board-marker")
     elif tag:
-        _require((columns, rows) == (1, 1), "tag-columns-rows", "a tag has no columns and rows", "Omit them.")
-        _require(spec.tag_id >= 0, "tag-id", f"id {spec.tag_id} is negative", "Use the tag's number.")
+        _require((columns, rows) == (1, 1), "tag-columns-rows")
+        _require(spec.tag_id >= 0, "tag-id", tag_id=spec.tag_id)
     if charuco or april or tag:
         named = spec.kind in (BoardKind.APRIL_GRID, BoardKind.APRIL_TAG) or bool(spec.dictionary)
-        remedy = "Write for example DICT_4X4_50."
-        _require(named, "dictionary-missing", f"{spec.kind.value} needs its dictionary", remedy)
+        _require(named, "dictionary-missing", kind=spec.kind.value)
         needed = spec.tag_id + 1 if tag else columns * rows // (2 if charuco else 1)
-        held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(tag_dictionary(spec))).bytesList)
-        if needed > held:
-            raise BoardError(
-                f"board: {needed} markers are needed, {tag_dictionary(spec)} holds {held}.",
-                code="dictionary-too-small",
-                remedy="Use fewer columns and rows, a smaller id, or a larger dictionary.",
-                needed=needed,
-                held=held,
-            )
+        dictionary = tag_dictionary(spec)
+        held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)).bytesList)
+        _require(needed <= held, "dictionary-too-small", needed=needed, held=held, dictionary=dictionary)
 
 
 def usual_markers(kind: BoardKind, square_m: float) -> tuple[float | None, str | None]:

@@ -117,9 +117,7 @@ def _origin(
 
 def _paper(paper: str, need_w: float, need_h: float, spec: BoardSpec) -> tuple[float, float]:
     if paper not in PAPER_MM:
-        raise BoardError(
-            f"There is no paper {paper!r}.", code="paper-unknown", remedy=f"Choose {', '.join(PAPER_MM)}."
-        )
+        raise BoardError("paper-unknown", paper=paper, papers=", ".join(PAPER_MM))
     fitting = {
         name: size
         for name, sides in PAPER_MM.items()
@@ -128,11 +126,12 @@ def _paper(paper: str, need_w: float, need_h: float, spec: BoardSpec) -> tuple[f
     }
     if paper not in fitting:
         raise BoardError(
-            f"{describe_board(spec)} needs {need_w:.0f} × {need_h:.0f} mm: not on {paper}.",
-            code="paper-too-small",
-            remedy=f"Print on {next(iter(fitting))}." if fitting else "Make the squares smaller.",
+            "paper-too-small",
+            board=describe_board(spec),
+            paper=paper,
             width_mm=need_w,
             height_mm=need_h,
+            advice=f"Print on {next(iter(fitting))}." if fitting else "Make the squares smaller.",
         )
     return fitting[paper]
 

@@ -88,22 +88,11 @@ def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") ->
     found = solution.arm
     arm = None if found is None else found.result
     if arm is None or found is None or found.uncorrected is None:
-        raise BadViewsError(
-            "No table of the arm was fitted, so there is none to verify.",
-            code="no-arm-table",
-            remedy="Record a robot whose model is known, at 8 poses or more.",
-        )
+        raise BadViewsError("no-arm-table")
     fitted = [view.joints_rad for view in solution.kept if view.joints_rad is not None]
     far = [place for place, view in enumerate(views) if _stands_elsewhere(view, fitted)]
     if len(far) < _FEWEST_ELSEWHERE:
-        raise BadViewsError(
-            f"Verification: {len(far)} of {len(views)} views have joints and stand elsewhere than the "
-            f"calibration's (minimum {_FEWEST_ELSEWHERE}).",
-            code="not-elsewhere",
-            remedy="Record poses in other parts of the workspace.",
-            views=len(far),
-            minimum=_FEWEST_ELSEWHERE,
-        )
+        raise BadViewsError("not-elsewhere", views=len(far), recorded=len(views), minimum=_FEWEST_ELSEWHERE)
     views, shape = views.select(far), solution.board
     observed = observe_views(views)
     numbers = np.zeros(len(SHAPE)) if shape is None else shape.numbers

@@ -136,11 +136,7 @@ def estimate(
         solved = linear.solve(priors.linearise(state, scales.table), scales, "nothing")
         covariance = linear.covariance(solved)
     except np.linalg.LinAlgError as problem:
-        raise BadViewsError(
-            f"The views do not determine the camera's pose ({problem}).",
-            code="pose-open",
-            remedy="Record more poses, tilted about two axes.",
-        ) from None
+        raise BadViewsError("pose-open", reason=str(problem)) from None
     return Estimate(
         state=state,
         scales=scales,

@@ -201,12 +201,10 @@ def require_plausible_noise(found: Estimate) -> None:
     """Raise PosesDisagreeError where the robot noise is above its limit, or nearly every view is rejected."""
     robot_m, robot_rad = found.scales.robot
     if found.used.sum() < FEWEST_USED:
-        raise PosesDisagreeError("Robot poses and images disagree in nearly every view.", remedy=_MEND)
+        raise PosesDisagreeError(how="in nearly every view", advice=_MEND)
     if robot_m > MAX_ROBOT_M or robot_rad > MAX_ROBOT_RAD:
         raise PosesDisagreeError(
-            f"Robot poses and images disagree by {robot_m * 1e3:.0f} mm, "
-            f"{np.degrees(robot_rad):.1f}° per axis.",
-            remedy=_MEND,
+            how=f"by {robot_m * 1e3:.0f} mm, {np.degrees(robot_rad):.1f}° per axis", advice=_MEND
         )
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsError
 from calibrate.geometry import Array, difference, is_rigid, pose, project_to_rotation, rotation_angle, skew
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses, screw_invariants
-from calibrate.projection import camera_matrix
+from calibrate.projection import camera_matrix, distortion
 from calibrate.results import HoldoutScore
 from calibrate.views import BoardView, ViewSet, require_no_copies
+from recordings.errors import Value
 
 _MIN_SECOND_AXIS_RAD = np.radians(0.3)
 """Rms rotation about the second axis below which X is not determined."""
@@ -84,19 +85,11 @@ def require_motion(pairs: Pairs) -> None:
     singular, directions = axis_spread(pairs)
     needed = _MIN_SECOND_AXIS_RAD
     if singular[0] < needed:
-        raise DegenerateMotionError(
-            f"Rotation range {np.degrees(angle_A.max()):.2f}° too small.",
-            code="rotation-range",
-            remedy="Rotate by 20° or more about two axes.",
-            largest_rad=float(angle_A.max()),
-        )
+        raise DegenerateMotionError("rotation-range", largest_rad=float(angle_A.max()))
     if singular[1] < needed:
-        axis = ", ".join(f"{v:+.2f}" for v in directions[0])
         raise DegenerateMotionError(
-            f"All rotations share axis ({axis}): {np.degrees(singular[1]):.2f}° rms about any other "
-            f"(limit {np.degrees(needed):.2f}°).",
-            code="one-axis",
-            remedy="Add tilts by 20° or more about a second axis.",
+            "one-axis",
+            axis=", ".join(f"{v:+.2f}" for v in directions[0]),
             second_axis_rad=float(singular[1]),
             limit_rad=float(needed),
         )
@@ -114,52 +107,38 @@ def require_solvable(views: ViewSet) -> None:
     """Check number and content of views. Raises TooFewViewsError or BadViewsError, naming view and remedy."""
     if len(views) < FEWEST_TO_SOLVE:
         raise TooFewViewsError(
-            f"{len(views)} usable views (minimum {FEWEST_TO_SOLVE}).",
-            remedy="Record 15 to 25 poses, or check why the board was not found in the others.",
+            counted=f"{len(views)} usable views",
             views=len(views),
-            minimum=FEWEST_TO_SOLVE,
+            needed=FEWEST_TO_SOLVE,
+            advice="Record 15 to 25 poses, or check why the board was not found in the others.",
         )
     if len(views) > MAX_VIEWS:
-        raise BadViewsError(
-            f"{len(views)} views (limit {MAX_VIEWS}).", code="too-many-views", remedy="Split the recording."
-        )
+        raise BadViewsError("too-many-views", views=len(views), limit=MAX_VIEWS)
     fewest = FEWEST_CORNERS_IN_VIEW if any(len(view.pixels) for view in views) else 0
     if views.camera.matrix is not None or fewest:
         camera_matrix(views.camera)
-        if not np.isfinite(views.camera.distortion).all():
-            raise BadViewsError(
-                "The distortion is not finite.", code="distortion", remedy="Correct it, or estimate it."
-            )
+        distortion(views.camera)
     for view in views:
         _require_view(view, fewest)
     first = views.views[0].base_from_flange
     if all(np.abs(view.base_from_flange - first).max() < 1e-9 for view in views):
-        raise BadViewsError(
-            "All robot poses are identical.", code="poses-identical", remedy="Check how they were recorded."
-        )
+        raise BadViewsError("poses-identical")
     require_no_copies(views)
 
 
 def _require_view(view: BoardView, fewest_corners: int) -> None:
-    def require(right: bool, code: str, wrong: str) -> None:
-        if not right:
-            raise BadViewsError(
-                f"View {view.index + 1} ({view.name}): {wrong}.",
-                code=code,
-                remedy="Correct or remove this view.",
-                view=view.index + 1,
-            )
+    T, corners, points = np.array(view.camera_from_board), len(view.pixels), len(view.board_points)
 
-    T, corners = np.array(view.camera_from_board), len(view.pixels)
-    require(is_rigid(np.asarray(view.base_from_flange)), "robot-pose", "the robot pose is no rigid transform")
-    require(T.shape == (4, 4), "no-board-pose", "no board pose is known")
-    require(is_rigid(T), "board-pose", "the board pose is mirrored or no rigid transform")
-    require(T[2, 3] > 0, "board-pose", "the board pose lies behind the camera")
-    points = len(view.board_points)
-    require(corners == points, "corners", f"{corners} pixels for {points} board points")
-    require(corners >= fewest_corners, "corners", f"{corners} corners (minimum {fewest_corners})")
+    def require(right: bool, code: str, **values: Value) -> None:
+        if not right:
+            raise BadViewsError(code, view=view.index + 1, name=view.name, **values)  # type: ignore[arg-type]
+
+    require(is_rigid(np.asarray(view.base_from_flange)), "robot-pose")
+    require(T.shape == (4, 4), "no-board-pose", reason="none was given")
+    require(is_rigid(T) and bool(T[2, 3] > 0), "board-pose")
     finite = np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()
-    require(bool(finite), "corners", "a corner is not finite")
+    right = bool(fewest_corners <= corners == points and finite)
+    require(right, "corners", corners=corners, points=points, minimum=fewest_corners)
 
 
 def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> Observability:

@@ -122,9 +122,7 @@ def _reprojection_only(views: ViewSet) -> Array:
     """Minimise the reprojection error from Park and Martin's X, robot poses and intrinsics taken as exact."""
     observed = observe_views(views)
     if not observed.has_pixels:
-        raise CalibrationError(
-            "These views hold no corners.", code="no-corners", remedy="Use a recording with its images."
-        )
+        raise CalibrationError("no-corners")
     H, C = _pose_arrays(views)
     X = opencv_hand_eye(H, C, HAND_EYE["Park-Martin"])
     lens = LensPrior.given(views.camera, _EXACT * np.maximum(np.abs(intrinsics_vector(views.camera)), 1.0))

@@ -91,8 +91,9 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         fit = fit_cell(views, priors, options.seed, options.model_arm)
     except PosesDisagreeError as problem:
         session = explain_recording(poses, options.seed)
-        remedy = explain_text(session, views)
-        raise PosesDisagreeError(str(problem), session.reading.value, remedy=remedy) from None
+        raise PosesDisagreeError(
+            hypothesis=session.reading.value, **problem.values | {"advice": explain_text(session, views)}
+        ) from None
     solution, session = _describe(fit, options), Explanation(Reading.AS_RECORDED, 0.0)
     if float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH or _doubtful(solution):
         session = explain_recording(poses, options.seed)

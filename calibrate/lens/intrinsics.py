@@ -47,10 +47,10 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     """
     if len(views) < FEWEST_FOR_INTRINSICS:
         raise TooFewViewsError(
-            f"{len(views)} views cannot tell the intrinsics (minimum {FEWEST_FOR_INTRINSICS}).",
-            remedy="Give the camera's matrix and distortion, or record more views with different tilts.",
+            counted=f"{len(views)} views to find the intrinsics",
             views=len(views),
-            minimum=FEWEST_FOR_INTRINSICS,
+            needed=FEWEST_FOR_INTRINSICS,
+            advice="Give the camera's matrix and distortion, or record more views with different tilts.",
         )
     dropped: dict[int, str] = {}
     used = views
@@ -59,11 +59,7 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
             lens, view_rms_px = _fit(used, model)
         except (cv2.error, np.linalg.LinAlgError) as problem:
             reason = problem.err if isinstance(problem, cv2.error) else problem
-            raise BadViewsError(
-                f"The intrinsics cannot be estimated from these corners ({reason}).",
-                code="intrinsics-open",
-                remedy="Check the board's size.",
-            ) from None
+            raise BadViewsError("intrinsics-open", reason=str(reason)) from None
         median_px = float(np.median(view_rms_px))
         good = np.flatnonzero(view_rms_px <= max(4 * median_px, 0.5)).tolist()
         if len(good) == len(used) or len(good) < FEWEST_FOR_INTRINSICS:
@@ -76,9 +72,8 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     rms_px = float(np.sqrt(np.average(view_rms_px**2, weights=[len(view.pixels) for view in used])))
     if not (0.2 * side < K[0, 0] < 100 * side and rms_px <= 0.01 * side):
         raise BadViewsError(
-            f"No lens explains the corners (focal length {K[0, 0]:.0f} px, rms {rms_px:.1f} px).",
-            code="no-lens-fits",
-            remedy="Check the board's columns and rows, give the camera's matrix, or tilt views by 20°.",
+            "no-lens-fits",
+            reason=f"focal length {K[0, 0]:.0f} px, rms {rms_px:.1f} px",
             focal_px=float(K[0, 0]),
             rms_px=rms_px,
         )
@@ -106,11 +101,7 @@ def _first_fisheye(views: ViewSet) -> CameraModel:
             object_points, pixels, size, np.eye(3), np.zeros(4), flags=flags, criteria=_FISHEYE_STEPS
         )
     except cv2.error as problem:
-        raise BadViewsError(
-            f"No fisheye lens explains the corners ({problem.err}).",
-            code="no-lens-fits",
-            remedy="Use plumb_bob, or record more tilted views.",
-        ) from None
+        raise BadViewsError("no-lens-fits", reason=f"fisheye: {problem.err}") from None
     matrix: Any = tuple(tuple(float(v) for v in row) for row in np.asarray(K))
     return CameraModel(*size, matrix, tuple(float(v) for v in np.asarray(D).ravel()), "equidistant")
 

@@ -82,10 +82,7 @@ def _planar_poses(views: ViewSet) -> list[list[Array]]:
         own = np.flatnonzero(in_front & (owner == i))
         if not len(own):
             raise BadViewsError(
-                f"View {view.index + 1} ({view.name}): no board pose before the camera fits.",
-                code="no-board-pose",
-                remedy="Remove this view, or check the board's columns and rows.",
-                view=view.index + 1,
+                "no-board-pose", view=view.index + 1, name=view.name, reason="none lies before the camera"
             )
         own = own[np.argsort(rms_px[own], kind="stable")]
         limit_px = _credible_px(rms_px[own[0]])
@@ -107,10 +104,7 @@ def planar_tilts(view: BoardView, camera: CameraModel) -> Array:
         count, turns, shifts, _ = cv2.solvePnPGeneric(points, pixels, K, None, flags=cv2.SOLVEPNP_IPPE)
     except cv2.error as problem:
         raise BadViewsError(
-            f"View {view.index + 1} ({view.name}): the corners fix no board pose ({problem.err}).",
-            code="no-board-pose",
-            remedy="Remove this view.",
-            view=view.index + 1,
+            "no-board-pose", view=view.index + 1, name=view.name, reason=problem.err
         ) from None
     return pose(
         rotation_exp(np.reshape(turns, (-1, 3))[:count]), np.reshape(shifts, (-1, 3))[:count]

@@ -108,7 +108,7 @@ def test_a_lens_of_another_camera_never_passes(real_session_file: Path) -> None:
     with contextlib.suppress(BadViewsError):
         assert not solve_recording(real_session_file, JobOptions(camera=other)).passed
     small = replace_size(CAMERA, 640, 480)
-    with raises_code(BadViewsError, "image-size", pose=1, width_px=480, height_px=384):
+    with raises_code(BadViewsError, "image-size", view=1, width_px=480, height_px=384):
         solve_recording(real_session_file, JobOptions(camera=small))
 
 

@@ -17,7 +17,7 @@ from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming
 from station.devices.base import Trigger
-from station.devices.frames import RETAKE, FrameClock, FrameCounter, TriggerPulse
+from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
 from station.simulation.launch import Json
 from station.simulation.truth import CellTruth
 
@@ -25,7 +25,6 @@ START_TIMEOUT_S = 20.0
 _ANSWER_S = 5.0
 _CLOCK_READINGS = 8
 _PIPE_LIMIT = 4 * 2**20
-_REOPEN = "Open it again."
 
 
 class RenderedCamera:
@@ -120,8 +119,7 @@ class RenderedCamera:
                 frame = await asyncio.wait_for(self._frames.get(), timeout_s)
             except TimeoutError:
                 self.counter.lost(None if pulse is None else pulse.count)
-                text = f"the camera sent no image within {timeout_s:g} s of its trigger"
-                raise CameraError(text, code="no-image", remedy=RETAKE, limit_s=timeout_s) from None
+                raise CameraError("no-image", limit_s=timeout_s) from None
             if isinstance(frame, CameraError):
                 raise frame
             count = None if pulse is None else pulse.count
@@ -174,12 +172,10 @@ class RenderedCamera:
             self._reader = None
 
     def _check_settings(self, frame: Image) -> None:
-        if (frame.exposure_us, frame.gain_db) != (self._exposure_us, self._gain_db):
-            raise CameraError(
-                f"the camera exposed {frame.exposure_us:g} µs at {frame.gain_db:g} dB, set were "
-                f"{self._exposure_us:g} µs at {self._gain_db:g} dB; something else changes its settings",
-                code="settings-changed",
-            )
+        found, wanted = (frame.exposure_us, frame.gain_db), (self._exposure_us, self._gain_db)
+        if found != wanted:
+            found_text, wanted_text = (f"{us:g} µs and {db:g} dB" for us, db in (found, wanted))
+            raise CameraError("settings-changed", found=found_text, wanted=wanted_text)
 
     async def _read_clock(self) -> None:
         asked_ns = time.monotonic_ns()
@@ -199,15 +195,14 @@ class RenderedCamera:
         try:
             answer = await asyncio.wait_for(self._answers.get(), timeout_s)
         except TimeoutError:
-            text = f"the rendered camera does not answer within {timeout_s:g} s"
-            raise CameraError(text, code="camera-silent", limit_s=timeout_s) from None
+            raise CameraError("camera-silent", limit_s=timeout_s) from None
         if isinstance(answer, CameraError):
             raise answer
         return answer
 
     def _write(self, request: Json) -> None:
         if self._process is None or self._process.stdin is None or self._process.returncode is not None:
-            raise CameraError("the rendered camera is not open or has ended", code="not-open", remedy=_REOPEN)
+            raise CameraError("not-open")
         self._process.stdin.write(json.dumps(request).encode() + b"\n")
 
     async def _read(self, process: asyncio.subprocess.Process) -> None:
@@ -222,13 +217,13 @@ class RenderedCamera:
                     case "preview":
                         self._answers.put_nowait(await _picture(process.stdout, header))
                     case "error":
-                        error = CameraError(f"the rendered camera: {header['text']}", code="camera-refused")
+                        error = CameraError("camera-refused", doing=header["cmd"], reason=header["text"])
                         (self._frames if header["cmd"] == "trigger" else self._answers).put_nowait(error)
                     case _:
                         self._answers.put_nowait(header)
         except (asyncio.IncompleteReadError, ConnectionError):
             pass  # it ended within a frame
-        gone = CameraError("the camera is gone (its process ended)", code="camera-gone", remedy=_REOPEN)
+        gone = CameraError("camera-gone", camera=self.identity.serial)
         self._frames.put_nowait(gone)
         self._answers.put_nowait(gone)
 

@@ -71,12 +71,8 @@ def make_cell(
     """Make the truth of a cell; equal arguments give the same cell. ConfigError for an unknown name."""
     published_cells = {"paper": _paper, "blog": _blog, "paper-binned": _paper_binned}
     if scene not in published_cells or noise not in _NOISE or mount not in ("eye-in-hand", "eye-to-hand"):
-        raise ConfigError(
-            f"no simulated cell '{scene}' with noise '{noise}' and mount '{mount}'",
-            code="unknown-cell",
-            remedy=f"Scenes are {', '.join(published_cells)}, noise levels {', '.join(_NOISE)}, "
-            "mounts eye-in-hand and eye-to-hand.",
-        )
+        known = {"scenes": ", ".join(published_cells), "levels": ", ".join(_NOISE)}
+        raise ConfigError("unknown-cell", scene=scene, noise=noise, mount=mount, **known)
     rng = np.random.default_rng([2026, seed])
     published = published_cells[scene]()
     camera = published.camera if seed == 0 else _other_lens(published.camera, rng)

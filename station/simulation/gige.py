@@ -68,7 +68,7 @@ class GigeCamera:
             address.encode(), serial.encode(), str(DESCRIPTION).encode()
         )
         if not self._server or not self._lib.arv_gv_fake_camera_is_running(self._server):
-            raise CameraError(f"the GigE simulator did not start on {address}", code="simulation-not-started")
+            raise CameraError("simulation-not-started", device=address, reason="it does not run")
         self._camera = self._lib.arv_gv_fake_camera_get_fake_camera(self._server)
         self._describe(width, height, serial)
         self._lib.arv_fake_camera_set_trigger_frequency(self._camera, 1000.0)
@@ -142,18 +142,15 @@ def _require_free(address: str) -> None:
         try:
             probe.bind((address, CONTROL_PORT))
         except OSError as error:
-            raise CameraError(
-                f"the GigE simulator cannot listen on {address}:{CONTROL_PORT}: {error}",
-                code="address-in-use",
-            ) from error
+            place = f"{address}:{CONTROL_PORT}"
+            raise CameraError("address-in-use", address=place, reason=str(error)) from error
 
 
 def _library() -> Any:
     try:
         lib: Any = ctypes.CDLL(LIBRARY)
     except OSError as error:
-        remedy = "Install Aravis with `apt install gir1.2-aravis-0.8`."
-        raise CameraError(str(error), code="no-aravis", remedy=remedy) from error
+        raise CameraError("no-aravis", reason=str(error)) from error
     pointer, text = ctypes.c_void_p, ctypes.c_char_p
     for name, result, arguments in (
         ("arv_gv_fake_camera_new_full", pointer, [text, text, text]),

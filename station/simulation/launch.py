@@ -38,8 +38,7 @@ class AdminClient:
         try:
             self._socket = socket.create_connection((host, ADMIN_PORT), timeout_s)
         except OSError as error:
-            text = f"no simulated controller answers on {host}:{ADMIN_PORT} ({error})"
-            raise RobotError(text, code="no-simulation") from error
+            raise self._gone(str(error)) from error
         self._lines = self._socket.makefile("rb")
 
     def ask(self, cmd: str, **arguments: object) -> Json:
@@ -48,14 +47,16 @@ class AdminClient:
             self._socket.sendall(json.dumps({"cmd": cmd, **arguments}).encode() + b"\n")
             line = self._lines.readline()
         except OSError as error:
-            text = f"the simulated controller on {self.host} does not answer ({error})"
-            raise RobotError(text, code="no-simulation") from error
+            raise self._gone(str(error)) from error
         if not line:
-            raise RobotError(f"the simulated controller on {self.host} has ended", code="no-simulation")
+            raise self._gone("it has ended")
         answer: Json = json.loads(line)
         if not answer.pop("ok"):
-            raise RobotError(f"the simulated controller refused {answer['error']}", code="simulation-refused")
+            raise RobotError("simulation-refused", reason=answer["error"])
         return answer
+
+    def _gone(self, reason: str) -> RobotError:
+        return RobotError("no-simulation", device=f"controller on {self.host}:{ADMIN_PORT}", reason=reason)
 
     def close(self) -> None:
         self._lines.close()
@@ -135,8 +136,7 @@ def start_controller(
             return SimulatedController(address, child)
         if host is not None or child.returncode != ADDRESS_TAKEN or attempt == 1:
             break
-    text = f"the simulated {model} did not start: {problem}"
-    raise RobotError(text, code="simulation-not-started", exit_code=child.returncode)
+    raise RobotError("simulation-not-started", device=model, reason=problem, exit_code=child.returncode)
 
 
 def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subprocess.Popen[bytes], str]:
@@ -171,7 +171,8 @@ class SimulatedGige(ChildProcess):
         self.process.stdin.write(json.dumps({"name": fault, "value": value}).encode() + b"\n")
         self.process.stdin.flush()
         if not self.process.stdout.readline():
-            raise CameraError(f"the GigE simulator ended on the fault '{fault}'", code="no-simulation")
+            reason = f"it ended on the fault '{fault}'"
+            raise CameraError("no-simulation", device="GigE camera", reason=reason)
 
 
 def start_gige(
@@ -189,14 +190,10 @@ def start_gige(
     CameraError where there is any network interface but `lo`: GigE discovery broadcasts on all of them.
     """
     if not is_isolated():
-        raise CameraError(
-            "the GigE simulator runs only in a network namespace with nothing but lo",
-            code="not-isolated",
-            remedy="Start the program with `python -m station.simulation.netns` in `unshare --net`.",
-        )
+        raise CameraError("not-isolated")
     command = [sys.executable, "-m", module, "--serial", serial, "--controller-host", controller_host]
     command += [] if truth is None else ["--truth", str(truth)]
     process, problem = _start(command, GIGE_TIMEOUT_S, log)
     if problem:
-        raise CameraError(f"the GigE simulator did not start: {problem}", code="simulation-not-started")
+        raise CameraError("simulation-not-started", device="GigE camera", reason=problem)
     return SimulatedGige(process)

@@ -26,8 +26,7 @@ def isolated_command(command: list[str]) -> list[str]:
     """Make the command that runs `command` in a new namespace. StationError where `unshare` is missing."""
     unshare = shutil.which("unshare")
     if unshare is None:
-        remedy = "Run apt install util-linux."
-        raise StationError("the GigE simulator needs 'unshare'", code="no-unshare", remedy=remedy)
+        raise StationError("no-unshare")
     # Without root, a user namespace permits making a network namespace.
     rights = [] if os.geteuid() == 0 else ["--map-root-user"]
     return [unshare, *rights, "--net", sys.executable, "-m", "station.simulation.netns", *command]

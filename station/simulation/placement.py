@@ -90,7 +90,7 @@ def place_moving_camera(
         start = _comfortable_start(layout, base_from_camera @ inverse(X), rng)
         if start is not None and _sees(layout, start) and _roomy(layout, start, rng):
             return Placement(X, Y, start)
-    raise ConfigError("no place found for the camera", code="no-placement", remedy="Take another seed.")
+    raise ConfigError("no-placement", mount="eye-in-hand")
 
 
 def place_fixed_camera(board: BoardSpec, camera: CameraModel, rng: np.random.Generator) -> Placement:
@@ -111,7 +111,7 @@ def place_fixed_camera(board: BoardSpec, camera: CameraModel, rng: np.random.Gen
         start = _comfortable_start(layout, flange, rng)
         if start is not None and _sees(layout, start) and _roomy(layout, start, rng):
             return Placement(X, Y, start)
-    raise ConfigError("no place found beside the cell", code="no-placement", remedy="Take another seed.")
+    raise ConfigError("no-placement", mount="eye-to-hand")
 
 
 def _camera_looking_down(rng: np.random.Generator) -> Array:

@@ -52,8 +52,4 @@ def read_truth(path: Path) -> CellTruth:
     try:
         return msgspec.json.decode(read_file(path, _LIMIT_BYTES), type=CellTruth)
     except (OSError, msgspec.DecodeError) as error:
-        raise ConfigError(
-            f"{path}: no truth of a simulated cell ({error})",
-            code="no-truth",
-            remedy="Make one with make_cell.",
-        ) from error
+        raise ConfigError("no-truth", path=path, reason=str(error)) from error

@@ -34,7 +34,7 @@ SHOWN: dict[str, str] = {
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
     "watch": r"^\| (repeated|any) .* of ",
-    "drift": r"planned \| [38] \|",
+    "drift": r"^\| [38] \|",
     "late_news": r"^\| all",
     "stop_latency": r"^\| both \| (first|bytes).* 200 \||no heartbeat \| rest",
 }

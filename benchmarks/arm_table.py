@@ -16,7 +16,6 @@ from functools import partial
 import numpy as np
 
 from benchmarks.imperfect_cells import BOARD, LENSES, _look
-from benchmarks.real_sets import real_sets
 from benchmarks.scene import grid
 from benchmarks.trials import in_processes, rms, share_spread, table, trials
 from calibrate.geometry import (
@@ -37,7 +36,6 @@ from calibrate.handeye.priors import BoardTolerance, LensPrior
 from calibrate.handeye.solve import Solution, SolveOptions, solve_views
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import MODELS, forward, inverse_many
-from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import intrinsics_names, intrinsics_vector, project_pixels, with_intrinsics_vector
 from calibrate.quality.gates import GateInputs, GateLimits, judge
@@ -282,7 +280,6 @@ def measure(
     found["inside flange"] = float((square <= result.flange_threshold).mean())
     gates = judge(with_table, GateInputs(None, None), GateLimits())
     found["refused"] = float(not all(gate.passed for gate in gates))
-    found["evidence"] = arm.log_bayes
     found["offered"] = float(result.offered)
     return found
 
@@ -317,40 +314,12 @@ def run() -> str:
     found: dict[str, list[dict[str, float]]] = {row.name: [] for row in ROWS}
     for (row, _), cell in zip(tasks, in_processes(_measured, tasks), strict=True):
         found[row.name].append(cell)
-    return described(found) + "\n\n" + of_real_arms()
+    return described(found)
 
 
 def _measured(task: tuple[Row, int]) -> dict[str, float]:
     row, seed = task
     return measure(seed, row.mount, row.size, row.told, row.views, row.planned)
-
-
-REAL = {"ur3a-two-swapped": "UR3", "ur5-chessboard": "UR5"}
-
-
-def of_real_arms() -> str:
-    """Left-out views of real arms, joints by inverse kinematics; without the sets, that is said."""
-    rows = []
-    for real in real_sets(tuple(REAL)):
-        model = REAL[real.name]
-        lens = calibrate_intrinsics(real.views).camera
-        views = solve_pnp(replace(real.views, camera=lens, robot_model=model), real.board)
-        options = SolveOptions(holdout=False, intrinsics_from_same_pictures=True)
-        arm = solve_views(views, options).arm
-        if arm is None or arm.result is None:
-            rows.append((real.name, model, len(views), "–", "–", "no: the flanges are out of its reach"))
-            continue
-        missed = arm.result.held_out_m
-        shown = "–"
-        if missed is not None:
-            without, with_table = 1e3 * np.sqrt(np.nanmean(missed**2, axis=1))
-            shown = f"{without:.2f} → {with_table:.2f}"
-        offered = "yes" if arm.result.offered else f"no: {arm.result.refused}"
-        rows.append((real.name, model, len(views), f"{arm.log_bayes:.1f}", shown, offered))
-    if not rows:
-        return "The sets of real arms are missing: see STATION_DATASETS."
-    header = ("real set", "arm", "views", "log evidence", "left out elsewhere, mm", "offered")
-    return table(header, rows)
 
 
 def described(found: dict[str, list[dict[str, float]]]) -> str:

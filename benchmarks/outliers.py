@@ -79,7 +79,7 @@ def run() -> str:
         print(" | ".join(rows[-1]), flush=True)
     text = (
         f"{count} cells per row (`imperfect_cells`, the lens given, nothing else wrong), {_VIEWS} views. "
-        "Swapped: two poses exchanged, pair by pair; shuffled: the poses of all bad views exchanged; turned: "
+        "Shuffled: the poses of all bad views exchanged; turned: "
         "corners in the order of the board turned by 180°; far: robot pose off by 10 … 60 robot sigmas in "
         "each component. Board, TCP, focus: changed for so many of the views (the last or, in every other "
         "cell, the first ones): board by 10 … 50 mm and 1 … 5°, TCP by 20 … 120 mm, focal length by "
@@ -119,7 +119,7 @@ def _bad_views(name: str, share: float, seed: int, rng: np.random.Generator) -> 
     count = round(_VIEWS * share)
     if name in _CHANGED:
         return np.arange(_VIEWS)[-count:] if seed % 2 else np.arange(count)
-    return np.asarray(rng.choice(_VIEWS, count - count % 2 if name == "swapped" else count, replace=False))
+    return np.asarray(rng.choice(_VIEWS, count, replace=False))
 
 
 def _named(solution: Solution, spoilt: Spoilt, bad: set[int]) -> tuple[bool, bool]:
@@ -179,10 +179,6 @@ def _exchange(cell: ImperfectCell, bad: Places, other: Places) -> Spoilt:
         replace(views[i], base_from_flange=views[j].base_from_flange) for i, j in zip(bad, other, strict=True)
     ]
     return _views_wrong(cell, bad, changed, "wrong-pose")
-
-
-def _swap(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
-    return _exchange(cell, bad, bad.reshape(-1, 2)[:, ::-1].ravel())
 
 
 def _shuffle(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
@@ -260,7 +256,7 @@ def _refocus(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoi
     return Spoilt(spoilt, cell.X, good, Reading.REFOCUSED)
 
 
-_VIEWS_WRONG: dict[str, Spoil] = {"swapped": _swap, "shuffled": _shuffle, "turned": _turn, "far": _far}
+_VIEWS_WRONG: dict[str, Spoil] = {"shuffled": _shuffle, "turned": _turn, "far": _far}
 _CHANGED: dict[str, Spoil] = {
     "board moved": _move_board,
     "TCP changed": _change_tcp,

@@ -11,7 +11,7 @@ import contextlib
 import gc
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,10 +20,8 @@ from typing import ClassVar
 from textual import events, work
 from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
-from textual.reactive import reactive
 from textual.screen import Screen
 
-from calibrate.files.calibration import Calibration
 from station.cell.errors import StationError
 from station.cell.status import MotionPreview, SessionStatus, StationState
 from station.operate.motion import prepared_motion
@@ -31,42 +29,27 @@ from station.protocol import verbs
 from station.protocol.client import Client
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose
+from station.tui.attendance import Attendance
 from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
 from station.tui.desk import Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion, Help
+from station.tui.disk_watch import DiskWatch
 from station.tui.frame import SESSION
-from station.tui.installed import LOOK_S, Marks, Result, marks, read_result, read_sessions, state_root
 from station.tui.log_screen import LogScreen
 from station.tui.plan_screen import PlanScreen
 from station.tui.result import InstallScreen, SolveScreen, VerifyScreen
-from station.tui.results import (
-    check_drift,
-    check_session,
-    discard,
-    export_result,
-    install_result,
-    recover_session,
-    solve_session,
-    undo_install,
-)
-from station.tui.screen import Ask, StationScreen
-from station.tui.sessions import SessionsScreen, SessionWish
+from station.tui.results import check_drift, solve_session
+from station.tui.screen import StationScreen
+from station.tui.sessions import SessionsScreen
 from station.tui.task import DIGITS
-from station.tui.touch_corners import run_touch_test
 from station.tui.widgets.graphics import detect
 from station.tui.widgets.preview import PreviewPane
 
-WHERE_IS_THE_CURSOR = "\x1b[6n"
-"""ECMA-48's device status report: a terminal answers by itself, from where the person sits."""
-ASK_S = 3.0
-UNANSWERED = 5
-TERMINAL_SILENT = "Terminal silent {:.0f} s. The arm was stopped, control released."
 PREVIEW_PERIOD_S = 0.25
 SETTLED_S = 2.0
 ACKNOWLEDGE = "Leave STOPPED or FAULT after looking"
 DECELERATES = "It decelerates at once, and the session pauses."
-ResultWork = Callable[[Desk, Result, Calibration], Awaitable[str | None]]
 
 
 def freeze_startup() -> None:
@@ -97,12 +80,6 @@ class StationApp(KnowingApp):
     CSS_PATH = "station.tcss"
     MODES: ClassVar[dict[str, type[StationScreen]]] = {screen.MODE: screen for screen in SCREENS}  # type: ignore[assignment]
     DEFAULT_MODE = "capture"
-    _unanswered: int | None = None
-    """Questions since the last answer; None: there was none yet."""
-    result_path: reactive[str] = reactive("", repaint=False, always_update=True)
-    """The calibration file that the result screens show; empty: that of the session just captured."""
-    _marks: tuple[str, Marks] = ("", frozenset())
-    _looking = False
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", show=False, priority=True, tooltip="Stop the arm now"),
         Binding("f1", "help", "Help", show=False, tooltip="What this screen is for, and all its keys"),
@@ -124,38 +101,18 @@ class StationApp(KnowingApp):
     def __init__(self, client: Client) -> None:
         super().__init__()
         self.desk = Desk(self, client)
+        self.attendance, self._disk = Attendance(self.desk), DiskWatch(self)
         self._greeted = False
 
     def on_mount(self) -> None:
         self.run_worker(self.desk.follow(), group="follow", exit_on_error=False)
         self.fetch_previews()
         self.set_timer(SETTLED_S, freeze_startup)
-        self._ask_terminal()
-        self.set_interval(ASK_S, self._look_for_terminal)
-        self.set_interval(LOOK_S, self._look)
-
-    # --- the person: an ssh that dies silently leaves this screen alive, and with it control of the arm ---
+        self.run_worker(self._disk.follow(), group="disk", exit_on_error=False)
+        self.attendance.begin()
 
     def on_cursor_position(self, event: events.CursorPosition) -> None:
-        self._unanswered = 0
-
-    def _ask_terminal(self) -> None:
-        if self._driver is not None:
-            self._driver.write(WHERE_IS_THE_CURSOR)
-
-    async def _look_for_terminal(self) -> None:
-        if self._unanswered is None:
-            return
-        if not self.known.works or not self.desk.has_control():
-            self._unanswered = 0
-            return
-        if self._unanswered >= UNANSWERED:
-            await self.desk.ask(verbs.Release(silent=True))
-            self._unanswered = 0
-            self.notify(TERMINAL_SILENT.format(ASK_S * UNANSWERED), severity="error", timeout=3600)
-            return
-        self._unanswered += 1
-        self._ask_terminal()
+        self.attendance.answered()
 
     # --- what is known ---
 
@@ -202,105 +159,26 @@ class StationApp(KnowingApp):
 
     @work(exclusive=True, group="sessions", exit_on_error=False)
     async def action_look_at_sessions(self) -> None:
-        root, sessions = self.desk.client.root, await self.desk.ask(verbs.Sessions())
-        if sessions is None:
-            self._marks = ("", frozenset())  # why was said; what was known stays until the next look
-            return
-        kept = await asyncio.to_thread(read_sessions, root, self.desk.client.camera, sessions)
-        self.known = replace(self.known, sessions=kept)
+        await self._disk.read_sessions()
 
     def watch_result_path(self) -> None:
         self.action_look_at_results()
 
-    def _look(self) -> None:
-        """Look whether another screen or a shell changed something; a daemon at work is left in peace."""
-        if not self.known.works:
-            self.action_look_at_results()
+    def action_look_at_results(self) -> None:
+        self._disk.look()
 
-    @work(group="look", exit_on_error=False)
-    async def action_look_at_results(self) -> None:
-        """Read the shown result, and the sessions where they are shown, if anything changed on the disk."""
-        if self._looking:
-            return  # what is under way comes to the newest, too
-        self._looking = True
-        try:
-            while (found := await self._found()) not in (None, self._marks):
-                assert found is not None
-                path, self._marks = found[0], found
-                result = await asyncio.to_thread(read_result, path) if path else None
-                self.known = replace(self.known, result=result)
-                if isinstance(self.screen, SessionsScreen):
-                    self.action_look_at_sessions()
-        finally:
-            self._looking = False
-
-    async def _found(self) -> tuple[str, Marks] | None:
-        """The shown file, and marks of all below the root; None without a root."""
-        live = self.known.live
-        path = self.result_path or ("" if live is None else live.session.calibration)
-        root = state_root(path) if path else self.desk.client.root
-        return None if root is None else (path, await asyncio.to_thread(marks, root))
-
-    # --- wishes of the screens ---
+    # --- what the screens ask for by a key ---
 
     async def action_open(self, mode: str) -> None:
         await self.switch_mode(mode)
-
-    async def show_result(self, calibration: str) -> None:
-        """Open a calibration file; empty: there is none any more."""
-        self.result_path = calibration
-        await self.switch_mode("solve" if calibration else "sessions")
-
-    def on_ask(self, wish: Ask) -> None:
-        self.run_worker(
-            self.desk.ask(wish.verb, timeout_s=wish.timeout_s), group="command", exit_on_error=False
-        )
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def on_session_wish(self, wish: SessionWish) -> None:
-        session, desk = wish.session, self.desk
-        match wish.what:
-            case "solve":
-                await self._solve(session.recording, session.folder)
-            case "show":
-                await self.show_result(session.calibration)
-            case "check":
-                await check_session(desk, session.recording, session.folder)
-            case "recover":
-                await recover_session(desk, session.folder)
-
-    async def _solve(self, recording: str, folder: str) -> None:
-        if path := await solve_session(self.desk, recording, folder):
-            await self.show_result(path)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def action_solve_newest(self) -> None:
         session = self.known.shown.session
         if session.recording:
-            await self._solve(session.recording, session.folder)
+            await solve_session(self.desk, session.recording, session.folder)
         else:
             self.notify("Nothing is finished yet: F7 finishes a session; older ones are on 7.")
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def action_on_result(self, what: str) -> None:
-        """Do something with the shown result."""
-        result = self.known.result
-        if result is None or result.calibration is None:
-            self.notify(f"There is no result to {what}: F9 on 7 makes one.")
-            return
-        works: dict[str, ResultWork] = {
-            "install": install_result,
-            "touch test": self._touch_test,
-            "export": export_result,
-            "undo": undo_install,
-            "discard": discard,
-        }
-        if (path := await works[what](self.desk, result, result.calibration)) is not None:
-            await self.show_result(path)
-
-    async def _touch_test(self, desk: Desk, result: Result, calibration: Calibration) -> str | None:
-        path = Path(result.path)
-        return result.path if await run_touch_test(desk, path) else None
 
     @work(exclusive=True, group="drift", exit_on_error=False)
     async def action_drift_check(self) -> None:

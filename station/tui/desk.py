@@ -50,9 +50,17 @@ class StatusChanged(Message):
 
 
 class KnowingApp(ThemedApp[None]):
-    """An app whose screens watch what is known."""
+    """An app whose screens watch what is known, and ask the daemon by one desk."""
 
     known: reactive[Known] = reactive(Known(), repaint=False)
+    result_path: reactive[str] = reactive("", repaint=False, always_update=True)
+    """The calibration file that the result screens show; empty: that of the session just captured."""
+    desk: Desk
+
+    async def show_result(self, calibration: str) -> None:
+        """Open a calibration file; empty: there is none any more."""
+        self.result_path = calibration
+        await self.switch_mode("solve" if calibration else "sessions")
 
 
 class Desk:

@@ -22,7 +22,6 @@ from calibrate.quality.drift_history import CheckEntry, read_checks
 from recordings.files import MAIN_CAMERA
 from station.cell.session_folder import SessionSummary
 
-LOOK_S = 2.0
 Marks = frozenset[tuple[str, int]]
 
 

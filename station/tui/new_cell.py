@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -21,9 +21,8 @@ from textual.widgets import Footer, Input, OptionList, Static
 from textual.widgets.option_list import Option
 
 from calibrate.boards.detect import Detection
-from calibrate.boards.model import board_points
 from recordings.errors import CodedError
-from recordings.schema.messages import BoardSpec, Image
+from recordings.schema.messages import Image
 from station.analysis.worker import preview_image
 from station.cell.errors import StationError
 from station.operate import new_cell as flow
@@ -176,15 +175,13 @@ class NewCell(ThemedApp[Ending]):
         self._show()
 
     async def _show_picture(self, image: Image, found: Detection | None) -> None:
-        pane, board = self.query_one(PreviewPane), self.setup.draft.board
+        pane = self.query_one(PreviewPane)
         if not pane.display:
             return
         self._pictures += 1
         corners = np.zeros((0, 2)) if found is None else found.pixels
         preview = preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures)
-        await pane.show(
-            preview, () if found is None or board is None else _axes(board, found, preview.corners)
-        )
+        await pane.show(preview)
 
     def _add_view(self) -> None:
         self.setup.take_view()
@@ -352,21 +349,6 @@ class NewCell(ThemedApp[Ending]):
 
     async def on_unmount(self) -> None:
         await self.setup.close()
-
-
-def _axes(
-    board: BoardSpec, found: Detection, shares: Sequence[tuple[float, float]]
-) -> tuple[tuple[str, float, float], ...]:
-    """O at the board's origin, x and y two squares along its axes, where these corners are seen."""
-    points = board_points(board)[:, :2]
-    step_m = 2 * board.square_m
-    marks = []
-    for letter, place in (("O", (0.0, 0.0)), ("x", (step_m, 0.0)), ("y", (0.0, step_m))):
-        row = int(np.argmin(np.linalg.norm(points - place, axis=1)))
-        at = np.flatnonzero(found.indices == row)
-        if len(at):
-            marks.append((letter, *shares[at[0]]))
-    return tuple(marks)
 
 
 def run(hardware: Hardware, root: Path, output: Path) -> Ending:

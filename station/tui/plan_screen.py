@@ -17,7 +17,7 @@ from station.cell.status import PoseStatus, StationStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
 from station.tui.frame import Line
-from station.tui.screen import Ask, Box, Panel, Rows, StationScreen
+from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw, view_of
 from station.tui.words import MARKS, UNKNOWN, Mark, degrees, dim, facts, limit_bar, lines, many, mark, mm
@@ -177,7 +177,7 @@ class PlanScreen(StationScreen):
 
     def action_pose(self, verb: str) -> None:
         if (index := self._selected()) is not None:
-            self.post_message(Ask(POSE_VERBS[verb](index)))
+            self.ask(POSE_VERBS[verb](index))
 
     def action_shift(self, by: int) -> None:
         status, line = self.known.live, self.table.cursor_row
@@ -188,7 +188,7 @@ class PlanScreen(StationScreen):
             return
         order = [pose.index for pose in status.session.poses]
         order[line], order[line + by] = order[line + by], order[line]
-        self.post_message(Ask(Reorder(tuple(order))))
+        self.ask(Reorder(tuple(order)))
         self.table.move_cursor(row=line + by)
 
     def action_add(self) -> None:
@@ -197,7 +197,7 @@ class PlanScreen(StationScreen):
             self.notify("The arm's posture is not known: no robot state.", severity="warning")
             return
         name = f"here-{max((pose.index for pose in status.session.poses), default=-1) + 2}"
-        self.post_message(Ask(Add(PlannedPose(name, status.robot.joints_rad, why="added on the screen"))))
+        self.ask(Add(PlannedPose(name, status.robot.joints_rad, why="added on the screen")))
 
     def action_make(self, aim: Literal["camera", "both"]) -> None:
-        self.post_message(Ask(MakePlan(25, seed=1, aim=aim), PREPARE_S))
+        self.ask(MakePlan(25, seed=1, aim=aim), PREPARE_S)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import ClassVar
 
 import numpy as np
+from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
@@ -26,10 +27,13 @@ from calibrate.files.validity import ValidityState, validity_text
 from calibrate.files.versions import LogEntry
 from calibrate.geometry import difference
 from station.operate.ending import Way, after_solve
+from station.tui.desk import Desk
 from station.tui.drift import drift_lines
 from station.tui.installed import Result, local
+from station.tui.results import discard, export_result, install_result, undo_install
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
+from station.tui.touch_corners import run_touch_test
 from station.tui.words import Mark, dim, facts, limit_bar, lines, mark, shortened, signed
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter shows older ones."
@@ -163,16 +167,25 @@ def residual_lines(calibration: Calibration) -> Content:
     return lines(*rows)
 
 
+WORKS: dict[str, Callable[[Desk, Result, Calibration], Awaitable[None]]] = {
+    "install": install_result,
+    "touch test": run_touch_test,
+    "export": export_result,
+    "undo": undo_install,
+    "discard": discard,
+}
+
+
 class ResultScreen(StationScreen):
     """Common base of the three: the verdict on top, and what may be done with a calibration."""
 
     LOOK = "look_at_results"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("i", "app.on_result('install')", "Install", tooltip=INSTALL),
-        Binding("h", "app.on_result('touch test')", "Touch test", tooltip=TOUCH_TEST),
-        Binding("e", "app.on_result('export')", "Export", tooltip=EXPORT),
-        Binding("b", "app.on_result('undo')", "Undo", tooltip=UNDO),
-        Binding("x", "app.on_result('discard')", "Discard", tooltip=DISCARD),
+        Binding("i", "act('install')", "Install", tooltip=INSTALL),
+        Binding("h", "act('touch test')", "Touch test", tooltip=TOUCH_TEST),
+        Binding("e", "act('export')", "Export", tooltip=EXPORT),
+        Binding("b", "act('undo')", "Undo", tooltip=UNDO),
+        Binding("x", "act('discard')", "Discard", tooltip=DISCARD),
     ]
 
     _drawn: object = ()
@@ -202,6 +215,15 @@ class ResultScreen(StationScreen):
 
     def tell(self, calibration: Calibration) -> None:
         """Fill what is no panel."""
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def action_act(self, what: str) -> None:
+        """Do what a key says with the shown result."""
+        result = self.known.result
+        if result is None or result.calibration is None:
+            self.notify(f"There is no result to {what}: F9 on 7 makes one.")
+        else:
+            await WORKS[what](self.desk, result, result.calibration)
 
 
 def _panel(

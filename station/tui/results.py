@@ -1,7 +1,6 @@
 """Work on recordings and results from the screen: solve, recover, install, go back, export, discard.
 
-Long work runs in a process of its own, its lines shown, and can be cancelled. What returns a text returns the
-calibration file to show next; None: what is shown stays, empty: there is none any more.
+Long work runs in a process of its own, its lines shown, and can be cancelled.
 """
 
 from __future__ import annotations
@@ -32,11 +31,13 @@ WITHDRAWS = "Your name and the reason are kept. Enter takes it out of use, Escap
 NO_VERDICT = "Another plan was loaded: the drift check has no verdict. Its views, if any, are on 7 (k)."
 
 
-async def solve_session(desk: Desk, recording: str, folder: str) -> str | None:
+async def solve_session(desk: Desk, recording: str, folder: str) -> None:
+    """Solve, and show the result."""
     output, report = (str(Path(folder) / name) for name in (CALIBRATION_FILE, "report.html"))
     what = ("solve", recording, "-o", output, "--report", report)
     code = await desk.question(JobScreen(f"Solving {Path(folder).name}", "calibrate.cli", *what))
-    return output if code in (0, 4) else None
+    if code in (0, 4):
+        await desk.app.show_result(output)
 
 
 async def recover_session(desk: Desk, folder: str) -> None:
@@ -159,12 +160,11 @@ async def export_result(desk: Desk, result: Result, calibration: Calibration) ->
         desk.app.notify(f"Written: {output}", timeout=20, markup=False)
 
 
-async def discard(desk: Desk, result: Result, calibration: Calibration) -> str | None:
+async def discard(desk: Desk, result: Result, calibration: Calibration) -> None:
     body = f"{result.path}\nis deleted. The recording stays and can be solved again."
-    if not await desk.question(Confirm("Discard this result?", body, yes="Discard")):
-        return None
-    Path(result.path).unlink(missing_ok=True)
-    return ""
+    if await desk.question(Confirm("Discard this result?", body, yes="Discard")):
+        Path(result.path).unlink(missing_ok=True)
+        await desk.app.show_result("")
 
 
 def _named(generation: InstalledVersion) -> str:

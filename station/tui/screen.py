@@ -10,12 +10,12 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Vertical
 from textual.content import Content
 from textual.coordinate import Coordinate
-from textual.message import Message
 from textual.reactive import reactive
 from textual.widgets import DataTable
 
 from station.protocol.client import ANSWER_S
 from station.protocol.verbs import Verb
+from station.tui.desk import Desk, KnowingApp
 from station.tui.frame import Frame, Framed, Keys, Line
 from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
@@ -85,14 +85,6 @@ class Rows(DataTable[object]):
         self._cells, self._variables = cells, variables
 
 
-class Ask(Message):
-    """A wish for the daemon; a notice says why it was refused."""
-
-    def __init__(self, verb: Verb[object], timeout_s: float = ANSWER_S) -> None:
-        super().__init__()
-        self.verb, self.timeout_s = verb, timeout_s
-
-
 class StationScreen(Framed[None]):
     """One screen; `body` is what differs."""
 
@@ -110,6 +102,16 @@ class StationScreen(Framed[None]):
     @property
     def heading(self) -> str:
         return self.NAME or self.MODE.title()
+
+    @property
+    def desk(self) -> Desk:
+        """The daemon, as every screen asks it."""
+        assert isinstance(self.app, KnowingApp)
+        return self.app.desk
+
+    def ask(self, verb: Verb[object], timeout_s: float = ANSWER_S) -> None:
+        """Send a request to the daemon; a notice says why it was refused."""
+        self.run_worker(self.desk.ask(verb, timeout_s=timeout_s), group="command", exit_on_error=False)
 
     def compose(self) -> ComposeResult:
         yield Frame(self.heading, self.MODE)

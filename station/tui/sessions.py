@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
+from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.content import Content
-from textual.message import Message
 from textual.widgets import Static
 
-from station.cell.session_folder import SessionSummary
 from station.operate.drift_check import POSES
 from station.tui.installed import Kept
+from station.tui.results import check_session, recover_session, solve_session
 from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.words import UNKNOWN, facts, mark, size
@@ -20,17 +20,6 @@ from station.tui.words import UNKNOWN, facts, mark, size
 DRIFT = f"Drift check: capture {POSES} poses in place of the loaded plan (asks)"
 NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
 COLUMNS = ("session", "what became of it", "verdict", "predicted", "held-out", "views", "size")
-
-
-SessionWork = Literal["solve", "show", "check", "recover"]
-
-
-class SessionWish(Message):
-    """A wish to do something with a recorded session."""
-
-    def __init__(self, what: SessionWork, session: SessionSummary) -> None:
-        super().__init__()
-        self.what, self.session = what, session
 
 
 class SessionsScreen(StationScreen):
@@ -75,18 +64,26 @@ class SessionsScreen(StationScreen):
         line = self.table.cursor_row
         return self._sessions[line] if self._sessions and line < len(self._sessions) else None
 
-    def action_act(self, what: SessionWork) -> None:
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def action_act(self, what: str) -> None:
         """Do what a key says with the highlighted session."""
         if (kept := self._highlighted()) is None:
             self.notify(NO_SESSION)
             return
-        session = kept.session
-        if what == "solve" and not session.sealed:
-            self.notify("This recording was never finished: press c to recover it first.")
-        elif what == "show" and not session.calibration:
-            self.notify("Not solved yet: F9 solves it.")
-        else:
-            self.post_message(SessionWish(what, session))
+        session, desk = kept.session, self.desk
+        match what:
+            case "solve" if not session.sealed:
+                self.notify("This recording was never finished: press c to recover it first.")
+            case "solve":
+                await solve_session(desk, session.recording, session.folder)
+            case "show" if not session.calibration:
+                self.notify("Not solved yet: F9 solves it.")
+            case "show":
+                await desk.app.show_result(session.calibration)
+            case "check":
+                await check_session(desk, session.recording, session.folder)
+            case "recover":
+                await recover_session(desk, session.folder)
 
     def on_data_table_row_selected(self) -> None:
         """Enter on a session: what it gave."""

@@ -13,12 +13,13 @@ from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
 from calibrate.boards.model import board_points, outer_corners
+from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch, touch_text
 from recordings.errors import CodedError
 from station.operate.tip_offsets import SeenBoard, note_touches, read_touch, see_board
 from station.tui.desk import Desk, told
 from station.tui.frame import Question
-from station.tui.installed import state_root
+from station.tui.installed import Result, state_root
 
 ABOUT = (
     "Bring the tip of the tool or pointer onto a corner of the board, with freedrive or the pendant, hold it "
@@ -80,12 +81,13 @@ class TouchCorners(Question[list[Touch]]):
         self.dismiss(list(self._found.values()))
 
 
-async def run_touch_test(desk: Desk, path: Path) -> bool:
-    """Read corners until the person ends it. True when something was written into the file."""
+async def run_touch_test(desk: Desk, result: Result, _: Calibration) -> None:
+    """Read corners until the person ends it, then write what was found into the file."""
+    path = Path(result.path)
     board = await desk.attempt(see_board(desk.client, path))
     if board is None or not (touches := await desk.question(TouchCorners(board))):
-        return False
-    words = await desk.attempt(asyncio.to_thread(note_touches, state_root(str(path)), path, touches))
+        return
+    words = await desk.attempt(asyncio.to_thread(note_touches, state_root(path), path, touches))
     if words:
         desk.app.notify(words, markup=False)
-    return bool(words)
+        await desk.app.show_result(result.path)

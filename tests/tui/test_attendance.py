@@ -8,7 +8,7 @@ from textual import events
 
 from station.cell.status import LeaseStatus, StationState, StationStatus
 from station.protocol import verbs
-from station.tui import app as attendance
+from station.tui import attendance
 from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 
 LOST = verbs.Release(silent=True)
@@ -37,7 +37,7 @@ async def test_who_commands_a_moving_arm_is_asked_for(
 ) -> None:
     monkeypatch.setattr(attendance, "ASK_S", 60.0)  # only the test asks
     asked = []
-    monkeypatch.setattr(attendance.StationApp, "_ask_terminal", lambda app: asked.append(app))
+    monkeypatch.setattr(attendance.Attendance, "ask", lambda seen: asked.append(seen))
     link.show(commanded(state, holder))
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
@@ -45,10 +45,10 @@ async def test_who_commands_a_moving_arm_is_asked_for(
         if answered:
             app.post_message(events.CursorPosition(0, 0))
         for _ in range(2 * attendance.UNANSWERED):
-            await app._look_for_terminal()
+            await app.attendance.look()
             await pilot.pause()
         assert (LOST in link.asked) is lost
-        assert any("Terminal silent" in said.message for said in app._notifications) is lost
+        assert any("control released" in said.message for said in app._notifications) is lost
         assert len(asked) >= attendance.UNANSWERED or not lost
 
 
@@ -60,9 +60,9 @@ async def test_a_terminal_that_answers_keeps_control(link: FakeLink, monkeypatch
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
         for _ in range(3):
             app.post_message(events.CursorPosition(0, 0))
-            await until(pilot, lambda: app._unanswered == 0)
+            await until(pilot, lambda: app.attendance.unanswered == 0)
             for _ in range(attendance.UNANSWERED):
-                await app._look_for_terminal()
+                await app.attendance.look()
         assert LOST not in link.asked
-        await app._look_for_terminal()
+        await app.attendance.look()
         assert LOST in link.asked

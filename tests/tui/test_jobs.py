@@ -50,18 +50,8 @@ async def test_its_lines_are_as_wide_as_the_window(link: FakeLink, job: Path) ->
         assert len(screen.said[0]) == screen.query_one(RichLog).scrollable_content_region.width > 80
 
 
-async def test_seconds_tell_that_it_works(link: FakeLink, job: Path) -> None:
-    job.write_text("import time; time.sleep(600)")
-    async with running(link) as (pilot, screen, _codes):
-        await until(pilot, lambda: screen._process)
-        screen._begun_s = time.monotonic() - 65.0
-        screen._say_how_long()
-        assert "1:05 Working …" in str(screen.query_one("#job-title", Label).render())
-        await pilot.press("escape")
-        await until(pilot, lambda: not isinstance(pilot.app.screen, JobScreen))
-
-
-async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, job: Path) -> None:
+@pytest.mark.parametrize("key", ["escape", "enter"])
+async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, job: Path, key: str) -> None:
     job.write_text("import sys; sys.exit('no board in any view')")
     async with running(link) as (pilot, screen, codes):
         button = screen.query_one("#job-cancel", Button)
@@ -69,7 +59,7 @@ async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, jo
         assert any("no board in any view" in line.text for line in screen.query_one(RichLog).lines)
         await until(pilot, lambda: READ.label in text_of(pilot.app, "#next"))
         assert codes == []
-        await pilot.press("escape")
+        await pilot.press(key)
         await until(pilot, lambda: codes)
         assert codes == [1]
 
@@ -77,8 +67,14 @@ async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, jo
 async def test_cancelling_ends_the_process(link: FakeLink, job: Path, tmp_path: Path) -> None:
     pid_file = tmp_path / "pid"
     job.write_text(f"import os, time; open({str(pid_file)!r}, 'w').write(str(os.getpid())); time.sleep(600)")
-    async with running(link) as (pilot, _screen, codes):
+    async with running(link) as (pilot, screen, codes):
         await until(pilot, lambda: pid_file.exists() and pid_file.read_text())
+        screen._begun_s = time.monotonic() - 65.0
+        screen._say_how_long()  # seconds tell that it works
+        assert "1:05 Working …" in str(screen.query_one("#job-title", Label).render())
+        await pilot.press("enter")  # by mistake: a second one after the question that began it
+        await pilot.pause()
+        assert codes == [] and not screen._cancelled
         await pilot.press("escape")
         await until(pilot, lambda: codes)
         assert codes == [-1]
@@ -93,28 +89,6 @@ async def test_leaving_the_program_ends_the_process(link: FakeLink, job: Path, t
         await until(pilot, lambda: pid_file.exists() and pid_file.read_text())
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid_file.read_text()), 0)
-
-
-async def test_enter_by_mistake_cancels_nothing(link: FakeLink, job: Path) -> None:
-    """A second Enter after the question that began it."""
-    job.write_text("import time; time.sleep(600)")
-    async with running(link) as (pilot, screen, codes):
-        await until(pilot, lambda: screen._process)
-        await pilot.press("enter")
-        await pilot.pause()
-        assert codes == [] and not screen._cancelled
-        await pilot.press("escape")
-        await until(pilot, lambda: codes)
-
-
-async def test_enter_closes_what_was_read(link: FakeLink, job: Path) -> None:
-    job.write_text("import sys; sys.exit('no board in any view')")
-    async with running(link) as (pilot, screen, codes):
-        button = screen.query_one("#job-cancel", Button)
-        await until(pilot, lambda: str(button.label) == "Close")
-        await pilot.press("enter")
-        await until(pilot, lambda: codes)
-        assert codes == [1]
 
 
 async def test_what_was_done_when_it_was_cancelled_counts(link: FakeLink, job: Path) -> None:

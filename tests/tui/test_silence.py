@@ -60,50 +60,28 @@ async def test_meanwhile_only_stop_is_sent_and_the_emergency_stop_is_named(link:
         link.silent.clear()
 
 
-async def test_why_there_is_no_daemon_is_said(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
-        link.show(None)
-        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
-        assert "The daemon ended" in text_of(pilot.app, "#next")
-
-
-async def test_what_the_daemon_said_last_stays_and_is_marked_old(link: FakeLink) -> None:
+async def test_without_a_daemon_what_it_said_last_stays_and_is_marked_old(link: FakeLink) -> None:
+    """Also on a screen that was away meanwhile: not what it had shown itself when it was left."""
     said = Event(1, "warning", "pose 3 did not come to rest")
-    link.show(msgspec.structs.replace(idle(StationState.MOVING), events=(said,)))
-    async with app_on(link).run_test(size=(160, 48)) as pilot:
-        await until(pilot, lambda: "pose 3" in text_of(pilot.app, "#events"))
-        link.show(None)
-        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
-        assert "robot" in text_of(pilot.app, "#devices")
-        assert str(pilot.app.screen.query_one("#devices").border_title) == "Devices: OLD"
-        assert "pose 3" in text_of(pilot.app, "#events")
-
-
-async def test_the_plan_stays_in_sight_too(link: FakeLink) -> None:
-    async with opened(link) as pilot:
+    async with opened(link, size=(160, 48)) as pilot:
         await pilot.press("2")
         await until(pilot, lambda: pilot.app.screen.query(DataTable))
         table = pilot.app.screen.query_one(DataTable)
         await until(pilot, lambda: table.row_count == 25)
-        link.show(None)
-        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
-        assert table.row_count == 25
-
-
-async def test_a_screen_that_was_away_meanwhile_shows_what_was_known_last(link: FakeLink) -> None:
-    """Not what it had shown itself when it was left."""
-    async with opened(link) as pilot:
-        await pilot.press("2")
         moving = idle(StationState.MOVING)
-        link.show(msgspec.structs.replace(moving, session=msgspec.structs.replace(moving.session, current=7)))
+        session = msgspec.structs.replace(moving.session, current=7)
+        link.show(msgspec.structs.replace(moving, session=session, events=(said,)))
         await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
         link.show(None)
         await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
+        assert "The daemon ended" in text_of(pilot.app, "#next")
+        assert table.row_count == 25
         await pilot.press("3")
         await until(pilot, lambda: "p08" in text_of(pilot.app, "#poses"))
         assert "NO DAEMON" in text_of(pilot.app, "#bar")
-        assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose 8 (8 of 25): OLD"
+        assert "robot" in text_of(pilot.app, "#devices") and "pose 3" in text_of(pilot.app, "#events")
+        titles = [str(pilot.app.screen.query_one(part).border_title) for part in ("#devices", "#progress")]
+        assert titles == ["Devices: OLD", "Pose 8 (8 of 25): OLD"]
 
 
 @pytest.mark.parametrize(("heard", "said"), [(True, "without a connection"), (False, "nothing was sent")])

@@ -55,15 +55,6 @@ async def test_what_was_missing_is_looked_for_on_every_screen(
         assert isinstance(pilot.app.screen, CaptureScreen)
 
 
-async def test_before_the_first_session_too(link: FakeLink) -> None:
-    fresh = idle()
-    link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
-    link.answers |= {"doctor": THERE, "sessions": []}
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConnectScreen))
-        await until(pilot, lambda: "Nothing&#160;is&#160;missing" in pilot.app.export_screenshot())
-
-
 async def test_later_the_live_screen_comes_first(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await pilot.pause()
@@ -86,7 +77,8 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
     link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
     link.answers |= {"doctor": THERE, "sessions": []}
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConnectScreen))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConnectScreen))  # before the first session
+        await until(pilot, lambda: "Nothing&#160;is&#160;missing" in pilot.app.export_screenshot())
         for screen, key, words in reasons:
             await pilot.press(screen)
             await pilot.pause()
@@ -153,18 +145,6 @@ def test_every_key_has_a_tooltip() -> None:
     for owner in (StationApp, *StationApp.MODES.values()):
         for binding in vars(owner).get("BINDINGS", ()):
             assert binding.tooltip, (owner, binding)
-
-
-@pytest.mark.parametrize("theme", ["station-dark", "station-light", "terminal"])
-async def test_the_state_is_a_word_in_every_theme(
-    link: FakeLink, theme: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TEXTUAL_THEME", theme)
-    link.show(idle(StationState.FAULT, "camera lost"))
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
-        assert pilot.app.theme == theme
-        assert "■ FAULT" in text_of(pilot.app, "#bar")
 
 
 def test_a_console_with_16_colours_gets_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import time
-from collections.abc import Sequence
 from functools import lru_cache
 from itertools import groupby
 from typing import ClassVar
@@ -28,12 +27,10 @@ from station.tui.widgets.graphics import PERIOD_S, SHARE, Graphics, SharpPicture
 Grey = NDArray[np.uint8]
 LEVELS = 20
 """Shades a terminal image is drawn with: fewer styles to send, and no eye sees more in half blocks."""
+_CORNER = -1
+"""A cell that shows a corner in place of shades."""
 CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_rgb(0, 0, 0), bold=True))
 """A sign and not only a colour."""
-LETTER = Style(color="black", bgcolor="bright_yellow", bold=True)
-Letters = Sequence[tuple[str, float, float]]
-"""Letter, x and y as shares of the image."""
-
 OLD = "OLD IMAGE"
 SMALLEST = (16, 16)
 """Pixels of an image that nobody will see."""
@@ -59,7 +56,6 @@ class PreviewPane(Widget):
         self._image: Grey | None = None
         self._sequence: int | None = None
         self._corners: NDArray[np.float64] = np.zeros((0, 2))
-        self._letters: Letters = ()
         self._rows: list[Strip] = []
         self._rows_size = Size(0, 0)
         self._sharp: SharpPicture | None = None
@@ -77,8 +73,8 @@ class PreviewPane(Widget):
         if due and answer.jpeg_base64:
             await self.show(answer)
 
-    async def show(self, answer: verbs.PreviewImage, letters: Letters = ()) -> None:
-        """Show an image, with letters in it where half blocks draw it, unless it stands there already."""
+    async def show(self, answer: verbs.PreviewImage) -> None:
+        """Show an image, unless it stands there already."""
         if answer.sequence == self._sequence:
             return
         data = np.frombuffer(base64.b64decode(answer.jpeg_base64), dtype=np.uint8)
@@ -87,7 +83,6 @@ class PreviewPane(Widget):
             return
         self._image, self._sequence = np.asarray(image, dtype=np.uint8), answer.sequence
         self._corners = np.array(answer.corners, dtype=float).reshape(-1, 2)
-        self._letters = letters
         self._rows_size = Size(0, 0)
         await self._sharpen(self.size)
         self.refresh()
@@ -138,10 +133,10 @@ class PreviewPane(Widget):
         few = self.app.current_theme.ansi
         shades_of_a_cell = shades[:, 0] + shades[:, 1] if few else shades[:, 0] * LEVELS + shades[:, 1]
         cells = shades_of_a_cell.tolist()
-        for letter, x, y in [*(("+", x, y) for x, y in self._corners), *self._letters]:
+        for x, y in self._corners:
             row, column = int(y * rows) // 2, int(x * columns)
             if 0 <= row < rows // 2 and 0 <= column < columns:
-                cells[row][column] = -ord(letter)
+                cells[row][column] = _CORNER
         left = (size.width - columns) // 2
         sides = (
             Segment(" " * left, self.rich_style),
@@ -155,8 +150,8 @@ def _runs(line: list[int], few: bool) -> list[Segment]:
     runs: list[Segment] = []
     for cell, alike in groupby(line):
         count = len(list(alike))
-        if cell < 0:
-            runs += [CORNER if cell == -ord("+") else Segment(chr(-cell), LETTER)] * count
+        if cell == _CORNER:
+            runs += [CORNER] * count
         elif few:
             shade = FEW_SHADES[cell * len(FEW_SHADES) // (2 * LEVELS - 1)]
             runs.append(Segment(shade * count, Style()))

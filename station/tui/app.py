@@ -1,7 +1,7 @@
 """The operator's screen: a client that shows the daemon's status and sends the operator's wishes.
 
-It holds no truth: closing it, killing it or losing ssh loses nothing but control, and the daemon then
-decelerates the arm and pauses.
+Nothing is kept here: closing or killing it, or losing ssh, loses only control of the arm, and the daemon
+then decelerates the arm and pauses.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ SCREENS: tuple[type[StationScreen], ...] = (
 class StationApp(KnowingApp):
     """One app, several screens; the same keys everywhere.
 
-    The screens are drawn from `known` alone, and ask by messages and by the actions below.
+    Screens are drawn from `known` alone. What they ask for goes to the daemon by `desk`.
     """
 
     TITLE = "Calibration station"
@@ -118,7 +118,7 @@ class StationApp(KnowingApp):
 
     @work(exclusive=True, group="preview", exit_on_error=False)
     async def fetch_previews(self) -> None:
-        """Only for a screen that shows them, and only as large as it can show."""
+        """Fetch camera images while a screen shows them, no larger than it can show."""
         while True:
             await asyncio.sleep(PREVIEW_PERIOD_S)
             for preview in self.screen.query(PreviewPane):
@@ -187,7 +187,7 @@ class StationApp(KnowingApp):
     # --- keys ---
 
     async def approves(self, preview: MotionPreview) -> bool:
-        """The one question before anything moves."""
+        """Show the motion and ask; the arm moves after this question only."""
         return await self.desk.question(ConfirmMotion(preview))
 
     async def plans_here(self, refusal: StationError) -> bool:
@@ -211,7 +211,7 @@ class StationApp(KnowingApp):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_ask(self, verb: str) -> None:
-        """A verb without arguments."""
+        """Send a request that has no arguments, by its name."""
         await self.desk.ask(verbs.VERBS[verb]())
 
     @work(exclusive=True, group="command", exit_on_error=False)
@@ -241,7 +241,7 @@ class StationApp(KnowingApp):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_release(self) -> None:
-        """Another screen or a command may take control then."""
+        """Release control, so that another screen or a command may take it."""
         if self.known.live is None or not self.desk.has_control():
             holder = "" if self.known.live is None else self.known.live.lease.holder
             self.notify(f"This screen does not have control: {holder or 'nobody'} does.", markup=False)
@@ -268,12 +268,12 @@ class StationApp(KnowingApp):
         self.exit()
 
     def get_key_display(self, binding: Binding) -> str:
-        """F5 as it is printed on the key, and as every text here calls it."""
+        """Write F5 as it is printed on the key."""
         shown = super().get_key_display(binding)
         return shown.upper() if shown[0] == "f" and shown[1:].isdigit() else shown
 
     def action_help(self) -> None:
-        """Own bindings in a window that fits a console; Textual's panel halves the screen."""
+        """Show the keys in a window that fits a console; Textual's own panel halves the screen."""
         screen = self.screen
         if isinstance(screen, StationScreen):
             own = screen.BINDINGS
@@ -281,12 +281,12 @@ class StationApp(KnowingApp):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_new_cell(self) -> None:
-        """The wizard in this terminal's place; this screen comes back when it is left."""
+        """Run the wizard in this terminal; this screen comes back when the wizard ends."""
         with self.suspend():
             await asyncio.to_thread(subprocess.run, [sys.executable, "-m", "station.cli", "new"], check=False)
 
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
-        """Every key's action by name too; what moves the arm asks the same question from here."""
+        """List every key's action by name; what moves the arm asks first from here too."""
         yield from super().get_system_commands(screen)
         yield SystemCommand("New cell", "Set up a robot, a camera and a board", self.action_new_cell)
         own = screen.BINDINGS if isinstance(screen, StationScreen) else []
@@ -300,7 +300,7 @@ class StationApp(KnowingApp):
 
 
 def run(socket: Path, who: str = "") -> None:
-    """Opens the screen on the daemon that serves `socket` and returns when it is closed."""
+    """Open the screen on the daemon that serves `socket` and returns when it is closed."""
 
     PreviewPane.graphics = detect()
     StationApp(Client(socket, who)).run()

@@ -15,7 +15,7 @@ BURNT = 0.01
 
 
 def quality_line(status: StationStatus) -> Content:
-    """The board in the newest image: each with a mark, a value and, where it is poor, a word."""
+    """Judge the board in the newest image: corners, sharpness and light, with advice where one is poor."""
     seen = status.detection
     if not seen.found:
         advice = f"  {seen.advice}" if seen.advice else ""
@@ -39,7 +39,7 @@ def quality_line(status: StationStatus) -> Content:
 
 
 def error_lines(known: Known, width: int, height: int) -> Content:
-    """The expected error as it falls towards its goal: measured solid, planned dotted."""
+    """Draw the expected error after each pose: estimated solid, planned dotted, the goal dashed."""
     status = known.shown
     estimate, poses = status.estimate, status.session.poses
     goal = estimate.goal_mm

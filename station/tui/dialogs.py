@@ -32,7 +32,7 @@ from station.tui.words import duration, limit_bar, lines
 
 TERMINATE_S = 5.0
 WIDTH, INDENT = 54, 10
-"""Letters of a fact in one line, and those before it."""
+"""Width of a fact in letters, and of its name before it."""
 KEYS = "Tab marks the other answer, Enter gives it; Escape: no"
 SIMULATED = "SIMULATED cell: nothing real moves"
 HELP_END = (
@@ -42,7 +42,7 @@ HELP_END = (
 
 
 class Confirm(Question[bool]):
-    """A question with consequences. Enter presses the focused button, which is the harmless one."""
+    """A question whose yes has consequences. Enter alone answers no: that button has the focus."""
 
     BOX, AUTO_FOCUS = "confirm", "#no"
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -119,7 +119,7 @@ class ConfirmMotion(Confirm):
 
 
 def motion_text(preview: MotionPreview) -> Content:
-    """The facts of a motion, one a line; then the question."""
+    """List the facts of a motion, one a line; then the question."""
     rows = []
     for name, text in motion_facts(preview):
         style = "bold $warn" if name == "WARNING" else "$foreground"
@@ -150,7 +150,7 @@ class ChooseFormat(Question[str | None]):
 
 
 class Reason(Question[str]):
-    """A person's reason to do something all the same; empty: they do not."""
+    """Ask for a reason to override a refusal; empty: not done."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "dismiss('')", "Cancel", tooltip="Change nothing")
@@ -175,7 +175,7 @@ class Reason(Question[str]):
 
 
 class Help(Question[None]):
-    """The purpose of a screen, and every key with what it does. Scrolls where it does not fit."""
+    """The purpose of a screen, and what each key does; scrolls on a small terminal."""
 
     BOX, NAME, NEXT = "help", "Help", Action("Esc", "Close this help", "F12 stops the arm here too.")
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -232,7 +232,7 @@ class JobScreen(Question[int]):
         self.call_after_refresh(self.run_job)  # the width of its lines is known then
 
     def _say_how_long(self) -> None:
-        """Count the seconds: they tell that it works while it says nothing."""
+        """Count the seconds, which show that the work goes on while it prints nothing."""
         if self._exit_code is None:
             spent = duration(time.monotonic() - self._begun_s)
             self.query_one("#job-title", Label).update(f"{spent} {self._title} …")

@@ -1,4 +1,4 @@
-"""Drift checks over time against what would be found, with a sentence."""
+"""Drift checks over time: the camera's shift, its limit, and whether it grows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from station.tui.words import Mark, dim, facts, many, mark
 
 
 def drift_lines(entries: Sequence[CheckEntry], width: int, height: int) -> Content:
-    """The camera's shift over time against what would be found, and a sentence; from five checks on."""
+    """Draw the camera's shift at each check against its limit; from five checks on say whether it grows."""
     if not entries:
         return dim("No drift check yet. d on 7 captures one: eight poses, two minutes.")
     trend = find_trend(entries, entries[-1].generation)

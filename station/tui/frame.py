@@ -25,11 +25,11 @@ R = TypeVar("R")
 STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
 STOP_NARROW = "STOP F12", "STOPPED"
 DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
-"""Driver of the arm."""
+"""How the bar names the way in which the arm is controlled."""
 RAIL_WIDE = 96
-"""Cells from which on a step has a second line of its own."""
+"""From this width on each step has a second line."""
 SESSION = Binding.Group("session")
-"""Keys of the app that act on the session, in a group of their own."""
+"""Group of the keys that act on the session."""
 GO_TO = (("1-6", "step"), ("7", "sessions"), ("8", "log"))
 ANSWER = Action(
     "", "Answer the question", "Enter alone is no; Tab marks the other answer. F12 stops.", look=True
@@ -50,7 +50,7 @@ class StopBlock(Static):
 
 
 class Line(Static):
-    """Text that is drawn anew only when it, or the width, changed."""
+    """Text that is drawn again only when it changed, or the width did."""
 
     def __init__(
         self, line: Callable[[Known, int], Content], *, id: str, layout: bool = False, classes: str = ""
@@ -73,7 +73,7 @@ class Line(Static):
             self.update(text, layout=layout)
 
     def _grows(self, text: Content) -> bool:
-        """It is as tall as its text, and this one has other lines than the last."""
+        """Tell whether the height follows the text and this text has another number of lines."""
         height = self.styles.height
         lines, shown = (each.plain.count("\n") for each in (text, self._shown))
         return lines != shown and height is not None and height.is_auto
@@ -117,7 +117,7 @@ def bar_line(known: Known, title: str, width: int) -> Content:
 
 
 def fitting(parts: list[Content], width: int) -> Content:
-    """Keep as many parts as fit, most important first; two always."""
+    """Join as many parts as fit, the most important first; always the first two."""
     for count in range(len(parts), 1, -1):
         line = Content("").join(parts[:count])
         if line.cell_length <= width:
@@ -126,7 +126,7 @@ def fitting(parts: list[Content], width: int) -> Content:
 
 
 def _bar_parts(known: Known, title: str) -> Iterator[Content]:
-    """Most important first."""
+    """Yield the parts of the bar, the most important first."""
     status = known.live
     yield Content.styled(f" {title} ", "bold $accent")
     if known.silent_s is not None:
@@ -182,7 +182,7 @@ _BACK = {"now": "$strong on $accentbg", "stopped": "$strong on $badbg", "look": 
 
 
 def rail_line(made: tuple[Step, ...], mode: str, width: int) -> Content:
-    """Two lines where there is room, else one; the open step's name is underlined."""
+    """Draw the steps in two lines where there is room, else in one; the open step is underlined."""
     if width < RAIL_WIDE:
         parts = []
         for step in made:
@@ -211,7 +211,7 @@ def _step_name(step: Step, mode: str, text: str) -> Content:
 
 
 def next_line(action: Action, width: int) -> Content:
-    """The filled chip, then a sentence: one line; where a person should look, as many as it takes."""
+    """Draw key and label, then the reason: cut to one line, but whole where a person should look."""
     chip = f" {action.key}  {action.label} " if action.key else f" {action.label} "
     back = "$warn" if action.look else "$accent"
     head = Content.assemble(
@@ -272,19 +272,19 @@ def _group(name: str, pairs: list[tuple[str, str]]) -> Content:
 
 
 BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]
-"""Classes of a screen by its columns, and by its rows."""
+"""Style classes by the terminal's columns, and by its rows."""
 
 
 class Framed(Screen[R]):
-    """A screen or a question under the frame; drawn anew, while it stands there, when the app knows more."""
+    """A screen or a question below the frame, drawn again whenever the app knows something new."""
 
     AUTO_FOCUS = ""
     known = Known()
-    """What the app knows."""
+    """What the app knew when this was drawn last."""
     HORIZONTAL_BREAKPOINTS, VERTICAL_BREAKPOINTS = BREAKPOINTS
 
     def show(self, known: Known) -> None:
-        """Hand what is known to every part that shows some of it."""
+        """Draw every part from what is known."""
         for frame in self.query(Frame):
             frame.show(known)
 

@@ -1,4 +1,4 @@
-"""The installed calibration of this cell, and those that were: rolled back, or replaced by another."""
+"""The installed calibration of this cell, and earlier ones: rolled back or replaced."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Installed:
 
     now: Calibration | None = None
     ended: tuple[Ended, ...] = ()
-    """The newest end last, one for each solve; without what is installed again."""
+    """Earlier ones, one a solve, the last to end last; without those that were installed again."""
     validity: Validity | None = None
     """Whether `now` still holds."""
 
@@ -55,7 +55,7 @@ class Installed:
 
     @property
     def held(self) -> str:
-        """INSTALLED, and what speaks against using it."""
+        """INSTALLED, and its validity where that is not valid."""
         if self.validity is None or self.validity.state is ValidityState.VALID:
             return "INSTALLED"
         return f"INSTALLED, {self.validity.state.replace('-', ' ')}"
@@ -95,7 +95,7 @@ def drift_history(root: Path, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
 
 
 def _log(root: Path, camera: str) -> list[LogEntry]:
-    """Empty where it cannot be read."""
+    """Read all installations; none where the log cannot be read."""
     try:
         return read_log(root, camera)
     except OSError:
@@ -103,12 +103,12 @@ def _log(root: Path, camera: str) -> list[LogEntry]:
 
 
 def _generation(root: Path, camera: str, number: int) -> Calibration | None:
-    """None when it is damaged or gone."""
+    """Read an installed version; None when it is damaged or gone."""
     return next(map(readable, (calibrations_folder(root, camera) / "gen").glob(f"{number:04d}-*.yaml")), None)
 
 
 def readable(path: Path) -> Calibration | None:
-    """A session's calibration, read once for as long as the file is the same; None when it is damaged."""
+    """Read a session's calibration, again only when the file changed; None when it is damaged."""
     try:
         return _read_at(path, path.stat().st_mtime_ns)
     except OSError:
@@ -128,7 +128,7 @@ def _by(entry: LogEntry) -> str:
 
 
 def local(iso: str) -> str:
-    """The files' UTC as the clock on the wall says it; as it is where it is no time."""
+    """Convert a file's UTC time to local time; what is no time stays as it is."""
     try:
         return datetime.fromisoformat(iso).astimezone().strftime("%Y-%m-%d %H:%M")
     except ValueError:
@@ -136,14 +136,14 @@ def local(iso: str) -> str:
 
 
 def state_root(calibration: str | Path) -> Path:
-    """A session lies in ROOT/sessions/NAME; what is installed lies below the same ROOT."""
+    """Return ROOT of ROOT/sessions/NAME/FILE; what is installed lies below the same ROOT."""
     return Path(calibration).resolve().parents[2]
 
 
 def marks(root: Path) -> Marks:
-    """Differs from the one before when a screen over this root shows old things. For a thread.
+    """Note when each session and installation below this root changed; other programs change them too.
 
-    Other screens and commands record, solve, install and roll back meanwhile.
+    Reads the disk: for a thread.
     """
     folders = [calibrations_folder(root), *(root / "calibrations" / "cameras").glob("*")]
     found = {_mark(folder / name) for folder in folders for name in ("current", VALIDITY_FILE)}
@@ -156,7 +156,7 @@ def marks(root: Path) -> Marks:
 
 
 def _mark(path: Path) -> tuple[str, int]:
-    """Path and time of its own change: a folder by what came or left, a link by where it leads."""
+    """Return a path and when it changed: a folder when a file came or left, a link when its target did."""
     try:
         return str(path), path.lstat().st_mtime_ns
     except OSError:
@@ -172,7 +172,7 @@ class Result:
     """None: it cannot be read, and `problem`."""
     state: Installed = Installed()
     objections: tuple[str, ...] = ()
-    """Reasons, other than gates, for which installing would ask a reason."""
+    """What installing would ask a reason for, besides failed gates."""
     problem: str = ""
     drift: tuple[CheckEntry, ...] = ()
     """Drift checks of what is installed now, oldest first."""
@@ -185,7 +185,7 @@ class Result:
 
     @property
     def verdict(self) -> Verdict:
-        """PASS WITH A REASON: a person gave one, or would have to, for something else than a gate."""
+        """PASS WITH A REASON: all gates pass, but installing needed a reason, or would."""
         if self.calibration is None or self.calibration.verdict == "FAIL":
             return "FAIL"
         off = not all(map(agrees, self.calibration.verification))

@@ -30,21 +30,21 @@ from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
 from station.operate.guided_views import enough
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
-from station.tui.new_cell_steps import DRAWINGS, SavePage, StepPage, pages
+from station.tui.new_cell_steps import DRAWINGS, STEP_ACTIONS, SavePage, StepPage, pages
 from station.tui.task import Step
 from station.tui.themes import ThemedApp
 from station.tui.widgets.preview import PreviewPane
 from station.tui.words import dim
 
 Ending = Literal["", "serve", "rehearse"]
-"""Next wish of the person: nothing, the cell itself, or its rehearsal."""
+"""What to open after the wizard: nothing, the cell, or its rehearsal."""
 ARM_PERIOD_S, CAMERA_PERIOD_S, LOOK_S = 0.1, 0.15, 1.0
 SHOWN_WIDTH_PX = 640
 NO_CAMERA = "No camera answers. Check its power, cable and network; this list refreshes every few seconds."
 
 
 class NewCell(ThemedApp[Ending]):
-    """One step after the other, each of them to be left and taken up again."""
+    """Asks step by step; one may leave at any step and go on later."""
 
     TITLE = "New cell"
     CSS_PATH = "station.tcss"
@@ -57,25 +57,13 @@ class NewCell(ThemedApp[Ending]):
         Binding("left,right", "other_mount", "Other drawing"),
         Binding("f2", "take", "Take view", tooltip="Take this view now"),
         Binding("f3", "drop", "Drop view", tooltip="Take the last view away"),
-        Binding(
-            "f4", "print_board", "Print board", tooltip="Write the board as a PDF, origin and axes marked"
-        ),
+        Binding("f4", "print_board", "Print board", tooltip="Write the board as a PDF"),
         Binding("f5", "expose(0.7)", "Darker"),
         Binding("f6", "expose(1.4)", "Brighter"),
         Binding("f7", "table_here", "Table here", tooltip="The table is as high as the tool now"),
         Binding("f9", "rehearse", "Rehearse", tooltip="Run the whole job with this cell in simulation"),
         Binding("escape", "leave", "Leave", tooltip="Leave; what was found is kept"),
     ]
-    ONLY: ClassVar[dict[str, tuple[CellStep, ...]]] = {
-        "other_mount": (CellStep.MOUNTING,),
-        "take": (CellStep.VIEWS,),
-        "drop": (CellStep.VIEWS,),
-        "print_board": (CellStep.BOARD,),
-        "expose": (CellStep.CAMERA, CellStep.BOARD, CellStep.VIEWS),
-        "table_here": (CellStep.LIMITS,),
-        "rehearse": (CellStep.SAVE,),
-    }
-    """Steps in which an action means something."""
     step: reactive[CellStep] = reactive(CellStep.ROBOT, init=False)
 
     def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
@@ -117,7 +105,7 @@ class NewCell(ThemedApp[Ending]):
 
     @work(group="accept", exit_on_error=False)
     async def resume(self) -> None:
-        """Connect to what the draft names; the first step that is not done is shown."""
+        """Connect to the devices of the draft, then show the first step that is not done."""
         draft = self.setup.draft
         with self._problems():
             if draft.host:
@@ -197,7 +185,7 @@ class NewCell(ThemedApp[Ending]):
     # --- keys ---
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        return action not in self.ONLY or self.step in self.ONLY[action]
+        return action in self.page.actions or action not in STEP_ACTIONS
 
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
@@ -247,7 +235,7 @@ class NewCell(ThemedApp[Ending]):
 
     @work(group="view", exclusive=True, exit_on_error=False)
     async def action_take(self) -> None:
-        """Take the view that the newest image shows, also where the station would wait."""
+        """Take a view now, without waiting for a new place or for rest."""
         try:
             self._add_view()
         except StationError as problem:
@@ -336,7 +324,7 @@ class NewCell(ThemedApp[Ending]):
 
     @contextmanager
     def _problems(self) -> Iterator[None]:
-        """What goes wrong is said on the page."""
+        """Show an error on the page instead of raising it."""
         try:
             yield
         except (CodedError, OSError) as problem:
@@ -352,5 +340,5 @@ class NewCell(ThemedApp[Ending]):
 
 
 def run(hardware: Hardware, root: Path, output: Path) -> Ending:
-    """Open the wizard; what the person wants next."""
+    """Open the wizard; return what to open next."""
     return NewCell(hardware, root, output).run() or ""

@@ -30,12 +30,14 @@ class StepPage:
     step: ClassVar[CellStep]
     title: ClassVar[str]
     words: ClassVar[str] = ""
-    """Its text, where that is always the same."""
+    """Its text, unless `about` depends on the draft."""
     parts: ClassVar[Sequence[str]] = ()
     """Widgets it shows below its words."""
+    actions: ClassVar[Sequence[str]] = ()
+    """Actions of the app that have a key in this step only."""
     placeholder: ClassVar[str] = ""
     working: ClassVar[str] = ""
-    """Said while `accept` works."""
+    """Shown while `accept` works."""
 
     def __init__(self, setup: CellSetup) -> None:
         self.setup = setup
@@ -55,7 +57,7 @@ class StepPage:
         raise NotImplementedError
 
     def live(self) -> list[str]:
-        """Lines that change while one looks."""
+        """Return the lines that follow arm and camera, shown ten times a second."""
         return []
 
     async def accept(self, typed: str) -> bool:
@@ -93,7 +95,7 @@ class RobotPage(StepPage):
 
 class CameraPage(StepPage):
     step, title = CellStep.CAMERA, "Which camera?"
-    parts = ("#choice", "#picture")
+    parts, actions = ("#choice", "#picture"), ("expose",)
     words = "Is this what the camera should see? F5 and F6 make it darker and brighter."
 
     @property
@@ -108,7 +110,7 @@ class CameraPage(StepPage):
 
 class MountingPage(StepPage):
     step, title = CellStep.MOUNTING, "Where is the camera?"
-    parts = ("#drawings",)
+    parts, actions = ("#drawings",), ("other_mount",)
     words = "Choose the drawing that looks like your robot. The views of step 5 check it."
 
     @property
@@ -123,6 +125,7 @@ class MountingPage(StepPage):
 class BoardPage(StepPage):
     step, title = CellStep.BOARD, "Which board?"
     parts: ClassVar[Sequence[str]] = ("#typed", "#picture")
+    actions: ClassVar[Sequence[str]] = ("expose", "print_board")
     placeholder = "7x6 25"
     words = (
         "Type columns, rows and size in mm. 7x6 25 is a chessboard of 7 × 6 inner corners. Others by "
@@ -155,7 +158,7 @@ class BoardPage(StepPage):
         ]
 
     async def accept(self, typed: str) -> bool:
-        """The first Enter sets the board, the next one, with the board seen, goes on."""
+        """Set the board at the first Enter; go on at the second."""
         if typed and typed != self.typed:
             self.setup.set_board(flow.read_board(typed))
             return False
@@ -164,7 +167,7 @@ class BoardPage(StepPage):
 
 class ViewsPage(BoardPage):
     step, title = CellStep.VIEWS, "Guide the arm to four views of the board"
-    parts: ClassVar[Sequence[str]] = ("#picture",)
+    parts, actions = ("#picture",), ("expose", "take", "drop")
     placeholder = ""
 
     @property
@@ -205,7 +208,7 @@ class ViewsPage(BoardPage):
 
 class LimitsPage(StepPage):
     step, title = CellStep.LIMITS, "Where may the arm move?"
-    parts = ("#typed",)
+    parts, actions = ("#typed",), ("table_here",)
     placeholder = "table's height over the arm's base, mm; empty: as shown"
     words = "The workspace lies around the guided views. F7: the table is as high as the tool is now."
 
@@ -245,7 +248,7 @@ class LimitsPage(StepPage):
 
 class SavePage(StepPage):
     step, title = CellStep.SAVE, "Write the configuration"
-    parts = ("#text",)
+    parts, actions = ("#text",), ("rehearse",)
 
     @property
     def about(self) -> str:
@@ -261,7 +264,7 @@ class SavePage(StepPage):
         return Action("Enter", "Open this cell", "Or F9: rehearse it first; nothing real moves.")
 
     def text(self) -> str:
-        """The file as it would be written."""
+        """Return the configuration as it would be written."""
         try:
             return flow.config_text(flow.made_config(self.setup.draft))
         except CodedError as problem:
@@ -276,9 +279,12 @@ class SavePage(StepPage):
 
 
 def pages(setup: CellSetup) -> dict[CellStep, StepPage]:
-    """All of them, in order."""
-    kinds = (RobotPage, CameraPage, MountingPage, BoardPage, ViewsPage, LimitsPage, SavePage)
-    return {kind.step: kind(setup) for kind in kinds}
+    """Make all steps, in order."""
+    return {kind.step: kind(setup) for kind in _KINDS}
+
+
+_KINDS = (RobotPage, CameraPage, MountingPage, BoardPage, ViewsPage, LimitsPage, SavePage)
+STEP_ACTIONS = {action for kind in _KINDS for action in kind.actions}
 
 
 def _marked(kind: Mark, text: str) -> str:

@@ -31,11 +31,11 @@ NEW_FOR_ARM = "Plan 25 poses that also tell the errors of the arm's table, board
 POSE_VERBS = {"retake": Retake, "skip": Skip, "drop": Drop}
 MOVE = Binding.Group("order", compact=True)
 SIGMA_SHOWN_MM = 100.0
-"""The first poses alone determine nothing: a number in metres would only puzzle."""
+"""Larger errors are not shown: after the first poses they are metres, which say nothing."""
 BAR_CELLS = 7
 TURN_DEG = 15.0
 _SEEN = re.compile(r"^\d+ mm, tilt \d+°, |board ")
-"""Part of the reason that the columns beside it say already."""
+"""Part of a reason that other columns show already."""
 _STATES: dict[str, tuple[Mark, str]] = {
     "planned": ("todo", "planned"),
     "done": ("done", "saved"),
@@ -45,7 +45,7 @@ _STATES: dict[str, tuple[Mark, str]] = {
 
 
 def row_of(pose: PoseStatus, goal_mm: float, scene: CellLayout | None) -> tuple[Content, ...]:
-    """One line of the table."""
+    """Make a row of the table."""
     sigma_mm = pose.estimated_sigma_mm or pose.predicted_sigma_mm
     shown = sigma_mm is not None and sigma_mm <= SIGMA_SHOWN_MM
     view = None if scene is None else view_of(scene, pose)
@@ -67,12 +67,12 @@ def row_of(pose: PoseStatus, goal_mm: float, scene: CellLayout | None) -> tuple[
 
 
 def _log(sigma_mm: float, goal_mm: float) -> float:
-    """1 at the goal, 0 at a tenth of it, 2 at ten times as much."""
+    """Scale an error for its bar: 1 at the goal, 0 at a tenth of it, 2 at ten times as much."""
     return max(0.05, 1 + math.log10(max(sigma_mm, 1e-6) / goal_mm))
 
 
 def facts_line(status: StationStatus) -> Content:
-    """The plan in one line."""
+    """Sum the plan up in one line."""
     poses = status.session.poses
     if not poses:
         return dim(NO_PLAN)
@@ -87,7 +87,7 @@ def facts_line(status: StationStatus) -> Content:
 
 
 def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: CellLayout | None) -> Content:
-    """One pose in words, with what the table has no room for."""
+    """Describe one pose: its reason, gain, view of the board, and what went wrong."""
     view = None if scene is None else view_of(scene, pose)
     seen = "" if pose.corners is None else f"{many(pose.corners, 'corner')} in attempt {pose.attempt}"
     rows = [Content.assemble((f"{pose.name}  ", "bold $strong"), pose.why or "added by hand")]
@@ -103,7 +103,7 @@ def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: CellLayout | N
 
 
 class PlanScreen(StationScreen):
-    """The table is the plan as the daemon holds it; every change is asked of the daemon."""
+    """The daemon's plan as a table; every change is a request to the daemon."""
 
     MODE, TIP = "plan", "All poses, their gain and reason"
     HELP = (

@@ -22,7 +22,7 @@ LEGEND = "✓ saved  ! saved, look  ▶ now  · to come  - skipped  ✗ failed"
 
 
 def pose_line(status: StationStatus) -> Content:
-    """Steps of the pose under way, or what comes next at rest."""
+    """Draw the steps of the pose under way; at rest say what comes next."""
     session = status.session
     pose = pose_under_way(status)
     if pose is None:
@@ -50,7 +50,7 @@ def pose_under_way(status: StationStatus) -> PoseStatus | None:
 
 
 def counted_line(session: SessionStatus) -> Content:
-    """Progress of a session while no pose is under way, and what comes next."""
+    """Say what comes next while no pose is under way."""
     if not session.poses:
         return dim("No plan yet: 2, then n makes one.")
     if not session.name:
@@ -64,7 +64,7 @@ def counted_line(session: SessionStatus) -> Content:
 
 
 def progress_lines(known: Known, width: int, height: int) -> Content:
-    """Draw how many are saved, the steps of this pose, a chip a pose."""
+    """Draw how many poses are saved, the steps of the present one, and a chip for each."""
     status = known.shown
     session, pose = status.session, pose_under_way(status)
     saved = sum(pose.counts for pose in session.poses)
@@ -81,7 +81,7 @@ def progress_lines(known: Known, width: int, height: int) -> Content:
 
 
 def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:
-    """A chip a pose, in the order of driving; of a long plan the rows around the one under way."""
+    """Draw a chip for each pose in driving order; of a long plan the rows around the present pose."""
     each = 4 if len(session.poses) < 100 else 5
     per_row = max(1, (width + 1) // (each + 1))
     made = [_chip(pose, pose.index == session.current, each) for pose in session.poses]

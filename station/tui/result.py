@@ -48,7 +48,7 @@ DISCARD = "Delete this result; the recording stays"
 
 
 def verdict_lines(result: Result) -> Content:
-    """The verdict; the accuracy in a sentence; what speaks against it; what was checked."""
+    """Write the verdict, the accuracy in a sentence, objections, and what was checked."""
     calibration = result.calibration
     if calibration is None:
         return Content(result.problem or NO_RESULT)
@@ -83,7 +83,7 @@ def verdict_lines(result: Result) -> Content:
 
 
 def _against(result: Result, calibration: Calibration) -> list[str]:
-    """Say what speaks against it, or who installed it all the same."""
+    """List objections; of an overridden installation who gave which reason."""
     if result.installed and result.state.now is not None and (taken := result.state.now.override) is not None:
         return [f"Override by {taken.who}: “{taken.reason}”"]
     end = after_solve(calibration, () if result.installed else result.objections)
@@ -92,7 +92,7 @@ def _against(result: Result, calibration: Calibration) -> list[str]:
 
 
 def gate_row(gate: Gate) -> tuple[Content, ...]:
-    """Mark, name, value, bar, limit, word."""
+    """Make a row of a gate: mark, name, value, bar, limit, pass or fail."""
     kind: Mark = "failed" if not gate.passed else "look" if gate.narrow else "done"
     colour = {"failed": "$bad", "look": "$warn", "done": "$ok"}[kind]
     style = "bold $strong" if kind != "done" else "$foreground"
@@ -127,7 +127,7 @@ def change_lines(result: Result, calibration: Calibration) -> Content:
 
 
 def pose_table(result: Result, calibration: Calibration) -> Content:
-    """The camera pose, this one beside the installed one; positions in millimetres."""
+    """Write the camera pose beside the installed one; positions in millimetres."""
     installed = result.state.now
     beside = installed is not None and not result.installed and installed.mount == calibration.mount
     frame = f"{calibration.result.parent_frame}_from_{calibration.result.child_frame}"
@@ -177,7 +177,7 @@ WORKS: dict[str, Callable[[Desk, Result, Calibration], Awaitable[None]]] = {
 
 
 class ResultScreen(StationScreen):
-    """Common base of the three: the verdict on top, and what may be done with a calibration."""
+    """What Solve, Verify and Install share: the verdict on top, and the keys that act on a result."""
 
     LOOK = "look_at_results"
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -189,7 +189,7 @@ class ResultScreen(StationScreen):
     ]
 
     _drawn: object = ()
-    """The result that it shows; before the first, nothing is."""
+    """The result that was drawn last; a value that no result has before the first."""
 
     def body(self) -> ComposeResult:
         yield Static(NO_RESULT, id="verdict")
@@ -214,7 +214,7 @@ class ResultScreen(StationScreen):
         self.draw_panels(known)
 
     def tell(self, calibration: Calibration) -> None:
-        """Fill what is no panel."""
+        """Draw the parts that are not panels."""
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def action_act(self, what: str) -> None:
@@ -229,7 +229,7 @@ class ResultScreen(StationScreen):
 def _panel(
     title: str, text: Callable[[Result, Calibration, int, int], Content], *, id: str, below: str = ""
 ) -> Panel:
-    """A panel of the shown result: `text` of it, and of the room."""
+    """Make a panel that is drawn from the shown result; `text` also gets width and height."""
 
     def body(known: Known, width: int, height: int) -> Content:
         result = known.result
@@ -241,7 +241,7 @@ def _panel(
 
 
 class SolveScreen(ResultScreen):
-    """The gates with value and limit, the camera pose, the views."""
+    """The gates with value and limit, and the reprojection error of each view."""
 
     MODE, TIP = "solve", "The verdict, and what it stands on"
     HELP = (
@@ -269,7 +269,7 @@ class SolveScreen(ResultScreen):
 
 
 class VerifyScreen(ResultScreen):
-    """Proofs apart from the images it was made of: the touch test, and drift checks over time."""
+    """Independent evidence: the touch test, held-out views, and drift checks over time."""
 
     MODE, TIP = "verify", "Touch test and drift checks"
     HELP = "h starts the touch test: a tip on corners of the board, by hand. d on 7 captures a drift check."
@@ -328,7 +328,7 @@ def held_out_lines(calibration: Calibration) -> Content:
 
 
 class InstallScreen(ResultScreen):
-    """Comparison with the installed one, what speaks against this one, and every version before."""
+    """The camera pose beside the installed one, the change, and every earlier installation."""
 
     MODE, TIP = "install", "What is installed, and what would change"
     HELP = "i installs the shown calibration, b undoes that; e writes it for other programs."

@@ -46,13 +46,13 @@ async def recover_session(desk: Desk, folder: str) -> None:
 
 
 async def check_session(desk: Desk, recording: str, folder: str) -> None:
-    """Judge the installed calibration on this recording; the verdict stays until it is read."""
+    """Check the installed calibration against this recording; the verdict stays until a person closes it."""
     title, arguments = f"Drift check on {Path(folder).name}", check_arguments(recording, folder)
     await desk.question(JobScreen(title, "calibrate.cli", *arguments, close_on=()))
 
 
 async def check_drift(desk: Desk, approves: Approve) -> None:
-    """Plan, ask, capture, also after pauses and new approvals in between; then the verdict."""
+    """Plan, ask, capture (pauses and new approvals included), then check for drift."""
     if (status := desk.known.live) is None:
         return
     plan_sha256 = await desk.start(start_drift_check(desk.client, status, approves))
@@ -69,7 +69,7 @@ async def check_drift(desk: Desk, approves: Approve) -> None:
 
 
 async def install_result(desk: Desk, result: Result, calibration: Calibration) -> None:
-    """Ask, then install below the daemon's root. A simulated result only on a simulated cell's root."""
+    """Ask, then install. A simulated result installs on a simulated cell only."""
     ended = result.state.end_of(calibration)
     known = installed_versions(state_root(result.path), calibration.camera_name)
     undo = (
@@ -101,13 +101,13 @@ async def install_result(desk: Desk, result: Result, calibration: Calibration) -
 
 
 def before_next(known: list[InstalledVersion], coming: Calibration) -> InstalledVersion | None:
-    """The version that is gone back to once `coming` is installed; None: none."""
+    """Return the version that an undo leads to once `coming` is installed; None: there is none."""
     number = known[-1].number + 1 if known else 1
     return before_current([InstalledVersion(number, Path(), True, coming), *known])
 
 
 async def undo_install(desk: Desk, result: Result, calibration: Calibration) -> None:
-    """Ask, naming both, then switch back to the calibration before; without one, take it out of use."""
+    """Ask, then install the calibration before again; without one, take this one out of use."""
     root, camera = state_root(result.path), calibration.camera_name
     known = installed_versions(root, camera)
     current = next((g for g in known if g.current), None)
@@ -127,7 +127,7 @@ async def undo_install(desk: Desk, result: Result, calibration: Calibration) -> 
 
 
 async def _withdraw(desk: Desk, root: Path, camera: str, current: InstalledVersion) -> None:
-    """Ask why, then let no program use what is installed."""
+    """Ask why, then withdraw what is installed."""
     if current.validity is not None and current.validity.state is ValidityState.WITHDRAWN:
         desk.app.notify("It is out of use already, and there is none before it to go back to.")
         return

@@ -26,12 +26,12 @@ class Panel(Line):
     """A titled box of text."""
 
     old: reactive[bool] = reactive(False)
-    """No longer how it is; said in the title too."""
+    """The text is out of date; the title says so."""
 
     def __init__(
         self, title: str, body: Callable[[Known, int, int], Content], *, id: str, below: str = ""
     ) -> None:
-        """`body`: of what is known, in so many cells and rows. `below`: unit or keys, in the border."""
+        """`body`: text from what is known, width and height. `below`: unit or keys, in the lower border."""
         super().__init__(lambda known, _: body(known, *self.content_size), id=id, classes="panel")
         self.border_title, self.border_subtitle = title, below
         self._title = title
@@ -54,7 +54,7 @@ class Box(Vertical):
 
 
 class Rows(DataTable[object]):
-    """A table of whole rows: one is marked, Home and End mark the first and the last."""
+    """A table with a cursor on a whole row; Home and End go to the first and the last."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("home", "scroll_top", show=False),
@@ -68,7 +68,7 @@ class Rows(DataTable[object]):
         self._variables: dict[str, str] = {}
 
     def show(self, cells: Sequence[tuple[Content, ...]]) -> None:
-        """Draw these rows; of as many as before only what differs. The same line stays marked."""
+        """Draw these rows; of as many as before only cells that differ. The cursor stays on its line."""
         variables = self.app.theme_variables
         if len(cells) == len(self._cells) and variables == self._variables:
             for line, (row, before) in enumerate(zip(cells, self._cells, strict=True)):
@@ -86,18 +86,18 @@ class Rows(DataTable[object]):
 
 
 class StationScreen(Framed[None]):
-    """One screen; `body` is what differs."""
+    """A screen below the frame; each has its own `body`."""
 
     AUTO_FOCUS = "Rows, #checklist-scroll, #log"
     MODE: ClassVar[str] = ""
-    """Its step of the task, or its name."""
+    """Its step of the rail, or its name."""
     TIP: ClassVar[str] = ""
     """Purpose in a few words."""
 
     LOOK: ClassVar[str] = ""
-    """Action of the app that looks for what it shows."""
+    """Action of the app that reads what this screen shows."""
     NAME: ClassVar[str] = ""
-    """Its name, where that is not its mode."""
+    """Its title, if other than its mode."""
 
     @property
     def heading(self) -> str:

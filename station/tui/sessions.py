@@ -1,4 +1,4 @@
-"""Sessions: what was recorded; solve, recover, or watch any of them again."""
+"""Sessions: what was recorded; solve, recover or check any of them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class SessionsScreen(StationScreen):
                 await recover_session(desk, session.folder)
 
     def on_data_table_row_selected(self) -> None:
-        """Enter on a session: what it gave."""
+        """Show a session's result at Enter."""
         self.action_act("show")
 
 

@@ -16,7 +16,7 @@ STOPPED_BY = {
     "emergency-stop": "An emergency stop is pressed.",
     "safeguard-stop": "A guard or a scanner stopped the arm.",
 }
-"""By the cause of a stop that a person clears at the pendant."""
+"""What happened, by the cause of a stop that is cleared at the pendant."""
 
 
 class Stopped(Static):

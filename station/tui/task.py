@@ -30,7 +30,7 @@ class Step:
     mark: Mark
     text: str
     brief: str = ""
-    """Where there is room for no more than a number."""
+    """What stands in place of `text` on a narrow screen."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Known:
     """All that the screens know and are drawn from: the app has one, replaced by another at every change."""
 
     status: StationStatus | None = None
-    """The newest there ever was; it outlives the daemon."""
+    """The newest status; kept when the daemon is gone."""
     checks: Sequence[Check] = ()
     """The preflight check, as it was last seen."""
     result: Result | None = None
@@ -80,17 +80,17 @@ class Known:
 
     @property
     def shown(self) -> StationStatus:
-        """The newest status, for what may be old."""
+        """The newest status, also when it is out of date."""
         return self.status or StationStatus()
 
     @property
     def old(self) -> bool:
-        """The status is no longer how it is."""
+        """The status is out of date."""
         return bool(self.gone) or self.silent_s is not None
 
     @property
     def works(self) -> bool:
-        """The arm works, or may: nothing beside it should cost the daemon time."""
+        """The arm works, or may: nothing else should cost the daemon time."""
         return self.live is not None and self.live.state in RUNNING
 
     @property
@@ -192,7 +192,7 @@ def _results(known: Known) -> tuple[Step, Step, Step]:
 
 
 def next_action(known: Known) -> Action:
-    """Exactly one; alternatives stand in its sentence."""
+    """Choose the one next action; its reason names alternatives."""
     status = known.live
     if known.silent_s is not None:
         why = f"No answer for {known.silent_s:.0f} s: the data below are old. {SILENT}"

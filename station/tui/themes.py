@@ -97,7 +97,7 @@ def chosen_theme(no_colour: bool = False) -> str:
 
 
 def few_signs() -> bool:
-    """A console's font has no braille."""
+    """Tell whether this is a console, whose font has no braille."""
     return os.environ.get("TERM", "") in FEW_COLOURS
 
 

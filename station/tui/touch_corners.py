@@ -31,7 +31,7 @@ END = "end"
 
 
 class TouchCorners(Question[list[Touch]]):
-    """What a person found at the corners, until they end it."""
+    """Reads the arm at each corner that a person chooses; returns the offsets."""
 
     TITLE = "Touch test of this calibration"
     BINDINGS: ClassVar[list[BindingType]] = [

@@ -30,7 +30,7 @@ BAR, TRACK, LIMIT = "━", "─", "┃"
 
 
 def shortened(text: str, cells: int, parts: bool = False) -> str:
-    """Keep as many whole words as fit, then `…`; `parts`: as many parts between commas, without a sign."""
+    """Cut text to whole words and `…`; `parts`: cut after a comma, without `…`."""
     while parts and len(text) > cells and ", " in text:
         text = text.rpartition(", ")[0]
     if len(text) <= cells:
@@ -53,7 +53,7 @@ def lines(*rows: Content) -> Content:
 
 
 def facts(*pairs: tuple[str, str, str]) -> Content:
-    """(label, value, unit) … in one line: labels and units dim, values bold."""
+    """Write (label, value, unit) … in one line: labels and units dim, values bold."""
     parts: list[Content | tuple[str, str]] = []
     for label, value, unit in pairs:
         parts += [
@@ -66,7 +66,7 @@ def facts(*pairs: tuple[str, str, str]) -> Content:
 
 
 def limit_bar(value: float, limit: float, cells: int, colour: str, at: float = 0.7) -> Content:
-    """A line as long as the value, with the limit as a stroke at the share `at` of the cells."""
+    """Draw a bar as long as the value; the limit is a stroke at the share `at` of the cells."""
     stroke = min(cells - 1, round(at * cells))
     ratio = value / limit if limit > 0 else 1.0
     reach = max(0, min(cells, round(stroke * ratio) if math.isfinite(ratio) else cells))
@@ -76,7 +76,7 @@ def limit_bar(value: float, limit: float, cells: int, colour: str, at: float = 0
 
 
 def rich_text(content: Content, variables: dict[str, str]) -> Text:
-    """The same for a table's cell, which knows no theme's names."""
+    """Convert content for a table's cell, which does not know the theme's names."""
     text = Text(content.plain, no_wrap=True)
     for start, end, style in content.spans:
         named = re.sub(r"\$([\w-]+)", lambda found: variables.get(found[1], "default"), str(style))
@@ -90,7 +90,7 @@ def signed(value: float, digits: int = 2) -> str:
 
 
 def state_of(status: StationStatus) -> tuple[str, str]:
-    """The chip of the state: text and style."""
+    """Return text and style of the state's chip."""
     state = status.state
     if state in (StationState.STOPPED, StationState.FAULT):
         return f"■ {STATE_WORDS[state]}", "bold $onstop on $stop"

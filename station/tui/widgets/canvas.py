@@ -1,4 +1,4 @@
-"""Drawing by dots inside letters: lines and areas with ranks, a curve with its axis."""
+"""Drawings made of braille dots: lines and areas, and curves with an axis."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ BLOCKS = " ▀▄█"
 
 
 class Canvas:
-    """`width` × `height` letters; x right, y down, in dots. A letter has the colour of its highest rank."""
+    """`width` × `height` letters to draw dots in; x right, y down, in dots.
+
+    Each part has a rank; a letter has the colour of the highest rank in it.
+    """
 
     def __init__(self, width: int, height: int) -> None:
         self.columns, self.rows = max(1, width), max(1, height)
@@ -31,7 +34,7 @@ class Canvas:
         self._texts: list[tuple[int, int, str, int]] = []
 
     def points(self, where: Points, rank: int) -> None:
-        """(n, 2) dots; what lies outside is left out."""
+        """Draw dots at (n, 2) places; those outside are left out."""
         if not len(where):
             return
         at = np.floor(where).astype(int)
@@ -40,7 +43,7 @@ class Canvas:
         np.maximum.at(self._rank, (at[:, 1] // self._per[1], at[:, 0] // self._per[0]), rank)
 
     def lines(self, starts: Points, ends: Points, rank: int, dash: int = 0) -> None:
-        """(n, 2) to (n, 2); `dash`: dots of a dash and of the gap after it, 0: whole."""
+        """Draw lines from (n, 2) to (n, 2) places; `dash`: length of dashes and gaps in dots, 0: solid."""
         for start, end in zip(starts, ends, strict=True):
             length = float(np.abs(end - start).max())
             if not math.isfinite(length) or length > 8 * (self.width + self.height):
@@ -51,7 +54,7 @@ class Canvas:
             self.points(start + (end - start) * (steps / max(length, 1.0))[:, None], rank)
 
     def rod(self, start: Points, end: Points, radius: float, rank: int) -> None:
-        """All dots within `radius` of the line from `start` to `end`, (2,) each."""
+        """Fill all dots within `radius` of the line from `start` to `end`, (2,) each."""
         low = np.floor(np.minimum(start, end) - radius).clip(0).astype(int)
         high = np.ceil(np.maximum(start, end) + radius).astype(int) + 1
         x, y = np.meshgrid(
@@ -66,13 +69,13 @@ class Canvas:
         self.points(dots[near], rank)
 
     def text(self, at: Points, words: str, rank: int) -> None:
-        """Words whose first letter holds the dot `at` (2,)."""
+        """Write words; their first letter is the one with the dot `at` (2,)."""
         if np.isfinite(at).all():
             column, row = (at // self._per).astype(int).tolist()
             self._texts.append((column, row, words, rank))
 
     def content(self, styles: Sequence[str]) -> Content:
-        """`styles`: of each rank, from 1."""
+        """Return the drawing; `styles` of the ranks, from rank 1 on."""
         across, down = self._per
         cells = self._dots.reshape(self.rows, down, self.columns, across).transpose(0, 2, 1, 3)
         if self._blocks:
@@ -93,7 +96,7 @@ class Canvas:
 
 
 def _row(letters: list[str], ranks: list[int], styles: Sequence[str]) -> Content:
-    """Neighbours alike become one run."""
+    """Join neighbours of one style."""
     runs: list[tuple[str, str]] = []
     begun = 0
     for i in range(1, len(letters) + 1):
@@ -106,7 +109,7 @@ def _row(letters: list[str], ranks: list[int], styles: Sequence[str]) -> Content
 
 @dataclass(frozen=True)
 class Series:
-    """A curve: numbers by place, None where there is none."""
+    """A curve through (x, y) points."""
 
     values: Sequence[tuple[float, float]]
     style: str
@@ -116,7 +119,7 @@ class Series:
 def curve(
     series: Sequence[Series], goal: float | None, width: int, height: int, *, log: bool = True, ends: str = ""
 ) -> Content:
-    """Curves over one axis whose numbers stand at the left; the goal is a dashed amber line.
+    """Draw curves with a labelled axis at the left; the goal is a dashed amber line.
 
     `ends`: words below the axis, its two ends parted by '|'.
     """
@@ -166,5 +169,5 @@ def curve(
 
 
 def _label(value: float) -> str:
-    """At most 5 letters."""
+    """Write a number in at most 5 letters."""
     return f"{value:.2f}" if value < 99 else f"{value:.0f}" if value < 1e5 else f"{value:.0e}"

@@ -1,4 +1,4 @@
-"""A little 3-D scene: the arm from its kinematics, camera frusta, board, and where the arm must not go."""
+"""A drawing of the cell: arm, what the camera sees from each pose, board, and where the arm must not go."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from station.tui.widgets.canvas import Canvas
 
 STYLES = ("$line", "$bad", "$accent", "$ok", "$strong", "bold $strong", "bold $warn")
 FLOOR, KEEP_OUT, PLANNED, SAVED, ARM, BOARD, CHOSEN = range(1, 8)
-"""Ranks: the higher is drawn over the lower."""
+"""Ranks on the canvas: the higher is drawn over the lower."""
 LEGEND = "saved green  planned blue  chosen amber  keep-out red"
 _LIFT_DEG = 22.0
 """Height of the eye above the floor."""
@@ -37,7 +37,7 @@ def _scene(encoded: bytes) -> CellLayout | None:
 
 
 def cell_scene(config: StationConfig | None, status: StationStatus) -> CellLayout | None:
-    """The cell as configured, with camera and board where the images say; None without initial poses."""
+    """Return the configured cell, camera and board where they were estimated; None without initial poses."""
     if config is None or (scene := _scene(msgspec.json.encode(config))) is None:
         return None
     estimate = status.estimate
@@ -47,7 +47,7 @@ def cell_scene(config: StationConfig | None, status: StationStatus) -> CellLayou
 
 
 def view_of(scene: CellLayout, pose: PoseStatus) -> tuple[float, float] | None:
-    """Distance (m) and tilt (rad) of the board as this pose sees it."""
+    """Return distance (m) and tilt (rad) of the board, seen from this pose."""
     if pose.base_from_flange is None:
         return None
     seen = scene.camera_from_board(np.array(pose.base_from_flange))
@@ -70,9 +70,9 @@ def draw(
     *,
     turn_deg: float = -60.0,
 ) -> Content:
-    """The scene as text. `chosen`: place in `session.poses`.
+    """Draw the cell. `chosen`: place in `session.poses`.
 
-    `turn_deg`: of the eye about the base's z axis.
+    `turn_deg`: direction of view, about the base's z axis.
     """
     canvas = Canvas(width, height)
     turn, lift = np.radians([turn_deg, _LIFT_DEG])
@@ -138,7 +138,7 @@ Edges = Callable[[Array, list[tuple[int, int]], int, int], None]
 def _surroundings(
     scene: CellLayout, everything: Array, edges: Edges, text: Callable[[Array, str, int], None]
 ) -> None:
-    """Planes and the workspace's box, as large as what stands on them."""
+    """Draw planes and the workspace's box, as large as what stands on them."""
     low, high = everything.min(axis=0) - 0.15, everything.max(axis=0) + 0.15
     limits = scene.geometry.limits
     for plane in limits.planes:

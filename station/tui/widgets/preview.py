@@ -30,10 +30,10 @@ LEVELS = 20
 _CORNER = -1
 """A cell that shows a corner in place of shades."""
 CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_rgb(0, 0, 0), bold=True))
-"""A sign and not only a colour."""
+"""A corner: a sign and not only a colour."""
 OLD = "OLD IMAGE"
 SMALLEST = (16, 16)
-"""Pixels of an image that nobody will see."""
+"""Pixels to ask for while no image is drawn: the daemon still looks for the board."""
 FEW_SHADES = " ░▒▓█"
 """Shades of a console with 16 colours, whose backgrounds have no greys: one a cell."""
 
@@ -49,7 +49,7 @@ class PreviewPane(Widget):
     graphics: ClassVar[Graphics | None] = None
     """The terminal's own graphics; None: half blocks only."""
     old: reactive[bool] = reactive(False)
-    """The camera may see something else by now; written across the picture."""
+    """The image is out of date; written across it."""
 
     def __init__(self, *, id: str | None = None) -> None:
         super().__init__(id=id)
@@ -60,7 +60,7 @@ class PreviewPane(Widget):
         self._rows_size = Size(0, 0)
         self._sharp: SharpPicture | None = None
         self._next_s = 0.0
-        """Not before: drawing takes no more than its share of the computer."""
+        """Time before which no image is drawn, to bound the processor's load."""
 
     async def fetch(self, link: Client) -> None:
         """Ask for an image and show it. What the daemon sees in it stands in the status, shown or not.
@@ -104,7 +104,7 @@ class PreviewPane(Widget):
         )
 
     def wanted_pixels(self) -> tuple[int, int]:
-        """Width and height of an image that shows all that this widget can: a cell is one by two."""
+        """Return width and height of the largest image that this widget can show: a cell is one by two."""
         if (graphics := self._graphics()) is not None:
             return graphics.pixels(self.size)
         return max(16, self.size.width), max(16, 2 * self.size.height)
@@ -146,7 +146,7 @@ class PreviewPane(Widget):
 
 
 def _runs(line: list[int], few: bool) -> list[Segment]:
-    """Neighbours alike become one run: less to send over ssh."""
+    """Join equal neighbours: less to send over ssh."""
     runs: list[Segment] = []
     for cell, alike in groupby(line):
         count = len(list(alike))

@@ -130,10 +130,10 @@ class Desk:
     def _guard(self, verb: Verb[object]) -> Iterator[None]:
         """Show what takes long on every screen; to a daemon that is silent send nothing but STOP."""
         if self.known.silent_s is not None and not isinstance(verb, verbs.Stop | verbs.Watch):
-            raise StationError("The station does not answer: nothing was sent.", code="no-answer")
+            raise StationError("daemon-silent")
         words = busy_words(verb)
         if words and self.known.busy:
-            raise RefusedError(f"Busy: {self.known.busy}", code="busy", remedy="Wait until it is done.")
+            raise RefusedError("screen-busy", work=self.known.busy)
         if words:
             self.app.known = replace(self.known, busy=words)
         try:

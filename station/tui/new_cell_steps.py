@@ -237,11 +237,7 @@ class LimitsPage(StepPage):
         try:
             height_m = float(typed.replace("mm", "").replace(",", ".")) / 1000
         except ValueError:
-            raise StationError(
-                f"{typed!r} is no height.",
-                code="no-height-typed",
-                remedy="Type the table's height over the arm's base in mm, e.g. -20.",
-            ) from None
+            raise StationError("no-height-typed", typed=typed) from None
         self.setup.change(table_m=height_m)
         return False
 

@@ -108,7 +108,7 @@ def coverage_lines(known: Known, width: int, height: int) -> Content:
 
 
 def device_lines(known: Known, width: int, height: int) -> Content:
-    """Name each device with its rate."""
+    """Name each device with its rate, as many a line as fit."""
     status = known.shown
     robot, camera, recorder, timing = status.robot, status.camera, status.recorder, status.camera.timing
     if status.playback:
@@ -138,7 +138,11 @@ def device_lines(known: Known, width: int, height: int) -> Content:
                 f"± {sum(known_ms):.1f} ms {timing.source if timing else ''}".rstrip(),
             )
         )
-    return Content("   ").join(parts)
+    rows = [parts[0]]
+    for part in parts[1:]:
+        longer = Content("   ").join((rows[-1], part))
+        rows[-1:] = [longer] if longer.cell_length <= width else [rows[-1], part]
+    return lines(*rows)
 
 
 def _device(name: str, good: bool, text: str) -> Content:

@@ -52,13 +52,14 @@ def row_of(pose: PoseStatus, goal_mm: float, scene: CellLayout | None) -> tuple[
     kind, word = _STATES.get(pose.state, ("now", pose.state))
     state = f"{word}: {pose.reason}" if pose.state == "failed" and pose.reason else word
     kind = "look" if pose.kept else kind
-    good = sigma_mm is not None and sigma_mm <= goal_mm
+    bar = Content()
+    if sigma_mm:
+        colour = "$ok" if sigma_mm <= goal_mm else "$warn"
+        bar = limit_bar(_log(sigma_mm, goal_mm), 1.0, BAR_CELLS, colour, 0.5)
     return (
         Content.styled(f"{pose.index + 1:>3} ", "$foreground") + mark(kind),
         facts(("", f"{sigma_mm:7.2f}" if shown else f"{UNKNOWN:>7}", "mm")),
-        limit_bar(
-            _log(sigma_mm, goal_mm) if sigma_mm else 9.0, 1.0, BAR_CELLS, "$ok" if good else "$warn", 0.5
-        ),
+        bar,
         Content.styled(mm(view[0], 0) if view else UNKNOWN, "$foreground"),
         Content.styled(f"{degrees(view[1], 0):>4}" if view else UNKNOWN, "$foreground"),
         Content.styled("to be captured again" if pose.kept else state, MARKS[kind][1]),

@@ -165,7 +165,7 @@ WINDOWS = [
 ]
 
 
-@pytest.mark.parametrize(("size", "theme"), zip(SIZES, THEMES, strict=True))
+@pytest.mark.parametrize(("size", "theme"), list(zip(SIZES, THEMES, strict=True)))
 async def test_stop_stands_whole_on_every_screen_and_question(
     link: FakeLink, size: tuple[int, int], theme: str
 ) -> None:

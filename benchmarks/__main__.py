@@ -29,6 +29,7 @@ SHOWN: dict[str, str] = {
     "real": r"^\| (ours /|the same|sets|split|good views)",
     "coverage": r"^\| (clean|size 0.5 %|bent 0.5 mm|arm 0.4 mm, arm unknown) \| eye-to",
     "outliers": r"^\| (far|shuffled) \| 40 % \| eye-in|moved \| 35 % \| eye-in",
+    "any_arm": r"^\| seven joints",
     "arm_table": r"^\| 0.3 mm, (measured|usual), 50 planned \| \d+ \|",
     "mistakes": r"^\*\*",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",

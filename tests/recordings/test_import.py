@@ -190,7 +190,7 @@ BAD: dict[str, Bad] = {
     "outside": pose("images/1.png", "../../secret.png", code="outside"),
     "joints in degrees": joints("10,-90,90,-60,-90,180", "not-radians"),
     "a joint missing": joints("0.1,,1.5,-1,-1.57,3.2"),
-    "four joints": joints("0.1,0.1,1.5,-1"),
+    "four joints": (lambda folder: with_joints(folder, "0.1,0.1,1.5,-1"), "header", {"line": 1}),
     "picture missing": image(lambda f: (f / "images/1.png").unlink()),
     "picture is a folder": image(replaced(Path.mkdir)),
     "picture is a pipe": image(replaced(os.mkfifo)),

@@ -189,7 +189,7 @@ def test_an_unknown_or_impossible_arm_is_learned_from_its_joints_alone(model):
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 @pytest.mark.parametrize("name", ["spherical wrist", "seven joints"])
 def test_an_arm_nobody_described_is_honest_and_better_by_its_joints(name, mount):
-    """Links off by 0.3 mm and mrad, 6 cells each; `benchmarks/results/any_arm.md` has 200."""
+    """Links off by 0.3 mm and mrad, 6 cells each; `benchmarks/results/any_arm.md` has more."""
     covered, errors = [], []
     for seed in range(6):
         cell = arm_cell(name, mount, 0.3, seed)

@@ -57,10 +57,9 @@ def test_help_may_be_asked_for_shortly(main: Callable[[], None], asked: tuple[st
     assert done.returncode == 0 and done.stdout and not done.stderr
 
 
-@pytest.mark.parametrize("command", ["calibrate.cli solve", "station.cli plan", "recordings.cli info"])
-def test_a_terminal_without_our_letters_gets_what_it_can_show(command: str) -> None:
+def test_a_terminal_without_our_letters_gets_what_it_can_show() -> None:
     latin = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
-    asked = [sys.executable, "-m", *command.split(), "--help"]
+    asked = [sys.executable, "-m", "station.cli", "plan", "--help"]
     done = subprocess.run(asked, env=latin, capture_output=True)
     assert done.returncode == 0 and done.stdout and not done.stderr
 

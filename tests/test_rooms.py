@@ -20,16 +20,11 @@ OF_THE_STATION = (
 )
 
 
-@pytest.mark.parametrize(
-    "module",
-    ["calibrate.cli.app", "calibrate.pipeline", "recordings.cli.commands", "recordings.cli.importing"],
-)
-def test_offline_rooms_load_nothing_of_the_station(module: str) -> None:
-    program = f"import sys, {module}; print([m for m in {OF_THE_STATION!r} if m in sys.modules])"
-    loaded = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout
-    assert loaded.strip() == "[]"
+def test_offline_rooms_load_nothing_of_the_station() -> None:
+    program = "import sys, calibrate.cli.app, calibrate.pipeline, recordings.cli.commands\n"
+    program += f"import recordings.cli.importing; print([m for m in {OF_THE_STATION!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 PLANTS = [
@@ -85,7 +80,7 @@ def test_a_forbidden_import_is_found(number: int, room: str, module: str, verdic
     assert re.search(rf"{re.escape(importer)} -> {re.escape(module)}\b", verdict)
 
 
-LONGEST_CHAIN = 14
+LONGEST_CHAIN = 19
 """Modules one above the other; imports for types and inside functions count."""
 
 

@@ -38,7 +38,7 @@ _FEWEST_VIEWS = 1
 class AnnotateError(CalibrationError):
     """The calibration and the recording do not belong together."""
 
-    code = "other-cell"
+    code = "not-of-recording"
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,15 +59,11 @@ def annotate(
     camera, info = calibration.intrinsics.model, recording.info
     if (camera.width, camera.height) != (info.camera.width, info.camera.height):
         raise AnnotateError(
-            f"The calibration is for {camera.width}×{camera.height} images, the recording holds "
-            f"{info.camera.width}×{info.camera.height}.",
-            remedy="Name the calibration of this camera.",
+            calibrated=f"for {camera.width}×{camera.height} images",
+            recorded=f"of {info.camera.width}×{info.camera.height}",
         )
     if calibration.mount != info.mount:
-        raise AnnotateError(
-            f"The calibration is {calibration.mount}, the recording {info.mount}.",
-            remedy="Name the calibration of this camera.",
-        )
+        raise AnnotateError(calibrated=calibration.mount, recorded=info.mount)
     seen = load_views(recording, calibration.board, camera, progress, fewest=_FEWEST_VIEWS).detections
     rejected = {view.index: view.reason for view in calibration.views.rejected}
     X, B = calibration.transform.matrix, calibration.board_place.transform.matrix

@@ -56,12 +56,7 @@ class _Bounded(AbstractContextManager[None]):
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._late_error = SolveLimitError(
-            f"The solve took longer than {limits.time_s:g} s; nothing was written.",
-            code="time-limit",
-            remedy="Reduce other load, or allow more with --time-limit-s.",
-            limit_s=limits.time_s,
-        )
+        self._late_error = SolveLimitError("time-limit", limit_s=limits.time_s)
 
     def __enter__(self) -> None:
         if self._limits.time_s > 0:
@@ -86,12 +81,7 @@ class _Bounded(AbstractContextManager[None]):
             self._last.cancel()
         resource.setrlimit(resource.RLIMIT_DATA, self._memory_before)
         if problem is not None and _is_out_of_memory(problem):
-            raise SolveLimitError(
-                f"The solve needs more than {self._limits.memory_mib} MiB of memory; nothing was written.",
-                code="memory-limit",
-                remedy="Check the recording's size (recordings info), or allow more with --memory-limit-mib.",
-                limit_mib=self._limits.memory_mib,
-            ) from None
+            raise SolveLimitError("memory-limit", limit_mib=self._limits.memory_mib) from None
 
     def _late(self, signal_number: int, frame: FrameType | None) -> None:
         """Raising in the middle of `__exit__` would leave the thread alive that ends the process."""

@@ -39,34 +39,20 @@ class Cluster:
         try:
             address = msgspec.json.decode(read_file(path, _FILE_LIMIT_BYTES), type=_SchedulerFile).address
         except (OSError, msgspec.DecodeError, UnicodeDecodeError) as problem:
-            raise UsageError(
-                f"{path} is no scheduler file ({problem}).",
-                code="cluster-file",
-                remedy="Start the scheduler with: dask scheduler --scheduler-file FILE",
-            ) from None
+            raise UsageError("cluster-file", path=path, why=str(problem)) from None
         return cls(address, *tls)
 
     def check(self) -> None:
         """Raises UsageError where address and files do not belong together."""
         scheme, _, place = self.address.partition("://")
         if scheme not in ("tcp", "tls") or ":" not in place:
-            raise UsageError(
-                f"{self.address!r} is no address of a scheduler.",
-                code="cluster-address",
-                remedy="Write tcp://HOST:PORT or tls://HOST:PORT, as `dask scheduler` prints it.",
-            )
+            raise UsageError("cluster-address", address=self.address)
         given = [path for path in (self.tls_ca, self.tls_cert, self.tls_key) if path is not None]
         if (scheme == "tls") != (len(given) == 3) or (scheme == "tcp" and given):
-            raise UsageError(
-                f"{self.address}: a tls:// address needs --tls-ca, --tls-cert and --tls-key; a "
-                "tcp:// address takes none of them.",
-                code="cluster-tls",
-            )
+            raise UsageError("cluster-tls", address=self.address)
         for path in given:
             if not path.is_file():
-                raise UsageError(
-                    f"{path} does not exist or is no file.", code="cluster-file", remedy="Check the name."
-                )
+                raise UsageError("cluster-file", path=path, why="it does not exist or is no file")
 
 
 class _SchedulerFile(msgspec.Struct):
@@ -82,11 +68,7 @@ def cluster_workers(cluster: Cluster) -> BatchWorkers:
     try:
         dask: Any = importlib.import_module("distributed")
     except ImportError:
-        raise UsageError(
-            "A cluster needs the package `distributed`.",
-            code="package-missing",
-            remedy="pip install 'calibration-station[cluster]', the same version as on the workers.",
-        ) from None
+        raise UsageError("package-missing") from None
 
     def run(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
         if tasks:
@@ -110,11 +92,7 @@ def dask_workers(client: Any) -> BatchWorkers:
         for future in dask.as_completed(futures):
             task = futures.pop(future)
             if future.cancelled() or client.status not in ("running", "connecting"):
-                raise BatchError(
-                    f"The connection to {address} is lost; finished results are kept.",
-                    code="cluster-lost",
-                    remedy="Run the same command again to go on.",
-                )
+                raise BatchError("cluster-lost", address=address)
             problem = future.exception()
             if problem is None:
                 yield task, future.result()
@@ -140,20 +118,12 @@ def _connect(dask: Any, cluster: Cluster) -> Any:
         client = dask.Client(cluster.address, security=security, timeout=_CONNECT_S)
     except (OSError, ValueError) as problem:
         reason = problem.__cause__ or problem
-        raise BatchError(
-            f"{cluster.address}: no scheduler answers ({reason}).",
-            code="cluster-silent",
-            remedy="Start `dask scheduler` there, with TLS exactly if the address begins with tls.",
-        ) from None
+        raise BatchError("cluster-silent", address=cluster.address, why=str(reason)) from None
     try:
         client.wait_for_workers(1, timeout=_CONNECT_S)
     except TimeoutError:
         client.close()
-        raise BatchError(
-            f"{cluster.address}: the scheduler has no workers.",
-            code="cluster-workers",
-            remedy=f"Start some: dask worker {cluster.address}",
-        ) from None
+        raise BatchError("cluster-workers", address=cluster.address) from None
     return client
 
 
@@ -164,15 +134,13 @@ def _require_same_software(client: Any, address: str) -> None:
         there: dict[str, dict[str, str]] = client.run(software_versions)
     except Exception as problem:  # whatever a worker without this package raises
         raise BatchError(
-            f"{address}: a worker cannot run this package ({problem}).",
-            code="cluster-software",
-            remedy="Install calibration-station[cluster] on every worker, the same version as here.",
+            "cluster-software", address=address, why=f"a worker cannot run this package ({problem})"
         ) from None
     for worker, versions in there.items():
         for name, version in versions.items():
             if version != here.get(name):
                 raise BatchError(
-                    f"{address}: worker {worker} has {name} {version}, here it is {here.get(name)}.",
-                    code="cluster-software",
-                    remedy="Install the same versions: results would differ.",
+                    "cluster-software",
+                    address=address,
+                    why=f"worker {worker} has {name} {version}, here it is {here.get(name)}",
                 )

@@ -96,7 +96,7 @@ def run_batch(
         results = [done[key] for _, key in tasks]
         write_output(output / "results.csv", _csv(results))
     except OSError as problem:
-        raise BatchError(f"{output}: {problem.strerror or problem}.", code="batch-folder") from None
+        raise BatchError("batch-folder", folder=output, why=problem.strerror or str(problem)) from None
     return results
 
 

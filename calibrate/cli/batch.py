@@ -51,14 +51,16 @@ def chosen_workers(
     tls = (tls_ca, tls_cert, tls_key)
     if scheduler is None and scheduler_file is None:
         if any(tls):
-            raise UsageError("--tls-ca, --tls-cert and --tls-key need --scheduler.", code="options")
+            raise UsageError("options", why="--tls-ca, --tls-cert and --tls-key need --scheduler", advice="")
         return pool(workers)
     if workers is not None:
-        raise UsageError("--workers counts processes here, not on a cluster.", code="options")
+        raise UsageError("options", why="--workers counts processes here, not on a cluster", advice="")
     if scheduler_file is None:
         return cluster_workers(Cluster(scheduler or "", *tls))
     if scheduler is not None:
-        raise UsageError("Give --scheduler or --scheduler-file, not both.", code="options")
+        raise UsageError(
+            "options", why="--scheduler and --scheduler-file exclude each other", advice="Give one."
+        )
     return cluster_workers(Cluster.from_file(scheduler_file, *tls))
 
 
@@ -81,10 +83,12 @@ def batch(
     Exit codes: 0 all solved, 3 some recordings could not be solved.
     """
     if output.is_file():
-        raise UsageError(f"{output} is a file; the results need a folder.", code="target-exists")
+        raise UsageError("target-exists", path=output, by="a folder of results")
     for place in map(str, (*recordings, output)):
         if re.match("[a-z0-9+]+:/", place):
-            raise GoneError(f"{place}: URLs are gone.", remedy="Copy the files here, or mount their store.")
+            raise GoneError(
+                word=place.partition("/")[0] + "//", instead="Copy the files here, or mount their store."
+            )
     gate_limits = GateLimits() if gates is None else read_limits(gates)
     options = JobOptions(profile=profile, seed=seed, limits=gate_limits)
     limits = Limits(time_limit_s, memory_limit_mib)

@@ -48,7 +48,7 @@ def board(
     station's configuration.
     """
     if output.suffix.lower() not in (".pdf", ".svg"):
-        raise UsageError(f"{output}: the name must end in .pdf or .svg.", code="board-format")
+        raise UsageError("board-format", path=output)
     check_target(output, "export")
     usual_m, usual = usual_markers(kind, square_mm / 1000)
     marker_m = usual_m if marker_mm is None else marker_mm / 1000

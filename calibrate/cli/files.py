@@ -27,26 +27,24 @@ def read_board(path: Path) -> BoardSpec:
     return board
 
 
-def read_camera(path: Path) -> CameraModel:
-    """Read a calibration file, ROS camera_info YAML, or a camera's fields (width, height, matrix …)."""
+def read_camera(path: Path) -> tuple[CameraModel, dict[str, float]]:
+    """Read a calibration file, ROS camera_info YAML, or a camera's fields (width, height, matrix …).
+
+    The second value: 1σ of each of the intrinsics, as a calibration file states them; else empty.
+    """
     plain = _read(path, "a calibration file, a camera_info file or a camera's width, height and matrix")
     if plain.get("format") == FORMAT:
-        return read_calibration(path).intrinsics.model
+        lens = read_calibration(path).intrinsics
+        return lens.model, dict(lens.sigma)
     if "camera_matrix" in plain:
         camera = _camera_info(path, plain)
     else:
         camera = _strictly(path, CameraModel, "camera")
     if camera.width < 1 or camera.height < 1:
-        raise UsageError(f"{path}: {camera.width}×{camera.height} is no image size.", code="input-file")
+        raise UsageError("input-file", path=path, why=f"{camera.width}×{camera.height} is no image size")
     camera_matrix(camera)
     distortion(camera)
-    return camera
-
-
-def read_lens_sigma(path: Path) -> dict[str, float]:
-    """1σ of each of the intrinsics, as a calibration file states them; empty for other files."""
-    plain = _read(path, "a calibration file, a camera_info file or a camera's width, height and matrix")
-    return dict(read_calibration(path).intrinsics.sigma) if plain.get("format") == FORMAT else {}
+    return camera, {}
 
 
 class CellFacts(NamedTuple):
@@ -64,11 +62,11 @@ def read_cell(path: Path) -> CellFacts:
     robot, camera, rule = plain.get("robot"), plain.get("camera"), plain.get("validity") or {}
     if not isinstance(robot, dict) or not isinstance(camera, dict) or not isinstance(rule, dict):
         raise UsageError(
-            f"{path}: no station configuration, robot and camera are missing.", code="input-file"
+            "input-file", path=path, why="no station configuration, robot and camera are missing"
         )
     days = rule.get("max_age_days")
     if not isinstance(days, int | float | None):
-        raise UsageError(f"{path}: validity.max_age_days {days!r} is no number of days.", code="input-file")
+        raise UsageError("input-file", path=path, why=f"validity.max_age_days {days!r} is no number of days")
     robot_serial, camera_serial = (str(device.get("serial") or "") for device in (robot, camera))
     return CellFacts(robot_serial, camera_serial, str(camera.get("name") or ""), days)
 
@@ -78,7 +76,9 @@ def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
     if model not in get_args(LensModel):
         known = ", ".join(get_args(LensModel))
         raise UsageError(
-            f"{path}: distortion_model {model!r} is not known here; known are {known}.", code="input-file"
+            "input-file",
+            path=path,
+            why=f"distortion_model {model!r} is not known here; known are {known}",
         )
     try:
         fields = {
@@ -91,28 +91,28 @@ def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
         }
         return msgspec.convert(fields, CameraModel)
     except (KeyError, TypeError, ValueError) as problem:
-        raise UsageError(f"{path}: not a whole camera_info file ({problem!r}).", code="input-file") from None
+        raise UsageError("input-file", path=path, why=f"not a whole camera_info file ({problem!r})") from None
 
 
 def _strictly(path: Path, kind: type[T], under: str) -> T:
     try:
         return strict_yaml.load(_content(path), kind, under)
     except strict_yaml.StrictYamlError as error:
-        raise UsageError(f"{path}: {'; '.join(map(str, error.problems))}.", code="input-file") from None
+        raise UsageError("input-file", path=path, why="; ".join(map(str, error.problems))) from None
 
 
 def _content(path: Path) -> bytes:
     try:
         return read_file(path, strict_yaml.LIMIT_BYTES)
     except OSError as problem:
-        raise UsageError(f"{path}: {problem.strerror or problem}.", code="input-file") from None
+        raise UsageError("input-file", path=path, why=problem.strerror or str(problem)) from None
 
 
 def _read(path: Path, wanted: str) -> dict[str, Any]:
     try:
         plain = strict_yaml.load_plain(_content(path))
     except strict_yaml.StrictYamlError as problem:
-        raise UsageError(f"{path}: {problem}.", code="input-file") from None
+        raise UsageError("input-file", path=path, why=str(problem)) from None
     if not isinstance(plain, dict):
-        raise UsageError(f"{path}: {wanted} is needed, and no fields are in it.", code="input-file")
+        raise UsageError("input-file", path=path, why=f"{wanted} is needed, and no fields are in it")
     return plain

@@ -123,7 +123,7 @@ def install(
     Exit codes: 0 installed, 4 a gate failed, 1 refused for another reason; then nothing was changed.
     """
     if root is None and cell != "real":
-        raise UsageError(f"{cell} needs its own folder.", code="root-missing", remedy="Name it with --root.")
+        raise UsageError("root-missing", cell=cell)
     facts = CellFacts("", "", "", None) if cell_config is None else read_cell(cell_config)
     made = installing.install(
         file,

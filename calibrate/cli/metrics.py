@@ -49,7 +49,7 @@ def metrics(
         typer.echo(text, nl=False)
         return
     if output.suffix != ".prom":
-        raise UsageError(f"{output} is no .prom file.", remedy="The collector reads *.prom only.")
+        raise UsageError(path=output, why="it is no .prom file", advice="The collector reads *.prom only.")
     check_target(output, "export")
     write_output(output, text.encode())
 

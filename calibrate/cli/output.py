@@ -32,15 +32,15 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
     try:
         if not target.parent.is_dir():
             raise UsageError(
-                f"{target}: the folder {target.parent} does not exist.", remedy="Create it, or name another."
+                path=target, why="its folder does not exist", advice="Create it, or name another."
             )
         if target.exists() and not target.is_file():
-            raise UsageError(f"{target} is a folder, a device or a pipe.", remedy="Name a file.")
+            raise UsageError(path=target, why="it is a folder, a device or a pipe", advice="Name a file.")
         if not target.exists():
             return
         start = read_beginning(target, 64)
     except OSError as problem:
-        raise UsageError(f"{target}: {problem.strerror}.", remedy="Name another place.") from None
+        raise UsageError(path=target, why=problem.strerror, advice="Name another place.") from None
     if kind == "calibration":
         spared = not _is_calibration(target)
     elif kind == "report":
@@ -48,11 +48,7 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
     else:
         spared = start.startswith((MAGIC, f"format: {FORMAT}".encode()))
     if spared:
-        raise UsageError(
-            f"{target} exists and is not replaced by this {kind}.",
-            code="target-exists",
-            remedy="Give another name with -o or --report.",
-        )
+        raise UsageError("target-exists", path=target, by=f"this {kind}")
 
 
 def _is_calibration(target: Path) -> bool:

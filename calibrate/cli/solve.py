@@ -56,11 +56,7 @@ def solve(
     if report is not None:
         check_target(report, "report")
         if os.path.realpath(report) == os.path.realpath(target):
-            raise UsageError(
-                f"{target} cannot be calibration and report.",
-                code="target-exists",
-                remedy="Give --report another name.",
-            )
+            raise UsageError("target-exists", path=target, by="both calibration and report")
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress, verify)
     write_calibration(job.calibration, target)

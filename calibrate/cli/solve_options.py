@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calibrate.cli.files import read_board, read_camera, read_lens_sigma
+from calibrate.cli.files import read_board, read_camera
 from calibrate.errors import UsageError
 from calibrate.handeye.solution import Profile
 from calibrate.job import JobOptions
@@ -89,16 +89,17 @@ def picture_options(
     """Options of reading images."""
     if camera is not None and find_intrinsics:
         raise UsageError(
-            "--camera fixes the intrinsics, --estimate-intrinsics estimates them.",
-            code="options",
-            remedy="Choose one of them.",
+            "options",
+            why="--camera fixes the intrinsics, --estimate-intrinsics estimates them",
+            advice="Choose one of them.",
         )
+    model, sigma = (None, {}) if camera is None else read_camera(camera)
     return JobOptions(
         seed=seed,
         board=None if board is None else read_board(board),
         square_m=None if square_mm is None else square_mm / 1000,
-        camera=None if camera is None else read_camera(camera),
-        camera_sigma={} if camera is None else read_lens_sigma(camera),
+        camera=model,
+        camera_sigma=sigma,
         lens_model=lens,
         find_intrinsics=find_intrinsics,
         without=() if without is None else _numbers(without),

@@ -126,9 +126,9 @@ def watch(
     opened = [_open(path, watched.calibration) for path in sources]
     if follow and not (sources[-1] / DATASET_FILE).is_file():
         raise UsageError(
-            f"--follow: {sources[-1]} does not grow.",
-            code="options",
-            remedy=f"Give a folder with {DATASET_FILE} and poses.csv last.",
+            "options",
+            why=f"--follow: {sources[-1]} does not grow",
+            advice=f"Give a folder with {DATASET_FILE} and poses.csv last.",
         )
     tag = opened[0].board if board is None else read_board(board)
     watch_pictures(opened, tag, watched, as_json, follow=follow, threads=threads)
@@ -175,9 +175,7 @@ def watch_pictures(
                 pass
     except OSError as problem:
         raise InstallError(
-            f"{problem.filename or folder}: {problem.strerror}. What was seen cannot be kept.",
-            code="state-folder",
-            remedy="Name another state folder with --root.",
+            "state-folder", path=problem.filename or str(folder), why=problem.strerror
         ) from None
     teller.summary(log, tag)
     if log.monitor.alarmed:
@@ -195,11 +193,7 @@ def _alone(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InstallError(
-                f"{folder} is being watched by another program.",
-                code="watched-already",
-                remedy="Let one watch take all images of a camera; several sources can be given to it.",
-            ) from None
+            raise InstallError("watched-already", folder=folder) from None
         yield
 
 
@@ -219,7 +213,7 @@ def _open(path: Path, calibration: Calibration) -> WatchSource:
     if (path / DATASET_FILE).is_file():
         return _open_folder(path, calibration)
     if path.is_socket():
-        raise WatchSourceError(f"{path} is a station.", remedy=f"Use `station watch --socket {path}`.")
+        raise WatchSourceError(why=f"{path} is a station", advice=f"Use `station watch --socket {path}`.")
     recording = open_recording(path)
     info, lens = recording.info, calibration.intrinsics.model
     require_same_cell(str(path), calibration, CellIdentity.of(info))
@@ -247,8 +241,8 @@ def _open_folder(folder: Path, calibration: Calibration) -> WatchSource:
     lens = calibration.intrinsics
     if dataset.mount != calibration.mount:
         raise WatchSourceError(
-            f"{folder} is {dataset.mount}, the calibration {calibration.mount}.",
-            remedy="Correct dataset.yaml, or name the calibration of this camera.",
+            why=f"{folder} is {dataset.mount}, the calibration {calibration.mount}",
+            advice="Correct dataset.yaml, or name the calibration of this camera.",
             found=dataset.mount,
             calibrated=calibration.mount,
         )
@@ -272,8 +266,8 @@ def _detect(folder: Path, row: PoseRow, tag: BoardSpec, size: tuple[int, int]) -
         _, _, pixels = read_image(folder, row, size)
     except ImportSourceError as problem:
         raise WatchSourceError(
-            problem.text,
-            remedy="Write an image before its line in poses.csv; delete lines of images that are not to be "
+            why=problem.text,
+            advice="Write an image before its line in poses.csv; delete lines of images that are not to be "
             "used.",
             line=row.line,
         ) from None

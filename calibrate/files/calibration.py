@@ -329,7 +329,7 @@ def decode_calibration(content: bytes, where: str) -> Calibration:
     try:
         calibration = msgspec.convert(plain, Calibration)
     except msgspec.ValidationError as problem:
-        raise CalibrationFileError(f"{where}: {problem}.") from None
+        raise CalibrationFileError(path=where, why=str(problem)) from None
     check_result(plain, where)
     return calibration
 
@@ -349,7 +349,9 @@ def write_output(path: Path, content: bytes) -> None:
     try:
         write_atomically(path, content, ASKED_FOR)
     except OSError as problem:
-        raise CalibrationFileError(f"{path} cannot be written: {problem.strerror or problem}.") from None
+        raise CalibrationFileError(
+            path=path, why=f"cannot be written: {problem.strerror or problem}"
+        ) from None
 
 
 def source_stamp(source: Source) -> str:

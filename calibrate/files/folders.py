@@ -20,9 +20,7 @@ VERSION_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
 def calibrations_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
     """Return the folder of a camera's installed calibrations. InstallError for an invalid camera name."""
     if not is_session_name(camera):
-        raise InstallError(
-            f"{camera!r} is no name of a camera.", code="camera-name", remedy="Use 1 to 40 of a-z, 0-9 and -."
-        )
+        raise InstallError("camera-name", camera=camera)
     folder = state_root(root) / "calibrations"
     return folder if camera == MAIN_CAMERA else folder / "cameras" / camera
 
@@ -33,11 +31,7 @@ def readable_folder(root: Path | str | None, camera: str = MAIN_CAMERA) -> Path:
     try:
         (folder / "gen").exists()
     except PermissionError as problem:
-        raise InstallError(
-            f"{folder}: {problem.strerror}.",
-            code="state-folder",
-            remedy="Name another state folder with --root.",
-        ) from None
+        raise InstallError("state-folder", path=folder, why=problem.strerror) from None
     return folder
 
 
@@ -56,11 +50,7 @@ def current_version(folder: Path) -> tuple[int, Path]:
         name = ""
     match = VERSION_NAME.fullmatch(name)
     if match is None:
-        raise InstallError(
-            f"{folder / 'current'}: nothing is installed.",
-            code="nothing-installed",
-            remedy="Run: calibrate install FILE",
-        )
+        raise InstallError("nothing-installed", folder=folder)
     return int(match[1]), folder / "gen" / name
 
 
@@ -82,7 +72,6 @@ def validity_of(folder: Path, number: int, now: datetime | None = None) -> Valid
         found = read_validity(folder).get(number) or unrecorded(number, time_text(installed))
     except OSError as problem:
         raise InstallError(
-            f"{problem.filename or folder}: {problem.strerror}. Its validity is not known.",
-            code="state-folder",
+            "state-folder", path=problem.filename or str(folder), why=problem.strerror
         ) from None
     return found.at(now or datetime.now(UTC))

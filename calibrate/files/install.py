@@ -110,9 +110,10 @@ def install(
         if overridden and not override.strip():
             kind = InstallError if objections else GateFailedError
             raise kind(
-                f"{path} is not installed. {' '.join(overridden)}",
-                code="objection" if objections else "",
-                remedy=f"To override: `{install_line(calibration.source, path, root, 'REASON')}`.",
+                "objection" if objections else "gate-failed",
+                path=path,
+                why=" ".join(overridden),
+                command=install_line(calibration.source, path, root, "REASON"),
                 gates=len(failed),
                 objections=len(objections),
             )
@@ -171,12 +172,7 @@ def rollback(
         else:
             target = next((g for g in known if g.number == to), None) or no_such_version(folder, to, known)
         if target.calibration is None:
-            raise InstallError(
-                f"Version {target.number} is damaged and cannot be used: {target.problem}",
-                code="damaged-version",
-                remedy="Choose another one of `calibrate list`.",
-                generation=target.number,
-            )
+            raise InstallError("damaged-version", generation=target.number, why=target.problem)
         before = None if current is None else current.calibration
         change = change_text(before, target.calibration)
         validity = _validity_again(target, _max_age_days(folder, None))
@@ -187,9 +183,9 @@ def _nothing_older(root: Path | None, camera: str, validity: Validity) -> Instal
     folder, command = calibrations_folder(root, camera), _withdraw_line(root, camera)
     withdrawn = validity.state is ValidityState.WITHDRAWN
     return InstallError(
-        f"{folder}: no older calibration to go back to.",
-        code="nothing-older",
-        remedy=f"{WITHDRAWN_REMEDY}." if withdrawn else f"To take it out of use: {command}",
+        "nothing-older",
+        folder=folder,
+        advice=f"{WITHDRAWN_REMEDY}." if withdrawn else f"To take it out of use: {command}",
     )
 
 
@@ -278,13 +274,7 @@ def _change_validity(
     with locked(folder):
         number, _ = current_version(folder)
         if version not in (None, number):
-            raise InstallError(
-                f"{folder}: version {number} is installed by now, version {version} was judged.",
-                code="other-version",
-                remedy="Check again.",
-                version=number,
-                judged=version,
-            )
+            raise InstallError("other-version", folder=folder, version=number, judged=version)
         before = read_validity(folder).get(number, current_validity(folder))
         after = change(before)
         if after != before:
@@ -300,8 +290,8 @@ def reason_problem(reason: str) -> str:
 
 
 def _require_words(reason: str) -> None:
-    if problem := reason_problem(reason):
-        raise InstallError(f"{problem} Nothing was changed.", code="reason-too-short")
+    if reason_problem(reason):
+        raise InstallError("reason-too-short")
 
 
 def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
@@ -348,19 +338,19 @@ def _refuse_foreign_source(
     kind = _CELL_OF[calibration.source]
     if kind != cell:
         raise InstallError(
-            f"{path} is {calibration.source} and is not installed on {_ARTICLE[cell]} {cell} cell.",
-            code="other-cell",
-            remedy=f"Files from elsewhere have their own place: {install_line(calibration.source, path)}",
+            "other-cell",
+            path=path,
             source=calibration.source,
             cell=cell,
+            advice=f"Files from elsewhere have their own place: {install_line(calibration.source, path)}",
         )
     if before is not None and _CELL_OF[before.source] != kind:
         raise InstallError(
-            f"{path} ({calibration.source}) does not follow a {before.source} calibration in the same place.",
-            code="other-cell",
-            remedy="Use another --root.",
+            "other-cell",
+            path=path,
             source=calibration.source,
             cell=_CELL_OF[before.source],
+            advice="Use another --root.",
         )
 
 

@@ -179,12 +179,7 @@ def load_installed(
     """
     found = _read(root, camera)
     if found.source in _NOT_REAL and not allow_simulated:
-        raise InstallError(
-            f"{found.path}: the installed calibration is {found.source}, not of a real cell.",
-            code="not-real",
-            remedy="Install a calibration of the real cell; a trial loads it with allow_simulated=True.",
-            source=found.source,
-        )
+        raise InstallError("not-real", path=found.path, source=found.source)
     for name, serial, device in (
         ("robot", robot_serial, found.robot),
         ("camera", camera_serial, found.camera),
@@ -213,7 +208,7 @@ def _read(root: Path | str | None, camera: str) -> InstalledCalibration:
         check_result(plain, str(path))
     except (KeyError, TypeError, ValueError) as problem:
         raise CalibrationFileError(
-            f"{path}: {problem} is missing or of another kind.", code="contradiction"
+            "contradiction", path=path, why=f"{problem} is missing or of another kind"
         ) from None
     return InstalledCalibration(camera, number, path, validity_of(folder, number), plain)
 

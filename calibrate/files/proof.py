@@ -26,10 +26,10 @@ def read_bounded(path: Path) -> bytes:
     try:
         return read_beginning(path, _LIMIT_BYTES + 1)
     except OSError as problem:
-        raise CalibrationFileError(f"{path}: {problem.strerror or problem}.") from None
+        raise CalibrationFileError(path=path, why=problem.strerror or str(problem)) from None
 
 
-_MEND = "Use the original, or solve the recording again."
+_GIVE = "Give one that `calibrate solve` wrote."
 
 
 def proven_plain(content: bytes, where: str) -> dict[str, Any]:
@@ -39,44 +39,38 @@ def proven_plain(content: bytes, where: str) -> dict[str, Any]:
     """
     if content.startswith(_MCAP):
         raise CalibrationFileError(
-            f"{where} is a recording, no calibration file.",
-            code="not-a-calibration",
-            remedy=f"First run: calibrate solve {shlex.quote(where)}",
+            "not-a-calibration",
+            path=where,
+            why="it is a recording",
+            advice=f"First run: calibrate solve {shlex.quote(where)}",
         )
     if len(content) > _LIMIT_BYTES:
         raise CalibrationFileError(
-            f"{where}: larger than any calibration file.",
-            code="not-a-calibration",
+            "not-a-calibration",
+            path=where,
+            why="it is larger than any",
+            advice=_GIVE,
             size_bytes=len(content),
             limit_bytes=_LIMIT_BYTES,
         )
     try:
         plain = strict_yaml.load_plain(content)
     except strict_yaml.StrictYamlError as problem:
-        raise CalibrationFileError(
-            f"{where}: damaged, or no calibration file: {problem}.",
-            code="damaged-calibration",
-            remedy=_MEND,
-        ) from None
+        raise CalibrationFileError("damaged-calibration", path=where, why=str(problem)) from None
     if not isinstance(plain, dict) or plain.get("format") != FORMAT_NAME:
         found = plain.get("format") if isinstance(plain, dict) else None
         raise CalibrationFileError(
-            f"{where}: not a calibration file: format is {found!r}, expected {FORMAT_NAME!r}.",
-            code="not-a-calibration",
-            remedy="Give one that `calibrate solve` wrote.",
+            "not-a-calibration",
+            path=where,
+            why=f"format is {found!r}, expected {FORMAT_NAME!r}",
+            advice=_GIVE,
         )
     try:
         hash_now = content_sha256(plain)
     except (TypeError, ValueError) as problem:
-        raise CalibrationFileError(
-            f"{where}: damaged ({problem}).", code="damaged-calibration", remedy=_MEND
-        ) from None
+        raise CalibrationFileError("damaged-calibration", path=where, why=str(problem)) from None
     if plain.pop("sha256", None) != hash_now:
-        raise CalibrationFileError(
-            f"{where}: the content does not fit its hash: it was edited by hand or damaged.",
-            code="damaged-calibration",
-            remedy=_MEND,
-        )
+        raise CalibrationFileError("damaged-calibration", path=where, why="the content does not fit its hash")
     return plain
 
 
@@ -151,9 +145,7 @@ def check_result(plain: dict[str, Any], where: str) -> None:
             wrong = "the covariance is not symmetric and positive"
     wrong = wrong or _wrong_table(plain.get("arm_table"), parent)
     if wrong:
-        raise CalibrationFileError(
-            f"{where}: {wrong}.", code="contradiction", remedy="Solve the recording again."
-        )
+        raise CalibrationFileError("contradiction", path=where, why=wrong)
 
 
 def _wrong_table(arm: dict[str, Any] | None, parent: str) -> str:
@@ -180,9 +172,4 @@ def _rotation(quaternion_xyzw: Array) -> Array:
 
 def refused_table(reason: str) -> CalibrationFileError:
     """Make the error for a calibration that offers no table of the arm."""
-    return CalibrationFileError(
-        f"This calibration offers no table of the arm ({reason}).",
-        code="table-not-offered",
-        remedy="Use its result, for the arm as it is, or record poses of station plan --for arm.",
-        reason=reason,
-    )
+    return CalibrationFileError("table-not-offered", reason=reason)

@@ -100,30 +100,34 @@ class Validity:
         return replace(changed, state=ValidityState.UNVERIFIED) if doubted else self
 
 
+_REFUSED = {
+    ValidityState.IN_DOUBT: "calibration-in-doubt",
+    ValidityState.WITHDRAWN: "calibration-withdrawn",
+    ValidityState.UNVERIFIED: "calibration-unverified",
+}
+
+
 def require_usable(
-    validity: Validity, what: str, anyway: str, *, proven: bool = False, **values: str | int
+    validity: Validity, what: str, anyway: str, *, proven: bool = False, camera: str = ""
 ) -> None:
     """Raise InstallError (code `calibration-STATE`) for one in doubt or withdrawn; `proven`: or unverified.
 
     `what`: subject of the message; `anyway`: how to use it all the same, for the remedy.
     """
-    refused = [
-        ValidityState.IN_DOUBT,
-        ValidityState.WITHDRAWN,
-        *([ValidityState.UNVERIFIED] if proven else []),
-    ]
-    if validity.state not in refused:
+    state = validity.state
+    if state not in _REFUSED or (state is ValidityState.UNVERIFIED and not proven):
         return
-    withdrawn = validity.state is ValidityState.WITHDRAWN
-    remedy = WITHDRAWN_REMEDY if withdrawn else "Run `station drift-check`, or calibrate again"
+    withdrawn = state is ValidityState.WITHDRAWN
     raise InstallError(
-        f"{what}: {validity_text(validity).rstrip('.')}.",
-        code=f"calibration-{validity.state}",
-        remedy=f"{remedy}; {anyway}.",
+        _REFUSED[state],
+        what=what,
+        held=validity_text(validity).rstrip("."),
+        advice=WITHDRAWN_REMEDY if withdrawn else "Run `station drift-check`, or calibrate again",
+        anyway=anyway,
         version=validity.version,
         since=validity.since,
         reason=validity.reason.code,
-        **values,
+        camera=camera,
     )
 
 

@@ -158,7 +158,7 @@ def content_name(content: bytes) -> str:
     """Return the first 8 hex digits of the hash that the file states."""
     found = re.search(rb"^sha256: '?([0-9a-f]{8})", content, re.MULTILINE)
     if found is None:
-        raise CalibrationFileError("A calibration file without its hash cannot be installed.")
+        raise CalibrationFileError("damaged-calibration", path="This file", why="it holds no hash")
     return found[1].decode()
 
 
@@ -177,11 +177,7 @@ def _switch(folder: Path, name: str, content: bytes) -> None:
     temporary.replace(folder / "current")
     sync_folder(folder)
     if read_bounded(folder / "current") != content:
-        raise InstallError(
-            f"{folder / 'current'} does not read back what was installed.",
-            code="read-back",
-            remedy="Check the disk.",
-        )
+        raise InstallError("read-back", path=folder / "current")
 
 
 @contextmanager
@@ -194,11 +190,7 @@ def locked(folder: Path) -> Iterator[None]:
                 share(part)
         descriptor = open_regular(folder / "lock", os.O_RDWR)
     except OSError as problem:
-        raise InstallError(
-            f"{folder} cannot be used: {problem.strerror}.",
-            code="state-folder",
-            remedy="Name another with --root.",
-        ) from None
+        raise InstallError("state-folder", path=folder, why=problem.strerror) from None
     before = ""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -210,7 +202,11 @@ def locked(folder: Path) -> Iterator[None]:
             f"{now} is installed now, and the log may not say so" if now != before else "Nothing was switched"
         )
         raise InstallError(
-            f"{folder}: {problem.strerror or problem}. {switched}.", code="install-io", switched=now != before
+            "install-io",
+            folder=folder,
+            why=problem.strerror or str(problem),
+            now=switched,
+            switched=now != before,
         ) from None
     finally:
         os.close(descriptor)
@@ -219,11 +215,7 @@ def locked(folder: Path) -> Iterator[None]:
 def no_such_version(folder: Path, number: int, known: list[InstalledVersion]) -> NoReturn:
     """Raise InstallError that lists the versions that exist."""
     have = ", ".join(str(g.number) for g in known) or "none"
-    raise InstallError(
-        f"{folder}: there is no version {number}; there are: {have}.",
-        code="no-such-version",
-        generation=number,
-    )
+    raise InstallError("no-such-version", folder=folder, generation=number, have=have)
 
 
 def who() -> str:
@@ -252,11 +244,7 @@ def note_installed(
     with locked(folder):
         current = next((g for g in installed_versions(root, camera) if g.current), None)
         if current is None or current.calibration is None:
-            raise InstallError(
-                f"{folder}: no whole calibration is installed, so nothing was noted.",
-                code="nothing-installed",
-                remedy="Install one: calibrate install FILE.",
-            )
+            raise InstallError("nothing-installed", folder=folder)
         calibration = _with_touches(current.calibration, touches)
         found = "; ".join(touch_text(touch) for touch in touches)
         before = read_validity(folder).get(current.number) or unrecorded(current.number)

@@ -45,9 +45,7 @@ def export(calibration: Calibration, name: str, frames: FrameNames | None = None
     An installed calibration (`frames.validity`) in doubt or withdrawn is refused as by `load_installed`.
     """
     if name not in FORMATS:
-        raise ExportError(
-            f"There is no format {name!r}.", remedy=f"Choose one of {', '.join(FORMATS)}.", format=name
-        )
+        raise ExportError(format=name, known=", ".join(FORMATS))
     frames = frames or FrameNames()
     if frames.validity is not None:
         anyway = "a calibration file that is named is exported all the same"
@@ -61,10 +59,6 @@ def _of_table(calibration: Calibration, name: str) -> Calibration:
     """Replace X by the one that belongs to the arm's corrected table. Raises as `installable`."""
     if not FORMATS[name].of_table:
         able = ", ".join(other for other, one in FORMATS.items() if one.of_table)
-        raise ExportError(
-            f"{name} is never for the corrected table alone.",
-            code="not-of-table",
-            remedy=f"Leave --with-table out, or choose one of {able}.",
-        )
+        raise ExportError("not-of-table", format=name, able=able)
     _, X = models.table_of(calibration).installable()
     return msgspec.structs.replace(calibration, result=FramePose.of(X))

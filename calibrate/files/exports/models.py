@@ -75,7 +75,7 @@ def link_origins(table: DhTable) -> Array:
     a, d, alpha, theta, beta = (getattr(table, name) for name in table.__struct_fields__)
     model, after = RobotModel("corrected", a, d, alpha, theta, beta), [a[5], alpha[5], beta[5]]
     if np.abs(after).max() > 1e-12:
-        raise ExportError("The table has a, alpha or beta of joint 6.", code="table-behind-joint-6")
+        raise ExportError("table-behind-joint-6")
     frames, behind, found = link_frames(model, np.zeros(6)), np.eye(4), []
     for i in range(6):
         step = inverse(frames[i]) @ frames[i + 1]
@@ -88,11 +88,7 @@ def link_origins(table: DhTable) -> Array:
 def table_of(calibration: Calibration) -> CorrectedArm:
     """Return the arm's table, offered or not. Raises ExportError where there is none."""
     if calibration.arm_table is None:
-        raise ExportError(
-            "This calibration holds no table of an arm.",
-            code="no-arm-table",
-            remedy="Solve a recording of a robot whose model is known.",
-        )
+        raise ExportError("no-arm-table")
     return calibration.arm_table
 
 

@@ -87,11 +87,7 @@ def generate_launch_description():
 def ros_launch_follow(calibration: Calibration, frames: FrameNames) -> str:
     """Make a launch file that runs itself as a node, which publishes what `calibrate follow` prints."""
     if not frames.follow:
-        raise ExportError(
-            "A file never changes: there is nothing to follow.",
-            code="not-installed",
-            remedy="Export the installed calibration: leave FILE out, or choose ros-launch.",
-        )
+        raise ExportError("not-installed")
     return _FOLLOWING.format(
         comment=comment(calibration, frames),
         command=list(frames.follow),

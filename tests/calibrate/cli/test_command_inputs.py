@@ -138,7 +138,7 @@ def test_a_lens_that_is_none_is_never_used(tmp_path: Path, field: str, value: ob
     }
     path = tmp_path / "info.yaml"
     path.write_text(yaml.safe_dump(info))
-    assert read_camera(path).distortion[0] == 1e-5
+    assert read_camera(path)[0].distortion[0] == 1e-5
     path.write_text(yaml.safe_dump(info | {field: value}))
     with pytest.raises(CalibrationError):
         read_camera(path)

@@ -53,7 +53,7 @@ class Workers:
         try:
             async with self._turn:
                 if self._closed:
-                    raise WorkerError("The station is ending.", code="station-ending")
+                    raise WorkerError("station-ending")
                 pool = self._pool
                 if pool is None:
                     pool = self._pool = ProcessPoolExecutor(
@@ -70,9 +70,8 @@ class Workers:
                 return await asyncio.wrap_future(pool.submit(work))
         except (BrokenProcessPool, TimeoutError) as error:
             self._discard(pool)
-            late = isinstance(error, TimeoutError)
-            text = f"The worker process {'took too long' if late else 'died'} in {work.func.__name__}."
-            raise WorkerError(text, code="worker-late" if late else "worker-died") from error
+            code = "worker-late" if isinstance(error, TimeoutError) else "worker-died"
+            raise WorkerError(code, function=work.func.__name__) from error
 
     def close(self) -> None:
         self._closed = True

@@ -68,9 +68,8 @@ def load_config(path: Path) -> tuple[StationConfig, bytes]:
 
 def config_error(path: Path, problems: tuple[YamlProblem, ...]) -> ConfigError:
     """Make one error of all problems of a file."""
-    count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
-    text = "\n".join([f"{path}: {count}. Nothing was started.", *(f"  {problem}" for problem in problems)])
-    return ConfigError(text, code="invalid-config", problems=len(problems))
+    listed = "".join(f"\n  {problem}" for problem in problems)
+    return ConfigError("invalid-config", path=path, problems=len(problems), listed=listed)
 
 
 def examine_config(path: Path) -> ConfigReport:
@@ -78,11 +77,7 @@ def examine_config(path: Path) -> ConfigReport:
     try:
         content = read_file(path, strict_yaml.LIMIT_BYTES)
     except OSError as error:
-        raise ConfigError(
-            f"{path}: {error.strerror}",
-            code="unreadable-config",
-            remedy="Write one with `station new`, or leave it out: the station then runs a simulated cell.",
-        ) from None
+        raise ConfigError("unreadable-config", path=path, reason=error.strerror) from None
     try:
         found = strict_yaml.examine(content, StationConfig)
     except strict_yaml.StrictYamlError as error:

@@ -117,20 +117,10 @@ def layout_of(config: StationConfig) -> CellLayout:
     """Make the layout of a cell from its configuration. ConfigError names what is missing."""
     camera, mount_guess, place_guess = config.camera.model, config.camera_guess, config.board_guess
     if camera is None or camera.matrix is None:
-        raise ConfigError(
-            "planning needs rough intrinsics",
-            code="no-lens",
-            remedy="Give camera.model with width, height and matrix (focal length in pixels = lens mm / "
-            "pixel size mm; the centre = half the image).",
-        )
+        raise ConfigError("no-lens")
     if mount_guess is None or place_guess is None:
         missing = "camera_guess" if mount_guess is None else "board_guess"
-        raise ConfigError(
-            f"planning needs {missing} in the configuration",
-            code="no-guess",
-            remedy="Add it, or let `station new` find it.",
-            missing=missing,
-        )
+        raise ConfigError("no-guess", missing=missing)
     return CellLayout(
         config.mount,
         camera,
@@ -171,11 +161,7 @@ def cell_geometry(config: StationConfig) -> CellGeometry:
 def arm_model(robot: RobotConfig) -> RobotModel:
     """Return the configured arm, with its factory calibration if given. ConfigError: unknown model."""
     if (model := MODELS.get(robot.model)) is None:
-        raise ConfigError(
-            f"robot.model '{robot.model}' is unknown",
-            code="unknown-robot-model",
-            remedy=f"Use one of {', '.join(MODELS)}.",
-        )
+        raise ConfigError("unknown-robot-model", model=robot.model, known=", ".join(MODELS))
     if (k := robot.kinematics) is not None:
         model = model.calibrated(k.a_m, k.d_m, k.alpha_rad, k.theta_rad)
     return model
@@ -232,14 +218,7 @@ def require_kept_clear(config: StationConfig) -> None:
     drawn = config.mount == "eye-in-hand" and config.limits.solids
     if guess is None or drawn or guess.sigma_m <= _MOST_DOUBT_M:
         return
-    raise LimitError(
-        f"{name} is known to {1000 * guess.sigma_m:.0f} mm only (limit {1000 * _MOST_DOUBT_M:.0f} mm): "
-        "moves of a plan might touch something",
-        code="guess-too-rough",
-        remedy="Let `station new` find it, or measure it better.",
-        sigma_m=guess.sigma_m,
-        limit_m=_MOST_DOUBT_M,
-    )
+    raise LimitError("guess-too-rough", guess=name, sigma_m=guess.sigma_m, limit_m=_MOST_DOUBT_M)
 
 
 def covers_its_doubt(guess: PoseGuess) -> bool:

@@ -74,9 +74,8 @@ def new_session_folder(root: Path, cell: str) -> Path:
                 continue
             return folder
     except OSError as error:
-        text = f"Cannot make a folder in {sessions}: {error.strerror}"
-        raise StationError(text, code="session-folder", remedy="Give another --root.") from error
-    raise StationError(f"{sessions} holds too many sessions of this second.", code="session-folder")
+        raise StationError("session-folder", folder=sessions, reason=error.strerror) from error
+    raise StationError("session-folder", folder=sessions, reason="it has too many of this second")
 
 
 def segment_path(folder: Path, segment: int) -> Path:

@@ -62,16 +62,11 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         owner = folder_owner(folder)
     except OSError as error:
-        text = f"{folder}: the sockets' folder cannot be made ({error.strerror})"
-        raise StationError(text, code="socket-folder") from None
+        raise StationError("socket-folder", folder=folder, reason=error.strerror) from None
     except UntrustedFolderError as error:
-        raise StationError(str(error), code="untrusted-folder") from None
+        raise StationError("untrusted-folder", reason=str(error)) from None
     if owner != os.getuid() and os.getuid() != ROOT:
-        raise StationError(
-            f"{folder} belongs to {user_name(owner)}",
-            code="untrusted-folder",
-            remedy="Name another place for the socket with --socket.",
-        )
+        raise StationError("untrusted-folder", reason=f"{folder} belongs to {user_name(owner)}")
 
 
 def folder_owner(folder: Path) -> int:

@@ -24,9 +24,6 @@ JOGGED_RAD = 0.01
 
 _DEG = math.degrees(1.0)
 POLL_S = 0.02
-FIND_SHAKE = "Find what shakes the arm or the camera, or retake the pose later."
-UNSEEN = "image motion unknown, no images"
-CHECK_CAMERA = "Check the camera's cable and power, or retake the pose later."
 KEPT_SAMPLES = 4096
 
 
@@ -127,7 +124,7 @@ class StillnessMonitor:
             old = alive() is None
             found = self.measure() if not old else None
             unrest = self.unrest(found) if found is not None else "too few robot states"
-            unrest, remedy = "no fresh news of the robot" if old else unrest, FIND_SHAKE
+            code = "no-news" if old else "not-settled"
             if found is None or unrest:
                 resting_since_ns = None
             else:
@@ -135,7 +132,7 @@ class StillnessMonitor:
                 resting_since_ns = resting_since_ns or newest_ns - round(found.window_s * 1e9)
                 seen = look(resting_since_ns)
                 if seen is None:
-                    unrest, remedy = UNSEEN, CHECK_CAMERA
+                    unrest, code = "no images", "no-images"
                 else:
                     motion_px = None if math.isnan(seen) else seen
                     found = msgspec.structs.replace(found, image_motion_px=motion_px)
@@ -143,11 +140,8 @@ class StillnessMonitor:
                     if not unrest:
                         return found
             if now_s() >= give_up_s:
-                limit_s = self._limits.timeout_s
-                code = "no-images" if remedy is CHECK_CAMERA else "no-news" if old else ""
-                text = f"Not settled after {limit_s:g} s: {unrest}."
                 measured = msgspec.structs.asdict(found) if found is not None else {}
-                raise NotStillError(text, code=code, remedy=remedy, limit_s=limit_s, **measured)
+                raise NotStillError(code, unrest=unrest, limit_s=self._limits.timeout_s, **measured)
             await asyncio.sleep(POLL_S)
 
     def require_rest(self, state: RobotState) -> None:
@@ -156,10 +150,7 @@ class StillnessMonitor:
         joint = int(speeds.argmax())
         if speeds[joint] > limit:
             raise NotStillError(
-                f"The arm was moved while the image was taken: joint {JOINT_NAMES[joint]} at "
-                f"{math.degrees(speeds[joint]):.2f}°/s (limit {math.degrees(limit):.2f}).",
-                code="moved-in-exposure",
-                remedy="Leave it at rest, and retake the pose.",
+                "moved-in-exposure",
                 joint=JOINT_NAMES[joint],
                 speed_rad_s=float(speeds[joint]),
                 limit_rad_s=limit,

@@ -76,11 +76,7 @@ class CellSetup:
         try:
             drafts.save_draft(self.root, draft)
         except OSError as problem:
-            raise StationError(
-                f"What was found cannot be kept in {self.root}: {problem.strerror}.",
-                code="draft-not-kept",
-                remedy="Free some space.",
-            ) from None
+            raise StationError("draft-not-kept", folder=self.root, reason=problem.strerror) from None
 
     def change(self, **values: object) -> None:
         """Keep values that the views taken so far do not depend on."""
@@ -161,7 +157,7 @@ class CellSetup:
     def take_view(self) -> None:
         """Take the view that the newest image shows. StationError: there is none."""
         if problem := self._not_takable():
-            raise StationError(problem, code="no-view")
+            raise StationError("no-view", reason=problem)
         assert self.state is not None and self.arm is not None and self.seen is not None
         view = guided_view(self.state, self.arm.identity.tcp_offset, self.seen[1])
         self.change(views=(*self.draft.views, view), limits_seen=False)
@@ -182,7 +178,7 @@ class CellSetup:
         """Write the board as a PDF beside the draft. Raises StationError, BoardError, OSError."""
         board = self.draft.board
         if board is None:
-            raise StationError("Type the board first.", code="no-board-typed")
+            raise StationError("board-missing")
         name = f"board-{board.kind.value}-{board.columns}x{board.rows}-{1000 * board.square_m:g}mm.pdf"
         write_atomically(self.root / name, board_sheet(board).encode("pdf"), ASKED_FOR)
         return self.root / name
@@ -216,5 +212,5 @@ async def _exposed(camera: CameraReader) -> Image:
             return image
         await camera.expose(wanted_us)
     if image is None:
-        raise StationError("The camera shows no image.", code="no-image", remedy="Check its cable and power.")
+        raise StationError("camera-dark")
     return image

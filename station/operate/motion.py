@@ -49,13 +49,7 @@ async def wait_until_idle(link: Client, *, camera: bool = True) -> StationStatus
                 there = status.camera.connected or not camera
                 if status.state is not StationState.DISCONNECTED and there and told:
                     return status
-    missing = "camera" if told else "robot"
-    raise RefusedError(
-        f"The {missing} did not come within {CONNECT_WAIT_S:.0f} s.",
-        code=f"no-{missing}",
-        remedy="`station doctor` says why.",
-        limit_s=CONNECT_WAIT_S,
-    )
+    raise RefusedError("no-camera" if told else "no-robot", limit_s=CONNECT_WAIT_S)
 
 
 async def prepared_motion(
@@ -122,7 +116,7 @@ async def carry_out(
 
 
 def not_approved() -> RefusedError:
-    return RefusedError("Nothing moved: the motion was not approved.", code="not-approved")
+    return RefusedError("not-approved")
 
 
 async def watched(link: Client, watch: Watcher, finish_with_loss: bool = False) -> StationStatus:

@@ -110,11 +110,7 @@ def read_board(text: str) -> BoardSpec:
         if len(marker) > (usual_m is not None) or min(columns, rows) < 3 or not 0.002 <= size_m <= 0.5:
             raise ValueError
     except (ValueError, IndexError):
-        raise ConfigError(
-            f"{text!r} is no board.",
-            code="no-board-typed",
-            remedy="Type columns, rows and size in mm, e.g. 7x6 25, or charuco 8x6 30 22 DICT_5X5_100.",
-        ) from None
+        raise ConfigError("no-board-typed", typed=text) from None
     board = BoardSpec(kind, columns, rows, size_m, marker[0] if marker else usual_m, dictionary or usual)
     check_board(board)
     return board
@@ -164,7 +160,7 @@ def made_config(draft: Draft) -> StationConfig:
     found = find_cell(draft)
     if draft.robot is None or draft.camera is None or draft.board is None or draft.mount is None or not found:
         step = next_step(draft)
-        raise RefusedError(f"Step {STEPS.index(step) + 1} ({step}) is not done.", code="step-missing")
+        raise RefusedError("step-missing", number=STEPS.index(step) + 1, step=step.value)
     Y_m = float(np.hypot(found.sigma_m, found.sigma_rad * float(np.linalg.norm(_seen_at(found, draft)))))
     return StationConfig(
         name="cell",

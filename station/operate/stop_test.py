@@ -68,11 +68,7 @@ class AcceptanceTest:
     async def run(self) -> Acceptance:
         """Test until all was tried, one failed, or the person ends it. StationError: no move was possible."""
         if not await self.person.holds_emergency_stop():
-            raise RefusedError(
-                "Nothing moved: nobody holds the emergency stop.",
-                code="no-emergency-stop",
-                remedy="Take the pendant into your hand, then begin again.",
-            )
+            raise RefusedError("no-emergency-stop")
         for way in self.ways:
             if not await self._tested(way):
                 break
@@ -81,7 +77,7 @@ class AcceptanceTest:
     def outcome(self) -> Acceptance:
         """Return the results so far. RefusedError when there are none."""
         if self.subject is None:
-            raise RefusedError("Nothing moved: no move was approved.", code="not-approved")
+            raise RefusedError("not-approved")
         passed = {result.way for result in self.results if result.passed}
         accepted = passed == set(StopWay)
         speed_m_s = self.speed_m_s if accepted else 0.0
@@ -132,11 +128,7 @@ class AcceptanceTest:
         assert preview.stop_test is not None
         subject = preview.stop_test.subject
         if self.subject is not None and (changed := self.subject.difference(subject)):
-            raise RefusedError(
-                f"{changed[0].upper()}{changed[1:]} changed during the test.",
-                code="subject-changed",
-                remedy="Begin again.",
-            )
+            raise RefusedError("subject-changed", changed=changed)
         self.subject = subject
 
     async def _ended(self, begun_ns: int) -> int | None:
@@ -151,7 +143,5 @@ class AcceptanceTest:
                     if status.state not in RUNNING:
                         return moment_ns
         except TimeoutError:
-            raise StationError(
-                "The move did not end.", code="no-end", remedy="Press the emergency stop.", limit_s=END_S
-            ) from None
+            raise StationError("no-end", limit_s=END_S) from None
         raise DaemonGoneError("The daemon ended during the test.")

@@ -61,11 +61,8 @@ async def see_board(link: Client, file: Path | None) -> SeenBoard:
     identity = CellIdentity(seen.mount, seen.source, seen.robot_serial, seen.camera_serial)
     require_same_cell("The station", calibration, identity)
     if not seen.corners:
-        raise RefusedError(
-            "No board in the image.",
-            code="no-board",
-            remedy="Jog the arm or lay the board so that the camera sees it whole.",
-        )
+        advice = "Jog the arm or lay the board so that the camera sees it whole."
+        raise RefusedError("no-board", reason="No board in the image.", advice=advice)
     points = board_points(calibration.board)[list(seen.corners)]
     view = BoardView(0, "touch test", np.array(seen.base_from_flange), points, np.array(seen.pixels))
     now = await asyncio.to_thread(locate_board, calibration, view, calibration.board)
@@ -83,15 +80,10 @@ def read_touch(
     tip_m, pointer = pointer_tip(board, pointer_m)
     robot = None if status is None else status.robot
     if robot is None or robot.state is None or robot.identity is None:
-        raise RefusedError(
-            "The robot's position is not known now.",
-            code="no-robot-state",
-            remedy="`station doctor` says why.",
-        )
+        raise RefusedError("no-robot-state")
     points = board_points(board.calibration.board)
     if not 0 <= corner < len(points):
-        text = f"The board has corners 0 to {len(points) - 1}, not {corner}."
-        raise RefusedError(text, code="no-such-corner", corner=corner, last=len(points) - 1)
+        raise RefusedError("no-such-corner", corner=corner, last=len(points) - 1)
     base_from_board = board.now.base_from_board
     flange = flange_pose(robot.state, robot.identity.tcp_offset)
     tip = transform_points(inverse(base_from_board), transform_points(flange, np.array(tip_m)))
@@ -114,19 +106,13 @@ def pointer_tip(board: SeenBoard, length_m: float | None) -> tuple[Vector3, str]
     """Return the tip in `flange` and its description: by `length_m`, configuration, or the pendant's TCP."""
     if length_m is not None:
         if not _SHORTEST_M <= length_m <= _LONGEST_M:
-            text = f"A pointer is 10 to 1000 mm long, not {1000 * length_m:g} mm."
-            raise RefusedError(text, code="pointer-length", pointer_m=length_m)
+            raise RefusedError("pointer-length", pointer_m=length_m)
         return (0.0, 0.0, length_m), f"pointer {1000 * length_m:.1f} mm along the flange's z axis"
     if board.configured is not None:
         return board.configured.tip_m, "the configured pointer"
     tip = board.tcp_offset[:3]
     if np.linalg.norm(tip) < _SHORTEST_M:
-        raise RefusedError(
-            "The station knows no pointer.",
-            code="no-pointer",
-            remedy="Give its length (--pointer-mm; Tab on the screen), `pointer` in the configuration, "
-            "or set the tool centre point on the pendant.",
-        )
+        raise RefusedError("no-pointer")
     return tip, "the pendant's tool"
 
 
@@ -134,22 +120,11 @@ def _offset_mm(corner: int, corner_m: Array, touching_m: Array) -> Array:
     """Compute the offset (2,), mm, of the tip from the true corner if the calibration sent it there."""
     height_m = abs(float(touching_m[2]))
     if height_m > _TOUCHING_M:
-        raise RefusedError(
-            f"The tip is {1000 * height_m:.0f} mm off the board.",
-            code="not-touching",
-            remedy="Bring it onto the corner.",
-            distance_m=height_m,
-            limit_m=_TOUCHING_M,
-        )
+        raise RefusedError("not-touching", distance_m=height_m, limit_m=_TOUCHING_M)
     offset = corner_m[:2] - touching_m[:2]
     beside_m = float(np.linalg.norm(offset))
     if beside_m > _BESIDE_M:
-        raise RefusedError(
-            f"The tip is {1000 * beside_m:.0f} mm from corner {corner}.",
-            code="other-corner",
-            distance_m=beside_m,
-            limit_m=_BESIDE_M,
-        )
+        raise RefusedError("other-corner", corner=corner, distance_m=beside_m, limit_m=_BESIDE_M)
     return np.asarray(1000 * offset)
 
 

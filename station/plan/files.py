@@ -43,8 +43,7 @@ def save_plan(plan: Plan, path: Path) -> None:
     try:
         write_atomically(path, text.encode(), ASKED_FOR)
     except OSError as error:
-        text = f"cannot write the plan to {path}: {error.strerror}"
-        raise ConfigError(text, code="plan-not-written", remedy="Choose another folder.") from error
+        raise ConfigError("plan-not-written", path=path, reason=error.strerror) from error
 
 
 def load_plan(path: Path) -> Plan:
@@ -68,9 +67,8 @@ def _checked(plan: Plan, name: str) -> Plan:
 
 
 def _report(name: str, problems: list[str]) -> ConfigError:
-    count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
-    text = "\n".join([f"{name}: {count}", *(f"  {problem}" for problem in problems)])
-    return ConfigError(text, code="invalid-plan", problems=len(problems))
+    listed = "".join(f"\n  {problem}" for problem in problems)
+    return ConfigError("invalid-plan", path=name, problems=len(problems), listed=listed)
 
 
 def _read(path: Path) -> bytes:
@@ -78,8 +76,7 @@ def _read(path: Path) -> bytes:
         return read_file(path, strict_yaml.LIMIT_BYTES)
     except OSError as error:
         code = "plan-too-large" if error.errno == errno.EFBIG else "unreadable-plan"
-        text = f"cannot read {path}: {error.strerror}"
-        raise ConfigError(text, code=code, remedy="Check the name.") from None
+        raise ConfigError(code, path=path, reason=error.strerror) from None
 
 
 def _value_problems(plan: Plan) -> list[str]:
@@ -122,18 +119,15 @@ def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
     of = recording.info
     if (of.robot.model, of.mount) != (robot, mount):
         raise ConfigError(
-            f"{path} is of a {of.robot.model or 'nameless arm'}, {of.mount}; this cell has a {robot}, "
-            f"{mount}: its poses are no plan for it",
-            code="other-cell",
+            "other-cell",
+            path=path,
+            recorded=f"{of.robot.model or 'nameless arm'}, {of.mount}",
+            configured=f"{robot}, {mount}",
         )
     views = recording.views()
     taught = [(view.name, view.joints_rad) for view in views if view.joints_rad is not None]
     if not taught or len(taught) < len(views):
-        raise ConfigError(
-            f"{path} holds {len(views)} poses, {len(taught)} of them with the arm's joints",
-            code="no-joints",
-            remedy="Name a recording whose poses all have joints.",
-        )
+        raise ConfigError("no-joints", path=path, poses=len(views), with_joints=len(taught))
     poses = tuple(pose_at(MODELS[robot], name, joints, "as taught") for name, joints in taught)
     plan = Plan(robot=robot, mount=mount, poses=poses, note=f"taught: the poses of {path.name}")
     return _checked(plan, str(path))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -57,16 +58,11 @@ def explain_shortage(
     layout: CellLayout, wanted: int, group: CandidateSet, found: CandidateSet, start: Array | None
 ) -> LimitError:
     """Make the error that says why there is no plan. `group`: usable candidates; `found`: all."""
-    counts = {"possible": len(group), "wanted": wanted}
+    counts: dict[str, Any] = {"possible": len(group), "wanted": wanted}
     if looks_back(layout, found):
-        angle_deg = float(np.rad2deg(np.arccos(np.clip(layout.X[2, 2], -1.0, 1.0))))
-        return LimitError(
-            f"The camera looks back at the arm: camera_guess's z axis is {angle_deg:.0f}° away from where "
-            f"the flange points, and in {found.alone[ARM_IN_SIGHT]} postures the arm would hide the board",
-            code="camera-looks-back",
-            remedy="Turn camera_guess by 180° about its x or y axis: z points out of the lens.",
-            **counts,
-        )
+        angle_rad = float(np.arccos(np.clip(layout.X[2, 2], -1.0, 1.0)))
+        hidden = found.alone[ARM_IN_SIGHT]
+        return LimitError("camera-looks-back", angle_rad=angle_rad, hidden=hidden, **counts)
     if start is not None and len(found) >= wanted and len(group) < wanted:
         return _start_is_cut_off(layout, counts, len(found), start)
     few = f"Only {len(group)} of the wanted {wanted} poses are possible"
@@ -87,9 +83,10 @@ def explain_shortage(
         f"{limit} ({'costs' if alone.total() else 'forbids'} {ranked[limit]} poses)" for limit in binding
     ]
     return LimitError(
-        f"{few}. Limiting constraint: {', '.join(gains) or 'none alone'}",
-        code="too-few-poses",
-        remedy=" ".join(_remedy(limit) for limit in binding),
+        "too-few-poses",
+        few=few,
+        limiting=", ".join(gains) or "none alone",
+        advice=" ".join(_remedy(limit) for limit in binding),
         constraints=", ".join(binding),
         **counts,
     )
@@ -109,7 +106,7 @@ def looks_back(layout: CellLayout, found: CandidateSet) -> bool:
     return bool(backwards and found.alone[ARM_IN_SIGHT] > _KEYHOLE * len(found))
 
 
-def _out_of_reach(layout: CellLayout, few: str, counts: dict[str, int], beyond: int) -> LimitError:
+def _out_of_reach(layout: CellLayout, few: str, counts: dict[str, Any], beyond: int) -> LimitError:
     model = layout.geometry.model
     arm_m = abs(model.a_m[1]) + abs(model.a_m[2]) + model.d_m[4]
     thing, centre = "camera", layout.X[:3, 3]
@@ -117,28 +114,22 @@ def _out_of_reach(layout: CellLayout, few: str, counts: dict[str, int], beyond: 
         thing, centre = "board", transform_points(layout.Y, board_points(layout.board).mean(axis=0))
     away_m = float(np.linalg.norm(centre - [0.0, 0.0, model.d_m[0]]))
     return LimitError(
-        f"{few}: {beyond} views of the board lie beyond the arm's reach. The {thing} stands {away_m:.2f} m "
-        f"from the {model.name}'s shoulder (limit {arm_m:.2f} m)",
-        code="out-of-reach",
-        remedy=f"Bring the {thing} nearer, turn it towards the arm, or correct {thing}_guess.",
+        "out-of-reach",
+        few=few,
+        beyond=beyond,
+        thing=thing,
+        arm=model.name,
         distance_m=away_m,
         limit_m=float(arm_m),
         **counts,
     )
 
 
-def _start_is_cut_off(layout: CellLayout, counts: dict[str, int], passing: int, start: Array) -> LimitError:
+def _start_is_cut_off(layout: CellLayout, counts: dict[str, Any], passing: int, start: Array) -> LimitError:
     gaps, contacts = margins(layout.geometry, start)
     worst = int(gaps[0].argmin())
     near = f"; {contacts[worst]}, {-1000 * gaps[0, worst]:.0f} mm too close" if gaps.min() < 0 else ""
-    return LimitError(
-        f"{passing} poses are possible, but from where the arm stands free direct moves lead to only "
-        f"{counts['possible']} of the wanted {counts['wanted']}{near}",
-        code="start-cut-off",
-        remedy="Jog the arm to where the camera looks at the board from the middle of the arm's room, and "
-        "plan again.",
-        **counts,
-    )
+    return LimitError("start-cut-off", passing=passing, near=near, **counts)
 
 
 @dataclass(frozen=True)
@@ -281,7 +272,7 @@ def _failing(plan: Plan, start: Array | None, layout: CellLayout) -> list[int]:
     check = check_plan(plan, start, layout.geometry)
     failing = [place for place, move in enumerate(check.moves) if move.problems]
     if check.problems and not failing:
-        raise LimitError("\n".join(map(str, check.problems)), code="plan-breaks-limits")
+        raise LimitError("plan-breaks-limits", listed="\n".join(map(str, check.problems)))
     return failing
 
 

@@ -37,8 +37,7 @@ def save_picture(layout: CellLayout, plan: Plan, path: Path) -> None:
     try:
         figure.savefig(path, dpi=110)
     except (OSError, ValueError) as error:
-        text = f"cannot write the picture {path}: {error}"
-        raise ConfigError(text, code="picture-not-written", remedy="Name it something.png.") from error
+        raise ConfigError("picture-not-written", path=path, reason=str(error)) from error
 
 
 def _placed(layout: CellLayout, plan: Plan) -> tuple[Array, Array, Array]:

@@ -93,7 +93,7 @@ async def take_image(context: SessionContext, index: int | None = None) -> Image
         except CameraError as error:
             last = error
             context.store.problem(error, "warning", index, f"image {number} of at most {tries}: {{}}")
-    raise PoseFailedError(f"No good image in {tries} tries: {last}", code="no-image", tries=tries)
+    raise PoseFailedError("no-good-image", tries=tries, reason=str(last))
 
 
 async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState, float]:
@@ -102,7 +102,7 @@ async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState
     PoseFailedError when the time is not known well enough, NotStillError when the arm moved, RobotError.
     """
     if image.time is None:
-        raise PoseFailedError("The camera's driver gave an image without a time.", code="no-time")
+        raise PoseFailedError("no-time")
     robot, deadline_s = context.cell.robot, time.monotonic() + RESTING_S
     while True:
         try:
@@ -117,16 +117,9 @@ async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState
     clock = robot.clock()
     bound_s = image.time.bound_s + (clock.bound_s if clock else 0.0)
     if bound_s > (limit_s := context.cell.config.capture.time_bound_s):
-        raise PoseFailedError(
-            f"Image time known to ±{1000 * bound_s:.1f} ms (limit {1000 * limit_s:.1f} ms, "
-            "capture.time_bound_s).",
-            code="time-unsure",
-            remedy="The camera's clock cannot be read: raise the limit, the arm is at rest."
-            if image.time.source == "arrival"
-            else "Reduce this computer's load.",
-            bound_s=bound_s,
-            limit_s=limit_s,
-        )
+        no_clock = image.time.source == "arrival"
+        advice = "Its clock cannot be read: raise the limit" if no_clock else "Reduce this computer's load"
+        raise PoseFailedError("time-unsure", bound_s=bound_s, limit_s=limit_s, advice=advice)
     return state, bound_s
 
 
@@ -169,16 +162,9 @@ def _unusable(sighting: BoardDetection) -> PoseFailedError | None:
     """Make the error where an image does not count; None when it does."""
     status = sighting.status
     if not status.found:
-        return PoseFailedError(status.reason or "No board in the image.", code="no-board")
+        return PoseFailedError("no-board", reason=status.reason or "No board in the image.", advice="")
     if status.saturated > SATURATED_LIMIT:
-        return PoseFailedError(
-            f"Over-exposed: {100 * status.saturated:.0f} % of the board's pixels are white "
-            f"(limit {100 * SATURATED_LIMIT:.0f} %).",
-            code="over-exposed",
-            remedy="Expose less.",
-            saturated=status.saturated,
-            limit=SATURATED_LIMIT,
-        )
+        return PoseFailedError("over-exposed", saturated=status.saturated, limit=SATURATED_LIMIT)
     return None
 
 

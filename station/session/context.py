@@ -76,7 +76,7 @@ class SessionContext:
     def loaded(self) -> PoseQueue:
         """Return the loaded plan's poses. RefusedError when no plan is loaded."""
         if self.queue is None:
-            raise RefusedError("No plan is loaded.", code="no-plan", remedy="Load or make one first.")
+            raise RefusedError("no-plan")
         return self.queue
 
     def require_queue(self) -> PoseQueue:

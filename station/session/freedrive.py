@@ -47,7 +47,7 @@ class FreedriveCapture:
     async def begin(self, auto: bool) -> None:
         """Begin freedrive; open a recording if none is open. `auto`: take an image at each new rest."""
         if self.taking:
-            raise _taking()
+            raise RefusedError("still-ending", what="the last image")
         self._end_watch()
         context, store = self._context, self._context.store
         await context.arm()
@@ -110,7 +110,7 @@ class FreedriveCapture:
     async def record(self) -> int:
         """Take an image now; return its pose number. RefusedError while one is being taken."""
         if self._taking.locked():
-            raise _taking()
+            raise RefusedError("still-ending", what="the last image")
         async with self._taking:
             return await self._record()
 
@@ -172,7 +172,3 @@ class FreedriveCapture:
         joints = self._context.cell.robot.latest().joints_rad
         last = self._last_place
         return last is None or bool(np.abs(np.subtract(joints, last)).max() > NEW_PLACE_RAD)
-
-
-def _taking() -> RefusedError:
-    return RefusedError("An image is being taken.", code="still-ending", remedy="Try again in a moment.")

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recordings.errors import Value
 from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError
 from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus, MotionPreview
@@ -41,14 +40,9 @@ class LeaseManager:
     def require(self, client_id: int) -> None:
         """RefusedError unless this client has control."""
         if self.lease.client_id is None:
-            raise RefusedError("No client has control.", code="no-control", remedy="Take control first.")
+            raise RefusedError("no-control")
         if self.lease.client_id != client_id:
-            raise RefusedError(
-                f"{self.lease.holder} has control.",
-                code="control-held",
-                remedy="Ask them to release it (F4 on their screen); you may watch and STOP.",
-                holder=self.lease.holder,
-            )
+            raise RefusedError("control-held", holder=self.lease.holder)
 
 
 @dataclass(frozen=True)
@@ -103,15 +97,14 @@ class ApprovalManager:
         """Return the approval, once. RefusedError when anything changed since the offer, then void."""
         asked, self.waiting = self.waiting, None
         if asked is None or not secrets.compare_digest(asked.preview.token.encode(), token.encode()):
-            raise _void("approval-used", "Approval used or revoked.")
+            raise RefusedError("approval-used")
         if self._clock() > asked.expires_s:
-            text = f"Approval older than {APPROVAL_LIFETIME_S:.0f} s."
-            raise _void("approval-expired", text, limit_s=APPROVAL_LIFETIME_S)
+            raise RefusedError("approval-expired", limit_s=APPROVAL_LIFETIME_S)
         if asked.client_id != client_id:
-            raise _void("approval-of-another", "Approval was asked for by another client.")
+            raise RefusedError("approval-of-another")
         # A stop test does not depend on the plan. A new session's poses have the hash of those shown so far.
         if asked.motion.stop_test is None and asked.preview.plan_sha256 != plan_sha256:
-            raise _void("plan-changed", "The plan changed since the approval was asked for.")
+            raise RefusedError("plan-changed")
         require_start(joints_rad, asked.start_joints_rad, "since the approval was asked for")
         return replace(asked, again=again)
 
@@ -120,9 +113,4 @@ def require_start(joints_rad: Sequence[float], start_rad: Sequence[float], when:
     """Raise RefusedError when joints (6,) differ from `start_rad` by more than `START_TOLERANCE_RAD`."""
     moved_rad = float(np.abs(np.subtract(joints_rad, start_rad)).max())
     if moved_rad > START_TOLERANCE_RAD:
-        text = f"The arm moved by {np.rad2deg(moved_rad):.1f}° {when}."
-        raise _void("arm-moved", text, moved_rad=moved_rad, limit_rad=START_TOLERANCE_RAD)
-
-
-def _void(code: str, text: str, **values: Value) -> RefusedError:
-    return RefusedError(text, code=code, remedy="Request the approval again.", **values)
+        raise RefusedError("arm-moved", when=when, moved_rad=moved_rad, limit_rad=START_TOLERANCE_RAD)

@@ -52,36 +52,30 @@ def session_motion(context: SessionContext, purpose: Purpose, index: int | None)
     """
     queue, begun = context.loaded(), context.recording is not None
     if purpose in (Purpose.RETAKE, Purpose.RESUME) and not begun:
-        raise RefusedError("No session is open.", code="no-session", remedy="Run the plan to begin one.")
+        raise RefusedError("no-session")
     if purpose is Purpose.RETAKE:
         if index is None:
-            raise RefusedError(
-                "The pose to retake is missing.", code="no-pose-named", remedy="Give its number."
-            )
+            raise RefusedError("no-pose-named")
         if queue.status(index).state != "planned":
             queue.retake(index)
         return Motion(purpose, queue, (index,))
     if purpose is Purpose.DRIFT_CHECK and begun:
-        raise RefusedError("A session is open.", code="session-open", remedy="Finish it first, then check.")
+        raise RefusedError("session-open")
     if purpose is Purpose.RUN and not begun:
         queue = queue.anew()
     if not queue.open:
-        raise RefusedError("No pose is left to take.", code="no-pose-left", remedy="Retake some, or finish.")
+        raise RefusedError("no-pose-left")
     return Motion(purpose, queue, queue.open)
 
 
 async def previewed(context: SessionContext, motion: Motion, notes: tuple[str, ...]) -> MotionPreview:
     """Check the whole path in the worker and make the preview. LimitError: not free; RobotError."""
     if motion.queue.plan.motion != "stops":
-        raise RefusedError(
-            "This plan is a sweep, and sweeps are gone.",
-            code="sweep",
-            remedy="Finish its session if one is open, then make a plan of poses.",
-        )
+        raise RefusedError("sweep")
     try:
         await DISK.run(require_free_space, context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
-        raise RefusedError(f"{full} Nothing moved.", code="disk-full") from None
+        raise RefusedError("disk-full", reason=str(full)) from None
     arm = await context.arm()
     start = arm.joints_rad
     queue, poses = motion.queue, motion.poses
@@ -108,21 +102,25 @@ async def previewed(context: SessionContext, motion: Motion, notes: tuple[str, .
 
 async def _refused(context: SessionContext, plan: Plan, check: PlanCheck, start: Vector6) -> LimitError:
     """Make the error for a plan that is not free, special if only the path to its first pose is not."""
-    refused = LimitError(_problem_text(check), code="plan", problems=len(check.problems))
+    refused = LimitError("plan", problems=len(check.problems), listed=_listed(check))
     if not plan.poses or len(check.problems) > len(check.moves[0].problems):
         return refused
     cell, first_rad = context.cell, plan.poses[0].joints_rad
     if (await context.workers.call(check_run, cell.config, plan, first_rad)).problems:
         return refused
-    command, own = "", plan.criterion is None
-    if cell.config_path:
-        command = f": `station plan --config {shlex.quote(cell.config_path)} -o plan.yaml`"
+    advice = "Bring the arm to its first pose by hand"
+    if plan.criterion is not None:
+        advice = "Plan again from here"
+        if cell.config_path:
+            advice += f": `station plan --config {shlex.quote(cell.config_path)} -o plan.yaml`"
     return LimitError(
-        f"The plan was made from another posture. The arm stands at {_degrees(start)}; from there "
-        f"to {check.moves[0].name} at {_degrees(first_rad)} {check.problems[0].text}",
-        code=PLANNED_ELSEWHERE,
-        remedy="Bring the arm to its first pose by hand." if own else f"Plan again from here{command}.",
+        PLANNED_ELSEWHERE,
+        standing=_degrees(start),
+        pose=check.moves[0].name,
+        target=_degrees(first_rad),
+        problem=check.problems[0].text,
         problems=len(check.problems),
+        advice=advice,
     )
 
 
@@ -130,11 +128,10 @@ def _degrees(joints_rad: Vector6) -> str:
     return ", ".join(f"{math.degrees(q):.0f}" for q in joints_rad) + "°"
 
 
-def _problem_text(check: PlanCheck) -> str:
+def _listed(check: PlanCheck) -> str:
     shown = [str(problem) for problem in check.problems[:_PROBLEMS_SHOWN]]
     more = len(check.problems) - len(shown)
-    tail = [f"… and {more} more"] if more > 0 else []
-    return "The plan is refused, nothing moved:\n" + "\n".join([*shown, *tail])
+    return "\n".join([*shown, *([f"… and {more} more"] if more else [])])
 
 
 def _purpose_words(context: SessionContext, motion: Motion) -> str:

@@ -66,8 +66,7 @@ class PoseQueue:
     def status(self, index: int) -> PoseStatus:
         """Return a pose's status. RefusedError for a number that does not exist."""
         if index not in self._status:
-            text = f"There is no pose {index + 1}; the plan has {len(self._poses)}."
-            raise RefusedError(text, code="no-such-pose", pose=index, poses=len(self._poses))
+            raise RefusedError("no-such-pose", pose=index, number=index + 1, poses=len(self._poses))
         return self._status[index]
 
     def mark(self, index: int, state: PoseState, reason: str | CodedError = "") -> None:
@@ -119,7 +118,7 @@ class PoseQueue:
         """Plan a pose again, at its position in the order."""
         status = self.status(index)
         if status.state in BUSY:
-            raise _refused("pose-busy", index, "is being taken right now")
+            raise _refused("pose-busy", index)
         self.mark(index, "planned", TAKE_AGAIN + (STILL_COUNTS if status.counts else ""))
 
     def skip(self, index: int) -> None:
@@ -130,15 +129,13 @@ class PoseQueue:
             self.mark(index, "done", NOT_AGAIN)
             return
         if state in BUSY or state == "done":
-            text = f"is {state}: only a pose that waits or failed can be skipped"
-            raise _refused("pose-busy" if state in BUSY else "pose-taken", index, text)
+            raise _refused("pose-busy" if state in BUSY else "pose-taken", index)
         self.mark(index, "skipped", "skipped by the operator")
 
     def reorder(self, order: Sequence[int]) -> None:
         """Change the order; `order`: every pose number once."""
         if sorted(order) != sorted(self._poses):
-            text = f"An order names each of the {len(self._poses)} poses exactly once."
-            raise RefusedError(text, code="wrong-order")
+            raise RefusedError("wrong-order", poses=len(self._poses))
         before = self.statuses
         self._poses = {i: self._poses[i] for i in order}
         for place, (index, was) in enumerate(zip(order, before, strict=True)):
@@ -151,9 +148,9 @@ class PoseQueue:
     def add(self, pose: PlannedPose) -> int:
         """Add a pose at the end; return its number."""
         if any(pose.name == other.name for other in self._poses.values()):
-            raise RefusedError(f"There is already a pose named '{pose.name}'.", code="pose-name")
+            raise RefusedError("pose-name", name=pose.name)
         if len(self._poses) >= POSE_LIMIT:
-            raise RefusedError(f"A session has at most {POSE_LIMIT} poses.", code="too-many-poses")
+            raise RefusedError("too-many-poses", limit=POSE_LIMIT)
         index, self.next_index = self.next_index, self.next_index + 1
         self._poses[index] = pose
         self._status[index] = _fresh(index, pose)
@@ -164,11 +161,11 @@ class PoseQueue:
         """Remove a pose that was never tried."""
         status = self.status(index)
         if status.state in BUSY:
-            raise _refused("pose-busy", index, "is being taken right now")
+            raise _refused("pose-busy", index)
         if status.attempt:
-            raise _refused("pose-tried", index, "was already tried", "Skip it instead.")
+            raise _refused("pose-tried", index)
         if len(self._poses) == 1:
-            raise _refused("last-pose", index, "is the last one", "Finish the session instead.")
+            raise _refused("last-pose", index)
         places = list(self._poses)
         for behind in places[places.index(index) :]:  # their predicted errors counted on this pose
             self._status[behind] = msgspec.structs.replace(self._status[behind], predicted_sigma_mm=None)
@@ -180,8 +177,8 @@ class PoseQueue:
         self._plan = msgspec.structs.replace(self._plan, criterion=None)
 
 
-def _refused(code: str, index: int, what: str, remedy: str = "") -> RefusedError:
-    return RefusedError(f"Pose {index + 1} {what}.", code=code, remedy=remedy, pose=index)
+def _refused(code: str, index: int) -> RefusedError:
+    return RefusedError(code, pose=index, number=index + 1)
 
 
 def _fresh(index: int, pose: PlannedPose) -> PoseStatus:

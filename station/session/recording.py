@@ -228,8 +228,7 @@ class SessionRecording:
         """Queue an image for writing. RecordingError when the disk cannot keep up or has failed."""
         recorder = self.require_open()
         if not recorder.image(image):
-            text = "The disk cannot keep up: an image was dropped."
-            raise recorder.error or RecordingError(text, code="disk-too-slow")
+            raise recorder.error or RecordingError("disk-too-slow")
 
     async def sync(self) -> None:
         """Wait until everything queued is on the disk (fdatasync). Raises RecordingError."""
@@ -237,12 +236,7 @@ class SessionRecording:
             async with asyncio.timeout(SYNC_TIMEOUT_S):
                 await asyncio.shield(asyncio.wrap_future(self.require_open().sync()))
         except TimeoutError as error:
-            raise RecordingError(
-                f"The disk did not take the data of {self.folder} within {SYNC_TIMEOUT_S:.0f} s.",
-                code="disk-hangs",
-                remedy="Check the disk, or record elsewhere (--root).",
-                limit_s=SYNC_TIMEOUT_S,
-            ) from error
+            raise RecordingError("disk-hangs", folder=self.folder, limit_s=SYNC_TIMEOUT_S) from error
 
     def require_space(self) -> None:
         """Check the free space before a pose. RecordingError tells how much to free."""
@@ -275,8 +269,7 @@ class SessionRecording:
             else:
                 mark_active(self._root, self.folder)
         except OSError as error:
-            text = f"Cannot write to {self.folder}: {error.strerror}"
-            raise RecordingError(text, code="disk-write") from error
+            raise RecordingError("disk-write", folder=self.folder, reason=error.strerror) from error
 
     async def seal(self, queue: PoseQueue) -> Path:
         """Finish the file; return the path of the recording: the file, or the folder of several."""
@@ -306,7 +299,7 @@ class SessionRecording:
     def require_open(self) -> Recorder:
         """Return the writer of the open file. RecordingError when none is open."""
         if self.recorder is None:
-            raise RecordingError(f"The recording in {self.folder} is not open.", code="not-open")
+            raise RecordingError("not-open", folder=self.folder)
         return self.recorder
 
 

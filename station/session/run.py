@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from recordings.errors import RecordingError
+from recordings.errors import ErrorData, RecordingError
 from recordings.schema.messages import Vector6
 from station.cell.collision import CellGeometry
 from station.cell.errors import (
@@ -261,12 +261,12 @@ class Run:
         # In a thread, so that heartbeat and STOP need not wait.
         check = await MOTION.run(check_path, self._geometry, here, target, name)
         if check.problems:
-            raise LimitError("; ".join(map(str, check.problems)), code="path")
+            raise LimitError("path", listed="; ".join(map(str, check.problems)))
         now = (await self._context.arm()).joints_rad
         moved_rad = float(np.abs(np.subtract(now, here)).max())
         if moved_rad > JOGGED_RAD:  # less may be settling
-            text = f"The arm moved by {np.rad2deg(moved_rad):.1f}° while its path was checked."
-            raise LimitError(text, code="arm-moved", moved_rad=moved_rad, limit_rad=JOGGED_RAD)
+            when = "while its path was checked"
+            raise LimitError("arm-moved", when=when, moved_rad=moved_rad, limit_rad=JOGGED_RAD)
         await self._context.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 
     async def _rest(self) -> None:
@@ -311,7 +311,7 @@ def _numbers(indices: Sequence[int]) -> str:
 
 def internal_error(error: Exception) -> StationError:
     """Make the error that reports a defect of this program."""
-    return StationError(f"Internal error ({error!r}).", code="internal", remedy="See the daemon's log.")
+    return StationError("internal", error=repr(error))
 
 
 async def seal(context: SessionContext) -> None:
@@ -347,7 +347,7 @@ def disk_failed(context: SessionContext, error: RecordingError) -> None:
     if context.recording is not None:
         context.recording.abandon()
     text = f"Recording: {str(error).rstrip('.')}. What was saved before is safe."
-    reason = StationError(text, code=error.code)
+    reason = StationError.from_data(ErrorData(error.code, text))
     if context.requests.halt:
         context.store.update(reason=f"{context.store.status.reason} — {reason}")
     else:

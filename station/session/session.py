@@ -183,7 +183,7 @@ class Session:
         self._void()
         voids = self.approvals.voids
         if (purpose is Purpose.STOP_TEST) is (stop_test is None):
-            raise RefusedError("A stop test, and no other motion, names its move.", code="wrong-arguments")
+            raise RefusedError("stop-test-named")
         if stop_test is not None:
             motion = await stop_motion(context, stop_test)
         else:
@@ -192,9 +192,7 @@ class Session:
         preview = await previewed(context, motion, self._notes)
         self.permit(verbs.Prepare, client_id)
         if self.approvals.voids != voids:
-            raise RefusedError(
-                "Conditions changed during the preflight check.", code="changed", remedy="Retry."
-            )
+            raise RefusedError("changed")
         self.approvals.offer(MotionApproval(motion, preview, client_id))
         # Watchers get it without the token, which is for the client that asked.
         self.store.update(go=msgspec.structs.replace(preview, token=""))
@@ -211,7 +209,7 @@ class Session:
         self.permit(verbs.Go, client_id)
         self._require_run_ended()
         if self.freedrive.taking:
-            raise _still_ending("freedrive")
+            raise RefusedError("still-ending", what="freedrive")
         plan_sha256 = context.queue.sha256 if context.queue else ""
         try:
             go = self.approvals.redeem(token, client_id, plan_sha256, joints, again)
@@ -246,7 +244,7 @@ class Session:
             self.store.event("finish-wanted", "finish after this pose")
             return
         if self.context.recording is None:
-            raise RefusedError("Nothing is recorded yet.", code="nothing-recorded")
+            raise RefusedError("nothing-recorded")
         await asyncio.gather(self._run_ended(), self.freedrive.last_picture())
         self._require_state(verbs.Finish)
         self._run = closing = asyncio.create_task(close_or_seal(self.context))  # as `_run`, it bars new runs
@@ -262,7 +260,7 @@ class Session:
 
     def _require_run_ended(self) -> None:
         if self._run is not None and not self._run.done():
-            raise _still_ending("the last run")
+            raise RefusedError("still-ending", what="the last run")
 
     # -- control, plan, freedrive ------------------------------------------------------------------------
 
@@ -306,7 +304,7 @@ class Session:
 
     def _require_no_session(self) -> None:
         if self.context.recording is not None:
-            raise RefusedError("A session is open.", code="session-open", remedy="Finish it first.")
+            raise RefusedError("session-open")
 
     def _replace_plan(self, plan: Plan) -> None:
         self._void()
@@ -331,8 +329,7 @@ class Session:
             try:
                 await context.recording.save_state(queue)
             except RecordingError as error:
-                text = f"The change holds, but a restart would lose it: {error}"
-                raise RecordingError(text, code="change-not-saved") from None
+                raise RecordingError("change-not-saved", reason=str(error)) from None
         return result
 
     async def switch_free_drive(self, client_id: int, on: bool, auto: bool) -> None:
@@ -376,10 +373,6 @@ class Session:
         self._notes = (f"the arm was moved by {how_far} since the pause",)
         self._void()
         self.store.event("jogged", f"Arm moved {how_far} while paused. Approve again.", "warning")
-
-
-def _still_ending(what: str) -> RefusedError:
-    return RefusedError(f"{what} is still ending", code="still-ending", remedy="Try again in a moment.")
 
 
 def show_interrupted(context: SessionContext, folder: Path, state: SessionState) -> None:

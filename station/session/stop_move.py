@@ -50,15 +50,10 @@ async def stop_motion(context: SessionContext, test: StopTest) -> Motion:
     RefusedError, LimitError and RobotError say what prevents it.
     """
     if context.recording is not None:
-        raise RefusedError("A session is open.", code="session-open", remedy="Finish it first.")
+        raise RefusedError("session-open")
     state = await context.arm()
     if (fraction := state.target_speed_fraction) < _SLIDER_FULL:
-        raise RefusedError(
-            f"The speed slider stands at {100 * fraction:.0f} % (wanted: 100 %).",
-            code="slider-low",
-            remedy="Raise it to 100 %: the test itself is slow.",
-            fraction=fraction,
-        )
+        raise RefusedError("slider-low", fraction=fraction)
     plan = await MOTION.run(_free_move, context, test, state.joints_rad)
     move = StopTestMove(
         test.way,
@@ -94,11 +89,7 @@ def _free_move(context: SessionContext, test: StopTest, start: Vector6) -> Plan:
         if not check.problems:
             return plan
         refused = refused or str(check.problems[0])
-    raise LimitError(
-        f"{joint} has no free path from here: {refused}",
-        code="stop-test-path",
-        remedy="Jog the arm to where it has room, or choose another joint (--joint).",
-    )
+    raise LimitError("stop-test-path", joint=joint, problem=refused)
 
 
 def _turns(near: MoveCheck, forward: bool) -> Iterator[float]:

@@ -25,11 +25,7 @@ class WorkThreads:
     async def run(self, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
         """Run `work` in a thread; return its result. RefusedError where too many calls are waiting."""
         if not self._places.acquire(blocking=False):
-            raise RefusedError(
-                "Too many requests wait for this computer's disk or network.",
-                code="busy",
-                remedy="Check the disk and the network of the station's computer, then try again.",
-            )
+            raise RefusedError("busy-disk")
         work_done = self._pool.submit(work, *args, **kwargs)
         work_done.add_done_callback(lambda _: self._places.release())
         return await asyncio.wrap_future(work_done)

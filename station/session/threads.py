@@ -25,7 +25,7 @@ class WorkThreads:
     async def run(self, work: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
         """Run `work` in a thread; return its result. RefusedError where too many calls are waiting."""
         if not self._places.acquire(blocking=False):
-            raise RefusedError("busy-disk")
+            raise RefusedError("busy")
         work_done = self._pool.submit(work, *args, **kwargs)
         work_done.add_done_callback(lambda _: self._places.release())
         return await asyncio.wrap_future(work_done)

@@ -17,7 +17,7 @@ from station.cell.layout import flange_pose
 from station.cell.status import DetectionStatus
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
-from station.session import monitor
+from station.session import previews
 from tests.codes import raises
 from tests.station.session_rig import TRUTH, NewRig, Rig
 
@@ -27,7 +27,7 @@ TAG = BoardSpec(BoardKind.APRIL_TAG, square_m=0.05)
 @pytest.fixture(autouse=True)
 def tag_in_sight(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = BoardDetection(DetectionStatus(found=True), np.arange(4), 100 + 2000 * board_points(TAG)[:, :2])
-    monkeypatch.setattr(monitor, "detect", lambda *args: seen)
+    monkeypatch.setattr(previews, "detect", lambda *args: seen)
 
 
 async def test_corners_and_the_arms_pose_of_mid_exposure_without_control_or_session(rig: Rig) -> None:

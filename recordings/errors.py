@@ -185,6 +185,21 @@ def exists_error(path: Path) -> RecordingError:
     return RecordingError("exists", path=path)
 
 
+def wrong_size_error(
+    image: str, size: tuple[int, int], camera: tuple[int, int], line: int = 0
+) -> RecordingError:
+    """An image is not of the size (width, height) that the description of its camera says."""
+    return RecordingError(
+        "image-size",
+        image=image,
+        width_px=size[0],
+        height_px=size[1],
+        camera_width_px=camera[0],
+        camera_height_px=camera[1],
+        line=line,
+    )
+
+
 def recover_line(path: Path) -> str:
     """The command that saves what is whole, as a shell takes it."""
     return f"recordings recover {shlex.quote(str(path))}"

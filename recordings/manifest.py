@@ -58,22 +58,14 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def _damaged(path: Path, reason: str) -> CorruptRecordingError:
-    return CorruptRecordingError(
-        f"{path} is damaged ({reason}): it lists the segments of the session",
-        code="damaged-manifest",
-        remedy="Use the original; only if you know that every segment is there, delete it.",
-    )
+    return CorruptRecordingError("damaged-manifest", path=path, reason=reason)
 
 
 def enter_part(folder: Path, session: str, part: int, file_name: str) -> None:
     """Note a segment without which the session is incomplete from now on. Returns when it is on the disk."""
     known = read_manifest(folder) or Manifest(session, {})
     if known.session != session:
-        raise RecordingError(
-            f"{folder} belongs to session '{known.session}'",
-            code="several-sessions",
-            remedy=f"Record '{session}' elsewhere.",
-        )
+        raise RecordingError("other-session", folder=folder, session=known.session, wanted=session)
     _write(folder, msgspec.structs.replace(known, parts=known.parts | {part: file_name}))
 
 

@@ -66,8 +66,9 @@ class Recording:
         try:
             return self._by_number[view.part].image(view.picture_sequence)
         except KeyError as error:
-            text = f"{self.path} has no image for view {view.index}"
-            raise RecordingError(text, code="no-image", view=view.index) from error
+            raise RecordingError(
+                "no-image", path=self.path, view=view.index, image=view.picture_sequence
+            ) from error
 
     def stored_image(self, view: View) -> tuple[str, bytes] | None:
         """(format, file bytes) of an image that is kept compressed; None when it is kept raw."""
@@ -106,12 +107,13 @@ def open_recording(path: Path, *, incomplete: bool = False) -> Recording:
     path = Path(path)
     if path.is_dir():
         recording = _open_folder(path)
-        remedy = f"Copy it back beside the others; if it is lost for good: {recover_line(path)}"
+        advice = f"Copy it back beside the others; if it is lost for good: {recover_line(path)}"
     else:
         recording = _open_file(path)
-        remedy = f"If the other segments are lost for good: {recover_line(path.parent)}"
+        advice = f"If the other segments are lost for good: {recover_line(path.parent)}"
     if recording.missing and not incomplete:
-        raise MissingSegmentError("; ".join(recording.missing), remedy=remedy, missing=len(recording.missing))
+        said = "; ".join(recording.missing)
+        raise MissingSegmentError(lacks=said, advice=advice, missing=len(recording.missing))
     return recording
 
 
@@ -145,11 +147,12 @@ def _open_folder(folder: Path) -> Recording:
     files = [name for name in names if name.endswith(".mcap")]
     manifest = read_manifest(folder)
     if not files and manifest is None:
-        raise RecordingError(f"{folder} holds no recording (*.mcap)", code="no-recording")
+        raise RecordingError("no-recording", folder=folder)
     if not files and manifest is not None:
         raise MissingSegmentError(
-            f"{folder} holds none of the segments of session '{manifest.session}'",
-            remedy=f"Copy back {', '.join(filter(None, manifest.parts.values()))}.",
+            lacks=f"{folder} holds none of the segments of session '{manifest.session}'",
+            advice=f"Copy back {', '.join(filter(None, manifest.parts.values()))}.",
+            missing=len(manifest.parts),
         )
     if len(files) > PARTS_LIMIT:
         raise _several_sessions(f"{folder} holds {len(files)} recordings")
@@ -165,12 +168,12 @@ def _open_folder(folder: Path) -> Recording:
 
 def _unfinished(path: Path, recover: Path | None = None) -> UnfinishedRecordingError:
     return UnfinishedRecordingError(
-        f"{path} is unfinished", remedy=f"Save what is whole: {recover_line(recover or path)}"
+        path=path, reason="it was never finished", rescue=recover_line(recover or path)
     )
 
 
 def _several_sessions(text: str) -> RecordingError:
-    return RecordingError(text, code="several-sessions", remedy="Name one of the files, not the folder.")
+    return RecordingError("several-sessions", difference=text)
 
 
 def _check_one_session(segments: list[RecordingSegment], manifest: Manifest | None) -> None:
@@ -190,9 +193,7 @@ def _check_one_session(segments: list[RecordingSegment], manifest: Manifest | No
             raise _several_sessions(f"{segment.path} was recorded with another camera than {path}")
         if before and before.info.part == info.part:
             raise CorruptRecordingError(
-                f"{before.path} and {segment.path} are both segment {info.part}",
-                code="segment-twice",
-                remedy="Move the copy away.",
+                "segment-twice", path=before.path, other=segment.path, segment=info.part
             )
 
 

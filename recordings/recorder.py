@@ -116,11 +116,7 @@ class Recorder:
     def view(self, view: View) -> None:
         """Raises RecordingError when its image was dropped or an earlier write failed."""
         if self.error is None and view.picture_sequence in self._dropped_images:
-            raise RecordingError(
-                f"The image of pose {view.index + 1} was dropped: the disk is too slow",
-                code="image-dropped",
-                remedy="Retake the pose.",
-            )
+            raise RecordingError("image-dropped", pose=view.index + 1)
         self._put(_Item(lambda: self._writer.view(view), _SMALL_BYTES))
 
     def event(self, event: CaptureEvent) -> None:
@@ -163,8 +159,10 @@ class Recorder:
                 if self.error is not None:
                     self._finished.set_exception(self.error)
                 elif self._closing:
-                    text, remedy = f"{self.part_path} is unfinished", f"Run {recover_line(self.part_path)}"
-                    self._finished.set_exception(UnfinishedRecordingError(text, remedy=remedy))
+                    path, rescue = self.part_path, recover_line(self.part_path)
+                    self._finished.set_exception(
+                        UnfinishedRecordingError(path=path, reason="the recorder was closed", rescue=rescue)
+                    )
                 self._wake.notify()
             return self._finished
 
@@ -196,7 +194,7 @@ class Recorder:
             if self.error is not None:
                 raise self.error
             if self._ended:
-                raise RecordingError(f"The recording {self._writer.path} is finished", code="closed")
+                raise RecordingError("closed", path=self._writer.path)
             self._append(item)
             self._wake.notify()
 
@@ -214,7 +212,7 @@ class Recorder:
         except RecordingError as error:
             self._fail(error)
         except Exception as error:
-            self._fail(RecordingError(f"The recorder failed on {self.part_path}: {error!r}", code="recorder"))
+            self._fail(RecordingError("recorder", path=self.part_path, reason=repr(error)))
         finally:
             self._writer.close()
 

@@ -82,9 +82,7 @@ def recover_recording(source: Path, output: Path | None = None) -> list[Recovery
     """
     if source.is_dir():
         if output is not None:
-            raise RecordingError(
-                "A session folder is recovered in place", code="no-output", remedy="Leave out the output."
-            )
+            raise RecordingError("no-output")
         return _recover_session(source)
     return [_recover_file(source, output)[0]]
 
@@ -95,7 +93,7 @@ def _recover_session(folder: Path) -> list[Recovery]:
     except OSError as error:
         raise disk_error("open", folder, error) from error
     if not files:
-        raise RecordingError(f"{folder} holds no recording (*.mcap, *.mcap.part)", code="no-recording")
+        raise RecordingError("no-recording", folder=folder)
     manifest = read_manifest(folder)
     done = [_recover_part(path) for path in files]
     present = {info.part: result.path.name for result, info in done if info is not None}
@@ -133,7 +131,7 @@ def _recover_file(source: Path, output: Path | None) -> tuple[Recovery, SessionI
         lock(descriptor, source)
         final = output or source.with_name(source.name.removesuffix(PART_SUFFIX))
         if final.suffix != ".mcap":
-            raise RecordingError(f"{final}: a recording's name ends in .mcap", code="recording-name")
+            raise RecordingError("recording-name", path=final)
         if final != source and os.path.lexists(final):
             raise exists_error(final)
         try:
@@ -220,11 +218,7 @@ def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment
     session = next((metadata[name] for name in SESSION_RECORDS if name in metadata), None)
     if session is None:
         size = os.fstat(descriptor).st_size
-        raise _NothingToSaveError(
-            f"Nothing can be saved from {source}: the description of the session is lost ({size} bytes)",
-            remedy="Look for another copy; this file is unchanged.",
-            size_bytes=size,
-        )
+        raise _NothingToSaveError(path=source, size_bytes=size)
     dropped = _orphans(found)
     file = OutputFile(target)
     try:
@@ -235,8 +229,7 @@ def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment
     try:
         return RecordingSegment(target), found.lost_bytes, found.losses
     except RecordingError as error:
-        text = f"{source} cannot be recovered and is unchanged: {error.text}"
-        raise RecordingError(text, code="unrecoverable") from error
+        raise RecordingError("unrecoverable", path=source, reason=error.text) from error
 
 
 def _orphans(found: Salvage) -> set[int]:

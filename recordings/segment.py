@@ -132,9 +132,8 @@ class RecordingSegment:
             image = self._decoded_image(topic, address, *size)
         except ImageError as error:
             place = self._source.place(address)
-            raise BadImageError(
-                f"{self.path} at byte {place}: image {sequence} {error}", image=sequence, at_byte=place
-            ) from error
+            where = f"{self.path} at byte {place}"
+            raise BadImageError(place=where, image=sequence, reason=str(error), at_byte=place) from error
         image.flags.writeable = False
         told = msgspec.structs.asdict(facts)
         del told["width"], told["height"]
@@ -160,9 +159,7 @@ class RecordingSegment:
     def _corrupt(self, topic: Topic, address: int, reason: str) -> CorruptRecordingError:
         place = self._source.place(address)
         return CorruptRecordingError(
-            f"{self.path} is damaged at byte {place} ({topic.value}): {reason}",
-            remedy="Use the original file.",
-            at_byte=place,
+            path=self.path, at_byte=place, reason=f"{topic.value}: {reason}", advice="Use the original file."
         )
 
     def parsed(self, topic: Topic) -> Iterator[Any]:
@@ -195,8 +192,8 @@ class RecordingSegment:
         for address in self.messages(topic).addresses:
             yield self._message(topic, address, struct)
 
-    def _unusable(self, reason: str, code: str = "contradiction", remedy: str = "") -> CorruptRecordingError:
-        return CorruptRecordingError(f"{self.path} cannot be used: {reason}", code=code, remedy=remedy)
+    def _unusable(self, reason: str) -> CorruptRecordingError:
+        return CorruptRecordingError("contradiction", path=self.path, reason=reason)
 
     def _check_channels(self) -> dict[Topic, MessageIndex]:
         """Known topics with exactly the meaning this version knows; the others are `foreign`."""
@@ -211,15 +208,15 @@ class RecordingSegment:
             schema = self._contents.schema_of(channel)
             meaning = (channel.message_encoding, schema.encoding, schema.name)
             if meaning != ("protobuf", "protobuf", schema_name(topic)):
-                text = f"topic {topic.value} holds {schema.name[:60]}, not {schema_name(topic)}"
-                raise self._unusable(text, "other-schema")
-            try:
-                difference = schema_difference(schema_bytes(topic), schema.data)
-            except SchemaError as error:
-                difference = str(error)
+                difference = f"it holds {schema.name[:60]}, not {schema_name(topic)}"
+            else:
+                try:
+                    difference = schema_difference(schema_bytes(topic), schema.data)
+                except SchemaError as error:
+                    difference = str(error)
             if difference:
-                raise self._unusable(
-                    f"topic {topic.value}: {difference}", "other-schema", "Use the version that wrote it."
+                raise CorruptRecordingError(
+                    "other-schema", path=self.path, topic=topic.value, difference=difference
                 )
             found.setdefault(topic, []).append(index)
         return {topic: joined(indexes) for topic, indexes in found.items()}
@@ -228,7 +225,7 @@ class RecordingSegment:
         record = self._contents.metadata.get(SESSION_RECORDS[0], {})
         version = record.get("format", "")
         if version not in FORMATS:
-            raise self._unusable(*_other_format(version))
+            raise self._other_format(version)
         if version != FORMATS[0] or "crc32" in record:
             try:
                 require_crc(record)
@@ -241,6 +238,14 @@ class RecordingSegment:
         if not is_session_name(info.name) or not 1 <= info.part <= PARTS_LIMIT:
             raise self._unusable(f"its session name '{info.name[:60]}' or part {info.part} is not allowed")
         return info
+
+    def _other_format(self, version: str) -> CorruptRecordingError:
+        """Say why a file with this format is not read."""
+        name, _, number = version.partition("/")
+        own_name, _, newest = FORMATS[-1].partition("/")
+        if name != own_name or not number.isdecimal():
+            return CorruptRecordingError("not-a-recording", path=self.path)
+        return CorruptRecordingError("newer-format", path=self.path, format=number[:20], newest=newest)
 
     @property
     def recovered(self) -> bool:
@@ -294,17 +299,6 @@ class RecordingSegment:
                 raise self._corrupt(Topic.VIEW, address, text)
             views.append(msgspec.structs.replace(view, part=self.info.part))
         return views
-
-
-def _other_format(version: str) -> tuple[str, str, str]:
-    """Say why a file with this format is not read: reason, code, remedy."""
-    name, _, number = version.partition("/")
-    own_name, _, newest = FORMATS[-1].partition("/")
-    if name != own_name or not number.isdecimal():
-        remedy = "Bring in other people's data with `recordings import`."
-        return "it is no recording of this station", "not-a-recording", remedy
-    text = f"it was written by newer software (format {number[:20]}, this version reads up to {newest})"
-    return text, "newer-format", ""
 
 
 def _is_rigid(view: View) -> bool:

@@ -19,7 +19,7 @@ from typing import Any, Self
 import msgspec
 from mcap.records import Message
 
-from recordings.errors import RecordingError, disk_error, exists_error, recover_line
+from recordings.errors import RecordingError, disk_error, exists_error, recover_line, wrong_size_error
 from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, rename_new, sync_folder
 from recordings.images import ImageError, encode_png, read_header
 from recordings.mcap.output import OutputFile
@@ -58,10 +58,9 @@ class RecordingWriter:
     def __init__(self, path: Path, info: SessionInfo, *, lossless_png: bool = False) -> None:
         """Creates `path` + '.part'. `lossless_png` compresses images (half the size, 20 ms each)."""
         if path.suffix != ".mcap":
-            raise RecordingError(f"{path}: a recording's name ends in .mcap", code="recording-name")
+            raise RecordingError("recording-name", path=path)
         if not is_session_name(info.name):
-            text = f"'{info.name}' is no session name"
-            raise RecordingError(text, code="session-name", remedy="Use 1 to 40 of a-z, 0-9 and '-'.")
+            raise RecordingError("session-name", name=info.name)
         if os.path.lexists(path):
             raise exists_error(path)
         self.path = path
@@ -106,18 +105,11 @@ class RecordingWriter:
     def image(self, image: Image, encoded: bytes | None = None) -> None:
         """`encoded`: the same image's PNG or JPEG bytes, stored instead of the array (imported files)."""
         if image.sequence in self._images or image.sequence < 0:
-            text = f"Image {image.sequence} was recorded before; sequences count up from 0"
-            raise RecordingError(text, code="image-twice", image=image.sequence)
+            raise RecordingError("sequence-twice", image=image.sequence)
         height, width = image.pixels.shape[:2]
         camera = self.info.camera
         if (width, height) != (camera.width, camera.height):
-            raise RecordingError(
-                f"Image {image.sequence} is {width}×{height}, the session's camera is "
-                f"{camera.width}×{camera.height}",
-                code="image-size",
-                width_px=width,
-                height_px=height,
-            )
+            raise wrong_size_error(f"Image {image.sequence}", (width, height), (camera.width, camera.height))
         told = msgspec.structs.asdict(image)
         del told["pixels"], told["clock_readings"]
         facts = PictureFacts(width=width, height=height, **told)
@@ -125,7 +117,9 @@ class RecordingWriter:
         try:
             topic, message = self._image(image, encoded, time_ns)
         except ImageError as error:
-            raise RecordingError(f"Image {image.sequence} {error}", code="bad-image") from error
+            raise RecordingError(
+                "bad-image", place=str(self.path), image=image.sequence, reason=str(error)
+            ) from error
         for reading in image.clock_readings:
             self.clock_reading(reading)
         self._add(Topic.PICTURE_FACTS, encode(facts), time_ns, image.sequence)
@@ -148,11 +142,7 @@ class RecordingWriter:
     def view(self, view: View) -> None:
         """The image must have been recorded before: a view never points at nothing."""
         if view.picture_sequence not in self._images:
-            raise RecordingError(
-                f"View {view.index} names image {view.picture_sequence}, which is not in the recording",
-                code="no-image",
-                remedy="Retake the pose.",
-            )
+            raise RecordingError("no-image", path=self.path, view=view.index, image=view.picture_sequence)
         time_ns = self._time_ns(view.stamps, view.picture_sequence)
         self._add(Topic.VIEW, encode(view), time_ns)
         if not self._shown_ns:  # imported, say: nothing else tells viewers where the flange is
@@ -212,11 +202,10 @@ class RecordingWriter:
     def attach(self, name: str, media_type: str, content: bytes) -> None:
         """A small file that rides along, like `plan.yaml`."""
         if not is_attachment_name(name) or name in self._attachments:
-            text = f"'{name}' is no new attachment name: a-z, 0-9, '-', single dots, once"
-            raise RecordingError(text, code="attachment-name")
+            raise RecordingError("attachment-name", name=name)
         if len(content) > ATTACHMENT_LIMIT_BYTES:
-            text = f"Attachment {name} is larger than {ATTACHMENT_LIMIT_BYTES >> 20} MiB"
-            raise RecordingError(text, code="attachment-size", size_bytes=len(content))
+            size, limit = len(content), ATTACHMENT_LIMIT_BYTES
+            raise RecordingError("attachment-size", name=name, size_bytes=size, limit_bytes=limit)
         with self._disk():
             self._mcap.add_attachment(self._start_ns, self._start_ns, name, media_type, content)
         self._attachments.add(name)
@@ -307,7 +296,7 @@ class RecordingWriter:
         if self.error is not None:
             raise self.error
         if self._file.closed:
-            raise RecordingError(f"{self.path} is closed", code="closed")
+            raise RecordingError("closed", path=self.path)
 
     def _failed(self, error: OSError) -> RecordingError:
         """A writer that failed once cannot be trusted again: what it holds in memory is thrown away."""

@@ -182,13 +182,7 @@ class _Messages:
     def header(self, time_ns: int, frame: str) -> Any:
         seconds, nanoseconds = divmod(time_ns, _NS)
         if seconds > _LAST_S:
-            raise RecordingError(
-                f"A message is stamped {seconds} s after 1970, and ROS 2 ends in 2038",
-                code="stamp-too-late",
-                remedy="The host's clock was wrong: export to csv or folder instead.",
-                stamp_s=seconds,
-                limit_s=_LAST_S,
-            )
+            raise RecordingError("stamp-too-late", stamp_s=seconds, limit_s=_LAST_S)
         stamp = self.make("builtin_interfaces/msg/Time", seconds, nanoseconds)
         return self.make("std_msgs/msg/Header", stamp, frame)
 

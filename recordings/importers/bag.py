@@ -16,7 +16,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from recordings.errors import ImportSourceError
+from recordings.errors import ImportSourceError, wrong_size_error
 from recordings.images import (
     KEPT_FORMATS,
     ImageError,
@@ -102,10 +102,11 @@ def import_bag(
         if len(stops) < STOPS_LEAST:
             why = ", ".join(f"{count} {reason}" for reason, count in passed.items() if count)
             raise ImportSourceError(
-                f"{source}: the arm stands still in {len(stops)} images of {len(images_ns)} ({why})",
-                code="no-stops",
-                remedy="Look at it with --dry-run; --still-mm and --still-deg allow for a noisier arm.",
+                "no-stops",
+                source=source,
                 stops=len(stops),
+                images=len(images_ns),
+                passed_over=why,
                 limit=STOPS_LEAST,
             )
         assert described is not None
@@ -129,11 +130,7 @@ def _description(source: Path, given: Path | None, needed: bool) -> tuple[Datase
         if path is not None and (path == given or path.is_file()):
             return read_dataset(path)
     if needed:
-        raise ImportSourceError(
-            f"Nothing says which board {source} shows and how the camera is mounted",
-            code="no-dataset",
-            remedy=f"Name a {DATASET_FILE} with mount and board by --dataset (docs/integrator/import.md).",
-        )
+        raise ImportSourceError("no-dataset", source=source)
     return None, b""
 
 
@@ -174,8 +171,7 @@ def _camera(described: Dataset, found: CameraModel | None, width: int, height: i
     """The description's, else the bag's, else the size alone. ImportSourceError for another size."""
     camera = described.camera or found or CameraModel(width, height)
     if (camera.width, camera.height) != (width, height):
-        text = f"The images are {width}×{height}, their camera is described as {camera.width}×{camera.height}"
-        raise ImportSourceError(text, code="image-size", width_px=width, height_px=height)
+        raise wrong_size_error("The first image", (width, height), (camera.width, camera.height))
     return camera
 
 
@@ -256,7 +252,7 @@ def _size(image: ImageMessage) -> tuple[int, int]:
     try:
         header = read_header(image.data)
     except ImageError as error:
-        raise ImportSourceError(f"The first image {error}", code="bad-image") from error
+        raise ImportSourceError("bad-image", place="the bag", image="first", reason=str(error)) from error
     return header.width, header.height
 
 
@@ -281,4 +277,4 @@ def _pixels(image: ImageMessage, place: int) -> tuple[Pixels, bytes | None]:
             pixels = pixels.reshape(image.height, image.width, channels)
         return (pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))), None
     except ImageError as error:
-        raise ImportSourceError(f"Image {place + 1} {error}", code="bad-image", image=place + 1) from error
+        raise ImportSourceError("bad-image", place="the bag", image=place + 1, reason=str(error)) from error

@@ -101,7 +101,7 @@ class Bag:
 def open_bag(path: Path, progress: Progress = lambda done, total, text: None) -> Bag:
     """A bag's folder, or one file; MCAP is proven first. Raises ImportSourceError or RecordingError."""
     if not path.exists():
-        raise ImportSourceError(f"{path} does not exist", code="no-file")
+        raise ImportSourceError("no-file", path=path)
     if path.is_dir():
         mcap, ros = sorted(path.glob("*.mcap")), sorted(path.glob("*.bag"))
         if not ros and any(file.suffix in (".db3", ".zstd") for file in path.iterdir()):
@@ -109,8 +109,7 @@ def open_bag(path: Path, progress: Progress = lambda done, total, text: None) ->
     else:
         mcap, ros = ([], [path]) if path.suffix in (".bag", ".db3") else ([path], [])
     if not mcap and not ros:
-        text = f"{path} holds neither dataset.yaml with poses.csv, nor a bag (*.mcap, *.db3, *.bag)"
-        raise ImportSourceError(text, code="no-bag", remedy="Name another folder.")
+        raise ImportSourceError("no-bag", path=path)
     return Bag(_McapBag(mcap, progress) if mcap else _RosBag(ros), progress)
 
 
@@ -133,10 +132,7 @@ class _McapBag:
                 self._files.append((contents, source))
                 done += source.size_bytes
                 if SESSION_RECORDS[0] in contents.metadata:
-                    remedy = f"Solve it: calibrate solve {path}"
-                    raise ImportSourceError(
-                        f"{path} is a recording already", code="a-recording", remedy=remedy
-                    )
+                    raise ImportSourceError("a-recording", path=path)
                 for number, channel in contents.channels.items():
                     schema, encoding = contents.schema_of(channel).name, channel.message_encoding
                     if encoding == CDR and "/msg/" not in schema:  # as some bridges write it
@@ -189,7 +185,7 @@ class _RosBag:
         self.declared = [(c.topic, CDR, c.msgtype, c.msgcount) for c in self._reader.connections]
 
     def _unreadable(self, error: Exception) -> ImportSourceError:
-        return ImportSourceError(f"{self._path} is no ROS bag that can be read: {error}", code="no-bag")
+        return ImportSourceError("unreadable-bag", path=self._path, reason=str(error))
 
     def close(self) -> None:
         self._reader.close()

@@ -46,7 +46,6 @@ _REACH_LIMIT_M = 20.0
 _UNIT_TOLERANCE = 0.01
 _TURN_LIMIT_RAD = 4 * math.pi
 """No joint turns this far: such numbers are degrees."""
-_HELP = "See docs/integrator/import.md."
 
 
 class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -92,14 +91,14 @@ def read_dataset(path: Path) -> tuple[Dataset, bytes]:
     try:
         dataset = strict_yaml.load(content, Dataset)
     except strict_yaml.StrictYamlError as error:
-        text, first = f"{path}: {'; '.join(map(str, error.problems))}", error.problems[0]
+        said, first = "; ".join(map(str, error.problems)), error.problems[0]
         raise ImportSourceError(
-            text, code="dataset", remedy=_HELP, line=first.line, key=first.where
+            "dataset", path=path, problems=said, line=first.line, key=first.where
         ) from None
     for problem in (_board_problem(dataset.board), _camera_problem(dataset.camera)):
         if problem:
             key, text = problem
-            raise ImportSourceError(f"{path}: {key}: {text}", code="dataset", remedy=_HELP, key=key)
+            raise ImportSourceError("dataset", path=path, problems=f"{key}: {text}", line=0, key=key)
     return dataset, content
 
 
@@ -153,14 +152,13 @@ def _camera_problem(camera: CameraModel | None) -> tuple[str, str] | None:
 def read_small_file(path: Path, limit_bytes: int) -> bytes:
     """The whole file. ImportSourceError when it is missing or too large to be right."""
     if not path.is_file():
-        remedy = f"A folder to import has {DATASET_FILE}, {POSES_FILE} and images."
-        raise ImportSourceError(f"{path} is missing", code="no-file", remedy=remedy)
+        raise ImportSourceError("missing-file", path=path)
     try:
         return read_file(path, limit_bytes)
     except OSError as error:
         if error.errno != errno.EFBIG:
             raise disk_error("read", path, error) from error
-        raise ImportSourceError(f"{path}: {error.strerror}", code="file-too-large") from error
+        raise ImportSourceError("file-too-large", path=path, reason=error.strerror) from error
 
 
 def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
@@ -170,38 +168,31 @@ def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ImportSourceError(
-            f"{path} is not UTF-8 text", code="poses", remedy="Save it as plain CSV."
-        ) from error
+        raise ImportSourceError("poses", path=path) from error
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     except csv.Error as error:
-        raise _wrong_row(path, reader.line_num, str(error)) from error
+        raise ImportSourceError("pose-row", path=path, line=reader.line_num, reason=str(error)) from error
     header = [cell.strip() for cell in lines[0][1]] if lines else []
     if header not in _HEADERS:
         found = ",".join(lines[0][1])[:100] if lines else "nothing"
         needed = f"'{','.join(HEADER)}' (metres, unit quaternion), perhaps with ,j1 … j6 (radians)"
-        raise _wrong_row(path, 1, f"the header is '{found}', it must be {needed}", "header")
+        raise ImportSourceError("header", path=path, line=1, found=found, needed=needed)
     rows = [_pose_row(path, line, header, [cell.strip() for cell in cells]) for line, cells in lines[1:]]
     if not rows:
-        raise _wrong_row(path, 1, "a header but no poses; add one line per image", "no-poses")
+        raise ImportSourceError("no-poses", path=path, line=1)
     first: dict[str, int] = {}
     for row in rows:
         if (line := first.setdefault(row.image, row.line)) != row.line:
-            text = f"{row.image} stands already in line {line}; each image has one pose"
-            raise _wrong_row(path, row.line, text, "image-twice")
+            raise ImportSourceError("image-twice", path=path, line=row.line, image=row.image, first_line=line)
     return rows, content
-
-
-def _wrong_row(path: Path, line: int, reason: str, code: str = "pose-row") -> ImportSourceError:
-    return ImportSourceError(f"{path} line {line}: {reason}", code=code, line=line)
 
 
 def _pose_row(path: Path, line: int, header: list[str], cells: list[str]) -> PoseRow:
     if len(cells) != len(header):
-        text = f"{len(cells)} values where {len(header)} are needed ({','.join(header)})"
-        raise _wrong_row(path, line, text)
+        reason = f"{len(cells)} values where {len(header)} are needed ({','.join(header)})"
+        raise ImportSourceError("pose-row", path=path, line=line, reason=reason)
     if not any(cells[len(HEADER) :]):  # this image's joints are not known
         header, cells = HEADER, cells[: len(HEADER)]
     numbers = []
@@ -209,21 +200,20 @@ def _pose_row(path: Path, line: int, header: list[str], cells: list[str]) -> Pos
         try:
             numbers.append(float(cell))
         except ValueError as error:
-            raise _wrong_row(path, line, f"{name} = '{cell[:40]}' is not a number") from error
+            reason = f"{name} = '{cell[:40]}' is not a number"
+            raise ImportSourceError("pose-row", path=path, line=line, reason=reason) from error
         if not math.isfinite(numbers[-1]):
-            raise _wrong_row(path, line, f"{name} = {cell} is not finite; correct or delete the line")
+            reason = f"{name} = {cell} is not finite"
+            raise ImportSourceError("pose-row", path=path, line=line, reason=reason)
     if not cells[0] or "\0" in cells[0]:
-        raise _wrong_row(path, line, "the image's name is missing")
+        raise ImportSourceError("pose-row", path=path, line=line, reason="the image's name is missing")
     position, quaternion, joints = numbers[:3], numbers[3:7], numbers[7:]
     if (far_m := max(map(abs, position))) > _REACH_LIMIT_M:
-        text = f"the flange is {far_m:g} m away: x, y, z must be metres, not millimetres"
-        raise _wrong_row(path, line, text, "not-metres")
+        raise ImportSourceError("not-metres", path=path, line=line, distance=far_m)
     length = math.hypot(*quaternion)
     if abs(length - 1) > _UNIT_TOLERANCE:
-        text = f"the quaternion's length is {length:.4g}, it must be 1 (qx,qy,qz,qw, no rotation vector)"
-        raise _wrong_row(path, line, text, "no-unit-quaternion")
+        raise ImportSourceError("no-unit-quaternion", path=path, line=line, length=length)
     if joints and (turn := max(map(abs, joints))) > _TURN_LIMIT_RAD:
-        text = f"a joint is at {turn:g}: joints must be radians, not degrees, from the base on"
-        raise _wrong_row(path, line, text, "not-radians")
+        raise ImportSourceError("not-radians", path=path, line=line, turn=turn)
     base_from_flange = matrix_from_quaternion(position, [q / length for q in quaternion])
     return PoseRow(line, cells[0], base_from_flange, tuple(joints) or None)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from recordings import strict_yaml
-from recordings.errors import ImportSourceError
+from recordings.errors import ImportSourceError, wrong_size_error
 from recordings.files import read_beginning
 from recordings.images import (
     IMAGE_LIMIT_BYTES,
@@ -63,13 +64,10 @@ def import_folder(
     ImportSourceError or RecordingError.
     """
     if not folder.is_dir():
-        remedy = f"Give the one that holds {DATASET_FILE}."
-        raise ImportSourceError(f"{folder} is not a folder", code="no-folder", remedy=remedy)
+        raise ImportSourceError("no-folder", path=folder)
     dataset, dataset_bytes = read_dataset(folder / DATASET_FILE)
     if (camera := dataset.camera) is None:
-        raise ImportSourceError(
-            f"{folder / DATASET_FILE}: camera is missing", code="dataset-value", key="camera"
-        )
+        raise ImportSourceError("dataset-value", path=folder / DATASET_FILE, key="camera")
     rows, poses_bytes = read_poses(folder)
     arm = {
         name: read_small_file(folder / name, strict_yaml.LIMIT_BYTES)
@@ -103,26 +101,26 @@ def read_image(folder: Path, row: PoseRow, size: tuple[int, int]) -> tuple[str, 
             raise ImageError(f"is larger than {IMAGE_LIMIT_BYTES >> 20} MiB")
         return file_format, data, decode_image(data, *size)
     except ImageError as error:
-        raise _wrong(folder, row, str(error), "bad-image") from error
+        raise _bad_image(folder, row, error) from error
 
 
 def _beginning(folder: Path, row: PoseRow, size: tuple[int, int], limit_bytes: int) -> tuple[str, bytes]:
     path = folder / row.image
+    place: dict[str, Any] = {"path": folder / POSES_FILE, "line": row.line, "image": row.image}
     try:
         if path.exists() and not path.is_file():  # a pipe would never be read to its end
-            raise _wrong(folder, row, "cannot be read (not a file)", "unreadable")
+            raise ImportSourceError("unreadable", **place, reason="not a file")
         if not Path(os.path.realpath(path)).is_relative_to(folder.resolve()):
-            raise _wrong(folder, row, "lies outside the folder", "outside", "Copy it inside.")
+            raise ImportSourceError("outside", **place)
         data = read_beginning(path, limit_bytes)
         header = read_header(data)
     except OSError as error:
-        raise _wrong(folder, row, f"cannot be read ({error.strerror})", "unreadable") from error
+        raise ImportSourceError("unreadable", **place, reason=error.strerror) from error
     except ImageError as error:
-        raise _wrong(folder, row, f"is no usable image: {error}", "bad-image", "Save it as PNG.") from error
+        raise _bad_image(folder, row, error) from error
     if (header.width, header.height) != size:
-        text = f"is {header.width}×{header.height}, the camera {size[0]}×{size[1]}"
-        remedy = "All images must come from one camera in one setting."
-        raise _wrong(folder, row, text, "image-size", remedy)
+        image = f"{folder / POSES_FILE} line {row.line}: {row.image}"
+        raise wrong_size_error(image, (header.width, header.height), size, row.line)
     return header.format, data
 
 
@@ -144,8 +142,6 @@ def _write_view(
     )
 
 
-def _wrong(folder: Path, row: PoseRow, reason: str, code: str, remedy: str = "") -> ImportSourceError:
-    text = f"{folder / POSES_FILE} line {row.line}: image {row.image} {reason}"
-    return ImportSourceError(
-        text, code=code, remedy=remedy or "Replace it or delete the line.", line=row.line
-    )
+def _bad_image(folder: Path, row: PoseRow, error: ImageError) -> ImportSourceError:
+    place = f"{folder / POSES_FILE} line {row.line}"
+    return ImportSourceError("bad-image", place=place, image=row.image, reason=str(error), line=row.line)

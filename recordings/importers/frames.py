@@ -57,12 +57,12 @@ class FrameTree:
             numbers = (*frame.position_m, *frame.rotation_xyzw)
             length = float(np.linalg.norm(frame.rotation_xyzw))
             if not np.isfinite(numbers).all() or abs(length - 1) > _UNIT_TOLERANCE:
-                text = f"Frame {frame.parent} → {frame.child} at {frame.stamp_ns} ns is no rigid transform"
-                raise ImportSourceError(text, code="not-rigid", at_ns=frame.stamp_ns)
+                raise ImportSourceError(
+                    "not-rigid", parent=frame.parent, child=frame.child, at_ns=frame.stamp_ns
+                )
             self._samples += 1
             if self._samples > SAMPLES_LIMIT:
-                text = f"The bag has more than {SAMPLES_LIMIT} frames"
-                raise ImportSourceError(text, code="too-many-frames", remedy="Cut it first.")
+                raise ImportSourceError("too-many-frames", limit=SAMPLES_LIMIT)
             edge = self.edges.setdefault((frame.parent.lstrip("/"), frame.child.lstrip("/")), Edge())
             edge.stamps_ns.append(frame.stamp_ns)
             edge.numbers.extend(numbers)
@@ -96,11 +96,7 @@ class FrameTree:
 
     def _no_chain(self, base: str, flange: str) -> ImportSourceError:
         names = ", ".join(sorted({name for pair in self.edges for name in pair})) or "none"
-        return ImportSourceError(
-            f"No frames lead from {base} to {flange} (frames: {names})",
-            code="no-frames",
-            remedy="Name them with --base and --flange, or a topic of poses with --pose-topic.",
-        )
+        return ImportSourceError("no-frames", base=base, flange=flange, frames=names)
 
     def moves(self, pair: tuple[str, str]) -> bool:
         """Tell whether a link is ever told to be anywhere else."""

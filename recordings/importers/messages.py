@@ -125,7 +125,7 @@ def decoded(
     except ImportSourceError:
         raise
     except Exception as error:  # whatever rosbags makes of bytes that are no message
-        raise _undecodable(schema, repr(error)) from error
+        raise ImportSourceError("undecodable-message", schema=schema, reason=repr(error)) from error
     return _from_ros(schema, message, time_ns)
 
 
@@ -136,18 +136,13 @@ def _protobufs_time(found: dict[str, Any]) -> object:
     return Timestamp(seconds=found["sec"], nanos=found["nsec"]).ToJsonString()
 
 
-def _undecodable(schema: str, reason: str) -> ImportSourceError:
-    return ImportSourceError(f"A {schema} cannot be decoded ({reason})", code="undecodable-message")
-
-
 @cache
 def ros_types() -> Any:
     """The message types of ROS 2 Humble. ImportSourceError when `rosbags` is not installed."""
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        text, remedy = "ROS messages need the package rosbags", "pip install 'calibration-station[ros]'"
-        raise ImportSourceError(text, code="missing-package", remedy=remedy) from error
+        raise ImportSourceError("missing-package") from error
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
@@ -194,11 +189,7 @@ def _from_ros(schema: str, message: Any, time_ns: int) -> Value:
     stamp_ns, frame = _ros_stamp(message.header, time_ns), str(message.header.frame_id)
     if schema == "sensor_msgs/msg/Image":
         if message.is_bigendian and "16" in message.encoding:
-            raise ImportSourceError(
-                "The bag's 16 bit images are big-endian",
-                code="big-endian",
-                remedy="Record them little-endian.",
-            )
+            raise ImportSourceError("big-endian")
         size = (message.width, message.height)
         return ImageMessage(stamp_ns, *size, message.encoding, message.step, message.data.tobytes())
     if schema == "sensor_msgs/msg/CompressedImage":

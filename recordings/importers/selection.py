@@ -104,16 +104,13 @@ def _one(bag: Bag, kind: Kind, name: str | None, option: str) -> BagTopic:
     if name is not None:
         found = [topic for topic in topics if topic.name == name]
         if not found:
-            text = f"The bag has no {kind.value} on {name} (there are: {there})"
-            raise ImportSourceError(text, code="no-topic", topic=name)
+            raise ImportSourceError("no-topic", kind=kind.value, topic=name, there=there)
         return found[0]
     if not topics:
-        others = f"; other topics: {', '.join(bag.others[:10])}" if bag.others else ""
-        text = f"The bag holds no topic with {kind.value} of a known kind{others}"
-        raise ImportSourceError(text, code="no-topic", kind=kind.value)
+        there = ", ".join(bag.others[:10]) or "none"
+        raise ImportSourceError("no-topic", kind=kind.value, topic="any topic", there=there)
     if len(topics) > 1:
-        text = f"The bag holds {kind.value} on several topics: {there}"
-        raise ImportSourceError(text, code="several-topics", remedy=f"Choose with {option}.", kind=kind.value)
+        raise ImportSourceError("several-topics", kind=kind.value, there=there, option=option)
     return topics[0]
 
 
@@ -123,8 +120,7 @@ def _from_poses(bag: Bag, topic: str) -> tuple[Track, str]:
         assert isinstance(frames, list)
         base = frames[0].parent or "base"
         if tree.edges and (base.lstrip("/"), _POSE_CHILD) not in tree.edges:
-            text, remedy = f"The poses on {topic} are in several frames", "Export one of them."
-            raise ImportSourceError(text, code="several-frames", remedy=remedy)
+            raise ImportSourceError("several-frames", topic=topic)
         pose = frames[0]
         tree.add([FrameMessage(pose.stamp_ns, base, _POSE_CHILD, pose.position_m, pose.rotation_xyzw)])
     return tree.track(base.lstrip("/"), _POSE_CHILD), f"poses on {topic} in {base}"

@@ -50,26 +50,18 @@ def scan_file(
     try:
         return scan.contents, scan.source, scan.run()
     except _CutError as error:
-        text = f"{path} is unfinished or cut ({error})"
-        raise UnfinishedRecordingError(text, remedy=f"Save what is whole: {rescue}") from error
+        raise UnfinishedRecordingError(path=path, reason=str(error), rescue=rescue) from error
     except TooLargeError as error:
-        text = f"{path} has {error}, more than is read"
-        raise RecordingError(text, code="too-large", remedy="Split it first.") from error
+        raise RecordingError("too-large", path=path, excess=str(error)) from error
     except BadRecordError as error:
         if not scan.source.size_bytes:
-            text = f"{path} is empty: it was never written, or its copy failed"
-            raise CorruptRecordingError(text, code="empty-file", remedy="Copy it again.") from error
+            raise CorruptRecordingError("empty-file", path=path) from error
+        advice = f"Use the original, or save what is whole: {rescue}"
         raise CorruptRecordingError(
-            f"{path} is damaged at byte {scan.position}: {error}",
-            remedy=f"Use the original, or save what is whole: {rescue}",
-            at_byte=scan.position,
+            path=path, at_byte=scan.position, reason=str(error), advice=advice
         ) from error
     except ShortFileError as error:
-        raise CorruptRecordingError(
-            f"{path} became shorter while it was read: another program changes it",
-            code="changed-while-read",
-            remedy="Try again afterwards.",
-        ) from error
+        raise CorruptRecordingError("changed-while-read", path=path) from error
 
 
 class _CutError(Exception):

@@ -162,7 +162,11 @@ REFUSED = {
         Wanted(image_topic="/left"),
         "no-topic",
     ),
-    "a ROS 1 bag that is cut": (lambda folder: cut(write_rosbag1(folder / "a.bag")), Wanted(), "no-bag"),
+    "a ROS 1 bag that is cut": (
+        lambda folder: cut(write_rosbag1(folder / "a.bag")),
+        Wanted(),
+        "unreadable-bag",
+    ),
     "nothing": (lambda folder: folder / "none", Wanted(), "no-file"),
     "no bag at all": (lambda folder: Path(__file__), Wanted(), "damaged-recording"),
 }

@@ -168,8 +168,8 @@ HEADER = "image,x,y,z,qx,qy,qz,qw\n"
 HALF = "0.7071067811865476,0.7071067811865476"
 SINGULAR = "height: 24, matrix: [[0,0,0],[0,0,0],[0,0,1]]"
 BAD: dict[str, Bad] = {
-    "no dataset": (lambda f: (f / "dataset.yaml").unlink(), "no-file", {}),
-    "no poses": (lambda f: (f / "poses.csv").unlink(), "no-file", {}),
+    "no dataset": (lambda f: (f / "dataset.yaml").unlink(), "missing-file", {}),
+    "no poses": (lambda f: (f / "poses.csv").unlink(), "missing-file", {}),
     "wrong header": pose("qx,qy,qz,qw", "qw,qx,qy,qz", 1, "header"),
     "no header": pose(HEADER, "", 1, "header"),
     "only a header": poses(HEADER, "no-poses", line=1),

@@ -165,7 +165,7 @@ def test_a_list_that_is_no_file_does_not_hang_its_reader(session: Path) -> None:
 
 
 def test_a_folder_belongs_to_one_session(session: Path) -> None:
-    with refused("several-sessions"):
+    with refused("other-session"):
         enter_part(session, "another", 1, "session.mcap")
 
 

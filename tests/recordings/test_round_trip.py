@@ -178,7 +178,7 @@ def test_a_view_never_points_at_nothing(tmp_path: Path) -> None:
 def test_pictures_of_another_size_or_a_sequence_used_twice_are_refused(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.image(make_picture(0))
-        with refused("image-twice"):
+        with refused("sequence-twice"):
             writer.image(make_picture(0))
         with refused("image-size", width_px=40, height_px=30):
             writer.image(make_picture(1, make_image(1, 40, 30)))

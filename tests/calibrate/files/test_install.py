@@ -140,18 +140,22 @@ def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type:
     assert "holdout_share" in override.overridden[0]
 
 
-def test_another_robot_or_camera_is_refused(make_file, solved_real: SolvedRecording, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_another_robot_camera_or_mount_is_refused(
+    make_file, solved_real: SolvedRecording, tmp_path: Path
+) -> None:  # type: ignore[no-untyped-def]
     """Fault 47."""
     root = tmp_path / "s"
     install(make_file(), root)
     before = (root / "calibrations/current").read_bytes()
-    robot = msgspec.structs.replace(solved_real.calibration.robot, serial="2099999999")
-    camera = msgspec.structs.replace(solved_real.calibration.camera, serial="99")
-    for changes in ({"robot": robot}, {"camera": camera}):
+    made = solved_real.calibration
+    others: list[dict[str, object]] = [
+        {part: msgspec.structs.replace(getattr(made, part), **{key: "99"})}
+        for part in ("robot", "camera")
+        for key in ("serial", "model")
+    ]
+    for changes in (*others, {"mount": "eye-to-hand"}):
         with raises_code(InstallError, "objection", objections=1):
             install(make_file(**changes), root)
-    with raises_code(InstallError, "objection", objections=1):
-        install(make_file(), tmp_path / "t", robot_serial="4711")
     assert (root / "calibrations/current").read_bytes() == before
 
 

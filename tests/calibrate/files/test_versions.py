@@ -146,22 +146,6 @@ def test_what_was_configured_for_the_cell_is_held_against_the_file(  # type: ign
     install(make_file(), tmp_path / "s", robot_serial=robot.serial, camera_serial=camera.serial)
 
 
-@pytest.mark.parametrize("part", ["robot", "camera"])
-def test_another_model_with_the_same_serial_is_another_device(  # type: ignore[no-untyped-def]
-    make_file, solved_real: SolvedRecording, tmp_path: Path, part: str
-) -> None:
-    install(make_file(), tmp_path / "s")
-    other = msgspec.structs.replace(getattr(solved_real.calibration, part), model="other")
-    with raises_code(InstallError, "objection", objections=1):
-        install(make_file(**{part: other}), tmp_path / "s")
-
-
-def test_another_mount_does_not_follow(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    install(make_file(), tmp_path / "s")
-    with raises_code(InstallError, "objection", objections=1):
-        install(make_file(mount="eye-to-hand"), tmp_path / "s")
-
-
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can be two operators")
 def test_two_operators_of_a_group_share_a_folder(make_file) -> None:  # type: ignore[no-untyped-def]
     """A folder like /var/lib/station/calibrations: setgid, the group may write."""

@@ -83,6 +83,8 @@ _NONE = 1e-6
 _BENDS = np.array([_NONE, 0.1, 0.4, 1.6])
 """1σ of a bracket's compliance, mrad; a rigid bracket has probability ½."""
 _BENDS_BEFOREHAND = np.array([3.0, 1.0, 1.0, 1.0]) / 6
+_ROUNDS = 3
+"""Rounds for each pair of sizes; its neighbour's noise is a good start."""
 _WORTH_SOLVING = 1e-3
 """Probability below which a pair of sizes is dropped after the first step."""
 
@@ -131,7 +133,7 @@ def allow_for_table(
         solutions: list[LinearSolution] = []
         for i in kept:  # neighbours have nearly the same noise
             start = solutions[-1].scales if solutions else scales
-            solutions.append(linear.solve(priors.linearise(state, sizes.sigma[i]), start, "robot"))
+            solutions.append(linear.solve(priors.linearise(state, sizes.sigma[i]), start, "robot", _ROUNDS))
         log_evidence = np.array([solution.log_evidence for solution in solutions])
         log_all = special.logsumexp(log_evidence, b=sizes.beforehand[kept])
         chances = sizes.beforehand[kept] * np.exp(log_evidence - log_all)

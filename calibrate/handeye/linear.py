@@ -21,7 +21,7 @@ from calibrate.handeye.reprojection import linearise_corners
 from calibrate.handeye.uncertainty import information_lost, inverse_of
 from calibrate.views import Observations
 
-ROUNDS = 4
+ROUNDS = 8
 """Rounds of expectation and maximisation at one linearisation; the next linearisation goes on with them."""
 MAX_STEPS = 15
 """Most linearisations of a fit."""
@@ -97,10 +97,12 @@ class Linear:
         """Take initial noise scales from the residuals, the robot's times `wide`."""
         return first_scales(self.m, 1.0 if self.modes is None else self.modes.typical_px, wide)
 
-    def solve(self, prior: Quadratic, scales: Scales, fit: Fit = "all") -> LinearSolution:
+    def solve(
+        self, prior: Quadratic, scales: Scales, fit: Fit = "all", rounds: int = ROUNDS
+    ) -> LinearSolution:
         """Find the step and the noise scales to be fitted, by rounds of expectation and maximisation."""
         residual, modes = self.m, self.modes
-        for _ in range(1 if fit == "nothing" else ROUNDS):
+        for _ in range(1 if fit == "nothing" else rounds):
             S, S_inverse = self.noise(scales)
             chances, _ = class_chances(residual, S, S_inverse, scales.shares)
             WJ = expected(chances, S_inverse) @ self.J

@@ -44,9 +44,8 @@ settings.load_profile("patient")
 
 MAY_BE_SENT = {
     "dashboard: stop", "dashboard: PolyscopeVersion", "dashboard: get serial number",
-    "dashboard: get robot model", "dashboard: is in remote control", "dashboard: robotmode",
-    "dashboard: safetystatus", "dashboard: programState", "dashboard: running",
-    "dashboard: get loaded program", "upload: rtde_control", "upload: station_control",
+    "dashboard: get robot model", "dashboard: is in remote control", "dashboard: programState",
+    "upload: rtde_control", "upload: station_control",
     "script: movej", "script: stopj", "script: rtde_set_watchdog",
     "script: force_mode_set_gain_scaling", "script: force_mode_set_damping",
 }  # fmt: skip

@@ -32,7 +32,6 @@ class FrameCounter:
         self.frames = 0
         """Numbered frames accepted; the newest has this sequence number minus 1."""
         self.missing = 0
-        self.unexpected = 0
         self.seen = 0
         """Frames accepted, previews included."""
         self.paired = 0
@@ -55,14 +54,12 @@ class FrameCounter:
         frames = self._step(last_id, frame_id)
         pulses = 1 if last_pulse is None or pulse_count is None else pulse_count - last_pulse
         if frames is None:
-            self.unexpected += 1
             raise CameraError(
                 f"the camera restarted its frame numbers: {frame_id} came after {last_id}",
                 code="frame-ids-restarted",
                 remedy=RETAKE,
             )
         if frames == 0:
-            self.unexpected += 1
             raise CameraError(f"the camera sent frame {frame_id} twice", code="frame-twice", remedy=RETAKE)
         if frames > 1 and frames > pulses:
             self.missing += frames - 1
@@ -74,7 +71,6 @@ class FrameCounter:
                 frames=frames - 1,
             )
         if pulses != 1:
-            self.unexpected += 1
             raise CameraError(
                 f"the trigger box counted {pulses} pulses for one image",
                 code="pulse-count",
@@ -106,7 +102,6 @@ class FrameCounter:
 
     def surplus(self, frames: int) -> CameraError:
         """Note frames that came without a trigger; return the error to raise."""
-        self.unexpected += frames
         self.restart()
         return CameraError(
             f"{frames} frame(s) came without a trigger (noise on the trigger line, or a double exposure)",

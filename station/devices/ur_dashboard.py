@@ -18,7 +18,7 @@ STOP = "stop"
 ALLOWED = frozenset(
     {
         STOP, "PolyscopeVersion", "get serial number", "get robot model", "is in remote control",
-        "robotmode", "safetystatus", "programState", "running", "get loaded program",
+        "programState",
     }
 )  # fmt: skip
 LINE_LIMIT = 4096

@@ -62,8 +62,6 @@ class UrLink:
         self.guided = False
         """True while a person moves the arm by hand."""
         self.dashboard: Dashboard | None = None
-        self.lost = 0
-        """Number of connections lost."""
         self._ended_reader: StateReader | None = None
         self._lock: RobotLock | None = None
         self.identity = RobotIdentity(model=config.model)
@@ -366,7 +364,6 @@ class UrLink:
         """Handle the end of a reader, once: reader and supervision may both report it."""
         if reader is self.reader and reader is not self._ended_reader and self._supervisor is not None:
             self._ended_reader = reader
-            self.lost += 1
             log.warning("robot state of %s: %s", self.config.host, why)
             self.on_link_lost(why)
 

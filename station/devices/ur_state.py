@@ -27,7 +27,7 @@ from calibrate.geometry import pose_from_rotvec
 from recordings.schema.clocks import ClockEstimator, ClockFit, monotonic_from_wall_ns
 from recordings.schema.messages import RobotState, Stamps, Vector6
 from station.cell.config import vector6
-from station.cell.errors import RobotError, StaleStateError
+from station.cell.errors import StaleStateError
 from station.cell.layout import pose_vector
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, Recipe, RtdeError, RtdeLink
 from station.devices.ur_dashboard import connect_trouble
@@ -35,7 +35,6 @@ from station.devices.ur_dashboard import connect_trouble
 log = logging.getLogger(__name__)
 
 HISTORY_S = 10.0
-RECONNECT_S = 0.3
 SILENCE_S = 2.0
 """Time without data after which the connection is closed."""
 SO_TIMESTAMPNS = 35
@@ -94,10 +93,6 @@ class StateReader(threading.Thread):
         self.newest: Sample | None = None
         self.history: deque[RobotState] = deque(maxlen=1)
         self.clock = ClockEstimator()
-        self.lost = 0
-        """Number of samples that the controller skipped or that were lost."""
-        self.frozen = 0
-        """Number of packets whose controller time did not advance."""
         self.stands_still = False
         """True when the controller time of the newest packet did not advance."""
         self.ended: str | None = None
@@ -223,14 +218,11 @@ class StateReader(threading.Thread):
         controller_s = v[0]
         before = self.newest
         if before is not None:
-            gap = (controller_s - before.state.stamps.controller_s) * self.rate_hz
-            if gap == 0:
-                self.frozen += 1
+            if controller_s == before.state.stamps.controller_s:
                 self.stands_still = True
                 return
-            if gap < 0:
+            if controller_s < before.state.stamps.controller_s:
                 self.history.clear()  # the controller's clock went back
-            self.lost += max(0, round(gap) - 1)
         state = RobotState(
             stamps=Stamps(host_monotonic_ns=monotonic_ns, host_wall_ns=wall_ns, controller_s=controller_s),
             joints_rad=v[1:7],  # type: ignore[arg-type]  # struct gave exactly six
@@ -321,44 +313,22 @@ def _mix_poses(first: Vector6, second: Vector6, fraction: float) -> Vector6:
 
 
 class TraceRecorder:
-    """Recorder of every state between `begin` and `end`; reusable, reconnects when the connection is lost."""
+    """Recorder of every state between `begin` and `end`, over a connection of its own; reusable."""
 
     def __init__(self, host: str) -> None:
         self._host = host
         self._states: list[RobotState] = []
         self._reader: StateReader | None = None
-        self._keeper: asyncio.Task[None] | None = None
 
     async def begin(self) -> None:
         """Begin recording; return once samples come. RobotError when none do."""
         self._states = []
-        await self._open()
-        self._keeper = asyncio.create_task(self._keep())
+        self._reader = StateReader(self._host, self._states.append, lambda _: None)
+        self._reader.start()
+        await asyncio.wrap_future(self._reader.started)
 
     async def end(self) -> list[RobotState]:
-        """End recording; return all samples since `begin`, in order."""
-        if self._keeper is not None:
-            self._keeper.cancel()
-            await asyncio.gather(self._keeper, return_exceptions=True)
-        await self._close()
+        """End recording; return all samples since `begin`, in order, as long as the connection lasted."""
+        if self._reader is not None:
+            await asyncio.to_thread(self._reader.close)
         return self._states
-
-    async def _open(self) -> None:
-        states = self._states
-        self._reader = reader = StateReader(self._host, states.append, lambda _: None)
-        reader.start()
-        await asyncio.wrap_future(reader.started)
-
-    async def _close(self) -> None:
-        reader, self._reader = self._reader, None
-        if reader is not None:
-            await asyncio.to_thread(reader.close)
-
-    async def _keep(self) -> None:
-        """Reopen a lost connection, as often as needed."""
-        while True:
-            await asyncio.sleep(RECONNECT_S)
-            if self._reader is None or self._reader.ended is not None:
-                await self._close()
-                with contextlib.suppress(RobotError):
-                    await self._open()

@@ -53,9 +53,9 @@ async def serve() -> AsyncIterator[Serve]:
 
 
 async def test_answers_keep_their_order_without_waiting(serve: Serve) -> None:
-    dashboard = await Dashboard.open(await serve({"robotmode": "Robotmode: RUNNING", "stop": "Stopped"}))
-    first, second = dashboard.send("robotmode"), dashboard.send("stop")
-    assert (await first, await second) == ("Robotmode: RUNNING", "Stopped")
+    dashboard = await Dashboard.open(await serve({"programState": "STOPPED x", "stop": "Stopped"}))
+    first, second = dashboard.send("programState"), dashboard.send("stop")
+    assert (await first, await second) == ("STOPPED x", "Stopped")
     await dashboard.close()
 
 

@@ -14,7 +14,7 @@ from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming, StreamCounts
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import DeviceThread, Trigger
-from station.devices.frames import RETAKE, FrameClock, FrameCounter, TriggerPulse
+from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
 from station.devices.genicam_settings import CHUNKS, TIME_CHUNKS
 
 _CLOCK_READINGS = 8
@@ -26,11 +26,7 @@ class AravisCamera:
 
     def __init__(self, config: CameraConfig, trigger: Trigger | None = None) -> None:
         if config.trigger == "hardware" and trigger is None:
-            raise CameraError(
-                "camera.trigger is 'hardware' but no trigger box is configured",
-                code="no-trigger",
-                remedy="Add `trigger: {port: /dev/ttyACM0}`, or choose camera.trigger: software.",
-            )
+            raise CameraError("no-trigger")
         self._config = config
         self._trigger = trigger
         self._device: GenicamDevice | None = None
@@ -120,7 +116,7 @@ class AravisCamera:
     def _live(self) -> GenicamDevice:
         """Return the open device; after it was lost, open it again by its serial number."""
         if self._device is None:
-            raise CameraError("the camera is not open", code="not-open")
+            raise CameraError("not-open")
         if self._device.lost:
             self._device.close()
             self._open()
@@ -139,10 +135,5 @@ class AravisCamera:
             device.trigger()
         picture = device.frame(timeout_s)
         if picture is None:
-            raise CameraError(
-                f"the camera sent no image within {timeout_s:g} s of its trigger",
-                code="no-image",
-                remedy=f"{RETAKE} With a hardware trigger, check its line.",
-                limit_s=timeout_s,
-            )
+            raise CameraError("no-image", limit_s=timeout_s)
         return picture

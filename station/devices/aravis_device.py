@@ -16,7 +16,6 @@ from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stam
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.cell.status import StreamCounts
-from station.devices.frames import RETAKE
 from station.devices.genicam_settings import (
     Applied,
     apply_settings,
@@ -52,12 +51,7 @@ def _aravis() -> tuple[Any, Any]:
             gi.require_version("Aravis", "0.8")
             from gi.repository import Aravis, GLib
     except (ImportError, ValueError) as error:
-        raise CameraError(
-            f"GenICam cameras need Debian's python3-gi and gir1.2-aravis-0.8 ({error})",
-            code="no-aravis",
-            remedy="Run apt install python3-gi gir1.2-aravis-0.8, then make the venv again with "
-            "--system-site-packages.",
-        ) from error
+        raise CameraError("no-aravis", reason=str(error)) from error
     return Aravis, GLib
 
 
@@ -168,7 +162,7 @@ class GenicamDevice:
 
     def _require_applied(self) -> Applied:
         if self._applied is None:
-            raise CameraError("the camera is not open", code="not-open")
+            raise CameraError("not-open")
         return self._applied
 
     @property
@@ -250,20 +244,11 @@ class GenicamDevice:
         applied = self._require_applied()
         if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
             self._calm_down()
-            raise CameraError(
-                f"frame {buffer.get_frame_id()} came incomplete ({buffer.get_status().value_nick}): packets "
-                "were lost",
-                code="frame-incomplete",
-                remedy="Check cable, network card and packet size, and retake this pose.",
-            )
+            raise CameraError("frame-incomplete", reason=buffer.get_status().value_nick)
         width, height = buffer.get_image_width(), buffer.get_image_height()
         if (width, height) != applied.region[2:]:
-            raise CameraError(
-                f"frame {buffer.get_frame_id()} came as {width}×{height}, set were {applied.region[2]}×"
-                f"{applied.region[3]}: another program changes the camera's settings",
-                code="settings-changed",
-                remedy=RETAKE,
-            )
+            wanted = f"{applied.region[2]}×{applied.region[3]}"
+            raise CameraError("settings-changed", found=f"{width}×{height}", wanted=wanted)
         wall_ns = buffer.get_system_timestamp()
         arrival_ns = monotonic_from_wall_ns(wall_ns)
         if applied.chunks and not buffer.has_chunks():  # Aravis 0.8 reads them of GigE Vision 2 only
@@ -322,11 +307,7 @@ class GenicamDevice:
 
     def _require_alive(self) -> None:
         if self.lost:
-            raise CameraError(
-                f"camera {self.identity.model} {self.identity.serial} is gone",
-                code="camera-gone",
-                remedy="Check cable and power; it is opened again when it is back.",
-            )
+            raise CameraError("camera-gone", camera=f"{self.identity.model} {self.identity.serial}")
 
     @contextmanager
     def _explained(self, doing: str) -> Iterator[None]:
@@ -336,7 +317,7 @@ class GenicamDevice:
         except self._glib.Error as error:
             gone = (self._aravis.DeviceError.TIMEOUT, self._aravis.DeviceError.NOT_CONNECTED)
             self._lost |= any(error.matches(self._aravis.device_error_quark(), code) for code in gone)
-            raise CameraError(f"{doing} failed: {error.message}", code="camera-refused") from error
+            raise CameraError("camera-refused", doing=doing, reason=error.message) from error
 
 
 def _threads() -> set[int]:
@@ -382,10 +363,6 @@ def _find(aravis: Any, wanted: str) -> str:
     chosen = exact or by_model
     if len(chosen) == 1:
         return chosen[0]
-    which = f"no camera '{wanted}'" if not chosen else "camera.device must name one camera, by its serial"
-    raise CameraError(
-        f"{which}: found {'; '.join(found) or 'none'}",
-        code="no-camera" if not chosen else "several-cameras",
-        remedy="Check power, cable and network, or give its serial number or IP address.",
-        found=len(found),
-    )
+    cameras = "; ".join(found) or "none"
+    code = "several-cameras" if chosen else "no-camera"
+    raise CameraError(code, wanted=wanted, cameras=cameras, found=len(found))

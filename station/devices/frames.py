@@ -54,29 +54,14 @@ class FrameCounter:
         frames = self._step(last_id, frame_id)
         pulses = 1 if last_pulse is None or pulse_count is None else pulse_count - last_pulse
         if frames is None:
-            raise CameraError(
-                f"the camera restarted its frame numbers: {frame_id} came after {last_id}",
-                code="frame-ids-restarted",
-                remedy=RETAKE,
-            )
+            raise CameraError("frame-ids-restarted", frame=frame_id, after=last_id)
         if frames == 0:
-            raise CameraError(f"the camera sent frame {frame_id} twice", code="frame-twice", remedy=RETAKE)
+            raise CameraError("frame-twice", frame=frame_id)
         if frames > 1 and frames > pulses:
             self.missing += frames - 1
-            raise CameraError(
-                f"{frames - 1} frame(s) were lost between {last_id} and {frame_id}: which image belongs to "
-                "this pose is not certain",
-                code="frames-lost",
-                remedy=RETAKE,
-                frames=frames - 1,
-            )
+            raise CameraError("frames-lost", frames=frames - 1, after=last_id, frame=frame_id)
         if pulses != 1:
-            raise CameraError(
-                f"the trigger box counted {pulses} pulses for one image",
-                code="pulse-count",
-                remedy=f"{RETAKE} If it returns, look for noise on the trigger line.",
-                pulses=pulses,
-            )
+            raise CameraError("pulse-count", pulses=pulses)
         self.frames += sequenced
         self.seen += 1
         self.paired += pulse_count is not None
@@ -103,12 +88,7 @@ class FrameCounter:
     def surplus(self, frames: int) -> CameraError:
         """Note frames that came without a trigger; return the error to raise."""
         self.restart()
-        return CameraError(
-            f"{frames} frame(s) came without a trigger (noise on the trigger line, or a double exposure)",
-            code="surplus-frames",
-            remedy=RETAKE,
-            frames=frames,
-        )
+        return CameraError("surplus-frames", frames=frames)
 
 
 class TriggerPulse(msgspec.Struct, frozen=True):

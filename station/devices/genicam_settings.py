@@ -110,9 +110,7 @@ def _set_line(camera: Any, line: str, values: dict[str, str], inverted: bool = F
 
 
 def _cannot(what: str, key: str) -> CameraError:
-    return CameraError(
-        f"this camera cannot {what}", code="camera-cannot", remedy=f"Leave {key} out of the configuration."
-    )
+    return CameraError("camera-cannot", what=what, key=key)
 
 
 def gain_unit(camera: Any) -> str:
@@ -137,13 +135,7 @@ def _wanted_gain(camera: Any, config: CameraConfig) -> float:
     low, high = camera.get_gain_bounds()
     if config.gain_db:
         unit = gain_unit(camera) or "a unit of its own"
-        raise CameraError(
-            f"this camera counts gain in {unit} from {low:g} to {high:g}, not in dB",
-            code="gain-unit",
-            remedy="Give camera.gain in its unit instead of camera.gain_db.",
-            low=low,
-            high=high,
-        )
+        raise CameraError("gain-unit", unit=unit, low=low, high=high)
     return float(low)
 
 
@@ -174,7 +166,7 @@ def require_settings(camera: Any, wanted_us: float, applied: Applied) -> tuple[f
     gain = float(camera.get_gain()) if camera.is_gain_available() else 0.0
     require_exposed(exposure_us, gain, wanted_us, applied)
     if (actual := _region(camera)) != applied.region:
-        raise _changed(exposure_us, gain, wanted_us, applied, f"; region {actual}, set {applied.region}")
+        raise _changed(exposure_us, gain, wanted_us, applied, f", region {actual}")
     return exposure_us, gain
 
 
@@ -186,18 +178,15 @@ def require_exposed(exposure_us: float, gain: float, wanted_us: float, applied: 
 
 
 def _changed(
-    exposure_us: float, gain: float, wanted_us: float, applied: Applied, more: str = ""
+    exposure_us: float, gain: float, wanted_us: float, applied: Applied, region: str = ""
 ) -> CameraError:
     unit = " dB" if applied.gain_in_db else ""
     return CameraError(
-        f"the camera stands at {exposure_us:g} µs, gain {gain:g}{unit}; set were {wanted_us:g} µs, gain "
-        f"{applied.gain:g}{unit}{more}",
-        code="settings-changed",
-        remedy="Set what the camera can do, and end other programs that use it.",
+        "settings-changed",
+        found=f"{exposure_us:g} µs, gain {gain:g}{unit}{region}",
+        wanted=f"{wanted_us:g} µs, gain {applied.gain:g}{unit}{region and f', region {applied.region}'}",
         exposure_us=exposure_us,
         wanted_exposure_us=wanted_us,
-        gain=gain,
-        wanted_gain=applied.gain,
     )
 
 

@@ -16,8 +16,6 @@ from typing import NamedTuple
 from recordings.schema.messages import RobotState
 from station.cell.errors import StaleStateError
 
-APPROVE_AGAIN = "then approve motion again"
-
 CURRENT_S = 0.1
 """Largest age of news that count as the present state of the arm."""
 MOVING_S = 0.25
@@ -34,17 +32,6 @@ class Delay(StrEnum):
     COMPUTER = "computer-late"
     CONTROLLER = "controller-late"
     NETWORK = "network-late"
-
-
-_TOLD = {
-    Delay.COMPUTER: ("this computer was busy", "End other programs on it"),
-    Delay.CONTROLLER: ("the robot's controller sent nothing", "Look at the pendant"),
-    Delay.NETWORK: (
-        "the network carried nothing from the robot",
-        "Check cable, switch and what else uses this network",
-    ),
-}
-"""What happened, and what to do."""
 
 
 class Evidence(NamedTuple):
@@ -80,9 +67,7 @@ class Evidence(NamedTuple):
         if (delay := self.delay) is None:
             return None
         late_ms = 1000 * (self.pause_s if delay is Delay.COMPUTER else self.gap_s)
-        what, remedy = _TOLD[delay]
-        text, remedy = f"{what} for {late_ms:.0f} ms{effect}", f"{remedy}, {APPROVE_AGAIN}."
-        return StaleStateError(text, code=delay, remedy=remedy, late_ms=late_ms)
+        return StaleStateError(delay.value, late_ms=late_ms, effect=effect)
 
 
 def largest_gap(

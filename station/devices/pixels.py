@@ -27,11 +27,7 @@ FORMATS = (
 def bits_per_pixel(pixel_format: str) -> int:
     """Return the bits per pixel on the wire. CameraError for a format that is not supported."""
     if pixel_format not in FORMATS:
-        raise CameraError(
-            f"pixel format '{pixel_format}' is not supported",
-            code="pixel-format",
-            remedy=f"Choose from {', '.join(FORMATS)}.",
-        )
+        raise CameraError("pixel-format", pixel_format=pixel_format, formats=", ".join(FORMATS))
     if pixel_format in ("RGB8", "BGR8"):
         return 24
     if pixel_format == "Mono10p":
@@ -48,12 +44,7 @@ def decode(data: bytes, width: int, height: int, pixel_format: str) -> Pixels:
     """
     size = (width * height * bits_per_pixel(pixel_format) + 7) // 8
     if len(data) < size:
-        raise CameraError(
-            f"an image of {len(data)} bytes came, {size} are needed for {pixel_format}",
-            code="image-size",
-            size_bytes=len(data),
-            needed_bytes=size,
-        )
+        raise CameraError("image-size", size_bytes=len(data), needed_bytes=size, pixel_format=pixel_format)
     raw = np.frombuffer(data, np.uint8, size)
     if pixel_format == "Mono8" or pixel_format in _BAYER:
         return raw.reshape(height, width)

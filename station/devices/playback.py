@@ -76,7 +76,7 @@ class PlaybackCamera:
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
         if not self._playing:
-            raise CameraError("nothing is being played", code="not-open", remedy="Open the camera first.")
+            raise CameraError("not-open")
         picture = await asyncio.to_thread(self._robot.picture)
         self._taken += 1
         now_ns = time.monotonic_ns()
@@ -114,11 +114,9 @@ class PlaybackRobot:
             self._recording: Recording = open_recording(recording)
             self.views: list[View] = self._recording.views()
         except RecordingError as error:
-            raise RobotError(f"{recording} cannot be played: {error}", code="unreadable-recording") from error
+            raise RobotError("unreadable-recording", recording=recording, reason=str(error)) from error
         if not self.views or any(len(v.joints_rad or ()) != 6 for v in self.views):
-            raise RobotError(
-                f"{recording} has no joints for every view: no arm can be played", code="no-joints"
-            )
+            raise RobotError("no-joints", recording=recording)
         self._lock = threading.Lock()
         self._from = self._to = self.views[0]
         self._move_start_s = -MOVE_S
@@ -143,11 +141,11 @@ class PlaybackRobot:
         """Return the image of the view at which the arm stands. CameraError during a move, or undecodable."""
         view, moving = self._standing()
         if moving:
-            raise CameraError("playback has images only from where the recorded arm stood", code="no-image")
+            raise CameraError("not-recorded")
         try:
             return self._recording.image(view)
         except RecordingError as error:
-            raise CameraError(error.text, code=error.code, remedy=error.remedy, **error.values) from error
+            raise CameraError.from_data(error.data) from error
 
     async def connect(self) -> RobotIdentity:
         if self._thread is None:
@@ -164,7 +162,7 @@ class PlaybackRobot:
     def at(self, host_monotonic_ns: int) -> RobotState:
         age_s = (time.monotonic_ns() - host_monotonic_ns) / 1e9
         if not -0.01 <= age_s <= 10.0:
-            raise StaleStateError(f"no played state {age_s:.1f} s ago", age_s=age_s)
+            raise StaleStateError("no-history")
         with self._lock:
             before, after, fraction = self._from, self._to, self._fraction(host_monotonic_ns / 1e9)
         a, b = np.array(before.joints_rad), np.array(after.joints_rad)
@@ -211,9 +209,9 @@ class PlaybackRobot:
         off = [float(np.abs(np.array(v.joints_rad) - target).max()) for v in self.views]
         nearest = int(np.argmin(off))
         if not self.control:
-            raise RobotError("playback cannot move: motion is not approved", code="no-control")
+            raise RobotError("control-not-started", why="")
         if off[nearest] > _SAME_JOINTS_RAD:
-            raise RobotError("playback moves only to where the recorded arm stood", code="not-recorded")
+            raise RobotError("not-recorded")
         with self._lock:
             self._from, self._to, self._halted_at = self._to, self.views[nearest], None
             self._move_start_s = time.monotonic()
@@ -232,7 +230,7 @@ class PlaybackRobot:
         return "play a recording that can be read"
 
     def stop_one_way(self, way: StopWay) -> None:
-        raise RobotError("a played-back arm has no ways to stop", code="playback")
+        raise RobotError("playback")
 
     async def stop(self, reason: str) -> None:
         with self._lock:
@@ -280,11 +278,7 @@ def playback_cell(recording: Path) -> Cell:
         content = open_recording(recording).attachments().get(CONFIG_NAME, b"")
         recorded = strict_yaml.load(content, StationConfig)
     except (RecordingError, strict_yaml.StrictYamlError) as error:
-        raise ConfigError(
-            f"{recording} holds no usable {CONFIG_NAME} of a station ({error}): it cannot be replayed",
-            code="no-config",
-            remedy="`calibrate solve` and Foxglove need none.",
-        ) from error
+        raise ConfigError("no-config", recording=recording, name=CONFIG_NAME, reason=str(error)) from error
     camera = msgspec.structs.replace(
         recorded.camera, driver="playback", device=str(recording), trigger="software"
     )

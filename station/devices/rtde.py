@@ -155,7 +155,7 @@ class PacketReader:
         while end - start >= HEADER.size:
             size, kind = HEADER.unpack_from(data, start)
             if size < HEADER.size:
-                raise RtdeError(f"an RTDE packet claims a size of {size} bytes; the other side is not RTDE")
+                raise RtdeError(reason=f"a packet claims {size} bytes, so the other side is not RTDE")
             if end - start < size:
                 break
             packets.append((kind, data[start + HEADER.size : start + size]))
@@ -177,7 +177,7 @@ class Recipe:
     def __post_init__(self) -> None:
         refused = [n for n, t in zip(self.names, self.types, strict=True) if t not in DATA_TYPES]
         if refused:
-            raise RtdeError(f"the controller refused {', '.join(refused)}", code="rtde-variables")
+            raise RtdeError("rtde-variables", names=", ".join(refused))
         codes = "".join(DATA_TYPES[t].code * DATA_TYPES[t].count for t in self.types)
         object.__setattr__(self, "packer", struct.Struct(">HBB" + codes))
 
@@ -188,13 +188,8 @@ class Recipe:
     def unpack_elements(self, payload: bytes) -> tuple[float, ...]:
         """Unpack a data packet's payload (recipe id first) to elements. RtdeError for a wrong length."""
         if len(payload) != self.packer.size - HEADER.size:
-            raise RtdeError(
-                f"a data packet of recipe {self.id} has {len(payload)} bytes, "
-                f"expected {self.packer.size - HEADER.size}",
-                code="rtde-size",
-                size_bytes=len(payload),
-                expected_bytes=self.packer.size - HEADER.size,
-            )
+            expected = self.packer.size - HEADER.size
+            raise RtdeError("rtde-size", recipe=self.id, size_bytes=len(payload), expected_bytes=expected)
         return self.packer.unpack(HEADER.pack(self.packer.size, PacketType.DATA) + payload)[3:]
 
 
@@ -207,7 +202,7 @@ def split_names(payload: bytes) -> tuple[str, ...]:
     try:
         text = payload.decode("ascii")
     except UnicodeDecodeError:
-        raise RtdeError("a list of variable names is not ASCII") from None
+        raise RtdeError(reason="a list of variable names is not ASCII") from None
     return tuple(name for name in text.split(",") if name)
 
 
@@ -223,12 +218,12 @@ class RtdeLink:
         """Packets received with an answer and not yet handled: after `start`, the first data packets."""
         accepted = self._ask(PacketType.PROTOCOL_VERSION, struct.pack(">H", PROTOCOL_VERSION))
         if accepted != b"\x01":
-            raise RtdeError(f"the controller does not speak RTDE version {PROTOCOL_VERSION}")
+            raise RtdeError(reason=f"the controller does not speak RTDE version {PROTOCOL_VERSION}")
 
     def version(self) -> tuple[int, int, int, int]:
         answer = self._ask(PacketType.CONTROLLER_VERSION)
         if len(answer) != 16:
-            raise RtdeError(f"the controller's version has {len(answer)} bytes, expected 16")
+            raise RtdeError(reason=f"the controller's version has {len(answer)} bytes, expected 16")
         major, minor, bugfix, build = struct.unpack(">4I", answer)
         return major, minor, bugfix, build
 
@@ -241,16 +236,12 @@ class RtdeLink:
         """Claim these input variables; RtdeError `registers-in-use` where another connection has one."""
         answer = self._ask(PacketType.INPUT_SETUP, join_names(names))
         if IN_USE in split_names(answer[1:]):
-            raise RtdeError(
-                "another program controls the robot (its RTDE registers are in use)",
-                code="registers-in-use",
-                remedy="Close that program, or the field bus on the pendant, then try again.",
-            )
+            raise RtdeError("registers-in-use")
         return _recipe(answer, names)
 
     def start(self) -> None:
         if self._ask(PacketType.START) != b"\x01":
-            raise RtdeError("the controller refused to send its state")
+            raise RtdeError(reason="the controller refused to send its state")
 
     def _ask(self, kind: PacketType, payload: bytes = b"") -> bytes:
         """Send a request; return the payload of its reply. Messages before it are skipped."""
@@ -263,7 +254,7 @@ class RtdeLink:
                     return answer
             data = self._link.recv(65536)
             if not data:
-                raise RtdeError("the controller closed the RTDE connection during the handshake")
+                raise RtdeError(reason="the controller closed the RTDE connection during the handshake")
             self.pending.extend(self.packets.feed(data))
         raise TimeoutError
 
@@ -271,8 +262,8 @@ class RtdeLink:
 def _recipe(answer: bytes, names: Sequence[str]) -> Recipe:
     types = split_names(answer[1:])
     if len(types) != len(names):
-        raise RtdeError(f"asked for {len(names)} variables, the controller answered {len(types)} types")
+        raise RtdeError(reason=f"the controller answered {len(types)} types for {len(names)} variables")
     refused = [n for n, t in zip(names, types, strict=True) if t == NOT_FOUND]
     if refused:
-        raise RtdeError(f"the controller has no {', '.join(refused)}; update its software")
+        raise RtdeError("rtde-variables", names=", ".join(refused))
     return Recipe(answer[0], tuple(names), types)

@@ -105,11 +105,7 @@ class SerialTrigger:
         try:
             self._port = _open_port(self._config.port)
         except (OSError, ValueError) as error:
-            raise TriggerError(
-                f"trigger port {self._config.port} cannot be opened ({error})",
-                code="trigger-port",
-                remedy="Plug the box in, and put this user into the group dialout.",
-            ) from error
+            raise TriggerError("trigger-port", port=self._config.port, reason=str(error)) from error
         self._lines = LineReader()
         self._count = self._first_count = 0
         try:
@@ -129,19 +125,11 @@ class SerialTrigger:
                 break
             except _BoxSilentError as error:
                 if time.monotonic() > end_s:
-                    raise TriggerError(
-                        f"what is on {self._config.port} does not answer like a trigger box",
-                        code="no-trigger-box",
-                        remedy="Check trigger.port; a udev rule gives the box a name of its own "
-                        "(docs/integrator/cameras.md).",
-                    ) from error
+                    found = "does not answer like a trigger box"
+                    raise TriggerError("no-trigger-box", port=self._config.port, found=found) from error
         if (product, protocol) != (PRODUCT, PROTOCOL):
-            raise TriggerError(
-                f"{self._config.port} is a '{product}' with protocol {protocol}, not a {PRODUCT} with "
-                f"protocol {PROTOCOL}",
-                code="no-trigger-box",
-                remedy="Check trigger.port.",
-            )
+            found = f"is '{product}' with protocol {protocol}, not {PRODUCT} with protocol {PROTOCOL}"
+            raise TriggerError("no-trigger-box", port=self._config.port, found=found)
         self._boot_id, count = self._status()
         self._count = self._first_count = count
         return f"{product} {serial}"
@@ -157,11 +145,7 @@ class SerialTrigger:
             before = self._count
             self._settle_count(*self._status())
             if (self._count - before) != 1:
-                raise TriggerError(
-                    "the trigger box did not confirm a pulse",
-                    code="pulse-count",
-                    remedy="Retake this pose.",
-                ) from None
+                raise TriggerError("pulse-count", pulses=self._count - before) from None
             bound_s = (time.monotonic_ns() - asked_ns) / 2e9
             return TriggerPulse(self._count, asked_ns + round(bound_s * 1e9), bound_s)
         answered_ns = time.monotonic_ns()
@@ -171,11 +155,7 @@ class SerialTrigger:
     def _settle_count(self, boot_id: str, count: int) -> None:
         if boot_id != self._boot_id:
             self._disconnect()
-            raise TriggerError(
-                "the trigger box restarted: the image belongs to no known pulse",
-                code="trigger-restarted",
-                remedy="Check its power; retake the pose.",
-            )
+            raise TriggerError("trigger-restarted")
         self._count += (count - self._count) % _COUNTS
 
     def _status(self) -> tuple[str, int]:
@@ -183,7 +163,7 @@ class SerialTrigger:
         try:
             boot_id, count, _ = self._ask("STATUS?", "STATUS", 3)
         except _BoxSilentError as error:
-            raise TriggerError(f"trigger box lost: {error}", code="trigger-lost") from error
+            raise TriggerError("trigger-lost", port=self._config.port, reason=str(error)) from error
         return boot_id, _number(count)
 
     def _ask(self, request: str, answer: str, fields: int, timeout_s: float = ANSWER_TIMEOUT_S) -> list[str]:
@@ -198,32 +178,21 @@ class SerialTrigger:
             while time.monotonic() < end_s:
                 texts = self._lines.feed(port.read(port.in_waiting or 1))
                 if self._lines.bad_lines - bad_before > BAD_LINES_LIMIT:
-                    raise TriggerError(
-                        f"more than {BAD_LINES_LIMIT} garbled lines for one answer from {self._config.port}",
-                        code="garbled-lines",
-                        remedy="Check the cable, and that this is a trigger box.",
-                        limit=BAD_LINES_LIMIT,
-                    )
+                    raise TriggerError("garbled-lines", what=f"more than {BAD_LINES_LIMIT} garbled lines")
                 for text in texts:
                     words = text.split()
                     if words[:1] == [answer] and len(words) == fields + 1:
                         return words[1:]
                     if words[:1] == ["ERR"]:
-                        raise TriggerError(
-                            f"the trigger box refused '{request}': {text[4:]}", code="trigger-refused"
-                        )
+                        raise TriggerError("trigger-refused", request=request, reason=text[4:])
         except (OSError, termios.error) as error:  # pyserial's SerialException is an OSError
             self._disconnect()
-            raise TriggerError(
-                f"trigger box lost: {self._config.port} is gone ({error})", code="trigger-lost"
-            ) from error
-        raise _BoxSilentError(f"no answer to '{request}' within {timeout_s:g} s on {self._config.port}")
+            raise TriggerError("trigger-lost", port=self._config.port, reason=str(error)) from error
+        raise _BoxSilentError(request=request, limit_s=timeout_s)
 
     def _require_port(self) -> Any:
         if self._port is None:
-            raise TriggerError(
-                "the trigger box is not open, or was lost", code="not-open", remedy="Open it again."
-            )
+            raise TriggerError("trigger-not-open")
         return self._port
 
     def _disconnect(self) -> None:
@@ -238,7 +207,7 @@ class _BoxSilentError(TriggerError):
 
 def _number(text: str) -> int:
     if not text.isdecimal():
-        raise TriggerError(f"the trigger box sent '{text}' where a number belongs", code="garbled-lines")
+        raise TriggerError("garbled-lines", what=f"'{text}' where a number belongs")
     return int(text)
 
 

@@ -24,8 +24,7 @@ from station.devices.base import fresh, ready
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import arm_held, control_ended, foreign_program, local_control
-from station.devices.ur_control import LIBRARY_REMEDY
-from station.devices.ur_dashboard import STOP, Dashboard, came
+from station.devices.ur_dashboard import STOP, Dashboard, DashboardError, came
 from station.devices.ur_end_cause import cause_of_end
 from station.devices.ur_link import POLL_S, UrLink, link_lost
 from station.devices.ur_moves import MoveWatch, check_goal
@@ -57,7 +56,8 @@ def library_installed() -> bool:
 def control_trouble(path: str) -> tuple[str, str]:
     """Say why this control path cannot be used, and the remedy; both empty: it can."""
     if path == "ur_rtde" and not library_installed():
-        return "ur_rtde is not installed", LIBRARY_REMEDY
+        missing = RobotError("ur-rtde-missing", reason="not found")
+        return missing.text, missing.remedy
     return "", ""
 
 
@@ -105,7 +105,7 @@ class UrRobot(UrLink):
         Call only after a motion approval. Raises RobotError.
         """
         if self._child is not None:
-            raise RobotError("control is already started", code="control-started")
+            raise RobotError("control-started")
         self._stop_reason, self._ended_by = "", None
         await self.idle()  # a child that is still ending keeps the registers
         await ready(self)
@@ -142,7 +142,7 @@ class UrRobot(UrLink):
         state = await fresh(self)
         if self.remote is False:
             raise local_control()
-        program = await dashboard.ask("programState")
+        _, _, program = (await dashboard.ask("programState")).partition(" ")
         if self._primary is not None:
             self._primary.started = ""
         if (trouble := arm_held(state) or foreign_program(state, program)) is not None:
@@ -173,13 +173,9 @@ class UrRobot(UrLink):
             await asyncio.sleep(POLL_S)
         child = self._child
         if child is None or not self.control:
-            raise self._ended_by or RobotError(
-                f"control is not started{self._why_stopped()}",
-                code="no-control",
-                remedy="Approve motion first.",
-            )
+            raise self._ended_by or RobotError("control-not-started", why=self._why_stopped())
         if self._moving:
-            raise RobotError("a move is already under way", code="moving")
+            raise RobotError("moving")
         self._moving, self._link_loss = True, ""
         try:
             await self._ready_to_move(child)
@@ -271,7 +267,7 @@ class UrRobot(UrLink):
         """
         child = self._child
         if child is None:
-            raise RobotError("control has ended", code="no-control")
+            raise RobotError("control-not-started", why="")
         if way is StopWay.KILLED:
             os.kill(child.pid, signal.SIGKILL)
             return
@@ -281,7 +277,7 @@ class UrRobot(UrLink):
         elif self.dashboard is not None and self.dashboard.alive:
             self.dashboard.send(STOP)
         else:
-            raise RobotError("the dashboard is not connected", code="dashboard")
+            raise DashboardError(host=self.config.host, reason="not connected")
 
     async def _one_way_ends(self) -> None:
         """Wait, at most `ONE_WAY_S`, until an arm that was stopped by one path alone rests."""
@@ -383,4 +379,4 @@ class UrRobot(UrLink):
 
 
 def _stopped(how: str = "") -> RobotError:
-    return RobotError(f"stopped{how}", code="stopped")
+    return RobotError("stopped", how=how)

@@ -23,7 +23,6 @@ from recordings.errors import ErrorData
 from recordings.files import open_regular
 from station.cell.config import ControlPath
 from station.cell.errors import RobotError
-from station.devices.news import APPROVE_AGAIN
 
 log = logging.getLogger(__name__)
 
@@ -108,11 +107,7 @@ class ControlChild:
                 )
         except OSError as error:
             ours.close()
-            raise RobotError(
-                f"the control process, which logs to {log_path}, cannot be started ({error})",
-                code="control-process",
-                remedy=f"Make room on this computer's disk or in its memory, {APPROVE_AGAIN}.",
-            ) from None
+            raise RobotError("control-not-spawned", log=log_path, reason=str(error)) from None
         return cls(process, ours, log_path)
 
     @property
@@ -127,9 +122,7 @@ class ControlChild:
         except TimeoutError:
             self.kill()
             await self.reap()
-            raise self._trouble(
-                f"the control process was not ready within {timeout_s:g} s and was killed", limit_s=timeout_s
-            ) from None
+            raise self._trouble(f"was not ready within {timeout_s:g} s and was killed") from None
         self.started_s = time.monotonic()
         self._beat_ns = 0  # heartbeats unanswered until now are no sign that the process hangs
         if answer.refused is not None or answer.died:
@@ -138,8 +131,7 @@ class ControlChild:
         if answer.died:
             raise self._death()
         if (told := answer.refused) is not None:
-            text = told.text + self.exit_description()
-            raise RobotError(text, code=told.code, remedy=told.remedy, **told.values)
+            raise RobotError.from_data(told)
         return answer.tcp or None
 
     async def heard(self) -> None:
@@ -153,12 +145,7 @@ class ControlChild:
                     await self._news.wait()
         except TimeoutError:
             self.check(patience_s=HEARD_S / 2)
-            raise RobotError(
-                f"no heartbeat of the session reached the control process within {HEARD_S:g} s",
-                code="no-heartbeat",
-                remedy=f"Reduce the load of this computer; see {self._log_path}.",
-                limit_s=HEARD_S,
-            ) from None
+            raise RobotError("no-heartbeat", limit_s=HEARD_S, log=self._log_path) from None
         self.check()
 
     def beat(self) -> None:
@@ -181,20 +168,17 @@ class ControlChild:
         }
         try:
             if not self._send(request):
-                raise self._trouble(f"the control process takes no requests{self.exit_description()}")
+                raise self._trouble(f"takes no requests{self.exit_description()}")
             async with asyncio.timeout(ACKNOWLEDGE_S):
                 reply = await answer
         except TimeoutError:
-            raise self._trouble(
-                f"the control process did not acknowledge the move within {ACKNOWLEDGE_S:g} s",
-                limit_s=ACKNOWLEDGE_S,
-            ) from None
+            raise self._trouble(f"did not acknowledge the move within {ACKNOWLEDGE_S:g} s") from None
         finally:
             self._moves.pop(self._number, None)
         if reply.died:
             raise self._death()
         if not reply.ok:
-            raise RobotError(f"the move was not started: {reply.error}", code="move-refused")
+            raise RobotError("move-refused", reason=reply.error)
 
     def stop(self) -> None:
         """Send the stop request to the child now. Never raises."""
@@ -205,19 +189,15 @@ class ControlChild:
         if self.gone.is_set():
             raise self._death()
         if self._beat_ns > self._answered_ns and time.monotonic_ns() - self._beat_ns > patience_s * 1e9:
-            raise self._trouble("the control process hangs, its watchdog stops the arm")
+            raise self._trouble("hangs, and its watchdog stops the arm")
         if self.kicks_refused:
-            raise RobotError(
-                "the watchdog of the control program could not be kicked: the session was busy for too long, "
-                "or the program stopped",
-                code="watchdog",
-            )
+            raise RobotError("watchdog")
 
     def _death(self) -> RobotError:
-        return self._trouble(f"the control process died{self.exit_description()}")
+        return self._trouble(f"died{self.exit_description()}")
 
-    def _trouble(self, text: str, **values: float) -> RobotError:
-        return RobotError(text, code="control-process", remedy=f"See {self._log_path}.", **values)
+    def _trouble(self, what: str) -> RobotError:
+        return RobotError("control-process", what=what, log=self._log_path)
 
     def _send(self, request: dict[str, object]) -> bool:
         try:

@@ -7,15 +7,11 @@ from enum import IntEnum
 from recordings.schema.messages import RobotState
 from station.cell.errors import RobotError, SafetyStopError
 from station.cell.status import ArmCondition
-from station.devices.news import APPROVE_AGAIN
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 
-NOT_STARTED_REMEDY = (
-    "Clear the pendant's messages, and look there why programs from the network are not started."
-)
 _RELEASE = "Release the brakes on the pendant"
-# Safety conditions that hold the arm, the gravest first: bits, modes, code, text, remedy.
-_SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str, str, str], ...] = (
+# Safety conditions that hold the arm, the gravest first: bits, modes, error code.
+_SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str], ...] = (
     (
         SafetyStatus.EMERGENCY_STOPPED
         | SafetyStatus.ROBOT_EMERGENCY_STOPPED
@@ -29,23 +25,13 @@ _SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str, str, str], ...] =
             }
         ),
         "emergency-stop",
-        "emergency stop",
-        "Make the cell safe, release the button, then power on and release the brakes",
     ),
     (
         SafetyStatus.FAULT | SafetyStatus.VIOLATION,
         frozenset({SafetyMode.FAULT, SafetyMode.VIOLATION}),
         "safety-fault",
-        "safety fault or violation",
-        "Read the pendant's log; only the pendant can clear it",
     ),
-    (
-        SafetyStatus.PROTECTIVE_STOPPED,
-        frozenset({SafetyMode.PROTECTIVE_STOP}),
-        "protective-stop",
-        "protective stop",
-        "Find what the arm ran into, then enable it again on the pendant",
-    ),
+    (SafetyStatus.PROTECTIVE_STOPPED, frozenset({SafetyMode.PROTECTIVE_STOP}), "protective-stop"),
     (
         SafetyStatus.SAFEGUARD_STOPPED,
         frozenset(
@@ -59,8 +45,6 @@ _SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str, str, str], ...] =
             }
         ),
         "safeguard-stop",
-        "safeguard stop",
-        "Close the guard (or clear the scanner) and reset it there",
     ),
     (
         SafetyStatus(0),
@@ -68,23 +52,9 @@ _SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str, str, str], ...] =
             {SafetyMode.SYSTEM_THREE_POSITION_ENABLING_STOP, SafetyMode.TP_THREE_POSITION_ENABLING_STOP}
         ),
         "enabling-stop",
-        "stopped by the three-position enabling switch",
-        "Switch the robot to automatic mode, or hold the switch in its middle position",
     ),
-    (
-        SafetyStatus.RECOVERY,
-        frozenset({SafetyMode.RECOVERY}),
-        "recovery-mode",
-        "recovery mode",
-        "Move the arm back inside its safety limits on the pendant",
-    ),
-    (
-        SafetyStatus.STOPPED_DUE_TO_SAFETY,
-        frozenset(),
-        "safety-stop",
-        "stopped for a safety reason",
-        "Read the pendant",
-    ),
+    (SafetyStatus.RECOVERY, frozenset({SafetyMode.RECOVERY}), "recovery-mode"),
+    (SafetyStatus.STOPPED_DUE_TO_SAFETY, frozenset(), "safety-stop"),
 )
 _MODES: dict[int, tuple[str, str]] = {
     RobotMode.NO_CONTROLLER: ("the controller is not running", "Restart the robot"),
@@ -100,40 +70,27 @@ _MODES: dict[int, tuple[str, str]] = {
 
 def safety_stop(state: RobotState) -> SafetyStopError | None:
     """Make the error for a safety stop; None without one. Bits and mode both count: either may come first."""
-    if (held := _held(state)) is None:
-        return None
-    code, what, remedy = held
-    return SafetyStopError(
-        what, code=code, remedy=f"{remedy}. Then acknowledge here and approve motion again."
-    )
-
-
-def _held(state: RobotState) -> tuple[str, str, str] | None:
-    """Find the safety condition that holds the arm: code, text, remedy; None: none does."""
-    for bits, modes, *held in _SAFETY:
+    for bits, modes, code in _SAFETY:
         if state.safety_status_bits & bits or state.safety_mode in modes:
-            return held[0], held[1], held[2]
+            return SafetyStopError(code, mode=safety_word(state))
     if state.safety_mode > SafetyMode.FAULT:  # all modes that were added later are stops
-        return "safety-stop", f"held by safety mode {safety_word(state)}", "Read the pendant"
+        return SafetyStopError("safety-stop", mode=safety_word(state))
     return None
 
 
 def condition(state: RobotState) -> ArmCondition:
     """Describe the arm's condition in words."""
-    if (stop := _held(state)) is not None:
-        held = f"{stop[1]}: {stop[2]}"
-    else:
-        held = str(not_powered(state) or "")
+    held = arm_held(state)
     mode = _word(RobotMode, state.robot_mode, "MODE")
-    return ArmCondition(mode, safety_word(state), program_word(state), held)
+    return ArmCondition(mode, safety_word(state), program_word(state), str(held or ""))
 
 
 def not_powered(state: RobotState) -> RobotError | None:
     if state.robot_mode == RobotMode.RUNNING:
         return None
     unknown = f"the robot is in mode {state.robot_mode}, which this software does not know"
-    what, remedy = _MODES.get(state.robot_mode, (unknown, "See the pendant"))
-    return RobotError(what, code="not-powered", remedy=f"{remedy}.", mode=state.robot_mode)
+    what, advice = _MODES.get(state.robot_mode, (unknown, "See the pendant"))
+    return RobotError("not-powered", what=what, advice=advice, mode=state.robot_mode)
 
 
 def arm_held(state: RobotState) -> RobotError | None:
@@ -148,11 +105,7 @@ def control_ended(state: RobotState) -> RobotError | None:
 
 
 def local_control() -> RobotError:
-    return RobotError(
-        "the robot is in local control",
-        code="local-control",
-        remedy=f"Switch the pendant to Remote (top right), {APPROVE_AGAIN}.",
-    )
+    return RobotError("local-control")
 
 
 def program_ended(runtime_state: int) -> RobotError:
@@ -163,34 +116,20 @@ def program_ended(runtime_state: int) -> RobotError:
     )
     if runtime_state in (RuntimeState.PAUSED, RuntimeState.PAUSING):
         by = "on the pendant"
-    return RobotError(
-        f"the control program was {_word(RuntimeState, runtime_state, 'IN STATE').lower()} {by}",
-        code="program-ended",
-        remedy="Look at the cell, acknowledge here and approve motion again.",
-        runtime_state=runtime_state,
-    )
+    state = _word(RuntimeState, runtime_state, "IN STATE").lower()
+    return RobotError("program-ended", state=state, by=by, runtime_state=runtime_state)
 
 
 def program_replaced(name: str) -> RobotError:
     """Make the error for another client's program that replaced the control program."""
-    return RobotError(
-        f"another client's program {f'({name}) ' if name else ''}replaced the control program",
-        code="program-replaced",
-        remedy="Keep that client from sending programs, acknowledge here and approve motion again.",
-        program=name,
-    )
+    return RobotError("program-replaced", program=name, called=f" ({name})" if name else "")
 
 
 def foreign_program(state: RobotState, name: str) -> RobotError | None:
     """Make the error where starting control would replace another program; None where none runs."""
     if state.runtime_state == RuntimeState.STOPPED:
         return None
-    return RobotError(
-        f"the program {name or 'on the robot'} is {program_word(state)}; starting control would replace it",
-        code="foreign-program",
-        remedy="Stop it on the pendant, then try again.",
-        program=name,
-    )
+    return RobotError("foreign-program", program=name, state=program_word(state))
 
 
 def program_word(state: RobotState) -> str:

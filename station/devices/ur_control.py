@@ -33,31 +33,17 @@ from station.cell.process import (
     die_with_parent,
     go_before_others,
 )
-from station.devices.ur_condition import NOT_STARTED_REMEDY
 
 BEAT_FRESH_NS = 100_000_000
 WATCHDOG_HZ = 5.0
 """Frequency of the controller's watchdog: it stops the script after 1/5 s without a reset."""
 MESSAGE_LIMIT = 4096
 LIBRARY_WORDS = {
-    "in use": (
-        "registers-in-use",
-        "another program controls the robot (its RTDE registers are in use)",
-        "Close that program, or the field bus on the pendant, then try again.",
-    ),
-    "remote control": (
-        "local-control",
-        "the robot is in local control",
-        "Switch the pendant to Remote (top right), then try again.",
-    ),
-    "start control script": (
-        "script-not-started",
-        "the control program did not start",
-        NOT_STARTED_REMEDY,
-    ),
+    "in use": "registers-in-use",
+    "remote control": "local-control",
+    "start control script": "script-not-started",
 }
-"""Parts of ur_rtde's messages (it has no error codes), in lower case → code, text, remedy."""
-LIBRARY_REMEDY = "Install it and restart the daemon, or set robot.control: script in the configuration."
+"""Parts of ur_rtde's messages (it has no error codes), in lower case → code."""
 
 
 class MotionServer:
@@ -142,15 +128,13 @@ def open_control(path: str, host: str) -> Any:
     try:
         from rtde_control import RTDEControlInterface
     except ImportError as error:
-        text = f"ur_rtde, for Python 3.10 to 3.12 on x86-64, is not installed ({error})"
-        raise RobotError(text, code="ur-rtde-missing", remedy=LIBRARY_REMEDY) from None
+        raise RobotError("ur-rtde-missing", reason=str(error)) from None
     try:
         return RTDEControlInterface(host)
     except RuntimeError as error:
         words = str(error).lower()
-        known = (what for said, what in LIBRARY_WORDS.items() if said in words)
-        code, text, remedy = next(known, ("control", f"control could not start: {error}", ""))
-        raise RobotError(text, code=code, remedy=remedy) from None
+        code = next((code for said, code in LIBRARY_WORDS.items() if said in words), "control")
+        raise RobotError(code, reason=str(error)) from None
 
 
 def main(path: str, host: str, descriptor: int, parent_pid: int) -> NoReturn:
@@ -164,7 +148,7 @@ def main(path: str, host: str, descriptor: int, parent_pid: int) -> NoReturn:
         control = open_control(path, host)
     except (RobotError, OSError) as error:
         if not isinstance(error, RobotError):
-            error = RobotError(f"control could not start: {error}", code="control")
+            error = RobotError("control", reason=str(error))
         channel.send(json.dumps({"refused": asdict(error.data)}).encode())
         os._exit(1)
     server = MotionServer(control, channel)

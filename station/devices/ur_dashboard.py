@@ -61,28 +61,21 @@ class Dashboard:
     @classmethod
     async def open(cls, host: str, timeout_s: float = 2.0) -> Dashboard:
         """Connect and wait for the greeting. Raises DashboardError."""
-        where = f"dashboard of {host} (port {PORT})"
         writer = None
         try:
             async with asyncio.timeout(timeout_s):
                 reader, writer = await _connect(host)
                 greeting = await reader.readline()
             if b"Dashboard Server" not in greeting:
-                raise DashboardError(
-                    f"{where}: unexpected greeting {greeting[:80]!r}", remedy="Check the robot's address."
-                )
+                raise DashboardError(host=host, reason=f"unexpected greeting {greeting[:80]!r}")
             return cls(host, reader, writer)
         except BaseException as error:
             if writer is not None:
                 writer.transport.abort()
             if isinstance(error, TimeoutError):
-                raise DashboardError(
-                    f"{where}: no answer within {timeout_s:g} s",
-                    remedy="Check the robot's address.",
-                    limit_s=timeout_s,
-                ) from None
+                raise DashboardError(host=host, reason=f"no answer within {timeout_s:g} s") from None
             if isinstance(error, OSError | ValueError):
-                raise DashboardError(f"{where}: {connect_trouble(error, 'Dashboard Server')}") from None
+                raise DashboardError(host=host, reason=connect_trouble(error, "Dashboard Server")) from None
             raise
 
     @property
@@ -95,7 +88,7 @@ class Dashboard:
             raise ValueError(f"the dashboard command {command!r} is never sent by this station")
         reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         if not self.alive:
-            reply.set_exception(DashboardError(f"the dashboard connection to {self._host} is gone"))
+            reply.set_exception(DashboardError(host=self._host, reason="the connection is gone"))
             return reply
         self._waiting.append(reply)
         self._writer.write(command.encode("ascii") + b"\n")
@@ -108,10 +101,8 @@ class Dashboard:
                 return await self.send(command)
         except TimeoutError:
             self._break("silent")
-            raise DashboardError(
-                f"dashboard of {self._host}: no reply to {command!r} within {timeout_s:g} s",
-                limit_s=timeout_s,
-            ) from None
+            reason = f"no reply to {command!r} within {timeout_s:g} s"
+            raise DashboardError(host=self._host, reason=reason) from None
 
     async def remote(self) -> bool | None:
         """Ask whether remote control is on; None where there is no such switch (CB3)."""
@@ -137,7 +128,7 @@ class Dashboard:
         while self._waiting:
             waiter = self._waiting.popleft()
             if not waiter.done():
-                waiter.set_exception(DashboardError(f"dashboard of {self._host}: {why}"))
+                waiter.set_exception(DashboardError(host=self._host, reason=why))
                 waiter.exception()  # mark as retrieved: without a caller asyncio would log it
 
     async def close(self) -> None:

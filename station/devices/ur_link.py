@@ -85,9 +85,7 @@ class UrLink:
         if self._supervisor is not None:
             return self.identity
         if not self.config.host:
-            raise RobotError(
-                "robot.host is empty", code="no-host", remedy="Give the robot's address in the configuration."
-            )
+            raise RobotError("no-host")
         try:
             await self._open()
         except BaseException:
@@ -115,11 +113,7 @@ class UrLink:
             async with asyncio.timeout(FIRST_STATE_S):
                 first = await asyncio.wrap_future(reader.started)
         except TimeoutError:
-            raise RobotError(
-                f"{host}: RTDE answers, but no state came within {FIRST_STATE_S:g} s",
-                code="no-state",
-                limit_s=FIRST_STATE_S,
-            ) from None
+            raise RobotError("no-state", host=host, limit_s=FIRST_STATE_S) from None
         self._primary = PrimaryReader(host)
         installation = await self._primary.first()
         if installation.tcp_offset is None:
@@ -133,23 +127,11 @@ class UrLink:
         if found.model and found.model not in MODELS:
             raise unsupported_model(found.model, host)
         if found.model and found.model != wanted.model:
-            raise RobotError(
-                f"the robot at {host} is a {found.model}, the configuration says {wanted.model}",
-                code="other-model",
-                remedy="Correct robot.model or robot.host.",
-            )
+            raise RobotError("other-model", host=host, model=found.model, configured=wanted.model)
         if wanted.serial and found.serial and found.serial != wanted.serial:
-            raise RobotError(
-                f"the robot at {host} has serial {found.serial}, the configuration says {wanted.serial}",
-                code="other-robot",
-                remedy="Correct robot.serial or robot.host.",
-            )
+            raise RobotError("other-robot", host=host, serial=found.serial, configured=wanted.serial)
         if self._lock is not None and found.serial != self.identity.serial:
-            raise RobotError(
-                f"another robot (serial {found.serial}) answers at {host} now",
-                code="robot-exchanged",
-                remedy="Finish this session, then restart the daemon.",
-            )
+            raise RobotError("robot-exchanged", host=host, serial=found.serial)
         self.remote = found.remote
 
     def _adopt(
@@ -287,19 +269,17 @@ class UrLink:
             return not_connected(self.config.host)
         if reader.ended is not None:
             return link_lost(reader.ended)
-        text, remedy = f"no news from the robot for {age_s * 1000:.0f} ms", "Check cable and network."
+        cause, remedy = "", "Check cable and network."
         if reader.stands_still:
-            text = f"the controller's clock stands still since {age_s * 1000:.0f} ms"
-            remedy = "Restart the controller."
+            cause, remedy = ": the controller's clock stands still", "Restart the controller."
         elif (waited := waited_share()) >= _BUSY_SHARE:
-            load = f"Reduce the load of this computer: programs wait for it {waited:.0%} of the time."
-            remedy = f"{load} {remedy}"
-        return StaleStateError(text, remedy=remedy, age_s=age_s, limit_s=limit_s)
+            cause, remedy = f": programs wait {waited:.0%} of the time for this computer", "Reduce its load."
+        return StaleStateError(age_s=age_s, limit_s=limit_s, cause=cause, advice=remedy)
 
     def at(self, host_monotonic_ns: int) -> RobotState:
         """Interpolate the state at a host time within the last 10 s; StaleStateError outside."""
         if self.reader is None:
-            raise StaleStateError("not connected to the robot", code="not-connected")
+            raise not_connected(self.config.host)
         return state_at(self.states(), self.clock(), host_monotonic_ns)
 
     def states(self) -> Sequence[RobotState]:
@@ -387,7 +367,7 @@ class UrLink:
             except StationError as error:
                 if self._trouble is None:
                     self._trouble_since_s = time.monotonic()
-                self._trouble = RobotError(error.text, code=error.code, remedy=error.remedy, **error.values)
+                self._trouble = RobotError.from_data(error.data)
             except Exception:
                 log.exception("the robot's supervision failed; it goes on")
 
@@ -412,15 +392,11 @@ class UrLink:
 
 
 def not_connected(host: str) -> StaleStateError:
-    return StaleStateError(f"no connection to the robot at {host}", code="not-connected")
+    return StaleStateError("not-connected", host=host)
 
 
 def link_lost(why: str) -> StaleStateError:
-    return StaleStateError(
-        f"connection to the robot lost ({why})",
-        code="link-lost",
-        remedy="Check cable, network and controller.",
-    )
+    return StaleStateError("link-lost", why=why)
 
 
 def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: object) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from recordings.schema.messages import RobotState, Vector6
 from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2
 from station.cell.errors import RobotError
-from station.devices.news import APPROVE_AGAIN, MOVING_S
+from station.devices.news import MOVING_S
 from station.devices.ur_condition import control_ended
 
 ARRIVED_RAD = 0.01
@@ -36,25 +36,14 @@ def check_goal(
     """Raise RobotError for an invalid goal: ur_rtde would send NaN and wrong lengths to the controller."""
     if len(joints_rad) != 6 or not all(math.isfinite(q) and abs(q) <= limit_rad for q in joints_rad):
         raise RobotError(
-            f"not six joint angles within ± {limit_rad:.2f} rad: {list(joints_rad)}",
-            code="bad-goal",
-            limit_rad=limit_rad,
+            "bad-goal", reason=f"not six joint angles within ± {limit_rad:.2f} rad: {joints_rad}"
         )
     if not SLOWEST_RAD_S <= speed_rad_s <= JOINT_SPEED_LIMIT_RAD_S:
-        raise RobotError(
-            f"joint speed {speed_rad_s} rad/s is not within {SLOWEST_RAD_S}…{JOINT_SPEED_LIMIT_RAD_S}",
-            code="bad-goal",
-            speed_rad_s=speed_rad_s,
-            limit_rad_s=JOINT_SPEED_LIMIT_RAD_S,
-        )
+        limits = f"{SLOWEST_RAD_S}…{JOINT_SPEED_LIMIT_RAD_S}"
+        raise RobotError("bad-goal", reason=f"joint speed {speed_rad_s} rad/s (limits {limits})")
     if not SLOWEST_RAD_S2 <= acceleration_rad_s2 <= JOINT_ACCELERATION_LIMIT_RAD_S2:
-        raise RobotError(
-            f"acceleration {acceleration_rad_s2} rad/s² is not within "
-            f"{SLOWEST_RAD_S2}…{JOINT_ACCELERATION_LIMIT_RAD_S2}",
-            code="bad-goal",
-            acceleration_rad_s2=acceleration_rad_s2,
-            limit_rad_s2=JOINT_ACCELERATION_LIMIT_RAD_S2,
-        )
+        limits = f"{SLOWEST_RAD_S2}…{JOINT_ACCELERATION_LIMIT_RAD_S2}"
+        raise RobotError("bad-goal", reason=f"acceleration {acceleration_rad_s2} rad/s² (limits {limits})")
 
 
 def operation_count(word: int) -> int:
@@ -101,15 +90,7 @@ class MoveWatch:
             raise trouble
         joint, off_rad = beside(self.start_rad, self.target_rad, state.joints_rad)
         if off_rad > STRAYED_RAD:
-            raise RobotError(
-                f"the arm is off the checked path: joint {joint + 1} by {math.degrees(off_rad):.1f}° "
-                f"(limit {math.degrees(STRAYED_RAD):.1f}°)",
-                code="off-path",
-                remedy="Look at the cell: something else commands the arm, or pushes it.",
-                joint=joint + 1,
-                off_rad=off_rad,
-                limit_rad=STRAYED_RAD,
-            )
+            raise RobotError("off-path", joint=joint + 1, off_rad=off_rad, limit_rad=STRAYED_RAD)
         distances = [abs(q - t) for q, t in zip(state.joints_rad, self.target_rad, strict=True)]
         distance_rad = max(distances)
         if abs(distance_rad - self._distance_rad) > PROGRESS_RAD:
@@ -126,14 +107,7 @@ class MoveWatch:
         if self._ended_s is None:
             self._ended_s = now_s
         if now_s - self._ended_s > MOVING_S:
-            raise RobotError(
-                f"the move ended {distance_rad:.3f} rad short on joint {joint + 1}: something else commanded "
-                "or stopped the arm",
-                code="ended-short",
-                joint=joint + 1,
-                distance_rad=distance_rad,
-                limit_rad=ARRIVED_RAD,
-            )
+            raise RobotError("ended-short", joint=joint + 1, distance_rad=distance_rad, limit_rad=ARRIVED_RAD)
         return False
 
     def _waiting(self, state: RobotState, now_s: float) -> None:
@@ -143,19 +117,9 @@ class MoveWatch:
         if fraction < SLIDER_STILL:
             self.notice = "the speed slider on the pendant is at 0: the arm waits for it"
             if idle_s > SLIDER_ZERO_S:
-                raise RobotError(
-                    f"the speed slider on the pendant stood at 0 for {SLIDER_ZERO_S:g} s",
-                    code="slider-zero",
-                    remedy=f"Raise it, {APPROVE_AGAIN}.",
-                    limit_s=SLIDER_ZERO_S,
-                )
+                raise RobotError("slider-zero", limit_s=SLIDER_ZERO_S)
             return
         if fraction < 0.995:
             self.notice = f"speed slider at {fraction * 100:.0f} %"
         if idle_s > NO_PROGRESS_S:
-            raise RobotError(
-                f"the arm has not moved for {NO_PROGRESS_S:g} s although a move is under way",
-                code="no-progress",
-                remedy="Look at the pendant.",
-                limit_s=NO_PROGRESS_S,
-            )
+            raise RobotError("no-progress", limit_s=NO_PROGRESS_S)

@@ -94,14 +94,7 @@ async def why_no_dashboard(host: str, error: DashboardError) -> RobotError:
         return error
     if version[0] < POLYSCOPE_X:
         return error
-    told = ".".join(map(str, version[:3]))
-    return RobotError(
-        f"the controller at {host} runs PolyScope X ({told}), which has no dashboard server: this station "
-        "cannot stop it by two ways and does not drive it",
-        code="polyscope-x",
-        remedy="Use an arm with PolyScope 3 or 5 (docs: Install).",
-        major=version[0],
-    )
+    return RobotError("polyscope-x", host=host, version=".".join(map(str, version[:3])))
 
 
 def _rtde_version(host: str) -> tuple[int, int, int, int]:
@@ -110,12 +103,7 @@ def _rtde_version(host: str) -> tuple[int, int, int, int]:
 
 
 def unsupported_model(model: str, host: str) -> RobotError:
-    return RobotError(
-        f"the robot at {host} is a {model}, which this station does not support",
-        code="unsupported-model",
-        remedy=f"Use one of {', '.join(MODELS)} (docs: Install).",
-        model=model,
-    )
+    return RobotError("unsupported-model", host=host, model=model, models=", ".join(MODELS))
 
 
 async def check_port(host: str, port: int) -> None:
@@ -141,17 +129,10 @@ async def _port_problem(host: str, port: int) -> RobotError | None:
                 writer.transport.abort()
     except TimeoutError:
         if accepted:
-            return RobotError(
-                f"{where} accepts connections and says nothing: programs sent there would be lost",
-                code="port-silent",
-                remedy=f"Switch the {_SERVICES[port]} on (PolyScope 5.17 and later: Settings → Security → "
-                "Services), and check what stands between: firewall, router, port forwarding.",
-                limit_s=CONNECT_S,
-            )
-        text = f"{where} did not answer within {CONNECT_S:g} s"
-        return RobotError(text, code="port-closed", remedy="Check cable, address and firewall.")
+            return RobotError("port-silent", where=where, service=_SERVICES[port])
+        return RobotError("port-closed", where=where, reason=f"no answer within {CONNECT_S:g} s")
     except OSError as error:
-        return RobotError(f"{where}: {connect_trouble(error, _SERVICES[port])}", code="port-closed")
+        return RobotError("port-closed", where=where, reason=connect_trouble(error, _SERVICES[port]))
     return None
 
 
@@ -174,11 +155,7 @@ class RobotLock:
             self._held.listen(1)
         except OSError as error:
             self._held.close()
-            raise RobotError(
-                f"robot {name} is owned by another station on this computer ({_owner(address) or error})",
-                code="robot-owned",
-                remedy="Use that one, or end it first.",
-            ) from None
+            raise RobotError("robot-owned", robot=name, owner=_owner(address) or str(error)) from None
 
     def release(self) -> None:
         self._held.close()

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 from station.cell.errors import RobotError
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, RtdeError, RtdeLink, RuntimeState
-from station.devices.ur_condition import NOT_STARTED_REMEDY
 from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
 
 SCRIPT_PORT = 30002
@@ -238,22 +237,14 @@ class ScriptControl:
         sequence = random.randrange(1, 2**30)  # so that an earlier script's answer is not taken for ours
         self._write(sequence, Command.NONE)
         if not self._wait(lambda: self._samples > SETTLE_SAMPLES, HANDSHAKE_S):
-            raise RtdeError(f"no robot state came within {HANDSHAKE_S:g} s", code="no-state")
+            raise RtdeError("no-state", host=host, limit_s=HANDSHAKE_S)
         if self._told.program not in (RuntimeState.STOPPED, RuntimeState.STOPPING):
-            raise RobotError(
-                "another program is playing on the robot",
-                code="program-playing",
-                remedy="Stop it on the pendant, then try again.",
-            )
+            raise RobotError("program-playing")
         with socket.create_connection((host, SCRIPT_PORT), HANDSHAKE_S) as upload:
             upload.sendall(script(sequence).encode("ascii"))
             # Keep it open until the script answers: closing with unread data could discard the text.
             if not self._wait(lambda: self._plays() and self._told.answer == sequence, START_S):
-                raise RobotError(
-                    "the control program did not start",
-                    code="script-not-started",
-                    remedy=NOT_STARTED_REMEDY,
-                )
+                raise RobotError("script-not-started")
 
     # -- the six calls ----------------------------------------------------------------------------------
 

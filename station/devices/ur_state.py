@@ -132,7 +132,7 @@ class StateReader(threading.Thread):
                 self._stop_read.close()
             self.ended = why
             if not self.started.done():
-                self.started.set_exception(RtdeError(f"robot state of {self.host}: {why}"))
+                self.started.set_exception(RtdeError(reason=f"robot state of {self.host}: {why}"))
             self._on_end(why)
 
     def close(self) -> None:
@@ -186,7 +186,7 @@ class StateReader(threading.Thread):
             while True:
                 ready = poller.poll(SILENCE_S * 1000)
                 if not ready:
-                    raise RtdeError(f"no data from the robot for {SILENCE_S:g} s")
+                    raise RtdeError(reason=f"no data from the robot for {SILENCE_S:g} s")
                 if any(fd == self._stop_read.fileno() for fd, _ in ready):
                     return
                 with self._reading:
@@ -204,7 +204,7 @@ class StateReader(threading.Thread):
             except BlockingIOError:
                 return
             if not data:
-                raise RtdeError("the robot closed the connection")
+                raise RtdeError(reason="the robot closed the connection")
             monotonic_ns, wall_ns = self._arrival(ancillary)
             for kind, payload in rtde.packets.feed(data):
                 self._take(kind, payload, recipe, monotonic_ns, wall_ns)
@@ -275,18 +275,14 @@ def _wall_ahead_ns() -> int:
 def state_at(history: Sequence[RobotState], clock: ClockFit | None, host_monotonic_ns: int) -> RobotState:
     """Interpolate at a host time; modes and bits are the older neighbour's. StaleStateError outside."""
     if clock is None or len(history) < 2:
-        raise StaleStateError("too few robot states yet to tell where the arm was", code="no-history")
+        raise StaleStateError("no-history")
     controller_s = clock.to_device_s(host_monotonic_ns)
     right = bisect_left(history, controller_s, key=lambda s: s.stamps.controller_s)
     if right == len(history):
         late_s = controller_s - history[-1].stamps.controller_s
-        raise StaleStateError(
-            f"the newest robot state is {late_s * 1000:.0f} ms older than the asked time", late_s=late_s
-        )
+        raise StaleStateError("not-yet", late_s=late_s)
     if right == 0 and history[0].stamps.controller_s > controller_s:
-        raise StaleStateError(
-            "the asked time lies before the robot states that are kept (10 s)", code="no-history"
-        )
+        raise StaleStateError("no-history")
     before, after = history[max(right - 1, 0)], history[max(right, 1)]
     span_s = after.stamps.controller_s - before.stamps.controller_s
     fraction = (controller_s - before.stamps.controller_s) / span_s

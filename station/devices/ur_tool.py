@@ -59,9 +59,6 @@ PAYLOAD_TOLERANCE_KG = 0.005
 CENTRE_TOLERANCE_M = 0.001
 SKEW_S = 0.016
 """Largest time between joints and tool pose of one sample: two cycles of a CB3."""
-_MODEL_REMEDY = "Check robot.model and robot.kinematics in the configuration."
-_CHANGED = "the TCP offset on the pendant was changed during the session"
-_CHANGED_REMEDY = "Set it back, or finish this session and restart the daemon."
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,7 @@ def read_state(payload: bytes) -> Installation:
     while at + _HEADER.size <= len(payload):
         size, kind = _HEADER.unpack_from(payload, at)
         if size < _HEADER.size or at + size > len(payload):
-            raise PrimaryError(f"a sub-package of the robot state claims {size} bytes", size_bytes=size)
+            raise PrimaryError(reason=f"a part of the robot state claims {size} bytes")
         body = payload[at + _HEADER.size : at + size]
         if kind == CARTESIAN_INFO and len(body) >= _CARTESIAN.size:
             offset = _six(_CARTESIAN.unpack_from(body)[6:])
@@ -110,7 +107,7 @@ def program_started(payload: bytes) -> str:
 
 def _six(values: Sequence[float]) -> Vector6:
     if not all(map(math.isfinite, values)):
-        raise PrimaryError("the robot state holds a number that is not finite")
+        raise PrimaryError(reason="the robot state holds a number that is not finite")
     return vector6(values)
 
 
@@ -168,11 +165,7 @@ class PrimaryReader:
 async def _message(reader: asyncio.StreamReader) -> tuple[int, bytes]:
     size, kind = _HEADER.unpack(await reader.readexactly(_HEADER.size))
     if not _HEADER.size <= size <= MESSAGE_LIMIT:
-        raise PrimaryError(
-            f"a message on port {PORT} claims {size} bytes",
-            remedy="Check the robot's address.",
-            size_bytes=size,
-        )
+        raise PrimaryError(reason=f"a message claims {size} bytes")
     return kind, await reader.readexactly(size - _HEADER.size)
 
 
@@ -194,14 +187,7 @@ class TcpCheck:
         self._first = _flange_from_tcp(self._model, first)
         length_m = float(np.linalg.norm(self._first[:3, 3]))
         if length_m > LONGEST_M:
-            raise RobotError(
-                f"the controller's tool pose lies {length_m:.2f} m from the flange pose of a {model.name} "
-                f"(limit {LONGEST_M:g} m)",
-                code="tcp-too-far",
-                remedy="Correct robot.model, or the TCP on the pendant (Installation → TCP).",
-                distance_m=length_m,
-                limit_m=LONGEST_M,
-            )
+            raise RobotError("tcp-too-far", model=model.name, distance_m=length_m, limit_m=LONGEST_M)
         if self._stated is not None:
             self.agree(self._stated)
 
@@ -213,8 +199,7 @@ class TcpCheck:
         """
         assert self._stated is not None
         ours, theirs = (forward(m, first.joints_rad) for m in (self._model, model))
-        what = f"the controller's own kinematics are not those of a {self._model.name}"
-        _compare(theirs, ours, FACTORY_LIMIT, what, "other-kinematics", _MODEL_REMEDY)
+        _compare(theirs, ours, FACTORY_LIMIT, "other-kinematics", self._model.name)
         own = _flange_from_tcp(model, first)
         if _exceeds(difference(own, _pose(self._stated)), CALIBRATED_TOLERANCE):
             log.warning("the kinematics stated by the controller do not explain its tool pose; using ours")
@@ -240,8 +225,7 @@ class TcpCheck:
 
     def agree(self, stated: Vector6) -> None:
         """Raise RobotError unless the stated offset explains the controller's tool pose."""
-        what = "our flange pose and the controller's tool pose do not fit its TCP offset"
-        _compare(self._first, _pose(stated), self._tolerance, what, "tcp-mismatch", _MODEL_REMEDY)
+        _compare(self._first, _pose(stated), self._tolerance, "tcp-mismatch", self._model.name)
 
     def check(self, state: RobotState, installation: Installation) -> None:
         """Raise RobotError when the TCP on the pendant differs from that at connect.
@@ -250,13 +234,12 @@ class TcpCheck:
         """
         offset = installation.tcp_offset
         if self._stated is not None and offset is not None and offset != self._stated:
-            now = _pose(offset)
-            _compare(now, _pose(self._stated), STATED_TOLERANCE, _CHANGED, "tcp-changed", _CHANGED_REMEDY)
+            _compare(_pose(offset), _pose(self._stated), STATED_TOLERANCE, "tcp-changed", self._model.name)
         now = _flange_from_tcp(self._model, state)
         turned_rad = SKEW_S * sum(map(abs, state.joint_speeds_rad_s))
         reach_m = float(np.linalg.norm(state.tcp_pose[:3])) + LONGEST_M
         tolerance = (self._tolerance[0] + turned_rad * reach_m, self._tolerance[1] + turned_rad)
-        _compare(now, self._first, tolerance, _CHANGED, "tcp-changed", _CHANGED_REMEDY)
+        _compare(now, self._first, tolerance, "tcp-changed", self._model.name)
 
 
 def check_payload(now: Payload, first: Payload) -> None:
@@ -264,13 +247,7 @@ def check_payload(now: Payload, first: Payload) -> None:
     centre_off_m = math.dist(now.centre_m, first.centre_m)
     if abs(now.mass_kg - first.mass_kg) > PAYLOAD_TOLERANCE_KG or centre_off_m > CENTRE_TOLERANCE_M:
         raise RobotError(
-            f"the payload on the pendant was changed during the session ({first.mass_kg:.2f} → "
-            f"{now.mass_kg:.2f} kg, its centre by {1000 * centre_off_m:.0f} mm)",
-            code="payload-changed",
-            remedy=_CHANGED_REMEDY,
-            before_kg=first.mass_kg,
-            now_kg=now.mass_kg,
-            centre_off_m=centre_off_m,
+            "payload-changed", before_kg=first.mass_kg, now_kg=now.mass_kg, centre_off_m=centre_off_m
         )
 
 
@@ -286,16 +263,13 @@ def _exceeds(delta: Array, tolerance: tuple[float, float]) -> bool:
     return bool(np.linalg.norm(delta[:3]) > tolerance[0] or np.linalg.norm(delta[3:]) > tolerance[1])
 
 
-def _compare(
-    found: Array, reference: Array, tolerance: tuple[float, float], what: str, code: str, remedy: str
-) -> None:
+def _compare(found: Array, reference: Array, tolerance: tuple[float, float], code: str, model: str) -> None:
     delta = difference(found, reference)
     if _exceeds(delta, tolerance):
         shift_m, turn_rad = float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
         raise RobotError(
-            f"TCP mix-up: {what} (by {shift_m * 1000:.1f} mm, {math.degrees(turn_rad):.2f}°)",
-            code=code,
-            remedy=remedy,
+            code,
+            model=model,
             shift_m=shift_m,
             limit_m=tolerance[0],
             turn_rad=turn_rad,

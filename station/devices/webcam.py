@@ -24,7 +24,6 @@ from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming
 from station.devices.base import DeviceThread
 from station.devices.discovery import kernel_text
-from station.devices.frames import RETAKE
 
 T = TypeVar("T")
 LATENCY_S = 0.2
@@ -99,12 +98,7 @@ class WebcamCamera:
         return running.result()
 
     def _late(self, timeout_s: float) -> CameraError:
-        return CameraError(
-            f"webcam {self._config.device} gave no image within {timeout_s:g} s",
-            code="no-image",
-            remedy=f"{RETAKE} Check the camera's cable, and end other programs that use it.",
-            limit_s=timeout_s,
-        )
+        return CameraError("no-image", limit_s=timeout_s)
 
     def _open(self) -> None:
         self._release()
@@ -113,20 +107,11 @@ class WebcamCamera:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
         video = cv2.VideoCapture(int(device) if device.isdecimal() else device)
         if not video.isOpened():
-            raise CameraError(
-                f"no webcam at {device}",
-                code="no-camera",
-                remedy="Check its cable and camera.device (ls /dev/v4l/by-id), the group 'video', and other "
-                "programs that use it.",
-            )
+            raise CameraError("no-webcam", device=device)
         found = _identity(device)
         if self.identity.serial not in ("", found.serial):
-            raise CameraError(
-                f"{device} is another camera now: {found.model} {found.serial} for {self.identity.model} "
-                f"{self.identity.serial}",
-                code="other-camera",
-                remedy="Name it by its link in /dev/v4l/by-id.",
-            )
+            before, now = (f"{camera.model} {camera.serial}" for camera in (self.identity, found))
+            raise CameraError("other-webcam", device=device, now=now, before=before)
         self._video, self.identity = video, found
         try:
             self._set_up(video)
@@ -147,18 +132,10 @@ class WebcamCamera:
         if video.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE):
             video.set(cv2.CAP_PROP_EXPOSURE, config.exposure_us / _EXPOSURE_UNIT_US)
         if video.get(cv2.CAP_PROP_AUTOFOCUS) > 0:
-            raise CameraError(
-                "the webcam's autofocus cannot be switched off: each image would have other intrinsics",
-                code="autofocus",
-                remedy="Switch it off with the maker's program, or use another camera.",
-            )
+            raise CameraError("autofocus")
         size = round(video.get(cv2.CAP_PROP_FRAME_WIDTH)), round(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
         if wanted not in (None, size):
-            raise CameraError(
-                f"the webcam gives {size[0]}×{size[1]}, asked were {wanted}",
-                code="camera-refused",
-                remedy="Set camera.region to a size that `v4l2-ctl --list-formats-ext` shows.",
-            )
+            raise CameraError("webcam-size", given=f"{size[0]}×{size[1]}", wanted=str(wanted))
         self._fixed = _readable(video)
 
     def _release(self) -> None:
@@ -170,7 +147,7 @@ class WebcamCamera:
         """Return the open device; after it was lost, open it again."""
         if self._video is None:
             if not self.identity.serial:
-                raise CameraError("the camera is not open", code="not-open")
+                raise CameraError("not-open")
             self._open()
         assert self._video is not None
         return self._video
@@ -198,21 +175,13 @@ class WebcamCamera:
     def _check(self, video: cv2.VideoCapture) -> None:
         now = _readable(video)
         if now != self._fixed:
-            raise CameraError(
-                f"the webcam stands at {now}, set were {self._fixed}: something else changes it",
-                code="settings-changed",
-                remedy=RETAKE,
-            )
+            raise CameraError("settings-changed", found=str(now), wanted=str(self._fixed))
 
     def _grab(self, video: cv2.VideoCapture) -> int:
         """Grab the next frame; return its arrival (host monotonic ns), by its stamp if there is one."""
         if not video.grab():
             self._release()
-            raise CameraError(
-                f"webcam {self._config.device} is gone",
-                code="camera-gone",
-                remedy="Check its cable; it is opened again when it is back.",
-            )
+            raise CameraError("camera-gone", camera=self._config.device)
         now_ns = time.monotonic_ns()
         stamp_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         return stamp_ns if 0 <= now_ns - stamp_ns < _FOUND_AT_S * 1e9 else now_ns
@@ -220,9 +189,7 @@ class WebcamCamera:
     def _image(self, video: cv2.VideoCapture, arrived_ns: int) -> Image:
         good, pixels = video.retrieve()
         if not good:
-            raise CameraError(
-                "an image of the webcam cannot be decoded", code="frame-incomplete", remedy=RETAKE
-            )
+            raise CameraError("frame-incomplete", reason="it cannot be decoded")
         self._seen += 1
         if grey := self._config.pixel_format.startswith("Mono"):
             pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
@@ -253,11 +220,7 @@ def _wanted_size(config: CameraConfig) -> tuple[int, int] | None:
         return (config.model.width, config.model.height) if config.model is not None else None
     x, y, width, height = config.region
     if (x, y) != (0, 0):
-        raise CameraError(
-            f"a webcam has no region that begins at {x}, {y}",
-            code="camera-refused",
-            remedy="Begin camera.region with 0, 0.",
-        )
+        raise CameraError("webcam-region", x=x, y=y)
     return width, height
 
 

@@ -31,7 +31,7 @@ async def test_stop_in_mid_move(cell: Make, model: str) -> None:
         await move
     await c.stops()
     await c.stays_at_rest()
-    with raises("no-control"):
+    with raises("control-not-started"):
         await c.robot.move(c.joints_rad(), 0.5, 1.0)
 
 

@@ -113,7 +113,7 @@ async def test_a_recorded_picture_that_cannot_be_decoded_is_the_cameras_error(tm
 
 async def test_the_played_robot_needs_a_go_and_known_joints(recording: Path) -> None:
     robot = PlaybackRobot(recording)
-    with raises("no-control"):
+    with raises("control-not-started"):
         await robot.move(STARTS[1], 0.6, 1.0)
     await robot.start_control()
     with raises("not-recorded"):

@@ -66,7 +66,7 @@ async def test_a_missing_port_names_port_and_remedy() -> None:
 
 async def test_a_closed_box_is_refused_and_can_be_opened_again(trigger: SerialTrigger) -> None:
     await trigger.close()
-    with raises("not-open"):
+    with raises("trigger-not-open"):
         await trigger.fire()
     await trigger.open()
     assert (await trigger.fire()).count == 1

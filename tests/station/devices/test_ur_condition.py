@@ -68,5 +68,5 @@ def test_every_mode_but_running_says_what_to_do(mode: RobotMode) -> None:
 def test_control_starts_only_where_no_program_runs_and_ours_must_play(state: RuntimeState) -> None:
     foreign = foreign_program(now(runtime_state=state), "pick.urp")
     assert (foreign is None) == (state is RuntimeState.STOPPED)
-    assert foreign is None or foreign.values == {"program": "pick.urp"}
+    assert foreign is None or foreign.values["program"] == "pick.urp"
     assert (control_ended(now(runtime_state=state)) is None) == (state is RuntimeState.PLAYING)

@@ -335,5 +335,5 @@ async def test_a_stop_is_acknowledged_by_its_answer_and_by_the_end(parent: Paren
 async def test_a_computer_that_starts_no_process_is_told_of_in_words(tmp_path: Path) -> None:
     in_the_way = tmp_path / "log"
     in_the_way.touch()
-    with raises("control-process"):
+    with raises("control-not-spawned"):
         ControlChild.spawn("127.0.0.1", in_the_way / "control.log")

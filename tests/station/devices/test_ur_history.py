@@ -65,7 +65,7 @@ def test_an_arm_at_rest_keeps_its_pose_to_the_bit() -> None:
 
 
 def test_what_lies_outside_of_the_samples_is_not_guessed() -> None:
-    with raises("stale-state"):
+    with raises("not-yet"):
         state_at(HISTORY, CLOCK, host_ns(10.042))
     with raises("no-history"):
         state_at(HISTORY, CLOCK, host_ns(9.99))

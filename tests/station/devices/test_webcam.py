@@ -119,9 +119,13 @@ async def test_an_autofocus_that_stays_on_is_refused(controls: type[Controls], p
         await WebcamCamera(CameraConfig(driver="webcam", device=pictures)).open()
 
 
-@pytest.mark.parametrize("region", [(0, 0, 800, 600), (8, 0, 320, 240)])
-async def test_a_size_that_it_has_not_is_refused(pictures: str, region: tuple[int, int, int, int]) -> None:
-    with raises("camera-refused"):
+@pytest.mark.parametrize(
+    ("region", "code"), [((0, 0, 800, 600), "webcam-size"), ((8, 0, 320, 240), "webcam-region")]
+)
+async def test_a_size_that_it_has_not_is_refused(
+    pictures: str, region: tuple[int, int, int, int], code: str
+) -> None:
+    with raises(code):
         await WebcamCamera(CameraConfig(driver="webcam", device=pictures, region=region)).open()
 
 
@@ -138,7 +142,7 @@ async def test_a_webcam_that_is_gone_is_opened_again(controls: type[Controls], p
 
 
 async def test_no_webcam_at_all() -> None:
-    with raises("no-camera"):
+    with raises("no-webcam"):
         await WebcamCamera(CameraConfig(driver="webcam", device="/dev/video-none")).open()
 
 

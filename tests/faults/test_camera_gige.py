@@ -49,20 +49,6 @@ async def test_18_an_incomplete_frame_is_refused_and_the_next_one_good(server: S
         await camera.close()
 
 
-async def test_19_frames_nobody_asked_for_are_noticed(server: SimulatedGige) -> None:
-    camera = AravisCamera(CONFIG)
-    await camera.open()
-    try:
-        await camera.capture()
-        server.inject("pulse")
-        await asyncio.sleep(0.3)
-        with raises("surplus-frames", frames=1):
-            await camera.capture()
-        await camera.capture()
-    finally:
-        await camera.close()
-
-
 async def test_23_settings_changed_behind_our_back_are_refused(server: SimulatedGige) -> None:
     camera = AravisCamera(CONFIG)
     await camera.open()

@@ -24,9 +24,3 @@ async def test_a_resting_camera_shows_no_motion_and_a_ringing_one_does(camera: R
     assert max([await motion_px(camera) for _ in range(3)]) > 1.0
     await camera.inject("ringing")
     assert await motion_px(camera) < 0.25
-
-
-async def test_glimpses_take_no_number_and_use_up_no_trigger(camera: RenderedCamera) -> None:
-    first = await camera.capture()
-    await camera.glimpse()
-    assert (await camera.capture()).frame_id in (first.frame_id + 1, 1)

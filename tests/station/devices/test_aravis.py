@@ -129,27 +129,6 @@ async def test_every_pixel_format_arrives(server: SimulatedGige, name: str) -> N
     assert picture.pixel_format == ("BGR8" if name == "RGB8" else name)
 
 
-async def test_the_cameras_clock_is_known_within_its_bound(server: SimulatedGige) -> None:
-    async with Opened() as camera:
-        before_ns = time.monotonic_ns()
-        picture = await camera.capture()
-        after_ns = time.monotonic_ns()
-    assert picture.time is not None and picture.time.source == "latched"
-    stamps, middle_ns, bound_s = picture.stamps, picture.time.host_monotonic_ns, picture.time.bound_s
-    assert bound_s < 0.02
-    assert before_ns - bound_s * 1e9 < middle_ns < after_ns + bound_s * 1e9
-    assert abs(stamps.device_ns - before_ns) > 1e9, "the device's epoch is another"
-
-
-async def test_a_preview_takes_no_sequence_number(server: SimulatedGige) -> None:
-    async with Opened() as camera:
-        first = await camera.capture()
-        preview = await camera.preview()
-        second = await camera.capture()
-    assert preview is not None and number_of(preview) == number_of(first) + 1
-    assert (first.sequence, second.sequence) == (0, 1) and number_of(second) == 2
-
-
 class Box:
     """A trigger box whose pulses reach the simulated camera's line; it can forget or add some."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
 import socket
 import sys
@@ -122,11 +123,31 @@ def test_a_script_that_took_no_kick_is_never_kicked_again(child: Conversation) -
     assert not answers[2]["ok"] and "moveJ" not in child.library.names
 
 
-@pytest.mark.parametrize("before", [[], [beat(age_ns=10 * BEAT_FRESH_NS)]])
-def test_nothing_moves_without_a_heartbeat(child: Conversation, before: list[dict[str, Any]]) -> None:
-    answer = child.say(*before, move())[-1]
-    assert answer == {"id": 7, "ok": False, "error": "the session's heartbeat is missing"}
-    assert "moveJ" not in child.library.names
+STOP = {"do": "stop", "deceleration": 4.0}
+FRESH = beat(age_ns=-3600 * 10**9)
+"""Fresh for the next hour."""
+
+
+@pytest.mark.parametrize(
+    ("deaf", "before", "joints"),
+    [
+        (set(), [], GOAL),
+        (set(), [beat(age_ns=10 * BEAT_FRESH_NS)], GOAL),
+        ({"setWatchdog"}, [FRESH], GOAL),
+        (set(), [FRESH, STOP, FRESH], GOAL),
+        *(
+            (set(), [FRESH], joints)
+            for joints in ([0.0] * 5, [0.0] * 7, [math.nan, *[0.0] * 5], [math.inf] * 6)
+        ),
+    ],
+    ids=["no heartbeat", "an old heartbeat", "no watchdog", "after a stop", "5", "7", "nan", "inf"],
+)
+def test_nothing_moves(
+    child: Conversation, deaf: set[str], before: list[dict[str, Any]], joints: list[float]
+) -> None:
+    child.library.deaf = deaf
+    answer = child.say(*before, move(joints))[-1]
+    assert not answer["ok"] and answer["error"] and "moveJ" not in child.library.names
 
 
 def test_the_watchdog_is_armed_before_every_move_and_moves_are_asynchronous(child: Conversation) -> None:
@@ -137,31 +158,11 @@ def test_the_watchdog_is_armed_before_every_move_and_moves_are_asynchronous(chil
     assert ("moveJ", (True,)) in child.library.calls
 
 
-def test_nothing_moves_when_the_watchdog_cannot_be_armed(child: Conversation) -> None:
-    child.library.deaf = {"setWatchdog"}
-    answers = child.say(beat(), move())
-    assert not answers[-1]["ok"] and "moveJ" not in child.library.names
-
-
-@pytest.mark.parametrize(
-    "joints", [[0.0] * 5, [0.0] * 7, [float("nan"), *[0.0] * 5], [float("inf"), *[0.0] * 5]]
-)
-def test_numbers_the_library_would_pass_on_are_refused(child: Conversation, joints: list[float]) -> None:
-    answers = child.say(beat(), move(joints))
-    assert "six finite joint angles" in answers[-1]["error"] and "moveJ" not in child.library.names
-
-
 def test_a_stop_is_the_one_that_the_librarys_script_takes_for_a_stop_of_the_joints(
     child: Conversation,
 ) -> None:
-    assert child.say({"do": "stop", "deceleration": 4.0}) == [{"stopped": True}]
+    assert child.say(STOP) == [{"stopped": True}]
     assert child.library.calls[0] == ("stopJ", (False,))
-
-
-def test_nothing_moves_after_a_stop(child: Conversation) -> None:
-    answers = child.say(beat(), {"do": "stop", "deceleration": 4.0}, beat(), move())
-    assert answers[-1] == {"id": 7, "ok": False, "error": "a stop was asked for"}
-    assert "moveJ" not in child.library.names
 
 
 # -- the parent's side, with the real library -----------------------------------------------------------
@@ -324,7 +325,7 @@ async def test_a_process_that_reads_nothing_does_not_hold_the_loop_up(parent: Pa
 
 async def test_a_stop_is_acknowledged_by_its_answer_and_by_the_end(parent: Parent, tmp_path: Path) -> None:
     parent.child.stop()
-    assert await parent.asked() == {"do": "stop", "deceleration": 4.0}
+    assert await parent.asked() == STOP
     parent.answer({"stopped": True})
     await asyncio.wait_for(parent.child.stop_acknowledged, PATIENCE_S)
     dying = Parent(tmp_path)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from station.devices.ur_dashboard import PORT, Dashboard, DashboardError
-from station.devices.ur_probe import identify, probe
+from station.devices.ur_probe import ProbeResult, identify, probe
 from tests.codes import raises
 from tests.patience import PATIENCE_S
 
@@ -59,20 +59,20 @@ async def test_answers_keep_their_order_without_waiting(serve: Serve) -> None:
     await dashboard.close()
 
 
-async def test_the_e_series_leaves_its_letter_out(serve: Serve) -> None:
-    dashboard = await Dashboard.open(await serve(E_SERIES))
-    found = await identify(dashboard)
-    assert (found.model, found.serial, found.version) == ("UR10e", "20195500001", (5, 11, 1, 108318))
-    assert found.remote is False and found.version[0] == 5
-    await dashboard.close()
-
-
-async def test_an_old_controller_that_knows_few_questions(serve: Serve) -> None:
-    dashboard = await Dashboard.open(
-        await serve({"PolyscopeVersion": "3.5.3.10825", "get robot model": "UR10"})
-    )
-    found = await identify(dashboard)
-    assert (found.model, found.serial, found.remote) == ("UR10", "", None)
+@pytest.mark.parametrize(
+    ("answers", "found"),
+    [
+        (E_SERIES, ProbeResult("UR10e", "20195500001", (5, 11, 1, 108318), False)),
+        (
+            {"PolyscopeVersion": "3.5.3.10825", "get robot model": "UR10"},
+            ProbeResult("UR10", "", (3, 5, 3, 10825)),
+        ),
+    ],
+    ids=["e-Series, which leaves its letter out", "an old controller that knows few questions"],
+)
+async def test_a_robot_is_identified(serve: Serve, answers: dict[str, str], found: ProbeResult) -> None:
+    dashboard = await Dashboard.open(await serve(answers))
+    assert await identify(dashboard) == found
     await dashboard.close()
 
 

@@ -10,6 +10,8 @@ from station.cell.status import ArmCondition
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 
 _RELEASE = "Release the brakes on the pendant"
+_ACKNOWLEDGE = " Then acknowledge here and approve motion again."
+"""End of the remedy of a safety stop, where one is latched."""
 # Safety conditions that hold the arm, the gravest first: bits, modes, error code.
 _SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str], ...] = (
     (
@@ -82,7 +84,8 @@ def condition(state: RobotState) -> ArmCondition:
     """Describe the arm's condition in words."""
     held = arm_held(state)
     mode = _word(RobotMode, state.robot_mode, "MODE")
-    return ArmCondition(mode, safety_word(state), program_word(state), str(held or ""))
+    what = f"{held.text}: {held.remedy.removesuffix(_ACKNOWLEDGE)}" if held is not None else ""
+    return ArmCondition(mode, safety_word(state), program_word(state), what)
 
 
 def not_powered(state: RobotState) -> RobotError | None:

@@ -364,5 +364,5 @@ def _find(aravis: Any, wanted: str) -> str:
     if len(chosen) == 1:
         return chosen[0]
     cameras = "; ".join(found) or "none"
-    code = "several-cameras" if chosen else "no-camera"
+    code = "several-cameras" if chosen else "camera-not-found"
     raise CameraError(code, wanted=wanted, cameras=cameras, found=len(found))

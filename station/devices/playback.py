@@ -115,8 +115,9 @@ class PlaybackRobot:
             self.views: list[View] = self._recording.views()
         except RecordingError as error:
             raise RobotError("unreadable-recording", recording=recording, reason=str(error)) from error
-        if not self.views or any(len(v.joints_rad or ()) != 6 for v in self.views):
-            raise RobotError("no-joints", recording=recording)
+        poses, with_joints = len(self.views), sum(len(v.joints_rad or ()) == 6 for v in self.views)
+        if not poses or with_joints < poses:
+            raise RobotError("no-joints", path=recording, poses=poses, with_joints=with_joints)
         self._lock = threading.Lock()
         self._from = self._to = self.views[0]
         self._move_start_s = -MOVE_S

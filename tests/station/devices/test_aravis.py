@@ -65,7 +65,7 @@ async def test_a_camera_is_found_by_serial_address_or_name(server: SimulatedGige
 
 
 async def test_an_unknown_camera_is_refused_with_what_was_found(server: SimulatedGige) -> None:
-    with raises("no-camera"):
+    with raises("camera-not-found"):
         await AravisCamera(CameraConfig(device="KJ0043")).open()
 
 

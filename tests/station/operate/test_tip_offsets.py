@@ -77,7 +77,7 @@ class Daemon:
         """The arm with the tip there in `board`, however the flange is turned."""
         R = rotation_exp([0.4, 2.8, -0.1])
         flange = pose(R, (self.board @ [*place_m, 1.0])[:3] - R @ tip_m)
-        tcp_pose = (*flange[:3, 3], *rotation_log(flange[:3, :3]))  # the pendant's offset is zero
+        tcp_pose = (*flange[:3, 3].tolist(), *rotation_log(flange[:3, :3]).tolist())  # no pendant offset
         state = msgspec.structs.replace(make_state(0), tcp_pose=tcp_pose)
         return StationStatus(robot=RobotStatus(RobotIdentity(), state))
 

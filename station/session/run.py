@@ -266,7 +266,7 @@ class Run:
         moved_rad = float(np.abs(np.subtract(now, here)).max())
         if moved_rad > JOGGED_RAD:  # less may be settling
             when = "while its path was checked"
-            raise LimitError("arm-moved", when=when, moved_rad=moved_rad, limit_rad=JOGGED_RAD)
+            raise LimitError("arm-moved", when=when, moved_rad=moved_rad, limit_rad=JOGGED_RAD, advice="")
         await self._context.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 
     async def _rest(self) -> None:

@@ -23,10 +23,8 @@ RECORDINGS = LazyGroup(
             (
                 "recordings export session.mcap --to csv -o tables",
                 "recordings export session.mcap --to folder -o images  # edit, then import",
+                "recordings export session.mcap --to excerpt -o small.mcap",
             ),
-        ),
-        "excerpt": LazyCommand(
-            "recordings.cli.commands:excerpt_command", ("recordings excerpt session.mcap -o small.mcap",)
         ),
         "recover": LazyCommand(
             "recordings.cli.commands:recover_command",
@@ -35,4 +33,5 @@ RECORDINGS = LazyGroup(
     },
     help="Look into, make, convert and rescue recordings.",
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage, 3 done with loss.",
+    gone={"excerpt": "Use `recordings export REC --to excerpt -o small.mcap`."},
 )

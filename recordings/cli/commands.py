@@ -1,4 +1,4 @@
-"""`recordings info | export | excerpt | recover`, and what they print."""
+"""`recordings info | export | recover`, and what they print."""
 
 from __future__ import annotations
 
@@ -39,30 +39,24 @@ def info_command(recording: Rec, as_json: AsJson = False) -> None:
 
 def export_command(
     recording: Rec,
-    output: Annotated[Path, typer.Option("-o", "--output", help="The folder to write; it must not exist.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="What to write; it must not exist.")],
     to: Annotated[
-        Target, typer.Option("--to", help="folder: images and poses, for `import`; csv: tables; ros2: a bag.")
+        Target,
+        typer.Option(
+            "--to",
+            help="folder: images and poses, for `import`; csv: tables; ros2: a bag; excerpt: an .mcap file.",
+        ),
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Write a folder of images and poses, CSV tables, or a ROS 2 bag."""
+    """Write images and poses, CSV tables, a ROS 2 bag, or a smaller recording.
+
+    An excerpt solves like the whole: its images are lossless PNG, its robot states those around the images.
+    """
     from recordings.exporters.folder import export_recording
 
-    _print_written(export_recording(open_recording(recording), output, to), as_json)
-
-
-def excerpt_command(
-    recording: Rec,
-    output: Annotated[Path, typer.Option("-o", "--output", help="The smaller recording (.mcap) to write.")],
-    as_json: AsJson = False,
-) -> None:
-    """Write a smaller recording that solves like the whole.
-
-    Raw images become lossless PNG; robot states stay only around the images.
-    """
-    from recordings.exporters.excerpt import write_excerpt
-
-    _print_written(write_excerpt(open_recording(recording), output), as_json)
+    path = export_recording(open_recording(recording), output, to)
+    print(json.dumps({"output": str(path)}) if as_json else f"{path} written")
 
 
 def recover_command(
@@ -85,10 +79,6 @@ def recover_command(
         if output is not None and not results[0].rebuilt:
             print(f"{output} was not written: there was nothing to repair")
     raise typer.Exit(3 if any(result.rebuilt or result.missing for result in results) else 0)
-
-
-def _print_written(path: Path, as_json: bool) -> None:
-    print(json.dumps({"output": str(path)}) if as_json else f"{path} written")
 
 
 def _print_info(facts: RecordingInfoJson) -> None:

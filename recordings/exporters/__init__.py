@@ -2,5 +2,5 @@
 
 from typing import Literal
 
-Target = Literal["folder", "csv", "ros2"]
+Target = Literal["folder", "csv", "ros2", "excerpt"]
 """Kind of output of `recordings export`."""

@@ -1,4 +1,4 @@
-"""A recording → a folder that `import` reads, CSV tables, or a ROS 2 bag. The recording is not changed."""
+"""A recording as a folder that `import` reads, CSV tables, a ROS 2 bag, or an excerpt."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from msgspec.structs import astuple
 
 from recordings.errors import disk_error, exists_error
 from recordings.exporters import Target
+from recordings.exporters.excerpt import write_excerpt
 from recordings.files import sync_folder
 from recordings.images import encode_png, mosaic_encoding, viewable
 from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE
@@ -27,7 +28,12 @@ _STAMPS = list(Stamps.__struct_fields__)
 
 
 def export_recording(recording: Recording, output: Path, target: Target) -> Path:
-    """Writes the folder `output`, which must not exist; nothing is left when it fails. RecordingError."""
+    """Write `output` (an excerpt is a file, all else a folder), which must not exist; all of it or nothing.
+
+    Raises RecordingError.
+    """
+    if target == "excerpt":
+        return write_excerpt(recording, output)
     with _new_folder(output) as folder:
         if target == "ros2":
             from recordings.exporters.ros2 import write_ros2

@@ -87,13 +87,10 @@ STATION = LazyGroup(
             "station.cli.control:doctor_command",
             ("station doctor --example > station.yaml", "station doctor --config station.yaml"),
         ),
-        "board": LazyCommand(
-            "station.cli.control:board_command",
-            passes_on=True,
-        ),
     },
     aliases={"check": "drift-check", "verify": "touch-test", "improve": "replan", "best": "next-pose"},
     gone={
+        "board": "`calibrate board` makes one.",
         "bootstrap": "`station new` finds camera and board from views that you guide by hand.",
         "next-pose": "F3 on the screen adds views that you guide by hand.",
         "replan": "`station finish`, then `station plan` plans again.",

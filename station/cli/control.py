@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -207,11 +206,3 @@ def doctor_command(
         out.print(table)
     if not good:
         raise typer.Exit(1)
-
-
-def board_command(context: typer.Context) -> None:
-    """Make a printable calibration board (`calibrate board`)."""
-    import subprocess
-
-    done = subprocess.run([sys.executable, "-m", "calibrate.cli", "board", *context.args])
-    raise typer.Exit(done.returncode)

@@ -49,8 +49,6 @@ class LazyCommand(NamedTuple):
     """Options by their names of the last release, and what they are called now."""
     gone: Mapping[str, str] = {}
     """Options that are no more, and what to do instead."""
-    passes_on: bool = False
-    """All arguments are another program's, `--help` too."""
 
     def first_line(self) -> str:
         """First line of the function's docstring, by its source: importing it may take a second."""
@@ -66,11 +64,9 @@ class LazyCommand(NamedTuple):
         """Import the module and declare the command."""
         module, _, function = self.where.partition(":")
         app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
-        free = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
         app.command(
             name,
             epilog=examples(*self.examples) if self.examples else None,
-            context_settings=free if self.passes_on else None,
         )(getattr(importlib.import_module(module), function))
         return cast(TyperCommand, get_command(app))
 

@@ -12,10 +12,11 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from recordings.schema.clock_fit import ClockFit
 
 Array = NDArray[np.float64]
 
@@ -42,42 +43,6 @@ def monotonic_from_wall_ns(wall_ns: int) -> int:
     """
     age_ns = time.time_ns() - wall_ns
     return time.monotonic_ns() - age_ns
-
-
-@dataclass(frozen=True)
-class ClockFit:
-    reference_s: float
-    """Device time at which `offset_ns` holds."""
-    offset_ns: float
-    """Host monotonic minus device time."""
-    drift: float
-    """Host seconds per device second, minus 1."""
-    drift_uncertainty: float
-    latency_s: float
-    residual_s: float = 0.0
-    """The shortest delay of each tenth of the window lies within this above the line."""
-    span_s: float = 0.0
-
-    @property
-    def drift_ppm(self) -> float:
-        return self.drift * 1e6
-
-    @property
-    def offset_s(self) -> float:
-        """At the newest device time."""
-        return self.offset_ns / 1e9
-
-    @property
-    def bound_s(self) -> float:
-        """95 % bound of the host time of a message inside the window."""
-        return self.latency_s + self.residual_s + self.drift_uncertainty * self.span_s / 2
-
-    def to_host_ns(self, device_s: float) -> int:
-        return round(device_s * 1e9 + self.offset_ns + self.drift * (device_s - self.reference_s) * 1e9)
-
-    def to_device_s(self, host_monotonic_ns: int) -> float:
-        since_s = (host_monotonic_ns - self.offset_ns) / 1e9 - self.reference_s
-        return self.reference_s + since_s / (1 + self.drift)
 
 
 class ClockEstimator:

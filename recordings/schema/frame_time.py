@@ -6,7 +6,8 @@ from collections import deque
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from recordings.schema.clocks import DRIFT_LIMIT, DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
+from recordings.schema.clock_fit import ClockFit
+from recordings.schema.clocks import DRIFT_LIMIT, DRIFT_SPAN_S, UNFITTED_DRIFT
 from recordings.schema.messages import ClockReading, FrameTime, TimeSource
 
 READINGS_KEPT = 200

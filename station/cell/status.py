@@ -8,7 +8,7 @@ from typing import Literal
 import msgspec
 
 from recordings.errors import Value
-from recordings.schema.clocks import ClockFit
+from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import (
     CameraIdentity,
     Matrix4,

@@ -58,7 +58,7 @@ async def _accept(socket: Path | None, joint: int, speed_m_s: float, quiet: bool
     async with attended(socket, headless=quiet, camera=False) as shell:
         status = await shell.status()
         if status.playback:
-            raise RefusedError("A played-back arm has no ways to stop.", code="playback")
+            raise RefusedError("playback")
         if quiet:
             shell.require_simulated()
         host = (await shell.client.call(Configuration())).robot.host

@@ -62,11 +62,7 @@ class Attended:
     def _decides(self, preview: MotionPreview) -> bool:
         if self._approved:
             if not preview.plan_sha256.startswith(self._approved) or len(self._approved) < HASH_DIGITS:
-                raise RefusedError(
-                    f"--approve {self._approved} is not the hash of this plan: nothing moved.",
-                    code="other-plan",
-                    remedy=f"Give at least {HASH_DIGITS} digits of the hash that was reviewed.",
-                )
+                raise RefusedError("other-plan")
             return True
         if self.interactive:
             return ask_person(preview)
@@ -81,8 +77,7 @@ class Attended:
     def require_simulated(self) -> None:
         """RefusedError on a real cell, where nothing moves without a person."""
         if not self._simulated:
-            text = "Nothing moved: --json prompts nobody, and is for simulated cells only."
-            raise RefusedError(text, code="no-person")
+            raise RefusedError("no-person", advice="--json prompts nobody, and is for simulated cells only.")
 
     async def carry_out(self, purpose: Purpose) -> StationStatus:
         """One session, until it rests."""
@@ -140,7 +135,7 @@ async def stop_and_say(client: Client) -> None:
 
 
 def no_terminal(remedy: str = "A person must stand at the arm (docs: Safety).") -> RefusedError:
-    return RefusedError("No terminal.", code="no-person", remedy=remedy)
+    return RefusedError("no-person", advice=remedy)
 
 
 def ask_person(preview: MotionPreview) -> bool:

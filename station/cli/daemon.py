@@ -102,7 +102,7 @@ def _started(arguments: Sequence[str], log: Path, channel: int) -> subprocess.Po
 
 def _not_started(log: Path) -> StationError:
     tail = "\n".join(read_file(log, LOG_LIMIT_BYTES).decode(errors="replace").splitlines()[-3:])
-    return StationError(f"The daemon did not start; {log} ends with:\n{tail}", code="no-daemon")
+    return StationError("not-started", log=log, tail=tail)
 
 
 def tell_what_goes_on(socket: Path) -> None:
@@ -134,9 +134,9 @@ def tui_command(socket: Socket = None) -> None:
     """
     if not sys.stdout.isatty() or not sys.stdin.isatty():
         raise StationError(
-            "The operator screen needs a terminal",
-            code="no-terminal",
-            remedy="Without one use `station capture` or `station demo`.",
+            "no-terminal",
+            what="The operator screen",
+            advice="Without one use `station capture` or `station demo`.",
         )
     from station.tui.app import run
 

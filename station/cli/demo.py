@@ -104,7 +104,7 @@ def demo_command(
     Exit codes: 0 done, 1 failed, 3 poses missing, 4 a gate failed.
     """
     if output is not None and output.exists() and not output.is_dir():
-        raise ConfigError(f"--out {output} is a file.", code="not-a-folder", remedy="Name a folder.")
+        raise ConfigError("not-a-folder", path=output)
     if gige and not is_isolated():
         # Discovery broadcasts on every network: the same command again, where there is only loopback.
         command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
@@ -232,7 +232,7 @@ def _solve(recording: Path, calibration: Path, report: Path) -> Calibration:
         except msgspec.DecodeError:
             said = done.stderr.decode(errors="replace").strip()
             raise DemoError(said or f"`calibrate solve` ended with {done.returncode}.") from None
-        raise DemoError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
+        raise DemoError.from_data(problem)
     return read_calibration(calibration)
 
 
@@ -240,11 +240,7 @@ def truth_error(recording: Path, found: Matrix4) -> tuple[float, float]:
     """Distance (mm) and angle (deg) of the found X from the truth that rides in a simulated recording."""
     attachment = open_recording(recording).attachments().get("truth.json")
     if attachment is None:
-        raise DemoError(
-            f"{recording} holds no truth.json.",
-            code="not-simulated",
-            remedy="Name a recording of a simulated cell.",
-        )
+        raise DemoError("not-simulated", path=recording)
     truth = msgspec.json.decode(attachment, type=CellTruth)
     delta = difference(np.array(found), np.array(truth.camera_mount))
     translation_mm = 1000 * float(np.linalg.norm(delta[:3]))

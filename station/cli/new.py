@@ -26,11 +26,6 @@ from station.devices.ur_link import UrLink
 from station.devices.ur_probe import probe, unsupported_model
 from station.operate.draft import ArmReader, CameraChoice, CameraReader
 
-SERVICES = (
-    "From PolyScope 5.17 on: ☰ → Settings → Security → Services, enable Dashboard Server, RTDE and the "
-    "primary and secondary client interfaces."
-)
-
 
 class GuidedArm(UrLink):
     """`draft.ArmReader`: the read-only half of the driver, and STOP."""
@@ -89,27 +84,15 @@ class RealHardware:
         address, _, told = host.partition(" ")
         found = await probe(address)
         if not found.answers:
-            raise RobotError(
-                f"No robot answers at {address}",
-                code="no-robot",
-                remedy="Switch it on, plug in its cable, and compare its address (pendant: ☰ → About).",
-            )
+            raise RobotError("no-robot-answers", host=address)
         if found.problems:
             who = found.model or "something"
-            raise RobotError(
-                f"{who} answers at {address}, but not whole: {found.problems[0]}",
-                code="robot-incomplete",
-                remedy=SERVICES,
-            )
+            raise RobotError("robot-incomplete", what=who, host=address, problem=found.problems[0])
         model = told or found.model
         if found.model and found.model not in MODELS:
             raise unsupported_model(found.model, address)
         if model not in MODELS:
-            raise RobotError(
-                f"The controller at {address} does not tell its model",
-                code="unknown-robot-model",
-                remedy=f"Type it after the address, e.g. {address} UR10; known are {', '.join(MODELS)}.",
-            )
+            raise RobotError("model-not-told", host=address, known=", ".join(MODELS))
         arm = GuidedArm(RobotConfig(model=model, host=address))
         await arm.connect()
         return arm
@@ -141,9 +124,9 @@ def new_command(
     """
     if not sys.stdout.isatty() or not sys.stdin.isatty():
         raise StationError(
-            "The wizard needs a terminal.",
-            code="no-terminal",
-            remedy="Without one write a configuration: `station doctor --example`.",
+            "no-terminal",
+            what="The wizard",
+            advice="Without one write a configuration: `station doctor --example`.",
         )
     from station.tui.new_cell import run
 
@@ -160,11 +143,7 @@ def _serve(config: Path) -> None:
 
     socket = default_socket()
     if answers(socket):
-        raise StationError(
-            f"Another station serves {socket} already.",
-            code="already-served",
-            remedy="End it first: closing its screen tells how.",
-        )
+        raise StationError("already-served", path=socket)
     run(ensure_daemon(socket, config))
     tell_what_goes_on(socket)
 

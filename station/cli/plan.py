@@ -127,9 +127,7 @@ def _require_replaceable(output: Path) -> None:
         try:
             load_plan(output)
         except ConfigError:
-            raise ConfigError(
-                f"{output} exists and is no plan.", code="target-exists", remedy="Give another name with -o."
-            ) from None
+            raise ConfigError("target-exists", path=output) from None
 
 
 def _cell(
@@ -200,9 +198,9 @@ def _joints(text: str) -> list[float]:
         degrees = []
     if len(degrees) != 6 or not np.isfinite(degrees).all():
         raise ConfigError(
-            f"--start {text!r} is no posture.",
-            code="usage",
-            remedy="Give six joint angles in degrees, e.g. 0,-90,90,-90,-90,0.",
+            "usage",
+            problem=f"--start {text!r} is no posture",
+            advice="Give six joint angles in degrees, e.g. 0,-90,90,-90,-90,0.",
         )
     return [float(np.deg2rad(angle)) for angle in degrees]
 
@@ -215,7 +213,7 @@ def _given(
     """The plan that is there already; None when one is to be made."""
     if check is not None and taught is not None:
         raise ConfigError(
-            "--check and --taught exclude each other.", code="usage", remedy="Give one of them."
+            "usage", problem="--check and --taught exclude each other", advice="Give one of them."
         )
     if check is not None:
         return load_plan(check)

@@ -59,13 +59,13 @@ def serve_command(
     """
     if [simulate, config is not None, replay is not None].count(True) != 1:
         raise ConfigError(
-            "Missing the cell to serve.",
-            code="usage",
-            remedy="Give one of --config FILE (a real cell), --simulate, --replay RECORDING.",
+            "usage",
+            problem="Missing the cell to serve",
+            advice="Give one of --config FILE (a real cell), --simulate, --replay RECORDING.",
         )
     if rehearse and config is None:
         raise ConfigError(
-            "--rehearse needs the cell to rehearse.", code="usage", remedy="Give --config FILE too."
+            "usage", problem="--rehearse needs the cell to rehearse", advice="Give --config FILE too."
         )
     log_to_stderr()
     go_before_others(DAEMON_NICENESS)

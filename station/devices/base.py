@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol, TypeVar
 
-from recordings.schema.clocks import ClockFit
+from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
 from station.cell.arm_acceptance import StopWay
 from station.cell.errors import StaleStateError

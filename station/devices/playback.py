@@ -19,7 +19,7 @@ from calibrate.geometry import interpolate, pose_from_rotvec
 from recordings import strict_yaml
 from recordings.errors import RecordingError
 from recordings.reader import Recording, open_recording
-from recordings.schema.clocks import ClockFit
+from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import (
     CameraIdentity,
     FrameTime,

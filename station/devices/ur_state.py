@@ -24,7 +24,8 @@ import msgspec
 
 from calibrate.geometry import interpolate as between_poses
 from calibrate.geometry import pose_from_rotvec
-from recordings.schema.clocks import ClockEstimator, ClockFit, monotonic_from_wall_ns
+from recordings.schema.clock_fit import ClockFit
+from recordings.schema.clocks import ClockEstimator, monotonic_from_wall_ns
 from recordings.schema.messages import RobotState, Stamps, Vector6
 from station.cell.config import vector6
 from station.cell.errors import StaleStateError

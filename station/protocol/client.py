@@ -45,7 +45,7 @@ class DaemonGoneError(StationError):
 class NoAnswerError(StationError):
     """The daemon does not answer although connected: it hangs, or its computer is overloaded."""
 
-    code = "no-answer"
+    code = "request-unanswered"
 
 
 def who_am_i() -> str:
@@ -107,19 +107,11 @@ class Client:
             async with asyncio.timeout(CONNECT_S):
                 reader, writer = await asyncio.open_unix_connection(str(path), limit=_ANSWER_LIMIT_BYTES)
         except (FileNotFoundError, ConnectionRefusedError):
-            raise DaemonGoneError(
-                f"No station daemon serves {path}.",
-                remedy="Start one: `station serve --config FILE`, or `station serve --simulate` for a cell "
-                "without hardware.",
-            ) from None
+            raise DaemonGoneError(path=path) from None
         except PermissionError:
-            raise DaemonGoneError(
-                f"{path}: not allowed.",
-                code="not-allowed",
-                remedy="Operators are members of the group station-operator; log in again after being added.",
-            ) from None
+            raise DaemonGoneError("not-allowed", path=path) from None
         except (OSError, TimeoutError) as error:
-            raise DaemonGoneError(f"{path}: the daemon does not answer ({error or 'timeout'}).") from None
+            raise DaemonGoneError("connect-failed", path=path, reason=str(error) or "timeout") from None
         self._writer, self._plain_status = writer, None
         self._reading = asyncio.create_task(self._read(reader, writer), name="client-read")
         try:
@@ -151,18 +143,13 @@ class Client:
         if verb == "stop":
             self.send_stop()  # by STOP's own socket, which cannot be delayed; then ask for the answer
         if (writer := self._writer) is None:
-            raise DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
+            raise DaemonGoneError("connection-lost", path=self._path)
         request = Request(self._next_id, verb, msgspec.Raw(msgspec.json.encode(args)))
         self._next_id += 1
         line = msgspec.json.encode(request) + b"\n"
         if len(line) > LINE_LIMIT_BYTES:
             raise RefusedError(
-                f"{verb}: {len(line) / 1e6:.1f} MB are more than the daemon takes "
-                f"({LINE_LIMIT_BYTES / 1e6:.1f} MB).",
-                code="request-too-long",
-                remedy="Make a plan of fewer poses, or shorten its notes.",
-                size_bytes=len(line),
-                limit_bytes=LINE_LIMIT_BYTES,
+                "request-too-long", verb=verb, size_bytes=len(line), limit_bytes=LINE_LIMIT_BYTES
             )
         answer: asyncio.Future[_Incoming] = asyncio.get_running_loop().create_future()
         self._waiting[request.id] = answer
@@ -172,19 +159,13 @@ class Client:
             async with asyncio.timeout(timeout_s):
                 reply = await answer
         except TimeoutError:
-            raise NoAnswerError(
-                f"{verb}: no answer from the daemon within {timeout_s:.0f} s.",
-                remedy="If the arm moves use the emergency stop; `systemctl status station` or the daemon's "
-                "log says more.",
-                timeout_s=timeout_s,
-            ) from None
+            raise NoAnswerError(verb=verb, timeout_s=timeout_s) from None
         except OSError:
             raise self._gone_error() from None
         finally:
             self._waiting.pop(request.id, None)
         if not reply.ok:
-            problem = reply.problem or ErrorData("refused", reply.error)
-            raise RefusedError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
+            raise RefusedError.from_data(reply.problem or ErrorData("refused", reply.error))
         return reply.result
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
@@ -253,12 +234,7 @@ class Client:
 
     def _gone_error(self) -> DaemonGoneError:
         """Make the error for a daemon lost during a request, which may or may not have been carried out."""
-        return DaemonGoneError(
-            f"The station daemon at {self._path} is gone and did not answer: whether it heard this is not "
-            "known.",
-            code="unanswered",
-            remedy="Look at the cell.",
-        )
+        return DaemonGoneError("unanswered", path=self._path)
 
 
 def ask(path: Path, verb: Verb[R]) -> R:

@@ -60,11 +60,11 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
         why, remedy = _NOT_NOW.get(state, (f"the session is {state.value}", "Pause or stop it first."))
         if cls is Acknowledge:
             why, remedy = "nothing is stopped", ""
-        said = cls.spoken or cls.verb().replace("_", " ")
         return RefusedError(
-            f"{said} is not possible now: {why}",
-            code="wrong-state",
-            remedy=remedy,
+            "wrong-state",
+            what=cls.spoken or cls.verb().replace("_", " "),
+            why=why,
+            advice=remedy,
             verb=cls.verb(),
             state=state.value,
         )

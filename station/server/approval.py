@@ -86,26 +86,19 @@ class ApprovalRule:
             self._require_permitted(asks)
             return f"at {terminal}"
         raise RefusedError(
-            f"{what} needs a person at a terminal.",
-            code="no-terminal",
-            remedy="A person must review and approve it there (docs: Safety).",
+            "no-terminal", what=what, advice="A person must review and approve it there (docs: Safety)."
         )
 
     def approve(self, asks: Peer, plan_sha256: str, offered_sha256: str) -> str:
         """Check as `by_person`, or that a configured service names the hash of the offered plan."""
         if plan_sha256 and offered_sha256 and plan_sha256 != offered_sha256:
-            raise RefusedError("The approved plan is not the one that is loaded.", code="other-plan")
+            raise RefusedError("other-plan")
         if self._simulated or self._terminal(asks):
             return self.by_person(asks, "A move")
         if asks.user not in self._config.services:
-            raise RefusedError(
-                f"{asks.user} has no terminal here and is no service in approval.services.",
-                code="no-terminal",
-                remedy="A person must review and approve the plan (docs: Safety).",
-            )
+            raise RefusedError("no-service", user=asks.user)
         if not plan_sha256:
-            text = f"The service {asks.user} must name the plan that a person approved."
-            raise RefusedError(text, code="no-plan-named")
+            raise RefusedError("no-plan-named", user=asks.user)
         return "as a service, by the plan's hash"
 
     def _terminal(self, asks: Peer) -> str:
@@ -116,5 +109,4 @@ class ApprovalRule:
 
     def _require_permitted(self, asks: Peer) -> None:
         if self._config.persons and asks.user not in self._config.persons:
-            text = f"{asks.user} is not in approval.persons."
-            raise RefusedError(text, code="not-permitted", remedy="Ask one of approval.persons to approve.")
+            raise RefusedError("not-permitted", user=asks.user)

@@ -75,8 +75,7 @@ class ControlServer:
             listening.listen(ACCEPT_BATCH)
         except OSError as error:
             listening.close()
-            text = f"{self._path}: the control socket cannot be made ({error})."
-            raise StationError(text, code="socket") from None
+            raise StationError("socket", path=self._path, reason=str(error)) from None
         finally:
             os.umask(old)
         self._listening = listening
@@ -134,12 +133,20 @@ class ControlServer:
     def _full_for(self, uid: int) -> RefusedError | None:
         """Make the error where this user may not connect now; None: there is room."""
         if len(self._serving) >= CLIENT_LIMIT:
-            return _full(f"{CLIENT_LIMIT} clients are connected already", CLIENT_LIMIT)
+            return RefusedError("house-full", limit=CLIENT_LIMIT, what="clients are connected already")
         if list(self._serving.values()).count(uid) >= USER_CLIENT_LIMIT:
-            return _full(f"{USER_CLIENT_LIMIT} clients of this user are connected already", USER_CLIENT_LIMIT)
+            return RefusedError(
+                "house-full",
+                what="clients of this user are connected already",
+                limit=USER_CLIENT_LIMIT,
+            )
         newest = self._opened[uid]
         if len(newest) == NEW_PER_S and asyncio.get_running_loop().time() - newest[0] < 1.0:
-            return _full(f"this user opened {NEW_PER_S} connections within a second", NEW_PER_S)
+            return RefusedError(
+                "house-full",
+                what="connections of this user within a second",
+                limit=NEW_PER_S,
+            )
         return None
 
     async def _serve(self, link: socket.socket, peer: Peer) -> None:
@@ -186,7 +193,7 @@ class _Connection:
                 try:
                     self._take(decoder.decode(line))
                 except (ValueError, RecursionError) as error:  # msgspec's
-                    self.refuse(0, RefusedError(f"not a request: {error}", code="not-a-request"))
+                    self.refuse(0, RefusedError("not-a-request", problem=str(error)))
                 await asyncio.sleep(0)  # readline never pauses while lines wait: let others' STOP in
         except ValueError:  # readline: the line is longer than the limit
             self.drop(f"a line of more than {LINE_LIMIT_BYTES} bytes")
@@ -203,15 +210,9 @@ class _Connection:
             stopping = self._handler.stop_now(self.peer)
             self._spawn(self._answer_stop(request.id, stopping))
         elif request.verb not in VERBS:
-            self.refuse(request.id, RefusedError(f"there is no verb '{request.verb}'", code="unknown-verb"))
+            self.refuse(request.id, RefusedError("unknown-verb", verb=request.verb))
         elif len(self._tasks) >= OPEN_REQUESTS_LIMIT:
-            busy = RefusedError(
-                "too many requests at once",
-                code="too-many-requests",
-                remedy="Wait for the answers.",
-                limit=OPEN_REQUESTS_LIMIT,
-            )
-            self.refuse(request.id, busy)
+            self.refuse(request.id, RefusedError("too-many-requests", limit=OPEN_REQUESTS_LIMIT))
         else:
             self._spawn(self._answer(request))
 
@@ -237,8 +238,7 @@ class _Connection:
             self.refuse(request.id, error)
         except Exception as error:
             log.exception("%s from client %d", request.verb, self.peer.client_id)
-            text = f"{request.verb}: internal error ({error!r})"
-            self.refuse(request.id, StationError(text, code="internal", remedy="See the daemon's log."))
+            self.refuse(request.id, StationError("internal", error=f"{request.verb}: {error!r}"))
 
     def refuse(self, request_id: int, error: CodedError) -> None:
         self.reply(Reply.refused(request_id, error))
@@ -257,7 +257,7 @@ class _Connection:
     def drop(self, why: str) -> None:
         log.warning("client %d (pid %d) is dropped: %s", self.peer.client_id, self.peer.pid, why)
         with contextlib.suppress(OSError):
-            dropped = Reply.refused(0, RefusedError(f"dropped: {why}", code="dropped"))
+            dropped = Reply.refused(0, RefusedError("dropped", why=why))
             self._writer.write(msgspec.json.encode(dropped) + b"\n")
         self.hang_up()
 
@@ -267,17 +267,11 @@ class _Connection:
         asyncio.get_running_loop().call_later(HANG_UP_S, self._writer.transport.abort)
 
 
-def _full(text: str, limit: int) -> RefusedError:
-    return RefusedError(
-        text, code="house-full", remedy="Close one, or wait a moment; `station stop` needs none.", limit=limit
-    )
-
-
 def _remove_stale(path: Path) -> None:
     """Remove a socket that a crash left. StationError where a daemon serves it or it is no socket."""
     if not path.is_socket():
         if path.exists():
-            raise StationError(f"{path} is not a socket.", code="socket", remedy="Move it.")
+            raise StationError("not-a-socket", path=path)
         return
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(1.0)
@@ -287,9 +281,5 @@ def _remove_stale(path: Path) -> None:
             path.unlink(missing_ok=True)
             return
         except OSError as error:
-            raise StationError(f"{path}: {error}.", code="socket") from None
-    raise StationError(
-        f"Another station daemon already serves {path}.",
-        code="already-served",
-        remedy="Stop it first, or use its socket.",
-    )
+            raise StationError("socket", path=path, reason=str(error)) from None
+    raise StationError("already-served", path=path)

@@ -74,7 +74,7 @@ class SessionDispatcher:
         try:
             request = msgspec.json.decode(args, type=kind)
         except msgspec.DecodeError as error:
-            raise RefusedError(f"{verb}: wrong arguments ({error})", code="wrong-arguments") from None
+            raise RefusedError("wrong-arguments", verb=verb, problem=str(error)) from None
         caller = self._caller(peer)
         self._session.admit(kind, caller.client_id, caller.who)
         result = await self._carry_out(caller, request)

@@ -74,8 +74,7 @@ class StopServer:
             link.bind(str(self._socket_path))
         except OSError as error:
             link.close()
-            text = f"{self._socket_path}: the socket for STOP cannot be made ({error})."
-            raise StationError(text, code="socket") from None
+            raise StationError("socket", path=self._socket_path, reason=str(error)) from None
         finally:
             os.umask(old)
         self._link = link

@@ -62,7 +62,7 @@ class Previewer:
             _require_between_sessions(context)
             await context.arm()
             if not context.stillness.at_rest:
-                raise NotStillError("The arm moves.", code="arm-moves", remedy="Ask again when it rests.")
+                raise NotStillError("arm-moves")
             image = await context.cell.camera.capture(_OBSERVE_S)
             state, _ = await at_exposure(context, image)
             _require_between_sessions(context)
@@ -115,4 +115,4 @@ def _require_between_sessions(context: SessionContext) -> None:
     if (refusal := Observe.refusal(context.store.state)) is not None:
         raise refusal
     if context.cell.source == "playback":
-        raise RefusedError("Played-back images are not new.", code="played", remedy="Use `calibrate watch`.")
+        raise RefusedError("played")

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recordings.schema.clocks import ClockEstimator, ClockFit, monotonic_from_wall_ns
+from recordings.schema.clock_fit import ClockFit
+from recordings.schema.clocks import ClockEstimator, monotonic_from_wall_ns
 
 OFFSET_NS = 5_000_000_000_000
 

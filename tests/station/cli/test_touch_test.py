@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.station.operate.test_touch_test import Daemon
 
 from calibrate.boards.model import board_points
 from calibrate.files.calibration import read_calibration
@@ -14,6 +13,7 @@ from station.cell.status import StationStatus
 from station.cli import touch_test
 from station.cli.app import STATION
 from tests.codes import raises
+from tests.station.operate.test_tip_offsets import Daemon
 
 
 @pytest.fixture
@@ -30,9 +30,7 @@ async def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Daemon,
 
         async def __aexit__(self, *_: object) -> None: ...
 
-        @staticmethod
-        async def connect(_: Path) -> Connected:
-            return Connected()
+        def __init__(self, _: Path) -> None: ...
 
     async def seen(*_: object) -> object:
         return board

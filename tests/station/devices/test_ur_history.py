@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from recordings.schema.clocks import ClockFit
+from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import RobotState, Stamps
 from station.devices.ur_state import state_at
 from tests.codes import raises

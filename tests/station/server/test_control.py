@@ -283,7 +283,7 @@ async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None
     assert gone.value.code == "unanswered"
     with pytest.raises(DaemonGoneError) as gone:
         await client.request("go", token="")
-    assert gone.value.code == "no-daemon"
+    assert gone.value.code == "connection-lost"
     async with asyncio.timeout(PATIENCE_S):
         assert len([s async for s in statuses]) <= 1
     await client.close()

@@ -8,7 +8,7 @@ import pytest
 
 from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, forward
-from recordings.schema.clocks import ClockFit
+from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import Image, RobotIdentity, RobotState, Stamps, Vector6
 from station.cell.errors import RobotError
 from station.cell.status import StationState as S

@@ -184,11 +184,7 @@ def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Sou
         from station.devices.webcam import WebcamCamera
 
         return WebcamCamera(config.camera), "real"
-    raise ConfigError(
-        f"camera.driver '{config.camera.driver}' shows no real image and never runs beside a real arm",
-        code="unreal-camera",
-        remedy=f"Use {' or '.join(REAL_DRIVERS)}, or rehearse: `station serve --config FILE --rehearse`.",
-    )
+    raise ConfigError("unreal-camera", driver=config.camera.driver, drivers=" or ".join(REAL_DRIVERS))
 
 
 def _trigger(config: StationConfig) -> Trigger | None:

@@ -49,18 +49,10 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
     near = (_SAME_PLACE_M, _SAME_PLACE_RAD)
     same = [k for k, miss in enumerate(misses) if (np.linalg.norm(miss.reshape(2, 3), axis=1) < near).all()]
     if same and not in_hand:
-        raise BadViewsError(
-            "The board is still on the flange.",
-            code="board-on-flange",
-            remedy="Lay it into the camera's view, fix the pointer to the flange, and start again.",
-        )
+        raise BadViewsError("board-on-flange")
     tilts = [r.camera_from_board for r in readings if r.turn == readings[0].turn]
     if not same and any(np.linalg.norm(difference(t, tilts[0])[3:]) > _SAME_TILT_RAD for t in tilts):
-        raise BadViewsError(
-            "The image leaves open to which side the board is tilted.",
-            code="ambiguous-tilt",
-            remedy="Bring the camera nearer, or look at the board from more to the side.",
-        )
+        raise BadViewsError("ambiguous-tilt")
     best = same[0] if same else 0
     return BoardNow(np.asarray(at[best]), readings[best].camera_from_board)
 

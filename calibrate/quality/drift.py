@@ -85,11 +85,7 @@ class Noise:
     def of(cls, calibration: Calibration) -> Noise:
         noise = calibration.quality.noise
         if not noise:
-            raise BadViewsError(
-                "The calibration states no measurement noise (paper profile).",
-                code="no-noise",
-                remedy="Solve its recording again with --profile robust and install that.",
-            )
+            raise BadViewsError("no-noise")
         return cls(
             max(noise["corner_px"], 0.02),
             noise["robot_mm"] / 1e3,
@@ -139,10 +135,10 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
     """
     if len(views) < FEWEST_FOR_DRIFT_CHECK:
         raise TooFewViewsError(
-            f"{len(views)} views are too few for a drift check (≥ {FEWEST_FOR_DRIFT_CHECK}).",
-            remedy="Capture more: station drift-check.",
             views=len(views),
             needed=FEWEST_FOR_DRIFT_CHECK,
+            counted=f"{len(views)} views for a drift check",
+            advice="Capture more: station drift-check.",
         )
     flanges, seen = views.base_from_flange, views.camera_from_board
     pnp = np.array(
@@ -186,11 +182,7 @@ def _inverse(information: Array) -> Array:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * scale * scale[:, None])
     if not values[0] > _SMALLEST_EIGENVALUE:
-        raise BadViewsError(
-            "These views do not determine a camera shift: they rotate about one axis only, or too little.",
-            code="degenerate-motion",
-            remedy="Capture views tilted by 20° and more about different axes.",
-        )
+        raise BadViewsError("shift-open")
     root = scale[:, None] * vectors / np.sqrt(values)
     return np.asarray(root @ root.T)
 
@@ -258,7 +250,7 @@ def pnp_covariance(points: Array, camera: CameraModel, camera_from_board: Array)
 class OtherCellError(UsageError):
     """The views are of another cell, robot or camera than the calibration."""
 
-    code = "other-cell"
+    code = "views-of-another-cell"
 
     @property
     def device(self) -> str:
@@ -291,13 +283,7 @@ def require_same_cell(where: str, calibration: Calibration, seen: CellIdentity) 
         ("camera", *_serials(seen.camera_serial, calibration.camera.serial)),
     ):
         if not same:
-            raise OtherCellError(
-                f"{where} has {name} {new}, the calibration {known}: that is no drift.",
-                remedy="Check with images of the calibrated cell, or calibrate this one.",
-                differs=name,
-                found=str(new),
-                calibrated=str(known),
-            )
+            raise OtherCellError(where=where, differs=name, found=str(new), calibrated=str(known))
 
 
 def _serials(new: str, known: str) -> tuple[str, str, bool]:

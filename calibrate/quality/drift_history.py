@@ -41,9 +41,8 @@ def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN
         folder.mkdir(parents=True, exist_ok=True)
         append_line(folder / FILE, entry)
     except OSError as problem:
-        raise InstallError(
-            f"{folder}: the drift check cannot be logged: {problem.strerror}.", code="state-folder"
-        ) from None
+        why = f"the drift check cannot be logged ({problem.strerror})"
+        raise InstallError("state-folder", path=folder, why=why) from None
 
 
 def read_checks(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[CheckEntry]:

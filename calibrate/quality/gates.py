@@ -73,9 +73,7 @@ def read_limits(path: Path) -> GateLimits:
     except (OSError, strict_yaml.StrictYamlError) as problem:
         names = ", ".join(GateLimits.__struct_fields__)
         said = problem.strerror if isinstance(problem, OSError) else problem
-        raise UsageError(
-            f"{path}: {said}.", code="gate-limits", remedy=f"Allowed: {names}.", path=str(path)
-        ) from None
+        raise UsageError("gate-limits", path=path, problem=str(said), names=names) from None
 
 
 def judge(solution: Solution, inputs: GateInputs, limits: GateLimits | None = None) -> tuple[Gate, ...]:

@@ -89,7 +89,7 @@ def test_nothing_installed_is_said(session_file: Path, tmp_path: Path) -> None:
 
 def test_a_check_of_the_wrong_kind_is_refused(session_file: Path, real_file: Path, tmp_path: Path) -> None:
     done = run("drift-check", session_file, "--calibration", real_file, cwd=tmp_path)
-    refused(done, 2, "other-cell", "simulated", "real")
+    refused(done, 2, "views-of-another-cell", "simulated", "real")
 
 
 def test_mixed_picture_sizes_name_the_view(session_file: Path, tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_another_camera_is_no_drift(real_session_file: Path, real_file: Path, tm
     other = msgspec.structs.replace(calibration.camera, serial="other")
     write_calibration(msgspec.structs.replace(calibration, camera=other), tmp_path / "other.yaml")
     done = run("drift-check", real_session_file, "--calibration", "other.yaml", cwd=tmp_path)
-    refused(done, 2, "other-cell")
+    refused(done, 2, "views-of-another-cell")
     assert done.error is not None and done.error.values["differs"] == "camera"
 
 

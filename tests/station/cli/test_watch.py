@@ -116,7 +116,7 @@ def test_a_camera_that_moves_is_noticed_in_the_stations_own_pictures(
 
 @pytest.mark.parametrize(
     ("changes", "error"),
-    [({"source": "simulated"}, "other-cell"), ({"width": 800, "height": 600}, "watch-source")],
+    [({"source": "simulated"}, "views-of-another-cell"), ({"width": 800, "height": 600}, "watch-source")],
 )
 def test_pictures_of_another_cell_are_no_pictures(
     root: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object], error: str

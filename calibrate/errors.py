@@ -65,8 +65,8 @@ class PosesDisagreeError(BadViewsError):
 
     code = "poses-disagree"
 
-    def __init__(self, said: str = "", /, *, hypothesis: str = "", **values: Value) -> None:
-        super().__init__(said, **values)  # type: ignore[arg-type]
+    def __init__(self, code: str = "", /, *, hypothesis: str = "", **values: Value) -> None:
+        super().__init__(code, **values)
         self.hypothesis = hypothesis
 
 

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -47,9 +46,6 @@ class CodedError(Exception):
     The class says who is to act and is what callers catch. The code finds text and remedy in `errors.toml` of
     the class's package, a class's own code may be left out. The values fill both and are what programs read.
 
-    Sites that were not converted yet give the text itself, `code` and `remedy`: a first argument that has not
-    the shape of a code, or `code=` beside it, tells the two apart. The last conversion deletes `_is_code`.
-
     `exit_code`: 1 failed, 2 usage or configuration, 3 done with loss, 4 a quality gate failed.
     """
 
@@ -59,21 +55,16 @@ class CodedError(Exception):
     """Default for errors of this class."""
     exit_code = 1
 
-    def __init__(
-        self, said: str = "", /, *, code: str = "", remedy: str = "", **values: Value | Path
-    ) -> None:
-        super().__init__(said)
+    def __init__(self, code: str = "", /, **values: Value | Path) -> None:
+        super().__init__(code)
+        self.code = code or self.code
         self.values = {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
-        if code or remedy or not _is_code(said or self.code):
-            self.text, self.remedy, self.code = said, remedy, code or self.code
-        else:
-            self.code = said or self.code
-            self.text, self.remedy = worded(self.package, self.code, self.values)
+        self.text, self.remedy = worded(self.package, self.code, self.values)
 
     @classmethod
     def from_data(cls, data: ErrorData) -> Self:
         """Make an error again that another process reported, in that process's words."""
-        error = cls(data.code, **data.values)  # type: ignore[arg-type]  # no more without `code=`
+        error = cls(data.code, **data.values)
         error.text, error.remedy = data.text, data.remedy
         return error
 
@@ -83,10 +74,6 @@ class CodedError(Exception):
     @property
     def data(self) -> ErrorData:
         return ErrorData(self.code, self.text, self.remedy, dict(self.values))
-
-
-def _is_code(said: str) -> bool:
-    return re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", said) is not None
 
 
 def worded(package: str, code: str, values: Mapping[str, Value]) -> tuple[str, str]:

@@ -24,8 +24,7 @@ def isolated_thread() -> Iterator[None]:
     with Path("/proc/thread-self/ns/net").open("rb") as before:
         if libc.unshare(_CLONE_NEWNET) != 0:
             reason = os.strerror(ctypes.get_errno())
-            text = f"no network namespace of its own for the GigE simulator: {reason}"
-            raise StationError(text, code="no-namespace")
+            raise StationError("no-namespace", reason=reason)
         try:
             bring_lo_up()
             yield

@@ -70,13 +70,12 @@ def sites() -> Iterator[Site]:
                 continue
             kind = error_classes().get(node.func.id)
             named = {word.arg for word in node.keywords}
-            if kind is None or "code" in named:
+            if kind is None:
                 continue
             for code in literals(node.args[0]) if node.args else [kind.code]:
-                if " " not in code:
-                    where = f"{path.relative_to(ROOT)}:{node.lineno}"
-                    values = frozenset(filter(None, named))
-                    yield Site(where, kind.package, code, values, None in named)
+                where = f"{path.relative_to(ROOT)}:{node.lineno}"
+                values = frozenset(filter(None, named))
+                yield Site(where, kind.package, code, values, None in named)
 
 
 def needed(entry: dict[str, str]) -> set[str]:

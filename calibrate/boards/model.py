@@ -45,7 +45,7 @@ def dictionary_id(name: str) -> int:
 
 def _require(right: bool, code: str, **values: Value) -> None:
     if not right:
-        raise BoardError(code, **values)  # type: ignore[arg-type]
+        raise BoardError(code, **values)
 
 
 def check_board(spec: BoardSpec) -> None:

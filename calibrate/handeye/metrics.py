@@ -131,7 +131,7 @@ def _require_view(view: BoardView, fewest_corners: int) -> None:
 
     def require(right: bool, code: str, **values: Value) -> None:
         if not right:
-            raise BadViewsError(code, view=view.index + 1, name=view.name, **values)  # type: ignore[arg-type]
+            raise BadViewsError(code, view=view.index + 1, name=view.name, **values)
 
     require(is_rigid(np.asarray(view.base_from_flange)), "robot-pose")
     require(T.shape == (4, 4), "no-board-pose", reason="none was given")

@@ -213,9 +213,10 @@ def simulated_daemon(root: Path, arguments: Sequence[str]) -> AbstractContextMan
 def unfinished(outcome: StationStatus) -> DemoError:
     """Why there is no recording, and where the poses are that were saved."""
     session, why = outcome.session, outcome.reason or outcome.state.value
-    count = f"{session.captured} of {len(session.poses)} poses"
     saved = f", saved in {session.folder}" if session.captured else ""
-    return DemoError(f"Stopped after {count}{saved}: {why}", remedy="Run it again.")
+    return DemoError(
+        "demo-unfinished", captured=session.captured, poses=len(session.poses), saved=saved, why=str(why)
+    )
 
 
 def _solve(recording: Path, calibration: Path, report: Path) -> Calibration:
@@ -225,13 +226,13 @@ def _solve(recording: Path, calibration: Path, report: Path) -> Calibration:
     try:
         done = subprocess.run(command, capture_output=True, timeout=SOLVE_TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        raise DemoError(f"`calibrate solve` did not end within {SOLVE_TIMEOUT_S:.0f} s.") from None
+        raise DemoError("demo-solve-hangs", limit_s=SOLVE_TIMEOUT_S) from None
     if done.returncode not in (0, _GATE_FAILED):
         try:
             problem = msgspec.json.decode(done.stdout, type=ErrorReport).error
         except msgspec.DecodeError:
             said = done.stderr.decode(errors="replace").strip()
-            raise DemoError(said or f"`calibrate solve` ended with {done.returncode}.") from None
+            raise DemoError("demo-solve-failed", exit_code=done.returncode, said=said) from None
         raise DemoError.from_data(problem)
     return read_calibration(calibration)
 

@@ -102,12 +102,8 @@ class _Taking:
         require_same_cell("The station", self._calibration, identity)
         lens = self._calibration.intrinsics
         if (seen.width, seen.height) != (lens.width, lens.height):
-            raise WatchSourceError(
-                f"The camera's images are {seen.width}×{seen.height}, the calibration is of "
-                f"{lens.width}×{lens.height}.",
-                width=seen.width,
-                height=seen.height,
-            )
+            why = f"the camera's images are {seen.width}×{seen.height}, the calibration is of "
+            raise WatchSourceError(why=why + f"{lens.width}×{lens.height}", advice="")
 
 
 def _entry(seen: Observation) -> WatchEntry:

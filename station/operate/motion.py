@@ -36,7 +36,7 @@ async def status_now(socket: Path) -> StationStatus:
     async with Client(socket) as client:
         async for status in client.statuses():
             return status
-    raise DaemonGoneError("The daemon ended before it told its status.", remedy="Start it again.")
+    raise DaemonGoneError("daemon-ended", during="before it told its status")
 
 
 async def wait_until_idle(link: Client, *, camera: bool = True) -> StationStatus:
@@ -135,4 +135,4 @@ async def _until_rest(link: Client, watch: Watcher) -> StationStatus:
             return status
         if status.state is StationState.IDLE and (status.session.recording or status.reason):
             return status
-    raise DaemonGoneError("The daemon ended during the session.", remedy="What was saved before is safe.")
+    raise DaemonGoneError("daemon-ended", during="during the session")

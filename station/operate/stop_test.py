@@ -144,4 +144,4 @@ class AcceptanceTest:
                         return moment_ns
         except TimeoutError:
             raise StationError("no-end", limit_s=END_S) from None
-        raise DaemonGoneError("The daemon ended during the test.")
+        raise DaemonGoneError("daemon-ended", during="during the test")

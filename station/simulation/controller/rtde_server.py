@@ -80,7 +80,7 @@ class RtdeConnection(Connection):
                     kind = PacketType(kind)
                     self.transport.write(packet(kind, self._handlers[kind](payload)))
                 else:
-                    raise RtdeError(f"packet type {kind}")
+                    raise RtdeError(reason=f"packet type {kind}")
         except (RtdeError, struct.error) as error:
             self._robot.journal.note("controller", "bad RTDE packet", error=str(error))
             self.transport.close()
@@ -131,7 +131,7 @@ class RtdeConnection(Connection):
     def _data(self, payload: bytes) -> None:
         number = payload[0] if payload else 0
         if not 1 <= number <= len(self._inputs):
-            raise RtdeError(f"data for input recipe {number}, which was never set up")
+            raise RtdeError(reason=f"data for input recipe {number}, which was never set up")
         recipe = self._inputs[number - 1]
         self._robot.receive_inputs(recipe.names, recipe.unpack_elements(payload))
 

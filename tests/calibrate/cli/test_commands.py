@@ -151,7 +151,11 @@ def test_a_session_of_this_cell_with_another_device_puts_what_is_installed_in_do
     )  # fmt: skip
     answer = run("drift-check", recording, "--root", root, "--json", cwd=tmp_path)
     told = json.loads(answer.stdout)["error"]
-    assert (answer.returncode, told["code"], told["values"]["differs"]) == (2, "views-of-another-cell", device)
+    assert (answer.returncode, told["code"], told["values"]["differs"]) == (
+        2,
+        "views-of-another-cell",
+        device,
+    )
     validity = load_installed(root, require_valid=False).validity
     if elsewhere:
         assert validity.state is ValidityState.VALID

@@ -42,7 +42,7 @@ class FakeDaemon:
 
     def __init__(self, first: int, **changes: object) -> None:
         self.pictures = production()[1][first:]
-        self.refusals = [RefusedError("moves", code="arm-moves"), RefusedError("run", code="wrong-state")]
+        self.refusals = [RefusedError("arm-moves"), RefusedError("wrong-state")]
         self.changes = changes
 
     def __call__(self, path: Path, verb: Verb[Any]) -> Observation:
@@ -134,7 +134,7 @@ def test_a_stop_of_the_arm_counts_once(root: Path, monkeypatch: pytest.MonkeyPat
 
 def test_a_station_that_gives_no_first_picture_ends_it(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def daemon(path: Path, verb: object) -> Observation:
-        raise RefusedError("dark", code="camera-gone")
+        raise RefusedError("camera-gone")
 
     code, lines = watch(daemon, root, monkeypatch)  # type: ignore[arg-type]
     assert code == 1 and lines[-1]["error"]["code"] == "camera-gone"

@@ -128,7 +128,7 @@ class Turned(Device):
 
     def check_settings(self) -> tuple[float, float]:
         if self.exposed:
-            raise CameraError("another exposure", code="settings-changed")
+            raise CameraError("settings-changed")
         return 1000.0, 0.0
 
     def frame(self, timeout_s: float) -> Any:

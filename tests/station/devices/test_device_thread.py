@@ -23,7 +23,7 @@ class Device:
         try:
             raise TimeoutError("the register was not read")
         except TimeoutError as error:
-            raise CameraError("the camera is gone", code="camera-lost") from error
+            raise CameraError("camera-lost") from error
 
 
 async def test_a_device_ends_in_the_thread_however_long_its_error_is_kept() -> None:

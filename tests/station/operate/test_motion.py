@@ -82,7 +82,7 @@ class Elsewhere:
             case MakePlan():
                 self.made = True
             case Prepare() if not self.made:
-                raise LimitError("The plan was made from another posture.", code=PLANNED_ELSEWHERE)
+                raise LimitError(PLANNED_ELSEWHERE)
             case Prepare():
                 return MotionPreview("t", "run plan", "ab" * 32, 1, 1.0, 0.1, 0.1, 10.0, "to pose 1")
         return Done()

@@ -16,7 +16,6 @@ from typing import Any
 import msgspec
 import pytest
 
-from recordings.errors import ErrorData
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
@@ -44,7 +43,7 @@ class RecordingHandler(SessionDispatcher):
         if verb == "make_plan":
             await self.release.wait()
         if verb == "go":
-            raise RefusedError("no", code="no-control", remedy="Take it.", holder="anna")
+            raise RefusedError("no-control", holder="anna")
         if verb == "skip":
             return {"index": msgspec.json.decode(args)["index"]}
         self.order.append(verb)
@@ -105,7 +104,7 @@ async def test_refusals_keep_their_code_values_and_remedy(server: Served) -> Non
     async with Client(path) as client:
         with pytest.raises(RefusedError) as refused:
             await client.call(Go("x"))
-    assert refused.value.data == ErrorData("no-control", "no", "Take it.", {"holder": "anna"})
+    assert refused.value.data == RefusedError("no-control", holder="anna").data
 
 
 async def test_watchers_get_everything_once_then_only_changes(server: Served) -> None:

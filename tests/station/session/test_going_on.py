@@ -13,7 +13,7 @@ from station.devices.news import Delay
 from tests.patience import until
 from tests.station.session_rig import POSES, NewRig, Rig, sealed
 
-LATE = [StaleStateError("busy", code=delay) for delay in Delay]
+LATE = [StaleStateError(delay) for delay in Delay]
 
 
 async def end_of_run(rig: Rig, errors: list[RobotError]) -> Rig:
@@ -62,8 +62,8 @@ async def test_the_fourth_lateness_waits_for_a_person(rig: Rig) -> None:
     ("error", "state"),
     [
         (StaleStateError("no news, and nobody knows why"), S.FAULT),
-        (RobotError("ended on the pendant", code="program-ended"), S.FAULT),
-        (SafetyStopError("protective stop", code="protective-stop"), S.STOPPED),
+        (RobotError("program-ended"), S.FAULT),
+        (SafetyStopError("protective-stop"), S.STOPPED),
     ],
 )
 async def test_nothing_but_lateness_is_gone_on_after(rig: Rig, error: RobotError, state: S) -> None:

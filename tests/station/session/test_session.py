@@ -207,7 +207,7 @@ async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_pl
 
 
 async def test_a_refused_control_leaves_everything_as_it_was(rig: Rig, tmp_path: Path) -> None:
-    rig.arm.refuse_control = RobotError("local", code="local-control")
+    rig.arm.refuse_control = RobotError("local-control")
     await rig.give_go()
     await rig.until(S.IDLE)
     assert rig.cause == "local-control"

@@ -26,8 +26,8 @@ from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 _TAG = board_points(BoardSpec(BoardKind.APRIL_TAG, square_m=0.05))
 _WIDTH, _HEIGHT, _PER_DAY = 1600, 1200, 1000
 _ARM = MODELS["UR10"]
-_BLURRED, _CREEP_MM = 0.05, 0.1
-"""Share of blurred pictures; by how much the camera creeps a day, from the first picture on."""
+_BLURRED = 0.05
+"""Share of blurred pictures."""
 _MOUNTS: tuple[Mount, Mount] = ("eye-in-hand", "eye-to-hand")
 
 
@@ -39,6 +39,8 @@ class Cell:
     """Few postures that come again and again in any order; else every posture is another."""
     narrow: bool = False
     """All views within ±5° of tilt and ±10° of roll."""
+    creep_mm: float = 0.1
+    """By which the camera creeps a day, from the first picture on."""
 
 
 @dataclass(frozen=True)
@@ -266,7 +268,7 @@ def _still(cell: Cell, count: int) -> _Still:
         arm,
         joints,
         joints + _repeating(rng, joints),
-        _with_day(rng, X, days, 0.05, _CREEP_MM),
+        _with_day(rng, X, days, 0.05, cell.creep_mm),
         _with_day(rng, P, days, 0.02, 0.0),
         _TAG * (1 + 0.003 * rng.normal()),
         ways / np.linalg.norm(ways, axis=1, keepdims=True),

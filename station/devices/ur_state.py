@@ -244,9 +244,9 @@ class StateReader(threading.Thread):
         self.newest = Sample(
             state, int(v[32]), Payload(v[33], (v[34], v[35], v[36])) if len(v) > 33 else Payload()
         )
+        self._on_state(state)
         if not self.started.done():
             self.started.set_result(self.newest)
-        self._on_state(state)
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> tuple[int, int]:
         """Return host monotonic and wall time of the newest bytes, from the kernel's stamp.

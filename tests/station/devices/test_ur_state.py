@@ -155,3 +155,13 @@ async def test_the_pose_at_a_moment(controller: Start, tmp_path: Path) -> None:
         with pytest.raises(StationError):
             link.at(time.monotonic_ns() + late_ns)
     await link.close()
+
+
+def test_the_first_sample_is_delivered_before_anybody_is_told_of_it(controller: Start) -> None:
+    """A link that was told first took a state that it had not been given for one that never came."""
+    told: list[bool] = []
+    reader = StateReader(controller("UR10e").host, lambda _: told.append(reader.started.done()), print)
+    reader.start()
+    reader.started.result(PATIENCE_S)
+    reader.close()
+    assert told[0] is False

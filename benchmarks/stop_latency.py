@@ -104,7 +104,7 @@ async def trial(context: LatencyRig, way: str, times: Times) -> None:
     child, dashboard = robot._child, robot.dashboard
     if child is None or dashboard is None:
         await context.rest(move)
-        raise RobotError("control ended before the STOP")
+        raise RobotError()
     if way == "no heartbeat":
         context.beating = False
         begun_ns = context.beat_ns

@@ -73,9 +73,7 @@ async def test_driving_process(
         begun = time.monotonic()
         await c.stops()  # 1/5 s of silence, then the controller decelerates
         stopped_s = time.monotonic() - begun
-        fault_times(
-            type("O", (), {"noticed_s": 0.0, "stopped_s": stopped_s, "error": RobotError("none left")})
-        )
+        fault_times(type("O", (), {"noticed_s": 0.0, "stopped_s": stopped_s, "error": RobotError()}))
         await c.stays_at_rest()
         if kill == signal.SIGSTOP:
             driver.send_signal(signal.SIGCONT)

@@ -77,7 +77,7 @@ def held_disk(monkeypatch: pytest.MonkeyPatch) -> HeldDisk:
         disk.asked += 1
         await disk.wait()
         if disk.fails:
-            raise RecordingError("cannot write: no space left on device")
+            raise RecordingError()
         await sync(recording)
 
     monkeypatch.setattr(SessionRecording, "sync", held)

@@ -105,7 +105,7 @@ class ArmInMemory:
 
     def latest(self) -> RobotState:
         if self.late or self.lost:
-            raise StaleStateError("no news from the robot")
+            raise StaleStateError()
         return self._state()
 
     def at(self, host_monotonic_ns: int) -> RobotState:
@@ -211,7 +211,7 @@ class CameraInMemory:
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
         if self.fail:
-            raise CameraError(self.fail.pop(0))
+            raise CameraError(reason=self.fail.pop(0))
         self.taken += 1
         shape, now_ns = (TRUTH.camera.height, TRUTH.camera.width), time.monotonic_ns()
         return Image(
@@ -232,7 +232,7 @@ class CameraInMemory:
         if self.blind:
             return None
         if self.glimpse_fails:
-            raise CameraError(self.glimpse_fails.pop(0))
+            raise CameraError(reason=self.glimpse_fails.pop(0))
         image = np.roll(GLIMPSED, self.jumps * (self.glimpses % 2), axis=0)
         return Image(image, Stamps(), 0, 0)
 

@@ -86,11 +86,11 @@ async def test_nothing_is_planned_where_nothing_is_installed(link: FakeLink, tmp
 
 
 async def test_what_the_daemon_refuses_is_said(link: FakeLink, installed: Path) -> None:
-    link.refuse["make_plan"] = RefusedError("a session is open: finish it first")
+    link.refuse["make_plan"] = refused = RefusedError("session-open")
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await ask_for_it(pilot)
-        await until(pilot, lambda: said(app, "a session is open"))
+        await until(pilot, lambda: said(app, str(refused)))
         assert "prepare" not in link.verbs and not app.known.busy
 
 

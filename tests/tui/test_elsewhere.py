@@ -139,9 +139,9 @@ async def test_a_list_that_did_not_come_is_asked_for_again_and_the_old_one_stays
     async with app.run_test(size=(80, 24)) as pilot:
         table = await list_of_sessions(app, pilot)
         await until(pilot, lambda: table.row_count == 2)
-        link.refuse["sessions"] = StationError("the daemon is gone")
+        link.refuse["sessions"] = gone = StationError()
         (root / "sessions" / "s-3").mkdir()
-        await until(pilot, lambda: any("gone" in notice.message for notice in app._notifications))
+        await until(pilot, lambda: any(str(gone) in notice.message for notice in app._notifications))
         assert table.row_count == 2
         link.answers["sessions"] = [summary("s-3"), *link.answers["sessions"]]
         del link.refuse["sessions"]

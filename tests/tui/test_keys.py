@@ -41,10 +41,10 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
 
 
 async def test_a_refusal_is_said_and_nothing_moves(link: FakeLink) -> None:
-    link.refuse["prepare"] = RefusedError("held by anna on tty1")
+    link.refuse["prepare"] = RefusedError("control-held", holder="anna on tty1")
     async with opened(link, notifications=True) as pilot:
         await pilot.press("f5")
-        await until(pilot, lambda: any("held by anna" in n.message for n in pilot.app._notifications))
+        await until(pilot, lambda: any("anna on tty1" in n.message for n in pilot.app._notifications))
         assert link.verbs == ["prepare"]
 
 
@@ -171,12 +171,12 @@ async def test_many_resizes_leave_a_working_screen(link: FakeLink) -> None:
 async def test_what_a_stop_refused_is_not_said_any_more_after_it(link: FakeLink) -> None:
     """A notice outlives its reason by seconds otherwise."""
     link.show(idle(StationState.STOPPED, "STOP by ann"))
-    link.refuse["prepare"] = RefusedError("STOP is latched")
+    link.refuse["prepare"] = refused = RefusedError("stop-latched")
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))
         await pilot.press("f5")
-        await until(pilot, lambda: [n.message for n in pilot.app._notifications] == ["STOP is latched"])
-        link.refuse["acknowledge"] = RefusedError("not you")
+        await until(pilot, lambda: [n.message for n in pilot.app._notifications] == [str(refused)])
+        link.refuse["acknowledge"] = RefusedError()
         await pilot.press("f8")
         await until(pilot, lambda: len(pilot.app._notifications) == 2)
         link.refuse.clear()

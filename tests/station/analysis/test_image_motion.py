@@ -137,7 +137,7 @@ async def test_a_camera_that_fails_when_nobody_looks_any_more_is_no_traceback(
 
     async def hangs() -> None:
         await given_up.wait()
-        raise CameraError("no answer")
+        raise CameraError()
 
     asyncio.get_running_loop().set_exception_handler(lambda loop, context: logged.append(context))
     monkeypatch.setattr(rig.camera, "glimpse", hangs)

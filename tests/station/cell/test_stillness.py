@@ -203,7 +203,7 @@ async def test_a_camera_that_shows_nothing_is_not_called_a_shake() -> None:
 
 async def test_a_lost_robot_ends_the_waiting() -> None:
     def dead() -> None:
-        raise StaleStateError("no news")
+        raise StaleStateError()
 
     with pytest.raises(StaleStateError):
         await monitor().settle(dead)

@@ -86,7 +86,7 @@ class Device:
         return self.surplus
 
     def frame(self, timeout_s: float) -> None:
-        raise CameraError("it is gone" if self.lost else "a frame came incomplete")
+        raise CameraError()
 
     def close(self) -> None: ...
 

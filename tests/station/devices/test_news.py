@@ -79,7 +79,7 @@ def test_a_connection_that_ended_is_waited_for_at_rest_only() -> None:
 def test_a_resting_arm_waits_for_its_dashboard_from_when_news_are_back() -> None:
     """The cable was out: the dashboard's trouble is old, and it can be asked again only now."""
     late: Any = link(0.0)
-    late._trouble, late._trouble_since_s = DashboardError("no answer"), time.monotonic() - 5.0
+    late._trouble, late._trouble_since_s = DashboardError(), time.monotonic() - 5.0
     late._tool = late._payload = None
     for age_s in (3.0, 0.0):
         late._deliver(arrived(time.monotonic() - age_s))

@@ -32,7 +32,7 @@ class FakeLink:
     async def call(self, verb: verbs.Verb[Any], *, timeout_s: float = 0.0) -> Any:
         self.asked.append(verb)
         if self.refuse is type(verb):
-            raise RefusedError("not now")
+            raise RefusedError()
         answers = {
             verbs.GetPlan: verbs.LoadedPlan(LOADED),
             verbs.MakePlan: verbs.PlanFacts(8, PREVIEW.plan_sha256),

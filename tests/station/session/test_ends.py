@@ -203,7 +203,7 @@ async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
 async def test_a_fault_between_moves_stops_the_arm_by_both_ways(rig: Rig, held_disk: HeldDisk) -> None:
     await rig.give_go()
     await rig.until(S.WRITING)
-    rig.arm.trouble = RobotError("the program was stopped")
+    rig.arm.trouble = RobotError()
     held_disk.set()
     await rig.until(S.FAULT)
     await until(lambda: "end control" in rig.arm.log)

@@ -54,7 +54,7 @@ async def test_an_arm_that_does_not_rest_fails_the_pose(rig: Rig, monkeypatch: p
 
 async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
     await rig.go_until_it_moves()
-    rig.arm.trouble = SafetyStopError("protective stop: find what the arm ran into")
+    rig.arm.trouble = SafetyStopError()
     rig.arm.arrive.set()
     await rig.until(S.STOPPED)
     assert rig.cause == "safety-stop"
@@ -68,8 +68,8 @@ async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("method", "error", "cause"),
     [
-        ("sync", RecordingError("no space left on the device: free 4 GB"), "recording"),
-        ("require_space", RecordingError("only 0.1 GB are free"), "recording"),
+        ("sync", RecordingError(), "recording"),
+        ("require_space", RecordingError(), "recording"),
         ("require_space", ZeroDivisionError("a defect"), "internal"),
     ],
 )

@@ -61,7 +61,7 @@ async def test_the_fourth_lateness_waits_for_a_person(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("error", "state"),
     [
-        (StaleStateError("no news, and nobody knows why"), S.FAULT),
+        (StaleStateError(), S.FAULT),
         (RobotError("program-ended"), S.FAULT),
         (SafetyStopError("protective-stop"), S.STOPPED),
     ],

@@ -106,11 +106,11 @@ async def test_what_speaks_against_the_pose_during_the_picture_counts(
     capture = rig.camera.capture
 
     async def meanwhile(timeout_s: float = 5.0) -> Image:
-        rig.arm.trouble = RobotError("TCP mix-up: the TCP offset on the pendant was changed")
+        rig.arm.trouble = RobotError("tcp-changed")
         return await capture(timeout_s)
 
     monkeypatch.setattr(rig.camera, "capture", meanwhile)
     await rig.give_go()
     await rig.until(S.FAULT)
-    assert "TCP mix-up" in rig.session.store.status.reason
+    assert rig.session.store.status.cause == "tcp-changed"
     assert rig.pose_states == ["planned"] * POSES

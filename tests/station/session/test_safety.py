@@ -215,7 +215,7 @@ async def test_a_disk_that_hangs_does_not_hang_the_station(rig: Rig, monkeypatch
     from recordings.errors import RecordingError
 
     async def no_sync(self: SessionRecording) -> None:
-        raise RecordingError("the disk did not take the data")
+        raise RecordingError()
 
     close = Recorder.close
 

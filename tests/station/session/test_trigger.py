@@ -16,7 +16,7 @@ from tests.station.session_rig import Rig
 async def test_a_lost_trigger_box_is_a_fault_of_the_session_until_the_next_go(rig: Rig) -> None:
     """The session's own devices in memory; the camera's box is gone at the first picture."""
     capture = rig.camera.capture
-    gone = [TriggerError("trigger box lost: /dev/ttyACM0 is gone")]
+    gone = [TriggerError()]
 
     async def with_box(timeout_s: float = 5.0) -> Image:
         if gone:
@@ -26,7 +26,7 @@ async def test_a_lost_trigger_box_is_a_fault_of_the_session_until_the_next_go(ri
     rig.camera.capture = with_box  # type: ignore[method-assign]
     await rig.give_go()
     await rig.until(S.FAULT)
-    assert "trigger box lost" in rig.session.store.status.reason
+    assert rig.session.store.status.cause == "trigger"
     assert "done" not in rig.pose_states
     await rig.session.acknowledge(1)
     await rig.give_go()
@@ -53,11 +53,11 @@ async def test_17_a_camera_that_loses_the_first_frame_after_a_pause_is_woken(
             return await capture(timeout_s)
         lost += 1  # the very first one however soon after a glimpse
         await asyncio.sleep(0.3)
-        raise CameraError("no picture within 0.3 s of its trigger")
+        raise CameraError()
 
     async def dozing_glimpse() -> Image | None:
         if not triggered():
-            raise CameraError("no picture")
+            raise CameraError()
         return await glimpse()
 
     monkeypatch.setattr(rig.camera, "capture", dozing_capture)

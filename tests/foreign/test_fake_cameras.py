@@ -28,7 +28,7 @@ from station.cell.status import MotionPreview, StationState, StationStatus
 from station.operate.motion import carry_out, prepared_motion, wait_until_idle
 from station.plan.planner import make_plan
 from station.protocol.client import Client
-from station.protocol.verbs import Check, Doctor, Finish, LoadPlan, Purpose, Stop
+from station.protocol.verbs import Check, Doctor, Finish, LoadPlan, Prepare, Purpose, Stop
 from station.simulation.camera_process import CameraProcess
 from station.simulation.cells import cell_config, make_cell
 from station.simulation.launch import SimulatedController, start_controller
@@ -113,7 +113,7 @@ async def stopped_in_mid_move(client: Client, plan: Plan, arm: SimulatedControll
         def speed_rad_s() -> float:
             return float(max(map(abs, admin.ask("state")["joint_speeds_rad_s"])))
 
-        assert await prepared_motion(client, Purpose.RUN, yes, headless=True)
+        assert await prepared_motion(client, Prepare(), yes, headless=True)
         async with asyncio.timeout(30):
             while speed_rad_s() < 0.1:
                 await asyncio.sleep(0.005)
@@ -154,7 +154,7 @@ async def test_a_session_with_the_emulated_camera(
             camera.mangle = loss(0.002)
             ended = await captured(client, plan)
             assert ended.session.captured == 3, ended.reason
-            assert ended.camera.resent_packets > 0
+            assert ended.camera.counts.stream.resent_packets > 0
             views = open_recording(Path(ended.session.recording)).views()
             assert all(view.time_bound_s is not None and view.time_bound_s < 0.02 for view in views)
             power.close()

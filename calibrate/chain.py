@@ -29,7 +29,6 @@ from calibrate.geometry import (
     rotation_log,
     skew,
 )
-from calibrate.kinematics import RobotModel, link_frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +91,6 @@ class Chain:
                 along = axis @ (at - point)
             at = point + along * axis
             yield at
-
-
-def chain_of(model: RobotModel) -> Chain:
-    """Describe a table of a Universal Robots arm as a chain."""
-    frames = link_frames(model, np.zeros(6))
-    return Chain(frames[:6, :3, 2], frames[:6, :3, 3], np.zeros(6), frames[6])
 
 
 @dataclass(frozen=True, eq=False)

@@ -103,7 +103,7 @@ def arm_postures(views: ViewSet) -> tuple[ArmPostures | None, str]:
     if joints is not None:
         if model is not None and joints.shape[1] == 6 and _agree(forward(model, joints), flanges):
             return ArmPostures(model, joints, True), ""
-        learned, joints, note = _learned(joints, flanges)
+        learned, joints, note = _learned(joints, views)
         if learned.explains:
             return ArmPostures(learned.chain, joints, True), note
     if published is None or model is None:
@@ -112,8 +112,9 @@ def arm_postures(views: ViewSet) -> tuple[ArmPostures | None, str]:
     return (None if found is None else ArmPostures(model, found, False)), note
 
 
-def _learned(joints: Array, flanges: Array) -> tuple[LearnedChain, Array, str]:
+def _learned(joints: Array, views: ViewSet) -> tuple[LearnedChain, Array, str]:
     """Learn a chain: it, the joints as they were read, and what is unusual about them."""
+    flanges = views.base_from_flange
     learned = learn_chain(joints, flanges)
     if learned.explains:
         return learned, joints, ""
@@ -125,7 +126,7 @@ def _learned(joints: Array, flanges: Array) -> tuple[LearnedChain, Array, str]:
     row = wrong_row(joints, flanges)
     if row is None:
         return learned, joints, note + "Check the order and unit of the joints."
-    return learned, joints, note + f"Without the {row + 1}. view they do: look at its joints."
+    return learned, joints, note + f"Without pose {views.views[row].index + 1} they do: look at its joints."
 
 
 def corrected_model(nominal: RobotModel, errors: Array) -> RobotModel:

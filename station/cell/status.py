@@ -225,7 +225,7 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     plan_sha256: str = ""
     poses: tuple[PoseStatus, ...] = ()
     current: int | None = None
-    """`index` (not position in `poses`) of the pose under way, or of the last one."""
+    """Number of the pose under way, or of the last one."""
     captured: int = 0
     elapsed_s: float = 0.0
     remaining_s: float | None = None
@@ -238,11 +238,6 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     check: bool = False
     """True: a drift check, to be compared with the installed calibration, not to be solved."""
     source: Source = "real"
-
-    @property
-    def place(self) -> int | None:
-        """Position of `current` in `poses`; None: there is none, or the pose was removed."""
-        return next((place for place, pose in enumerate(self.poses) if pose.index == self.current), None)
 
 
 class LeaseStatus(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -18,7 +18,7 @@ from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, Vector
 from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
-from station.cell.pose_plan import Plan, PlannedPose
+from station.cell.pose_plan import Plan
 from station.cell.session_folder import SessionSummary
 from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
@@ -163,7 +163,6 @@ class Purpose(StrEnum):
     RUN = "run"
     DRIFT_CHECK = "check"
     RESUME = "resume"
-    RETAKE = "retake"
     STOP_TEST = "stop-test"
 
 
@@ -245,8 +244,6 @@ class Prepare(Verb[MotionPreview], frozen=True):
     states = RESTING
     spoken = "a motion"
     purpose: Purpose = Purpose.RUN
-    index: int | None = None
-    """The pose to retake."""
     stop_test: StopTest | None = None
     """The move of a stop test."""
 
@@ -288,34 +285,12 @@ class Skip(Verb[Done], frozen=True):
     index: int
 
 
-class Reorder(Verb[Done], frozen=True):
-    """Change the order of the poses; each number once."""
-
-    states = RESTING
-    order: tuple[int, ...]
-
-
-class Add(Verb[PoseNumber], frozen=True):
-    """Add a pose at the end."""
-
-    states = RESTING
-    pose: PlannedPose
-
-
-class Drop(Verb[Done], frozen=True):
-    """Remove a pose that was never tried."""
-
-    states = RUNNING | RESTING
-    index: int
-
-
 class Freedrive(Verb[Done], frozen=True):
-    """Begin or end capture by hand; `auto`: an image whenever the arm rests anew."""
+    """Begin or end capture by hand."""
 
     wire = "free_drive"
     states = RESTING | {S.FREE_DRIVE}
     on: bool
-    auto: bool = False
 
 
 class Record(Verb[PoseNumber], frozen=True):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Awaitable, Callable, Coroutine
-from operator import methodcaller
 
 import msgspec
 
@@ -109,7 +108,7 @@ class SessionDispatcher:
             case verbs.Prepare():
                 if verb.stop_test is not None:
                     self._rule.by_person(await self._named(caller), "A stop test")
-                return await session.prepare(client, verb.purpose, verb.index, verb.stop_test)
+                return await session.prepare(client, verb.purpose, verb.stop_test)
             case verbs.Go():
                 approval = await self._approval(caller, verb.plan_sha256)
                 await session.go(client, verb.token, approval, again=verb.headless)
@@ -117,13 +116,10 @@ class SessionDispatcher:
                 session.pause(caller.who)
             case verbs.Finish():
                 await self._to_the_end(session.finish(client))
-            case verbs.Retake() | verbs.Skip() | verbs.Reorder() | verbs.Add() | verbs.Drop():
-                # The queue's method has the verb's name and arguments.
-                change = methodcaller(verb.verb(), *msgspec.structs.astuple(verb))
-                index: int | None = await session.edit(type(verb), client, change)
-                return None if index is None else verbs.PoseNumber(index)
+            case verbs.Retake() | verbs.Skip():
+                await session.edit(client, verb)
             case verbs.Freedrive():
-                await self._to_the_end(session.switch_free_drive(client, verb.on, verb.auto))
+                await self._to_the_end(session.switch_free_drive(client, verb.on))
             case verbs.Record():
                 return verbs.PoseNumber(await session.record(client))
             case verbs.Preview():

@@ -48,6 +48,7 @@ class Estimator:
             camera = config.camera.model
             if camera is None or camera.matrix is None:
                 continue
+            queue = context.queue
             try:
                 estimate = await self._estimate()
             except Exception as error:  # the capture does not depend on it, so it must not end
@@ -56,7 +57,7 @@ class Estimator:
                 context.store.problem(error, said="no running estimate: {}")
                 continue
             context.store.update(estimate=estimate)
-            if (queue := context.queue) is not None:
+            if queue is not None and queue is context.queue:
                 queue.note_estimate(self._known[-1], estimate.sigma_translation_mm)
                 context.store.update_session(poses=queue.statuses)
             if (recording := context.recording) is not None:

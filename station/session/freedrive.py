@@ -5,10 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 
-import numpy as np
-
 from recordings.errors import RecordingError
-from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError, RobotError, StaleStateError, StationError, TriggerError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState
@@ -23,9 +20,6 @@ from station.session.run import disk_failed, internal_error, unmark_busy
 log = logging.getLogger(__name__)
 
 _GUIDE = "Guide the arm by hand. The station does not move it."
-NEW_PLACE_RAD = 0.1
-"""Turn of a joint since the last image from which an image is taken automatically."""
-WATCH_PERIOD_S = 0.1
 
 
 class FreedriveCapture:
@@ -34,8 +28,6 @@ class FreedriveCapture:
     def __init__(self, context: SessionContext) -> None:
         self._context = context
         self._taking = asyncio.Lock()
-        self._watcher: asyncio.Task[None] | None = None
-        self._last_place: Vector6 | None = None
         context.store.watch(self._note_guiding)
 
     def _note_guiding(self) -> None:
@@ -44,11 +36,10 @@ class FreedriveCapture:
         if state not in (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING):
             self._context.cell.robot.guided = state is StationState.FREE_DRIVE
 
-    async def begin(self, auto: bool) -> None:
-        """Begin freedrive; open a recording if none is open. `auto`: take an image at each new rest."""
+    async def begin(self) -> None:
+        """Begin freedrive; open a recording if none is open."""
         if self.taking:
             raise RefusedError("still-ending", what="the last image")
-        self._end_watch()
         context, store = self._context, self._context.store
         await context.arm()
         if (refusal := Freedrive.refusal(store.state)) is not None:
@@ -69,9 +60,6 @@ class FreedriveCapture:
             raise refusal  # STOP, or the end of freedrive, came in between
         store.enter(StationState.FREE_DRIVE, _GUIDE)
         context.show_poses()
-        self._last_place = None
-        if auto:
-            self._watcher = asyncio.create_task(self._watch())
 
     async def _open_recording(self) -> None:
         context, new = self._context, self._context.recording is None
@@ -86,7 +74,6 @@ class FreedriveCapture:
 
     def end(self) -> None:
         """End freedrive: to paused; the recording stays open."""
-        self._end_watch()
         if self._context.store.state is StationState.FREE_DRIVE:
             self._context.store.enter(
                 StationState.PAUSED, "Freedrive ended. Resume or finish.", "freedrive-ended"
@@ -98,14 +85,9 @@ class FreedriveCapture:
         return self._taking.locked()
 
     async def last_picture(self) -> None:
-        """Wait for the image under way; no further automatic one begins."""
+        """Wait for the image under way."""
         async with self._taking:
-            self._end_watch()
-
-    def _end_watch(self) -> None:
-        if self._watcher is not None:
-            self._watcher.cancel()
-            self._watcher = None
+            pass
 
     async def record(self) -> int:
         """Take an image now; return its pose number. RefusedError while one is being taken."""
@@ -119,10 +101,9 @@ class FreedriveCapture:
         queue, store = context.require_queue(), context.store
         joints = (await fresh(context.cell.robot)).joints_rad
         index = queue.add(
-            PlannedPose(f"hand-{queue.next_index + 1:02d}", joints, why="guided by hand", guided=True)
+            PlannedPose(f"hand-{len(queue.statuses) + 1:02d}", joints, why="guided by hand", guided=True)
         )
         attempt = queue.start_attempt(index)
-        self._last_place = joints
         try:
             await take_pose(context, index, attempt)
         except (PoseFailedError, NotStillError, StaleStateError) as error:  # late states: no move to stop
@@ -151,24 +132,3 @@ class FreedriveCapture:
         if not self._context.requests.halt:
             self._context.store.enter(StationState.FAULT, error)
             self._context.store.problem(error, "error", index)
-
-    async def _watch(self) -> None:
-        """Take images automatically until freedrive ends."""
-        while self._context.store.state not in (StationState.PAUSED, StationState.IDLE):
-            await asyncio.sleep(WATCH_PERIOD_S)
-            if self._context.store.state is not StationState.FREE_DRIVE:
-                continue
-            try:
-                if self._at_rest_elsewhere():
-                    await self.record()
-            except StaleStateError:
-                continue  # states are late; an image waits for current ones
-            except StationError as error:
-                self._context.store.problem(error)
-
-    def _at_rest_elsewhere(self) -> bool:
-        if not self._context.stillness.at_rest:
-            return False
-        joints = self._context.cell.robot.latest().joints_rad
-        last = self._last_place
-        return last is None or bool(np.abs(np.subtract(joints, last)).max() > NEW_PLACE_RAD)

@@ -45,20 +45,14 @@ class Motion:
     """Move of a stop test, which records nothing; None: images are captured."""
 
 
-def session_motion(context: SessionContext, purpose: Purpose, index: int | None) -> Motion:
+def session_motion(context: SessionContext, purpose: Purpose) -> Motion:
     """Choose the poses that an approval for this purpose would cover. RefusedError when there are none.
 
     A new session gets poses of its own: until the approval the last session stays shown.
     """
     queue, begun = context.loaded(), context.recording is not None
-    if purpose in (Purpose.RETAKE, Purpose.RESUME) and not begun:
+    if purpose is Purpose.RESUME and not begun:
         raise RefusedError("no-session")
-    if purpose is Purpose.RETAKE:
-        if index is None:
-            raise RefusedError("no-pose-named")
-        if queue.status(index).state != "planned":
-            queue.retake(index)
-        return Motion(purpose, queue, (index,))
     if purpose is Purpose.DRIFT_CHECK and begun:
         raise RefusedError("session-open")
     if purpose is Purpose.RUN and not begun:
@@ -137,8 +131,6 @@ def _listed(check: PlanCheck) -> str:
 def _purpose_words(context: SessionContext, motion: Motion) -> str:
     if motion.stop_test is not None:
         return motion.queue.plan.note
-    if motion.purpose is Purpose.RETAKE:
-        return f"retake pose {motion.poses[0] + 1}"
     if motion.purpose is Purpose.DRIFT_CHECK:
         return "drift check of the installed calibration"
     if context.recording is None:

@@ -9,10 +9,8 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import msgspec
 
@@ -48,7 +46,6 @@ from station.session.threads import DISK
 
 log = logging.getLogger(__name__)
 
-R = TypeVar("R")
 END_RUN_S = 10.0
 END_RUN_AT_CLOSE_S, CLOSE_DEVICES_S = 1.0, 1.8
 """Longest waits at the daemon's end for a run and for devices."""
@@ -173,7 +170,6 @@ class Session:
         self,
         client_id: int,
         purpose: Purpose,
-        index: int | None = None,
         stop_test: verbs.StopTest | None = None,
     ) -> MotionPreview:
         """Check the whole path from where the arm is and offer it for approval, once."""
@@ -188,7 +184,7 @@ class Session:
             motion = await stop_motion(context, stop_test)
         else:
             await look_back(context)
-            motion = session_motion(context, purpose, index)
+            motion = session_motion(context, purpose)
         preview = await previewed(context, motion, self._notes)
         self.permit(verbs.Prepare, client_id)
         if self.approvals.voids != voids:
@@ -314,15 +310,16 @@ class Session:
         count = len(plan.poses)
         self.store.event("plan-loaded", f"plan of {count} poses loaded", poses=count)
 
-    async def edit(self, verb: type[Verb[object]], client_id: int, change: Callable[[PoseQueue], R]) -> R:
-        """Change the poses (retake, skip, reorder, add, drop), voiding an offered motion.
+    async def edit(self, client_id: int, verb: verbs.Retake | verbs.Skip) -> None:
+        """Retake or skip a pose, voiding an offered motion.
 
         RecordingError: the change is made, but could not be saved.
         """
-        self.permit(verb, client_id)
+        self.permit(type(verb), client_id)
         context = self.context
         queue = context.loaded()
-        result = change(queue)
+        change = queue.retake if isinstance(verb, verbs.Retake) else queue.skip
+        change(verb.index)
         self._void()
         context.show_poses(self.store.status.session.current)
         if context.recording is not None:
@@ -330,14 +327,13 @@ class Session:
                 await context.recording.save_state(queue)
             except RecordingError as error:
                 raise RecordingError("change-not-saved", reason=str(error)) from None
-        return result
 
-    async def switch_free_drive(self, client_id: int, on: bool, auto: bool) -> None:
+    async def switch_free_drive(self, client_id: int, on: bool) -> None:
         self.permit(verbs.Freedrive, client_id)
         self._void()
         if on:
             await self._run_ended()
-            await self.freedrive.begin(auto)
+            await self.freedrive.begin()
         else:
             self.freedrive.end()
 

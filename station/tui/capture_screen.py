@@ -52,9 +52,8 @@ class CaptureScreen(StationScreen):
             return
         session = status.session
         title = "Poses"
-        if session.place is not None and status.state in RUNNING:
-            number = session.poses[session.place].index + 1
-            title = f"Pose {number} ({session.place + 1} of {len(session.poses)})"
+        if session.current is not None and status.state in RUNNING:
+            title = f"Pose {session.current + 1} of {len(session.poses)}"
         self.query_one("#progress").border_title = f"{title}: OLD" if known.old else title
         self.query_one("#picture").border_title = (
             f"Camera  {status.camera.model}"

@@ -1,4 +1,4 @@
-"""Plan: every pose with its gain and reason, the cell around it; add, drop, skip, retake."""
+"""Plan: every pose with its gain and reason, the cell around it; skip, retake."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from textual.containers import Horizontal, Vertical
 from textual.content import Content
 
 from station.cell.layout import CellLayout
-from station.cell.pose_plan import PlannedPose
 from station.cell.status import PoseStatus, StationStatus
 from station.operate.motion import PREPARE_S
-from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
+from station.protocol.verbs import MakePlan, Retake, Skip
 from station.tui.frame import Line
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
@@ -23,13 +22,12 @@ from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw, view_of
 from station.tui.words import MARKS, UNKNOWN, Mark, degrees, dim, facts, limit_bar, lines, many, mark, mm
 
 COLUMNS = ("#", "error after", "", "distance", "tilt", "state", "reason")
-NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
+NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves)."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
 NEW = "Plan 25 poses from the configured initial poses (seconds)"
 NEW_FOR_ARM = "Plan 25 poses that also tell the errors of the arm's table, board and lens"
-POSE_VERBS = {"retake": Retake, "skip": Skip, "drop": Drop}
-MOVE = Binding.Group("order", compact=True)
+POSE_VERBS = {"retake": Retake, "skip": Skip}
 SIGMA_SHOWN_MM = 100.0
 """Larger errors are not shown: after the first poses they are metres, which say nothing."""
 BAR_CELLS = 7
@@ -117,10 +115,6 @@ class PlanScreen(StationScreen):
         Binding("m", "make('both')", "New+arm", tooltip=NEW_FOR_ARM),
         Binding("r", "pose('retake')", "Retake", tooltip=RETAKE),
         Binding("s", "pose('skip')", "Skip", tooltip=SKIP),
-        Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
-        Binding("a", "add", "Add here", tooltip="Add the arm's present posture as a pose"),
-        Binding("ctrl+up", "shift(-1)", "Order", group=MOVE, tooltip="Visit this pose earlier"),
-        Binding("ctrl+down", "shift(1)", "Order", group=MOVE, tooltip="Visit this pose later"),
         Binding("left_square_bracket", "turn(-1)", "Turn", show=False, tooltip="Turn the view of the cell"),
         Binding("right_square_bracket", "turn(1)", "Turn", show=False, tooltip="Turn it the other way"),
     ]
@@ -179,26 +173,6 @@ class PlanScreen(StationScreen):
     def action_pose(self, verb: str) -> None:
         if (index := self._selected()) is not None:
             self.ask(POSE_VERBS[verb](index))
-
-    def action_shift(self, by: int) -> None:
-        status, line = self.known.live, self.table.cursor_row
-        if self._selected() is None or status is None:
-            return
-        if not 0 <= line + by < len(status.session.poses):
-            self.notify(f"This pose is the {'first' if by < 0 else 'last'} already.")
-            return
-        order = [pose.index for pose in status.session.poses]
-        order[line], order[line + by] = order[line + by], order[line]
-        self.ask(Reorder(tuple(order)))
-        self.table.move_cursor(row=line + by)
-
-    def action_add(self) -> None:
-        status = self.known.live
-        if status is None or status.robot.joints_rad is None:
-            self.notify("The arm's posture is not known: no robot state.", severity="warning")
-            return
-        name = f"here-{max((pose.index for pose in status.session.poses), default=-1) + 2}"
-        self.ask(Add(PlannedPose(name, status.robot.joints_rad, why="added on the screen")))
 
     def action_make(self, aim: Literal["camera", "both"]) -> None:
         self.ask(MakePlan(25, seed=1, aim=aim), PREPARE_S)

@@ -42,9 +42,9 @@ def pose_line(status: StationStatus) -> Content:
 def pose_under_way(status: StationStatus) -> PoseStatus | None:
     """Return the pose that the arm works at; None at rest."""
     session = status.session
-    if session.place is None:
+    if session.current is None:
         return None
-    pose = session.poses[session.place]
+    pose = session.poses[session.current]
     resting = status.state in (StationState.IDLE, StationState.PAUSED)
     return None if pose.state == "done" and resting else pose
 
@@ -86,7 +86,7 @@ def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:
     per_row = max(1, (width + 1) // (each + 1))
     made = [_chip(pose, pose.index == session.current, each) for pose in session.poses]
     whole = [made[i : i + per_row] for i in range(0, len(made), per_row)]
-    first = max(0, min((session.place or 0) // per_row - 1, len(whole) - rows))
+    first = max(0, min((session.current or 0) // per_row - 1, len(whole) - rows))
     for row in whole[first : first + rows]:
         yield Content(" ").join(row)
 

@@ -88,9 +88,6 @@ async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(link: Fa
     requests: dict[str, verbs.Verb[Any]] = {
         "r": verbs.Retake(2),
         "s": verbs.Skip(2),
-        "d": verbs.Drop(2),
-        "ctrl+up": verbs.Reorder((0, 2, 1, *range(3, 25))),
-        "ctrl+down": verbs.Reorder((0, 1, 3, 2, *range(4, 25))),
         "n": verbs.MakePlan(25, seed=1),
         "m": verbs.MakePlan(25, seed=1, aim="both"),
     }

@@ -14,7 +14,6 @@ from station.protocol import verbs
 from station.tui.desk import busy_words
 from station.tui.plan_screen import facts_line
 from station.tui.task import Known, steps
-from tests.recordings.small_recording import make_state
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 
@@ -52,27 +51,9 @@ async def test_the_end_of_two_hundred_poses_is_told_as_the_start_is(link: FakeLi
         await until(pilot, lambda: "/200" in text_of(pilot.app, "#rail"))
         await pilot.press("2", "end")
         await until(pilot, lambda: "place 200" in text_of(pilot.app, "#plan-detail"))
-        await pilot.press("d")
-        await until(pilot, lambda: verbs.Drop(199) in link.asked)
         fewer = msgspec.structs.replace(status.session, poses=poses[:-1])
         link.show(msgspec.structs.replace(status, session=fewer))
         await until(pilot, lambda: "place 199" in text_of(pilot.app, "#plan-detail"))
-
-
-async def test_a_pose_added_here_is_called_by_its_number(link: FakeLink) -> None:
-    status = idle()
-    status = msgspec.structs.replace(
-        status,
-        session=msgspec.structs.replace(status.session, poses=status.session.poses[3:]),  # some were dropped
-        robot=msgspec.structs.replace(status.robot, state=make_state(0)),
-    )
-    link.show(status)
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "/22" in text_of(pilot.app, "#rail"))
-        await pilot.press("2", "a")
-        await until(pilot, lambda: "add" in link.verbs)
-        (added,) = [verb for verb in link.asked if isinstance(verb, verbs.Add)]
-        assert added.pose.name == "here-26"
 
 
 async def test_the_sketch_fills_its_place_before_anything_new_is_told(link: FakeLink) -> None:

@@ -143,7 +143,7 @@ def test_what_a_person_should_look_at_is_never_cut(why: str, look: bool, width: 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 160])
 def test_the_keys_fit_into_one_line(width: int) -> None:
-    own = [("r", "retake"), ("s", "skip"), ("d", "drop"), ("a", "add here")]
+    own = [("n", "new"), ("m", "new+arm"), ("r", "retake"), ("s", "skip")]
     common = [("F5", "run"), ("F6", "pause"), ("F7", "finish"), ("F9", "solve"), ("F3", "freedrive")]
     groups = [
         ("plan", own),

@@ -14,13 +14,12 @@ from station.protocol.verbs import VERBS
 from station.server.approval import Peer
 from station.server.dispatch import SessionDispatcher
 from tests.codes import raises
-from tests.station.session_rig import POSES, Rig
+from tests.station.session_rig import Rig
 
 ANNA, BERT = Peer(1, 100, 0), Peer(2, 101, 0)
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "acknowledge": {}, "load_plan": {}, "make_plan": {}, "prepare": {}, "go": {"token": "t"},
     "pause": {}, "finish": {}, "retake": {"index": 0}, "skip": {"index": 1},
-    "reorder": {"order": [1, 0, *range(2, POSES)]}, "add": {}, "drop": {"index": 1},
     "free_drive": {"on": True}, "record": {},
     "observe": {"tag": {"kind": "april-tag", "square_m": 0.05}},
 }  # fmt: skip
@@ -32,7 +31,7 @@ NONE = msgspec.Raw(b"{}")
 
 
 def arguments(verb: str, plan: Plan) -> msgspec.Raw:
-    made = {"load_plan": {"plan": plan}, "add": {"pose": plan.poses[0]}}
+    made = {"load_plan": {"plan": plan}}
     return msgspec.Raw(msgspec.json.encode(made.get(verb, ARGUMENTS[verb])))
 
 
@@ -72,9 +71,9 @@ async def test_whoever_does_not_hold_the_lease_commands_nothing(
 async def test_control_that_nobody_has_goes_to_the_first_that_needs_it(rig: Rig, small_plan: Plan) -> None:
     dispatcher, lease = SessionDispatcher(rig.session), rig.session.leases
     await rig.session.release(1)
-    for verb, code in (("go", "no-control"), ("record", "wrong-state"), ("reorder", "wrong-arguments")):
+    for verb, code in (("go", "no-control"), ("record", "wrong-state"), ("retake", "wrong-arguments")):
         with raises(code):  # an approval of another's motion, nothing that could be done, no request
-            await dispatcher.handle(BERT, verb, NONE if verb == "reorder" else arguments(verb, small_plan))
+            await dispatcher.handle(BERT, verb, NONE if verb == "retake" else arguments(verb, small_plan))
     await dispatcher.handle(BERT, "configuration", NONE)
     assert lease.lease.client_id is None
     await dispatcher.handle(BERT, "skip", arguments("skip", small_plan))

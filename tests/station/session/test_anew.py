@@ -29,7 +29,7 @@ async def test_the_sealed_session_stays_shown_until_the_go(rig: Rig) -> None:
 
 async def test_a_pose_that_was_left_out_stays_left_out(rig: Rig) -> None:
     """Before the first run, and in the next one."""
-    await rig.session.edit(Skip, 1, lambda queue: queue.skip(1))
+    await rig.session.edit(1, Skip(1))
     for _ in range(2):
         assert (await rig.session.prepare(1, Purpose.RUN)).poses == POSES - 1
         await _sealed_session(rig)
@@ -40,13 +40,13 @@ async def test_a_pose_that_was_left_out_stays_left_out(rig: Rig) -> None:
 async def test_pictures_by_hand_after_a_sealed_session_are_a_session_of_their_own(rig: Rig) -> None:
     await _sealed_session(rig)
     for pictures in (1, 2):
-        await rig.session.switch_free_drive(1, True, auto=False)
+        await rig.session.switch_free_drive(1, True)
         begun = rig.session.store.status.session
         assert (begun.captured, begun.elapsed_s, begun.recording) == (0, 0.0, "")
         assert set(rig.pose_states) == {"planned"} and len(rig.pose_states) == POSES
         for _ in range(pictures):
             await rig.session.record(1)
         assert rig.session.store.status.session.captured == pictures
-        await rig.session.switch_free_drive(1, False, auto=False)
+        await rig.session.switch_free_drive(1, False)
         await rig.session.finish(1)
         assert len(list(sealed(rig).views())) == pictures

@@ -13,6 +13,7 @@ from station.analysis.estimation import running_estimate
 from station.analysis.pool import WorkerError, Workers
 from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import RobotError
+from station.cell.pose_plan import PlannedPose
 from station.cell.session_folder import SessionState
 from station.cell.status import StationState as S
 from station.cli.attended import STOP_ANSWER_S
@@ -21,14 +22,14 @@ from station.session import session
 from station.session.recording import SessionRecording
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
-from tests.station.session_rig import POSES, HeldDisk, Rig
+from tests.station.session_rig import POSES, TRUTH, HeldDisk, Rig
 
 
 @pytest.fixture
 async def guided(bare_rig: Rig) -> Rig:
     """In free drive, at a place where no picture was taken yet."""
     bare_rig.arm.rest()
-    await bare_rig.session.switch_free_drive(1, True, auto=False)
+    await bare_rig.session.switch_free_drive(1, True)
     return bare_rig
 
 
@@ -56,19 +57,6 @@ async def test_what_ends_freedrive_waits_for_its_image_unless_it_is_stop(
         await ending
     assert guided.state is state and guided.pose_states == poses
     assert bool(guided.session.store.status.session.recording) == (by == "finish")
-
-
-async def test_free_drive_switched_on_twice_watches_once(guided: Rig) -> None:
-    def watchers() -> int:
-        return sum("FreedriveCapture._watch" in str(task.get_coro()) for task in asyncio.all_tasks())
-
-    for _ in range(3):
-        await guided.session.switch_free_drive(1, True, auto=True)
-    await asyncio.sleep(0)
-    assert watchers() == 1
-    await guided.session.switch_free_drive(1, True, auto=False)
-    await asyncio.sleep(0)
-    assert watchers() == 0
 
 
 async def test_control_has_ended_before_the_recording_is_sealed(
@@ -143,12 +131,12 @@ async def test_of_two_states_of_a_session_the_newer_one_stays_on_the_disk(
     older = asyncio.create_task(recording.save_state(queue))
     await asyncio.sleep(0.01)
     older.cancel()  # as STOP does
-    queue.drop(POSES - 1)
+    queue.add(PlannedPose("hand", TRUTH.start_joints_rad))
     newer = asyncio.create_task(recording.save_state(queue))
     await asyncio.sleep(0.05)
     disk.set()
     await asyncio.wait({older, newer})
-    assert written == [POSES, POSES - 1]
+    assert written == [POSES, POSES + 1]
 
 
 class HeldSeal(asyncio.Event):

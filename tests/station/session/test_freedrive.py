@@ -11,67 +11,24 @@ from recordings.errors import RecordingError
 from recordings.schema.messages import Image
 from station.cell.errors import RefusedError, TriggerError
 from station.cell.status import StationState as S
-from station.cell.stillness import StillnessMonitor
-from station.protocol.verbs import Drop, Purpose
-from station.session import freedrive
+from station.protocol.verbs import Purpose
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from tests.codes import raises
-from tests.patience import until
-from tests.station.session_rig import POSES, Rig, sealed
+from tests.station.session_rig import Rig, sealed
 
 
 async def test_a_free_hand_records_without_control(bare_rig: Rig) -> None:
-    await bare_rig.session.switch_free_drive(1, True, auto=False)
+    await bare_rig.session.switch_free_drive(1, True)
     assert bare_rig.state is S.FREE_DRIVE
     for turn in (0.0, 0.2):
         bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + turn)
         bare_rig.arm.rest()
         await bare_rig.session.record(1)
-    await bare_rig.session.switch_free_drive(1, False, auto=False)
+    await bare_rig.session.switch_free_drive(1, False)
     await bare_rig.session.finish(1)
     assert [view.name for view in sealed(bare_rig).views()] == ["hand-01", "hand-02"]
     assert "start control" not in bare_rig.arm.log
-
-
-async def test_a_dropped_pose_does_not_take_the_name_of_the_next_picture(rig: Rig) -> None:
-    await rig.session.switch_free_drive(1, True, auto=False)
-    await rig.session.record(1)
-    await rig.session.switch_free_drive(1, False, auto=False)
-    await rig.session.edit(Drop, 1, lambda queue: queue.drop(POSES - 1))
-    await rig.session.switch_free_drive(1, True, auto=False)
-    assert await rig.session.record(1) == POSES + 1
-    names = [pose.name for pose in rig.session.store.status.session.poses]
-    assert names[-2:] == [f"hand-{POSES + 1:02d}", f"hand-{POSES + 2:02d}"]
-
-
-async def test_auto_record_takes_a_new_place_once_and_outlives_a_moment_without_news(bare_rig: Rig) -> None:
-    bare_rig.arm.rest()
-    await bare_rig.session.switch_free_drive(1, True, auto=True)
-    await until(lambda: bare_rig.session.store.status.session.captured == 1)
-    bare_rig.arm.lost = True  # for two rounds of its watch
-    await asyncio.sleep(0.25)
-    assert bare_rig.session.store.status.session.captured == 1
-    bare_rig.arm.lost = False
-    bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
-    bare_rig.arm.rest()
-    await until(lambda: bare_rig.session.store.status.session.captured == 2)
-    await bare_rig.session.stop("anna")
-    assert bare_rig.state is S.STOPPED
-
-
-async def test_auto_record_waits_for_an_arm_that_is_still_guided(
-    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rig = bare_rig
-    monkeypatch.setattr(StillnessMonitor, "at_rest", False)
-    monkeypatch.setattr(freedrive, "WATCH_PERIOD_S", 0.005)
-    await rig.session.switch_free_drive(1, True, auto=True)
-    await asyncio.sleep(0.05)
-    assert rig.state is S.FREE_DRIVE and rig.pose_states == []
-    rig.arm.rest()
-    monkeypatch.setattr(StillnessMonitor, "at_rest", True)
-    await until(lambda: rig.session.store.status.session.captured == 1)
 
 
 @pytest.mark.parametrize("broken", [TriggerError(), ZeroDivisionError("a defect")])
@@ -79,7 +36,7 @@ async def test_a_picture_that_ends_oddly_leaves_no_state_of_work(
     bare_rig: Rig, monkeypatch: pytest.MonkeyPatch, broken: Exception
 ) -> None:
     bare_rig.arm.rest()
-    await bare_rig.session.switch_free_drive(1, True, auto=False)
+    await bare_rig.session.switch_free_drive(1, True)
 
     async def capture(timeout_s: float = 5.0) -> None:
         raise broken
@@ -101,7 +58,7 @@ async def _begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> tuple[asyncio.Ev
         return await settings()
 
     monkeypatch.setattr(rig.camera, "settings", slow)
-    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
+    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True))
     await asyncio.sleep(0.02)
     return opened, beginning
 
@@ -130,16 +87,16 @@ async def test_free_drive_does_not_begin_beside_a_picture_that_a_lost_lease_left
     bare_rig: Rig, held_camera: asyncio.Event
 ) -> None:
     rig = bare_rig
-    await rig.session.switch_free_drive(1, True, auto=False)
+    await rig.session.switch_free_drive(1, True)
     taking = asyncio.ensure_future(rig.session.record(1))
     await rig.until(S.CAPTURING)
     await rig.session.lease_lost(1)
     rig.session.take_lease(1, "anna")
     with raises("still-ending"):
-        await rig.session.switch_free_drive(1, True, auto=False)
+        await rig.session.switch_free_drive(1, True)
     held_camera.set()
     await taking
-    await rig.session.switch_free_drive(1, True, auto=False)
+    await rig.session.switch_free_drive(1, True)
     assert rig.state is S.FREE_DRIVE
 
 
@@ -156,7 +113,7 @@ async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
         await opening(recording, queue, picture)
 
     monkeypatch.setattr(SessionRecording, "open", slow)
-    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
+    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True))
     await rig.until(S.FREE_DRIVE)
     await rig.session.stop("bert")
     await rig.session.acknowledge("anna")

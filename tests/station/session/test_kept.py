@@ -39,7 +39,7 @@ async def test_a_plan_that_was_changed_in_a_pause_is_known_after_a_crash(new_rig
     first = await new_rig()
     await first.go_until_it_moves()
     await first.pause_after_this_pose("anna")
-    await first.session.edit(Skip, 1, lambda queue: queue.skip(2))
+    await first.session.edit(1, Skip(2))
     crash(first)
     second = await new_rig(with_plan=False)
     assert second.pose_states == ["done", "planned", "skipped", "planned"]
@@ -56,7 +56,7 @@ async def test_a_change_that_the_disk_does_not_take_is_told_to_who_asked(
 
     monkeypatch.setattr("station.session.recording.write_state", full)
     with raises("change-not-saved", RecordingError):
-        await rig.session.edit(Skip, 1, lambda queue: queue.skip(2))
+        await rig.session.edit(1, Skip(2))
     assert rig.pose_states == ["done", "planned", "skipped", "planned"]
 
 
@@ -79,7 +79,7 @@ async def test_a_drift_check_is_still_one_after_a_crash(new_rig: NewRig) -> None
 async def test_a_picture_counts_until_its_pose_was_taken_again(rig: Rig) -> None:
     await rig.go_until_it_moves()
     await rig.pause_after_this_pose("anna")
-    await rig.session.edit(Retake, 1, lambda queue: queue.retake(0))
+    await rig.session.edit(1, Retake(0))
     assert rig.session.store.status.session.captured == 1
     await rig.session.finish(1)
     assert len(list(sealed(rig).views())) == rig.session.store.status.session.captured
@@ -88,13 +88,11 @@ async def test_a_picture_counts_until_its_pose_was_taken_again(rig: Rig) -> None
 async def test_an_arm_that_stands_at_its_pose_is_not_moved(rig: Rig) -> None:
     await rig.go_until_it_moves()
     await rig.pause_after_this_pose("anna")
-    summary = await rig.session.prepare(1, Purpose.RETAKE, 0)
-    await rig.session.go(1, summary.token)
-    poses = rig.session.store
-    await until(lambda: rig.state is S.PAUSED and poses.status.session.poses[0].attempt == 2)
-    assert rig.pose_states[0] == "done" and summary.purpose == "retake pose 1"
-    assert rig.arm.log.count("move") == 1
-    await rig.session.finish(1)
+    await rig.session.edit(1, Retake(0))
+    rig.arm.slow = False
+    await rig.give_go(Purpose.RESUME)
+    await rig.until(S.IDLE)
+    assert rig.arm.log.count("move") == POSES
     assert sealed(rig).views()[0].attempt == 2
 
 

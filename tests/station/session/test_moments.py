@@ -11,7 +11,7 @@ import pytest
 from station.cell import limits
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
-from station.protocol.verbs import Drop, Purpose
+from station.protocol.verbs import Purpose, Skip
 from station.session import run, session
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
@@ -31,15 +31,15 @@ class HeldStart:
         await self.go_on.wait()
 
 
-async def test_a_pose_dropped_while_control_starts_is_not_driven(rig: Rig) -> None:
+async def test_a_pose_skipped_while_control_starts_is_not_driven(rig: Rig) -> None:
     held = HeldStart(rig)
     await rig.give_go()
     await until(lambda: rig.arm.control)
-    await rig.session.edit(Drop, 1, lambda queue: queue.drop(1))
+    await rig.session.edit(1, Skip(1))
     held.go_on.set()
     await rig.until(S.IDLE, S.FAULT)
     assert rig.state is S.IDLE, rig.session.store.status.reason
-    assert rig.pose_states == ["done"] * (POSES - 1)
+    assert rig.pose_states == ["done", "skipped", *["done"] * (POSES - 2)]
 
 
 async def test_finish_while_control_starts_seals_without_a_move(rig: Rig) -> None:
@@ -153,7 +153,7 @@ async def test_nothing_new_begins_beside_a_run_that_does_not_end(
     await rig.session.acknowledge("anna")
     assert rig.state is S.PAUSED
     for what in (
-        lambda: rig.session.switch_free_drive(1, True, auto=False),
+        lambda: rig.session.switch_free_drive(1, True),
         lambda: rig.session.prepare(1, Purpose.RESUME),
         lambda: rig.session.finish(1),
     ):

@@ -88,7 +88,7 @@ async def test_an_arm_that_is_moved_between_rest_and_exposure_gives_no_view(
         return msgspec.structs.replace(at(host_monotonic_ns), joint_speeds_rad_s=(0, 0, -0.1, 0, 0, 0))
 
     monkeypatch.setattr(rig.arm, "at", pushed)
-    await rig.session.switch_free_drive(1, True, False)
+    await rig.session.switch_free_drive(1, True)
     index = await rig.session.record(1)
     status = rig.session.context.require_queue().status(index)
     assert status.state == "failed"

@@ -18,7 +18,7 @@ from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import StationError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
-from station.protocol.verbs import Purpose, Reorder
+from station.protocol.verbs import Purpose, Skip
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
 from station.session import device_connector, monitor
@@ -67,7 +67,7 @@ async def test_what_changes_leaves_no_approval(rig: Rig, change: str, offered: b
         await rig.session.stop("bert")
         await rig.session.acknowledge("anna")
     elif change == "edit":
-        await rig.session.edit(Reorder, 1, lambda queue: queue.reorder([1, 0, *range(2, POSES)]))
+        await rig.session.edit(1, Skip(1))
     elif change == "release":
         await rig.session.release(1)
         rig.session.take_lease(1, "anna")

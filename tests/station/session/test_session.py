@@ -20,7 +20,7 @@ from recordings.schema.messages import ArmKinematics
 from station.cell.errors import LimitError, RobotError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
-from station.protocol.verbs import Add, Drop, Purpose, Reorder, Retake, Skip
+from station.protocol.verbs import Purpose
 from tests.codes import raises
 from tests.patience import PATIENCE_S, until
 from tests.station.session_rig import POSES, HeldDisk, Rig, sealed
@@ -183,19 +183,6 @@ async def test_finish_seals_what_is_there(rig: Rig) -> None:
     assert len(sealed(rig).views()) == 1
 
 
-async def test_plans_can_be_changed(rig: Rig, small_plan: Plan) -> None:
-    session = rig.session
-    await session.edit(Reorder, 1, lambda queue: queue.reorder([3, 2, 1, 0]))
-    await session.edit(Drop, 1, lambda queue: queue.drop(0))
-    extra = msgspec.structs.replace(small_plan.poses[0], name="again")
-    assert await session.edit(Add, 1, lambda queue: queue.add(extra)) == POSES
-    with raises("no-such-pose"):
-        await session.edit(Retake, 1, lambda queue: queue.retake(0))
-    assert [pose.index for pose in session.store.status.session.poses] == [3, 2, 1, 4]
-    with raises("control-held"):
-        await session.edit(Skip, 2, lambda queue: queue.skip(2))
-
-
 async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_plan: Plan) -> None:
     far = (*small_plan.poses[2].joints_rad[:5], 7.5)
     poses = list(small_plan.poses)
@@ -266,13 +253,12 @@ async def test_a_notice_of_the_arm_is_shown_while_it_moves(rig: Rig) -> None:
     assert rig.session.store.status.reason == ""
 
 
-@pytest.mark.parametrize("purpose", ["resume", "retake"])
-async def test_a_sealed_session_is_not_added_to(rig: Rig, purpose: str) -> None:
+async def test_a_sealed_session_is_not_added_to(rig: Rig) -> None:
     await rig.give_go()
     await until(lambda: bool(rig.session.store.status.session.recording))
     await rig.until(S.IDLE)
     with raises("no-session"):
-        await rig.session.prepare(1, purpose, 0)
+        await rig.session.prepare(1, Purpose.RESUME)
 
 
 async def test_a_plan_from_another_posture_is_told_from_one_that_is_not_free(

@@ -66,7 +66,7 @@ async def test_a_person_is_asked(rig: Rig, shaken: list[int]) -> None:
     assert rig.pose_states == ["done", "failed", "done", "done"]
     assert rig.cause == "unsettled"
     moves = rig.arm.log.count("move")
-    await rig.session.edit(Retake, 1, lambda queue: queue.retake(SHAKY))
+    await rig.session.edit(1, Retake(SHAKY))
     assert rig.arm.log.count("move") == moves
     await rig.give_go(Purpose.RESUME)
     await rig.until(S.IDLE)

@@ -25,7 +25,7 @@ from textual.pilot import Pilot
 from station.cell.status import StationState
 from station.protocol.client import Client
 from station.tui.app import StationApp
-from station.tui.result import SolveScreen
+from station.tui.result import ResultScreen
 
 SIZES = {"80x24": (80, 24), "120x36": (120, 36), "160x48": (160, 48)}
 PATIENCE_S = 120.0
@@ -139,10 +139,9 @@ async def photograph(cameras: list[Camera], socket: Path) -> None:
     driver = cameras[-1]
     await drive(driver, lambda: first.app.known.status.session.recording)
     await driver.pilot.press("f9")
-    await driver.until(lambda: driver.app.known.result and isinstance(driver.app.screen, SolveScreen))
-    await everywhere("solve", "4", ready=lambda camera: camera.app.known.result)
-    await everywhere("verify", "5")
-    await driver.pilot.press("6", "i")
+    await driver.until(lambda: driver.app.known.result and isinstance(driver.app.screen, ResultScreen))
+    await everywhere("result", "4", ready=lambda camera: camera.app.known.result)
+    await driver.pilot.press("4", "i")
     await driver.until(lambda: driver.app.screen.query("#confirm-body"))
     await driver.pilot.press("tab", "enter")
 
@@ -150,9 +149,9 @@ async def photograph(cameras: list[Camera], socket: Path) -> None:
         return camera.app.known.result is not None and camera.app.known.result.installed
 
     await driver.until(lambda: installed(driver))
-    await everywhere("install", "6", ready=installed)
-    await everywhere("sessions", "7")
-    await everywhere("log", "8")
+    await everywhere("installed", "4", ready=installed)
+    await everywhere("sessions", "5")
+    await everywhere("log", "6")
     await everywhere("help", "3", "f1")
 
 

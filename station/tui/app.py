@@ -36,10 +36,10 @@ from station.tui.desk import Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion, Help
 from station.tui.disk_watch import DiskWatch
 from station.tui.frame import SESSION
+from station.tui.jobs import check_drift, solve_session
 from station.tui.log_screen import LogScreen
 from station.tui.plan_screen import PlanScreen
-from station.tui.result import InstallScreen, SolveScreen, VerifyScreen
-from station.tui.results import check_drift, solve_session
+from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.task import DIGITS
@@ -62,9 +62,7 @@ SCREENS: tuple[type[StationScreen], ...] = (
     ConnectScreen,
     PlanScreen,
     CaptureScreen,
-    SolveScreen,
-    VerifyScreen,
-    InstallScreen,
+    ResultScreen,
     SessionsScreen,
     LogScreen,
 )
@@ -178,7 +176,7 @@ class StationApp(KnowingApp):
         if session.recording:
             await solve_session(self.desk, session.recording, session.folder)
         else:
-            self.notify("Nothing is finished yet: F7 finishes a session; older ones are on 7.")
+            self.notify("Nothing is finished yet: F7 finishes a session; older ones are on 5.")
 
     @work(exclusive=True, group="drift", exit_on_error=False)
     async def action_drift_check(self) -> None:

@@ -32,7 +32,7 @@ class CaptureScreen(StationScreen):
                 with Box("Camera", id="picture", below="+ found corners"):
                     yield PreviewPane(id="preview")
                     yield Line(lambda known, _: quality_line(known.shown), id="quality")
-                yield Panel("What happened", newest_events, id="events", below="8 all")
+                yield Panel("What happened", newest_events, id="events", below="6 all")
             with Vertical(id="live-right"):
                 with Box("Poses", id="progress"):
                     yield ProgressBar(id="bar-of-poses", show_eta=False, show_percentage=False)

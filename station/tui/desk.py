@@ -36,7 +36,7 @@ STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGE
 REMEDIES = {
     "nothing-installed": "4 shows the newest result, i installs it.",
     "no-pointer": "Give its length (Tab in the list of corners), or set the tool on the pendant.",
-    "unfinished-recording": "c on 7 recovers it.",
+    "unfinished-recording": "c on 5 recovers it.",
 }
 """By an error's code, where the way out on a screen is another than in a shell."""
 
@@ -54,13 +54,13 @@ class KnowingApp(ThemedApp[None]):
 
     known: reactive[Known] = reactive(Known(), repaint=False)
     result_path: reactive[str] = reactive("", repaint=False, always_update=True)
-    """The calibration file that the result screens show; empty: that of the session just captured."""
+    """The calibration file that the result screen shows; empty: that of the session just captured."""
     desk: Desk
 
     async def show_result(self, calibration: str) -> None:
         """Open a calibration file; empty: there is none any more."""
         self.result_path = calibration
-        await self.switch_mode("solve" if calibration else "sessions")
+        await self.switch_mode("result" if calibration else "sessions")
 
 
 class Desk:

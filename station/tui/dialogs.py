@@ -18,10 +18,8 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, VerticalScroll
 from textual.content import Content
-from textual.widgets import Button, Input, Label, OptionList, RichLog, Static
-from textual.widgets.option_list import Option
+from textual.widgets import Button, Input, Label, RichLog, Static
 
-from calibrate.files.exports import FORMATS
 from calibrate.files.install import reason_problem
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
@@ -132,21 +130,6 @@ def motion_text(preview: MotionPreview) -> Content:
         Content("The emergency stop on the pendant is the safety device. F12 stops too."),
     ]
     return lines(*rows)
-
-
-class ChooseFormat(Question[str | None]):
-    """Choice of an export format."""
-
-    TITLE = "Export for"
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "dismiss(None)", "Cancel")]
-
-    def body(self) -> ComposeResult:
-        lines = [Option(f"{name:<20}  {kind.says}", id=name) for name, kind in FORMATS.items()]
-        yield OptionList(*lines, id="formats", markup=False, compact=True)
-        yield Label("Enter writes it beside the recording, Escape: no", id="dialog-keys")
-
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        self.dismiss(event.option.id)
 
 
 class Reason(Question[str]):

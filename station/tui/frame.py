@@ -30,7 +30,7 @@ RAIL_WIDE = 96
 """From this width on each step has a second line."""
 SESSION = Binding.Group("session")
 """Group of the keys that act on the session."""
-GO_TO = (("1-6", "step"), ("7", "sessions"), ("8", "log"))
+GO_TO = (("1-4", "step"), ("5", "sessions"), ("6", "log"))
 ANSWER = Action(
     "", "Answer the question", "Enter alone is no; Tab marks the other answer. F12 stops.", look=True
 )
@@ -80,11 +80,12 @@ class Line(Static):
 
 
 class Rail(Line):
-    """The six steps; a click opens one."""
+    """The steps of the task; a click opens one."""
 
     def on_click(self, event: events.Click) -> None:
         if self.size.height > 1:
-            self.run_worker(self.app.run_action(f"open('{STEPS[min(5, 6 * event.x // self.size.width)]}')"))
+            place = min(len(STEPS) - 1, len(STEPS) * event.x // self.size.width)
+            self.run_worker(self.app.run_action(f"open('{STEPS[place]}')"))
 
 
 class Frame(Horizontal):
@@ -253,7 +254,7 @@ def _pairs(bindings: list[Binding], display: Callable[[Binding], str]) -> list[t
 def keys_line(groups: list[tuple[str, list[tuple[str, str]]]], width: int) -> Content:
     """Draw the keys that fit: first the groups' names go, then where to go becomes short, then words."""
     groups = [group for group in groups if group[1]]
-    short = [(name, [("1-8", "go to")] if name == "go to" else pairs) for name, pairs in groups]
+    short = [(name, [("1-6", "go to")] if name == "go to" else pairs) for name, pairs in groups]
     short[-1] = ("", [("F1", "help")])
     fewer = [(name, pairs) for name, pairs in short if name != "session"] if len(short) > 2 else short
     line = Content()

@@ -1,13 +1,11 @@
-"""The installed calibration of this cell, and earlier ones: rolled back or replaced."""
+"""Results and installed calibrations as they lie on the disk."""
 
 from __future__ import annotations
 
-import os
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
-from itertools import pairwise
 from pathlib import Path
 
 from calibrate.errors import CalibrationError
@@ -26,32 +24,26 @@ Marks = frozenset[tuple[str, int]]
 
 
 @dataclass(frozen=True)
-class Ended:
-    """The end of an installed calibration."""
-
-    calibration: Calibration
-    how: str
-    """'rolled back' or 'replaced'"""
-    by: str
-    """'anna, 2026-11-22 04:50 (“the board had moved”)'"""
-
-
-@dataclass(frozen=True)
 class Installed:
-    """`now`: what consumers of the cell read; None when there is nothing, or it is damaged."""
+    """What was ever installed for one camera."""
 
     now: Calibration | None = None
-    ended: tuple[Ended, ...] = ()
-    """Earlier ones, one a solve, the last to end last; without those that were installed again."""
+    """What programs read; None when there is nothing, or it is damaged."""
     validity: Validity | None = None
     """Whether `now` still holds."""
+    earlier: tuple[Calibration, ...] = ()
+    """Other solves that were installed before."""
+    drift: tuple[CheckEntry, ...] = ()
+    """Drift checks of `now`, oldest first."""
+    log: tuple[LogEntry, ...] = ()
+    """Every installation, oldest first."""
 
     def word(self, session: str) -> str:
         """State of a session whose calibration is or was installed; else empty."""
         if self.now is not None and self.now.provenance.session == session:
             return self.held
-        ends = [end.how for end in self.ended if end.calibration.provenance.session == session]
-        return ends[-1] if ends else ""
+        before = any(calibration.provenance.session == session for calibration in self.earlier)
+        return "installed before" if before else ""
 
     @property
     def held(self) -> str:
@@ -65,66 +57,35 @@ class Installed:
         """A person took `now` out of use."""
         return self.validity is not None and self.validity.state is ValidityState.WITHDRAWN
 
-    def end_of(self, calibration: Calibration) -> Ended | None:
-        return next((end for end in self.ended if same_solve(end.calibration, calibration)), None)
-
 
 def read_installed(root: Path, camera: str = MAIN_CAMERA) -> Installed:
     """Read all of one camera, in a thread: many files take a moment."""
-    now, validity = None, None
+    folder = calibrations_folder(root, camera)
+    now, validity, log = None, None, list[LogEntry]()
     with suppress(CalibrationError):
         now = installed_calibration(root, camera)
-        validity = current_validity(calibrations_folder(root, camera))
-    ended: list[Ended] = []
-    for before, entry in pairwise(_log(root, camera)):
-        was = _generation(root, camera, before.generation)
-        if was is None or entry.generation == before.generation or entry.action == "verify":
-            continue  # a check by hand goes into a generation of its own, of the same solve
-        how = "rolled back" if entry.action == "rollback" else "replaced"
-        ended = [end for end in ended if not same_solve(end.calibration, was)]
-        ended.append(Ended(was, how, _by(entry)))
-    return Installed(now, tuple(end for end in ended if not same_solve(end.calibration, now)), validity)
+        validity = current_validity(folder)
+    with suppress(CalibrationError, OSError):
+        log = read_log(root, camera)
+    versions = {entry.generation: readable(folder, entry.generation) for entry in log}
+    ours = [number for number, version in versions.items() if version and same_solve(version, now)]
+    earlier = [version for number, version in versions.items() if version and number not in ours]
+    drift = [check for check in read_checks(root, camera) if check.generation in ours]
+    return Installed(now, validity, tuple(earlier), tuple(drift), tuple(log))
 
 
-def drift_history(root: Path, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
-    """Drift checks of what is installed now, oldest first; its touch tests do not begin another history."""
-    held: set[int] = set()
-    for entry in _log(root, camera):
-        held = {entry.generation} | (held if entry.action == "verify" else set())
-    return [check for check in read_checks(root, camera) if check.generation in held]
-
-
-def _log(root: Path, camera: str) -> list[LogEntry]:
-    """Read all installations; none where the log cannot be read."""
-    try:
-        return read_log(root, camera)
-    except OSError:
-        return []
-
-
-def _generation(root: Path, camera: str, number: int) -> Calibration | None:
-    """Read an installed version; None when it is damaged or gone."""
-    return next(map(readable, (calibrations_folder(root, camera) / "gen").glob(f"{number:04d}-*.yaml")), None)
-
-
-def readable(path: Path) -> Calibration | None:
-    """Read a session's calibration, again only when the file changed; None when it is damaged."""
+def readable(folder: Path, version: int | None = None) -> Calibration | None:
+    """Read a calibration file, or a version installed below `folder`; None when it is damaged or gone."""
+    path = folder if version is None else next((folder / "gen").glob(f"{version:04d}-*.yaml"), folder)
     try:
         return _read_at(path, path.stat().st_mtime_ns)
-    except OSError:
+    except (CalibrationError, OSError):
         return None
 
 
 @lru_cache(maxsize=256)
-def _read_at(path: Path, changed_ns: int) -> Calibration | None:
-    try:
-        return read_calibration(path)
-    except CalibrationError:
-        return None
-
-
-def _by(entry: LogEntry) -> str:
-    return f"{entry.who}, {local(entry.wall)}" + (f" (“{entry.reason}”)" if entry.reason else "")
+def _read_at(path: Path, changed_ns: int) -> Calibration:
+    return read_calibration(path)
 
 
 def local(iso: str) -> str:
@@ -143,29 +104,22 @@ def state_root(calibration: str | Path) -> Path:
 def marks(root: Path) -> Marks:
     """Note when each session and installation below this root changed; other programs change them too.
 
-    Reads the disk: for a thread.
+    A folder changes when a file comes or leaves, a link when its target does. Reads the disk: for a thread.
     """
     folders = [calibrations_folder(root), *(root / "calibrations" / "cameras").glob("*")]
-    found = {_mark(folder / name) for folder in folders for name in ("current", VALIDITY_FILE)}
-    try:
-        with os.scandir(root / "sessions") as entries:
-            found |= {_mark(Path(entry.path)) for entry in entries}
-    except OSError:
-        pass
+    found = set[tuple[str, int]]()
+    for path in (
+        *(root / "sessions").glob("*"),
+        *(f / n for f in folders for n in ("current", VALIDITY_FILE)),
+    ):
+        with suppress(OSError):
+            found.add((str(path), path.lstat().st_mtime_ns))
     return frozenset(found)
-
-
-def _mark(path: Path) -> tuple[str, int]:
-    """Return a path and when it changed: a folder when a file came or left, a link when its target did."""
-    try:
-        return str(path), path.lstat().st_mtime_ns
-    except OSError:
-        return str(path), 0
 
 
 @dataclass(frozen=True)
 class Result:
-    """A calibration file as the screens show it, beside what is installed."""
+    """A calibration file as the screen shows it, beside what is installed."""
 
     path: str
     calibration: Calibration | None = None
@@ -174,10 +128,6 @@ class Result:
     objections: tuple[str, ...] = ()
     """What installing would ask a reason for, besides failed gates."""
     problem: str = ""
-    drift: tuple[CheckEntry, ...] = ()
-    """Drift checks of what is installed now, oldest first."""
-    log: tuple[LogEntry, ...] = ()
-    """Every installation, oldest first."""
 
     @property
     def installed(self) -> bool:
@@ -198,14 +148,11 @@ class Result:
 def read_result(path: str) -> Result:
     """Read the result, for a thread. What cannot be read is said in `problem`."""
     try:
-        root = state_root(path)
-        calibration = read_calibration(Path(path))
-        camera = calibration.camera_name
+        root, calibration = state_root(path), read_calibration(Path(path))
         objections = tuple(objections_beside(calibration, root))
     except CalibrationError as problem:
         return Result(path, problem=str(problem))
-    state, drift = read_installed(root, camera), tuple(drift_history(root, camera))
-    return Result(path, calibration, state, objections, drift=drift, log=tuple(_log(root, camera)))
+    return Result(path, calibration, read_installed(root, calibration.camera_name), objections)
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def counted_line(session: SessionStatus) -> Content:
     if session.calibration:
         return mark("done", "finished and solved: 4 shows the result")
     if session.recording:
-        return mark("done", "finished: k on 7 judges it" if session.check else "finished: F9 solves it")
+        return mark("done", "finished: k on 5 judges it" if session.check else "finished: F9 solves it")
     return dim(f"{again} to be captured again" if again else "resting")
 
 

@@ -10,14 +10,12 @@ from textual.binding import Binding, BindingType
 from textual.content import Content
 from textual.widgets import Static
 
-from station.operate.drift_check import POSES
 from station.tui.installed import Kept
-from station.tui.results import check_session, recover_session, solve_session
+from station.tui.jobs import check_session, recover_session, solve_session
 from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.words import UNKNOWN, facts, mark, size
 
-DRIFT = f"Drift check: capture {POSES} poses in place of the loaded plan (asks)"
 NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
 COLUMNS = ("session", "what became of it", "verdict", "predicted", "held-out", "views", "size")
 
@@ -33,9 +31,8 @@ class SessionsScreen(StationScreen):
     )
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f9", "act('solve')", "Solve", tooltip="Solve this recording again, outside the daemon"),
-        Binding("v", "act('show')", "Result", tooltip="Show this session's calibration; so does Enter"),
+        Binding("enter", "act('show')", "Result", show=False, tooltip="Show this session's calibration"),
         Binding("k", "act('check')", "Check", tooltip="Drift check on the views of this recording"),
-        Binding("d", "app.drift_check", "Drift", tooltip=DRIFT),
         Binding("c", "act('recover')", "Recover", tooltip="Rebuild an unfinished recording"),
     ]
 

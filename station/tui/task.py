@@ -1,4 +1,4 @@
-"""The task in six steps, and the one next action: pure functions of what is known."""
+"""The task in four steps, and the one next action: pure functions of what is known."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from station.protocol.verbs import Check
 from station.tui.installed import Kept, Result
 from station.tui.words import Mark, duration, many
 
-STEPS = ("connect", "plan", "capture", "solve", "verify", "install")
+STEPS = ("connect", "plan", "capture", "result")
 DIGITS = {mode: str(place) for place, mode in enumerate((*STEPS, "sessions", "log"), start=1)}
 SILENT = (
     "Daemon not responding: the data below are old. The arm's watchdog stops it; if it moves, press the "
@@ -103,7 +103,7 @@ def steps(known: Known) -> tuple[Step, ...]:
     status = known.live
     if status is None:
         return tuple(Step(mode, "todo", UNTOLD) for mode in STEPS)
-    made = [_connect(known, status), _plan(status), _capture(status), *_results(known)]
+    made = [_connect(known, status), _plan(status), _capture(status), _result(known)]
     now = _now(made, status, known)
     return tuple(
         Step(step.mode, "now", step.text, step.brief)
@@ -121,10 +121,8 @@ def _now(made: list[Step], status: StationStatus, known: Known) -> int:
         return 2
     undone = [place for place, step in enumerate(made) if step.mark != "done"]
     if known.result is not None and known.result.calibration is not None:
-        undone = [place for place in undone if place >= 3]
-        # A touch test is a person's choice: what passed may be installed without one.
-        undone = [place for place in undone if place != 4] or undone
-    return undone[0] if undone else 5
+        return 3
+    return undone[0] if undone else 3
 
 
 def _connect(known: Known, status: StationStatus) -> Step:
@@ -164,31 +162,20 @@ def _capture(status: StationStatus) -> Step:
     return Step("capture", "now", f"{count}, {state.value}", brief)
 
 
-def _results(known: Known) -> tuple[Step, Step, Step]:
+def _result(known: Known) -> Step:
     result, status = known.result, known.live
-    calibration = None if result is None else result.calibration
-    if result is None or calibration is None:
-        waits = "after capture" if status is None or not status.session.recording else "not yet"
-        first = Step(
-            "solve", "todo" if result is None else "failed", waits if result is None else "unreadable"
-        )
-        return first, Step("verify", "todo", "after solve"), Step("install", "todo", "after solve")
-    gates, failed = calibration.quality.gates, calibration.quality.failed
-    solved = Step(
-        "solve", "failed" if failed else "done", f"{len(gates) - len(failed)} of {len(gates)} gates passed"
-    )
-    touches = calibration.verification
-    end = after_solve(calibration)
-    if not touches:
-        verified = Step("verify", "todo", "no touch test")
-    else:
-        bad = end.way is Way.LOOK_FOR and not failed
-        verified = Step("verify", "look" if bad else "done", many(len(touches), "corner") + " touched")
+    if result is None:
+        waits = status is None or not status.session.recording
+        return Step("result", "todo", "after capture" if waits else "not solved yet")
+    calibration = result.calibration
+    if calibration is None:
+        return Step("result", "failed", "unreadable")
     if result.installed:
-        if result.state.withdrawn:
-            return solved, verified, Step("install", "look", "withdrawn")
-        return solved, verified, Step("install", "done", result.state.held.lower())
-    return solved, verified, Step("install", "todo", "not installed")
+        return Step("result", "look" if result.state.withdrawn else "done", result.state.held.lower())
+    gates, failed = calibration.quality.gates, calibration.quality.failed
+    return Step(
+        "result", "failed" if failed else "todo", f"{len(gates) - len(failed)} of {len(gates)} gates passed"
+    )
 
 
 def next_action(known: Known) -> Action:
@@ -270,16 +257,16 @@ def _at_rest(known: Known, status: StationStatus) -> Action:
 def _with_result(result: Result, status: StationStatus) -> Action:
     calibration = result.calibration
     if calibration is None:
-        return Action("7", "Choose a session", result.problem, look=True)
+        return Action("5", "Choose a session", result.problem, look=True)
     end = after_solve(calibration, () if result.installed else result.objections)
     if result.state.withdrawn and result.installed:
-        why = "Withdrawn: programs are refused this one. i on 6 installs it again."
+        why = "Withdrawn: programs are refused this one. i on 4 installs it again."
         return Action("n", "Plan 25 poses", why, at="plan", look=True)
     if result.installed:
-        return Action("d", "Drift check", "Installed. Check in some days that it still holds.", at="sessions")
+        return Action("d", "Drift check", "Installed. Check in some days that it still holds.", at="result")
     if end.way is Way.INSTALL:
-        touch = "" if calibration.verification or status.simulated else " Or h on 5: a touch test first."
-        return Action("i", "Install", f"PASS: {end.text}.{touch}", at="install")
+        touch = "" if calibration.verification or status.simulated else " Or h: a touch test first."
+        return Action("i", "Install", f"PASS: {end.text}.{touch}", at="result")
     if end.way is Way.RETAKE:
         return Action("n", "Plan and retake", end.text, at="plan", look=True)
     return Action("4", "See what failed", f"Look for: {end.text}", look=True)

@@ -42,7 +42,7 @@ def test_what_comes_next_fits_what_was_recorded() -> None:
     assert "F9" in counted_line(session(idle(), recording="/r").session).plain
     assert "4 shows" in counted_line(session(idle(), recording="/r", calibration="/c").session).plain
     check = counted_line(session(idle(), recording="/r", check=True).session).plain
-    assert "k on 7" in check and "F9" not in check
+    assert "k on 5" in check and "F9" not in check
 
 
 def test_steps_of_a_pose_are_marked_one_after_the_other() -> None:

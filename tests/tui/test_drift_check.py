@@ -17,11 +17,11 @@ from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
 from station.operate.drift_check import POSES, SEED
 from station.protocol import verbs
-from station.tui import results
+from station.tui import jobs
 from station.tui.app import StationApp
 from station.tui.desk import REMEDIES, busy_words
 from station.tui.dialogs import ConfirmMotion, JobScreen
-from station.tui.installed import drift_history
+from station.tui.installed import read_installed
 from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 from tests.tui.test_install import GOOD
 from tests.tui.test_plan_screen import SlowPlanner
@@ -51,7 +51,7 @@ def installed(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     (tmp_path / "some_job.py").write_text(JOB)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(
-        results, "JobScreen", lambda title, module, *args, **more: JobScreen(title, "some_job", *args, **more)
+        jobs, "JobScreen", lambda title, module, *args, **more: JobScreen(title, "some_job", *args, **more)
     )
     return tmp_path
 
@@ -69,7 +69,7 @@ def check_session(root: Path, recording: str = "", state: StationState = Station
 
 async def ask_for_it(pilot: Pilot[None]) -> None:
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
-    await pilot.press("7", "d")
+    await pilot.press("4", "d")
 
 
 def said(app: StationApp, words: str) -> bool:
@@ -167,7 +167,7 @@ async def test_planning_it_is_said_on_every_screen(tmp_path: Path) -> None:
     async with app.run_test(size=(80, 24)) as pilot:
         await ask_for_it(pilot)
         await until(pilot, lambda: PLANNING in text_of(app, "#next"))
-        await pilot.press("8")
+        await pilot.press("6")
         await until(pilot, lambda: app.current_mode == "log" and PLANNING in text_of(app, "#next"))
         link.show(idle(StationState.PAUSED, "poses 3, 7 failed: retake or skip them, or finish"))
         await until(pilot, lambda: "poses 3, 7 failed" in text_of(app, "#next"))
@@ -183,8 +183,8 @@ def test_the_history_is_of_this_camera_and_of_what_is_installed(tmp_path: Path) 
         number = install(path, root, cell="simulated", camera=camera).number
         entry = CheckEntry(0.0, number, camera, True, (0.0,) * 6, ((0.0,) * 6,) * 6, 1.0, 12.6)
         append_check(entry, root, camera)
-    assert [check.recording for check in drift_history(root, "right")] == ["right"]
-    assert not drift_history(root)
+    assert [check.recording for check in read_installed(root, "right").drift] == ["right"]
+    assert not read_installed(root).drift
     write_calibration(msgspec.structs.replace(GOOD, created="2026-02-01T00:00:00+00:00"), path)
     install(path, root, cell="simulated", camera="right")
-    assert not drift_history(root, "right") and drift_history(root, "left")
+    assert not read_installed(root, "right").drift and read_installed(root, "left").drift

@@ -15,7 +15,6 @@ from calibrate.files.versions import note_installed, who
 from station.cell.errors import StationError
 from station.tui import disk_watch
 from station.tui.app import StationApp
-from station.tui.dialogs import Confirm
 from station.tui.installed import read_installed
 from tests.tui.conftest import FakeLink, app_on, idle, summary, text_of, until
 from tests.tui.test_install import GOOD, OFF
@@ -45,7 +44,7 @@ def put(root: Path, session: str) -> None:
 
 async def list_of_sessions(app: StationApp, pilot: Pilot[None]) -> DataTable[str]:
     await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-    await pilot.press("7")
+    await pilot.press("5")
     await until(pilot, lambda: app.current_mode == "sessions")
     return app.screen.query_one(DataTable)
 
@@ -64,12 +63,12 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
         await until(pilot, lambda: states() == ["solved, not installed", "● INSTALLED"])
         assert table.cursor_row == 1  # what was marked still is
         put(root, "s-2")
-        await until(pilot, lambda: states() == ["● INSTALLED", "replaced"])
+        await until(pilot, lambda: states() == ["● INSTALLED", "installed before"])
         rollback(root)
-        await until(pilot, lambda: states() == ["rolled back", "● INSTALLED, unverified"])
+        await until(pilot, lambda: states() == ["installed before", "● INSTALLED, unverified"])
         link.answers["sessions"] = [summary("s-3"), *link.answers["sessions"]]
         (root / "sessions" / "s-3").mkdir()
-        await until(pilot, lambda: states() == ["", "rolled back", "● INSTALLED, unverified"])
+        await until(pilot, lambda: states() == ["", "installed before", "● INSTALLED, unverified"])
         assert table.cursor_row == 2
 
 
@@ -78,15 +77,14 @@ async def test_the_result_says_when_it_is_the_installed_one(link: FakeLink, root
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
         await app.show_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
-        await pilot.press("6")
         await until(pilot, lambda: "ready to install" in text_of(app, "#verdict"))
-        assert "Nothing is installed" in text_of(app, "#change")
+        assert "Nothing is installed" in text_of(app, "#evidence")
         put(root, "s-1")
         await until(pilot, lambda: "INSTALLED" in text_of(app, "#verdict"))
-        assert "this one is installed" in text_of(app, "#change")
+        assert "this one is installed" in text_of(app, "#evidence")
         put(root, "s-2")
-        await until(pilot, lambda: "from the installed one" in text_of(app, "#change"))
-        assert "REPLACED" in text_of(app, "#verdict")
+        await until(pilot, lambda: "from the one before" in text_of(app, "#evidence"))
+        assert "installed before" in text_of(app, "#verdict")
 
 
 async def test_a_calibration_that_was_taken_back_says_so_and_who_did_it(link: FakeLink, root: Path) -> None:
@@ -97,18 +95,14 @@ async def test_a_calibration_that_was_taken_back_says_so_and_who_did_it(link: Fa
         put(root, "s-2")
         rollback(root, reason="the camera had slipped")
         await app.show_result(str(root / "sessions" / "s-2" / "calibration.yaml"))
-        await until(pilot, lambda: "ROLLED BACK" in text_of(app, "#verdict"))
+        await until(pilot, lambda: "installed before" in text_of(app, "#verdict"))
         said = text_of(app, "#verdict")
         assert "ready to install" not in said
-        assert f"installed before, and rolled back by {who()}, 20" in said
+        assert f"rollback by {who()}, 20" in said
         assert "the camera had slipped" in said
-        await pilot.press("i")
-        await until(pilot, lambda: isinstance(app.screen, Confirm) and app.screen.query("#confirm-body"))
-        assert "installed before, and rolled back" in text_of(app, "#confirm-body")
-        await pilot.press("escape")
         put(root, "s-2")
         await until(pilot, lambda: "INSTALLED" in text_of(app, "#verdict"))
-        assert "rolled back" not in text_of(app, "#verdict")
+        assert "rollback" not in text_of(app, "#verdict")
 
 
 def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
@@ -116,8 +110,7 @@ def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
     note_installed(root, [OFF])
     assert read_installed(root).word("s-1") == "INSTALLED, in doubt"
     put(root, "s-2")
-    (end,) = read_installed(root).ended
-    assert (end.how, end.calibration.verification) == ("replaced", [OFF])
+    assert {c.provenance.session for c in read_installed(root).earlier} == {"s-1"}
 
 
 async def test_the_result_of_the_session_just_captured_needs_no_picking(link: FakeLink, root: Path) -> None:
@@ -154,4 +147,4 @@ async def test_enter_on_a_session_shows_what_it_gave(link: FakeLink, root: Path)
         table = await list_of_sessions(app, pilot)
         await until(pilot, lambda: table.row_count == 2)
         await pilot.press("down", "enter")
-        await until(pilot, lambda: app.current_mode == "solve" and "session s-1" in text_of(app, "#verdict"))
+        await until(pilot, lambda: app.current_mode == "result" and "session s-1" in text_of(app, "#verdict"))

@@ -10,10 +10,9 @@ import msgspec
 import pytest
 from rich.console import Console
 from textual.pilot import Pilot
-from textual.widgets import Input, OptionList, Static
+from textual.widgets import Input, Static
 
 from calibrate.files.calibration import Override, write_calibration
-from calibrate.files.exports import FORMATS
 from calibrate.files.folders import calibrations_folder, current_validity
 from calibrate.files.formatting import figures, summary
 from calibrate.files.install import install, installed_calibration
@@ -21,10 +20,9 @@ from calibrate.files.touch import Touch
 from calibrate.files.validity import Validity, ValidityReason, ValidityState
 from calibrate.files.versions import installed_versions, note_installed
 from recordings.schema.messages import CameraIdentity, RobotIdentity
-from station.tui.dialogs import ChooseFormat, Confirm, Reason
+from station.tui.dialogs import Confirm, Reason
 from station.tui.installed import Installed, Result, local
-from station.tui.result import held_out_lines, verdict_lines
-from station.tui.results import before_next
+from station.tui.result import evidence, verdict_lines
 from station.tui.task import next_action
 from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
@@ -66,12 +64,12 @@ def test_there_is_one_verdict_in_three_states(result: Result, verdict: str) -> N
 def test_terminal_and_screen_say_the_same_figures() -> None:
     said = io.StringIO()
     Console(file=said, width=200).print(summary(DOUBTED))
-    screen = verdict_lines(Result("", DOUBTED)).plain
+    screen = verdict_lines(Result("", DOUBTED)).plain + evidence(Result("", DOUBTED), DOUBTED).plain
     told = figures(DOUBTED, DOUBTED.verification)
     assert {"error", "gates", "views", "touch"} <= set(told)
-    for name, figure in told.items():
+    for figure in told.values():
         assert figure.value in said.getvalue()
-        assert figure.value in (held_out_lines(DOUBTED).plain if name == "held_out" else screen)
+        assert figure.value in screen
 
 
 async def press_on_result(pilot: Pilot[None], calibration: Path, *keys: str) -> None:
@@ -147,7 +145,7 @@ async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
-        await pilot.press("6")
+        await pilot.press("4")
         for answer in ("escape", "enter"):
             await until(pilot, lambda: "INSTALLED" in text_of(pilot.app, "#verdict"))
             assert current_validity(calibrations_folder(root)).state == "valid"
@@ -162,16 +160,6 @@ async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
         await pilot.press("b")
         await until(pilot, lambda: "out of use" in said(pilot))
         assert not isinstance(pilot.app.screen, Reason)
-
-
-def test_only_another_solve_is_gone_back_to_from_what_is_installed_next(calibration: Path) -> None:
-    root = calibration.parents[2]
-    assert before_next(installed_versions(root), GOOD) is None
-    write_calibration(GOOD, calibration)
-    install(calibration, root, cell="simulated")
-    assert before_next(installed_versions(root), GOOD) is None
-    older = before_next(installed_versions(root), LATER)
-    assert older is not None and older.calibration == GOOD
 
 
 def test_a_calibration_that_was_installed_all_the_same_says_by_whom_and_why() -> None:
@@ -209,21 +197,6 @@ def test_times_are_the_wall_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
     finally:
         monkeypatch.undo()
         time.tzset()
-
-
-async def test_the_formats_say_who_reads_them(link: FakeLink, calibration: Path) -> None:
-    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await press_on_result(pilot, calibration, "e")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ChooseFormat))
-        await until(pilot, lambda: pilot.app.screen.query(OptionList))
-        shown = pilot.app.screen.query_one(OptionList)
-        lines = [str(option.prompt) for option in shown.options]
-        assert lines[0] == "ros-camera-info       ROS camera_info YAML: the intrinsics"
-        assert shown.size.height >= min(12, len(FORMATS))  # the others come by scrolling; none is cut
-        assert max(map(len, lines)) <= shown.content_size.width
-        await pilot.press("enter")
-        await until(pilot, lambda: "Written" in said(pilot))
-    assert calibration.with_name("calibration-ros-camera-info.yaml").is_file()
 
 
 def test_a_calibration_that_no_longer_holds_says_so_where_it_said_installed() -> None:

@@ -69,9 +69,7 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
         ("2", "r", "No plan is loaded"),
         ("2", "ctrl+up", "No plan is loaded"),
         ("4", "i", "There is no result"),
-        ("4", "e", "There is no result"),
-        ("7", "v", "No session is recorded yet"),
-        ("7", "c", "No session is recorded yet"),
+        ("5", "c", "No session is recorded yet"),
     ]
     fresh = idle()
     link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
@@ -90,12 +88,12 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
 
 async def test_an_empty_list_says_how_to_begin_but_not_before_it_is_known(link: FakeLink) -> None:
     async with opened(link) as pilot:
-        await pilot.press("7")
+        await pilot.press("5")
         await until(pilot, lambda: pilot.app.screen.query_one(DataTable).row_count == 1)
         hint = pilot.app.screen.query_one("#sessions-none")
         assert not hint.display
         link.answers["sessions"] = []
-        await pilot.press("3", "7")
+        await pilot.press("3", "5")
         await until(pilot, lambda: hint.display)
 
 

@@ -23,7 +23,7 @@ from station.cell.status import (
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import Hardware
 from station.protocol.verbs import Check
-from station.tui.dialogs import ChooseFormat, Confirm, ConfirmMotion, Help, Reason
+from station.tui.dialogs import Confirm, ConfirmMotion, Help, Reason
 from station.tui.frame import StopBlock, bar_line, keys_line, next_line, rail_line
 from station.tui.new_cell import NewCell
 from station.tui.task import DIGITS, Action, Known, next_action, steps
@@ -84,9 +84,9 @@ def test_a_key_of_another_screen_becomes_the_way_there() -> None:
 
 @pytest.mark.parametrize("known", [known for known, _ in CASES])
 @pytest.mark.parametrize("width", [70, 100, 140])
-def test_rail_names_six_steps_and_marks_one_now(known: Known, width: int) -> None:
+def test_rail_names_every_step_and_marks_one_now(known: Known, width: int) -> None:
     made = steps(known)
-    assert [step.mode for step in made] == ["connect", "plan", "capture", "solve", "verify", "install"]
+    assert [step.mode for step in made] == ["connect", "plan", "capture", "result"]
     line = rail_line(made, "plan", width)
     assert max(len(row) for row in line.plain.split("\n")) <= width
     assert all(step.mode.title() in line.plain for step in made)
@@ -148,7 +148,7 @@ def test_the_keys_fit_into_one_line(width: int) -> None:
     groups = [
         ("plan", own),
         ("session", common),
-        ("go to", [("1-6", "step"), ("7", "sessions")]),
+        ("go to", [("1-4", "step"), ("5", "sessions")]),
         ("", [("F1", "help")]),
     ]
     line = keys_line(groups, width).plain
@@ -159,7 +159,6 @@ def test_the_keys_fit_into_one_line(width: int) -> None:
 WINDOWS = [
     lambda: Confirm("Finish?", "words", "Finish"),
     lambda: ConfirmMotion(SUMMARY),
-    lambda: ChooseFormat(),
     lambda: Reason("Not installed", "a gate failed", "Enter installs it."),
     lambda: Help("Plan", "about", []),
 ]

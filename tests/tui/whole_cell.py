@@ -91,7 +91,7 @@ def main(folder: Path) -> None:
             person.sees("F9 +Solve")
             person.press("f9")
             person.sees("gates passed")
-            person.press("6", "i")
+            person.press("i")
             person.sees("Install this calibration")
             person.press("tab", "enter")
             person.sees("INSTALLED")

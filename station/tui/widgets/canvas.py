@@ -117,48 +117,40 @@ class Series:
 
 
 def curve(
-    series: Sequence[Series], goal: float | None, width: int, height: int, *, log: bool = True, ends: str = ""
+    series: Sequence[Series], goal: float | None, width: int, height: int, *, ends: str = ""
 ) -> Content:
-    """Draw curves with a labelled axis at the left; the goal is a dashed amber line.
+    """Draw curves over a logarithmic axis with labels at the left; the goal is a dashed amber line.
 
     `ends`: words below the axis, its two ends parted by '|'.
     """
-    values = [y for line in series for _, y in line.values if math.isfinite(y) and (y > 0 or not log)]
+    points = [[(x, y) for x, y in line.values if math.isfinite(y) and y > 0] for line in series]
     places = [x for line in series for x, _ in line.values]
-    if not values or width < 20 or height < 3:
+    levels = [y for line in points for _, y in line]
+    if not levels or width < 20 or height < 3:
         return Content()
-    low, high = min([*values, *([goal] if goal else [])]), max([*values, *([goal] if goal else [])])
-    if log:
-        low, high = low / 1.15, high * 1.15
-    else:
-        low, high = min(0.0, low), high * 1.1 or 1.0
-    label = 7
-    rows = height - bool(ends)
+    levels += [goal] if goal else []
+    low, high = min(levels) / 1.15, max(levels) * 1.15
+    label, rows = 7, height - bool(ends)
     canvas = Canvas(width - label, rows)
     left, right = min(places), max(max(places), min(places) + 1e-9)
 
     def dots(line: Sequence[tuple[float, float]]) -> Points:
-        shown = [(x, y) for x, y in line if math.isfinite(y) and (y > 0 or not log)]
-        xy = np.array(shown, dtype=float).reshape(-1, 2)
-        share = np.log(xy[:, 1] / low) / math.log(high / low) if log else (xy[:, 1] - low) / (high - low)
+        xy = np.array(line, dtype=float).reshape(-1, 2)
+        share = np.log(xy[:, 1] / low) / math.log(high / low)
         across = (xy[:, 0] - left) / (right - left)
         return np.stack([across * (canvas.width - 1), (1 - share) * (canvas.height - 1)], axis=1)
 
-    goal_row = -1
+    marks = {0: (_label(high), "$dim"), rows - 1: (_label(low), "$dim")}
     if goal:
         at = dots([(left, goal), (right, goal)])
         canvas.lines(at[:1], at[1:], 1, dash=3)
-        goal_row = min(rows - 1, max(0, int(at[0, 1]) * rows // canvas.height))
-    for rank, line in enumerate(series, start=2):
-        at = dots(line.values)
-        canvas.lines(at[:-1], at[1:], rank, dash=line.dash)
+        marks[min(rows - 1, max(0, int(at[0, 1]) * rows // canvas.height))] = (_label(goal), "$warn")
+    for rank, (line, drawn) in enumerate(zip(points, series, strict=True), start=2):
+        at = dots(line)
+        canvas.lines(at[:-1], at[1:], rank, dash=drawn.dash)
         canvas.points(at, rank)
-    drawn = canvas.content(["$warn", *(line.style for line in series)]).split("\n")
-    marks = {0: (_label(high), "$dim"), rows - 1: (_label(low), "$dim")}
-    if goal:
-        marks[goal_row] = (_label(goal), "$warn")
     lines = []
-    for row, text in enumerate(drawn):
+    for row, text in enumerate(canvas.content(["$warn", *(line.style for line in series)]).split("\n")):
         words, style = marks.get(row, ("", "$dim"))
         lines.append(Content.assemble((f"{words:>5} ", style), ("│", "$line"), text))
     if ends:

@@ -1,4 +1,4 @@
-"""Work on recordings and results from the screen: solve, recover, install, go back, export, discard.
+"""Work on recordings and results from the screen: solve, recover, check, install, undo.
 
 Long work runs in a process of its own, its lines shown, and can be cancelled.
 """
@@ -6,29 +6,26 @@ Long work runs in a process of its own, its lines shown, and can be cancelled.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration
-from calibrate.files.exports import FORMATS, FrameNames, export, follow_command
 from calibrate.files.install import Cell, install, rollback, withdraw
 from calibrate.files.validity import ValidityState
 from calibrate.files.versions import InstalledVersion, before_current, installed_versions
-from recordings.files import ASKED_FOR, write_atomically
 from station.cell.session_folder import CALIBRATION_FILE
 from station.operate.drift_check import check_arguments, judged, recorded, start_drift_check
 from station.operate.motion import Approve
 from station.tui.desk import Desk
-from station.tui.dialogs import ChooseFormat, Confirm, JobScreen, Reason
-from station.tui.installed import Result, local, read_result, state_root
+from station.tui.dialogs import Confirm, JobScreen, Reason
+from station.tui.installed import Result, local, state_root
 
 OVERRIDABLE = ("gate-failed", "objection")
 """Codes of refusals that a person may override with a reason."""
 OVERRIDES = "Your name and the reason go into the file. Enter installs, Escape does not."
 WITHDRAWS = "Your name and the reason are kept. Enter takes it out of use, Escape does not."
-NO_VERDICT = "Another plan was loaded: the drift check has no verdict. Its views, if any, are on 7 (k)."
+NO_VERDICT = "Another plan was loaded: the drift check has no verdict. Its views, if any, are on 5 (k)."
 
 
 async def solve_session(desk: Desk, recording: str, folder: str) -> None:
@@ -70,15 +67,7 @@ async def check_drift(desk: Desk, approves: Approve) -> None:
 
 async def install_result(desk: Desk, result: Result, calibration: Calibration) -> None:
     """Ask, then install. A simulated result installs on a simulated cell only."""
-    ended = result.state.end_of(calibration)
-    known = installed_versions(state_root(result.path), calibration.camera_name)
-    undo = (
-        "It is the first here: b on 6 takes it out of use."
-        if before_next(known, calibration) is None
-        else "b on 6 goes back to the one before."
-    )
-    body = f"{result.path}\nbecomes what every program of this cell reads. {undo}"
-    body += "" if ended is None else f"\n\nIt was installed before, and {ended.how} by {ended.by}."
+    body = f"{result.path}\nbecomes what every program of this cell reads. b undoes it."
     if not await desk.question(Confirm("Install this calibration?", body, yes="Install")):
         return
     cell: Cell = "simulated" if desk.known.live is not None and desk.known.live.simulated else "real"
@@ -97,13 +86,7 @@ async def install_result(desk: Desk, result: Result, calibration: Calibration) -
     except CalibrationError as refusal:
         desk.app.notify(str(refusal), title="Not installed", severity="error", timeout=20, markup=False)
         return
-    desk.app.notify(f"Installed. {undo}")
-
-
-def before_next(known: list[InstalledVersion], coming: Calibration) -> InstalledVersion | None:
-    """Return the version that an undo leads to once `coming` is installed; None: there is none."""
-    number = known[-1].number + 1 if known else 1
-    return before_current([InstalledVersion(number, Path(), True, coming), *known])
+    desk.app.notify("Installed. b undoes it.")
 
 
 async def undo_install(desk: Desk, result: Result, calibration: Calibration) -> None:
@@ -122,7 +105,7 @@ async def undo_install(desk: Desk, result: Result, calibration: Calibration) -> 
     if await desk.question(Confirm("Go back to the calibration before?", body, yes="Go back")):
         made = await desk.attempt(asyncio.to_thread(rollback, root, camera=camera))
         if made is not None:
-            said = "The calibration before is installed again; a drift check proves it (7, k)."
+            said = "The calibration before is installed again; a drift check proves it (d)."
             desk.app.notify(said)
 
 
@@ -139,32 +122,6 @@ async def _withdraw(desk: Desk, root: Path, camera: str, current: InstalledVersi
         return
     if await desk.attempt(asyncio.to_thread(withdraw, root, reason, camera=camera)) is not None:
         desk.app.notify("Out of use: programs are refused it. i installs a calibration.")
-
-
-async def export_result(desk: Desk, result: Result, calibration: Calibration) -> None:
-    chosen = await desk.question(ChooseFormat())
-    if chosen is None:
-        return
-    output = Path(result.path).with_name(f"calibration-{chosen}{FORMATS[chosen].suffix}")
-
-    def write() -> Path:
-        names = FrameNames.of_camera(calibration.camera_name)
-        root, now = state_root(result.path), read_result(result.path)
-        if now.installed:
-            follow = follow_command(root, calibration.camera_name)
-            names = replace(names, validity=now.state.validity, follow=follow)
-        write_atomically(output, export(calibration, chosen, names), ASKED_FOR)
-        return output
-
-    if await desk.attempt(asyncio.to_thread(write)) is not None:
-        desk.app.notify(f"Written: {output}", timeout=20, markup=False)
-
-
-async def discard(desk: Desk, result: Result, calibration: Calibration) -> None:
-    body = f"{result.path}\nis deleted. The recording stays and can be solved again."
-    if await desk.question(Confirm("Discard this result?", body, yes="Discard")):
-        Path(result.path).unlink(missing_ok=True)
-        await desk.app.show_result("")
 
 
 def _named(generation: InstalledVersion) -> str:

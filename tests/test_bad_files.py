@@ -84,7 +84,6 @@ PLACES: dict[str, Place] = {
     "configuration, plan": ("station.yaml", _command(station, "plan", "--config", "FILE", "-o", "NEW")),
     "calibration, install": ("cell.yaml", _command(calibrate, "install", "FILE", "--root", "NEW")),
     "plan": ("plan.yaml", _command(station, "plan", "--check", "FILE")),
-    "taught recording": ("taught.mcap", _command(station, "plan", "--taught", "FILE", "-o", "NEW")),
     "plan to capture": ("plan.yaml", _command(station, "capture", "--plan", "FILE", "--socket", "NEW")),
     "replay": ("session.mcap", _command(station, "serve", "--replay", "FILE", "--root", "NEW")),
     "session.json": ("sessions/one/session.json", lambda path: _of_session(path.parents[2])),

@@ -17,10 +17,7 @@ from tests.command_line import call
 from tests.test_examples import PROGRAMS, commands_in
 
 ROOT = Path(__file__).parents[1]
-NEEDS_A_CELL = (
-    *(f"station {name}" for name in ("serve", "capture", "drift-check")),
-    "station plan --config station.yaml --taught",
-)
+NEEDS_A_CELL = tuple(f"station {name}" for name in ("serve", "capture", "drift-check"))
 """Run against a simulated cell by tests/system and tests/station/cli; parsed by tests/test_examples.py."""
 
 

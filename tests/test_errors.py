@@ -27,7 +27,6 @@ from tests.command_line import call
         (station.cli.main, ("status", "--socket", "none")),
         (station.cli.main, ("doctor", "--config", "none.yaml")),
         (station.cli.main, ("plan", "--check", "none.yaml")),
-        (station.cli.main, ("plan", "--taught", "none.mcap")),
     ],
 )
 def test_an_error_begins_with_the_name_of_its_command(

@@ -35,7 +35,7 @@ from station.cell.config import (
     vector6,
 )
 from station.cell.errors import ConfigError, LimitError
-from station.cell.pose_plan import Plan, PlannedPose
+from station.cell.pose_plan import PlannedPose
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
 _DOUBT = 3.0
@@ -93,12 +93,6 @@ def pose_at(model: RobotModel, name: str, joints_rad: ArrayLike, why: str = "") 
     """Make a plan's pose from joints (6,), with the expected flange pose."""
     joints = np.asarray(joints_rad, dtype=float)
     return PlannedPose(name, vector6(joints), matrix4(forward(model, joints)), why=why)
-
-
-def flange_poses(layout: CellLayout, plan: Plan) -> Array:
-    """Compute base_from_flange (n, 4, 4) of a plan's joints."""
-    joints = np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6)
-    return np.asarray(forward(layout.geometry.model, joints))
 
 
 def board_extent(board: BoardSpec) -> tuple[Array, Array]:

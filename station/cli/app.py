@@ -5,6 +5,7 @@ from __future__ import annotations
 from recordings.cli.lazy import LazyCommand, LazyGroup, examples
 
 _APPROVED = {"--go": "--approve"}
+_PLAN_DRAWN = "Plan (2) on the screen draws the plan and turns it."
 
 STATION = LazyGroup(
     {
@@ -30,10 +31,13 @@ STATION = LazyGroup(
             "station.cli.plan:plan_command",
             (
                 "station plan --config station.yaml -o plan.yaml  # from where the arm stands",
-                "station plan --config station.yaml --check plan.yaml --picture plan.png",
+                "station plan --config station.yaml --check plan.yaml",
             ),
             gone={
-                "--foxglove": "`--picture plan.png` draws the plan; Plan (2) on the screen turns it.",
+                "--foxglove": _PLAN_DRAWN,
+                "--picture": _PLAN_DRAWN,
+                "--scene": "Give the cell's --config; without it the paper's simulated cell is planned for.",
+                "--taught": "Write the joints into a plan (robot, mount, poses) and `--check` it.",
                 "--d-optimal": "Leave it out: the poses are chosen for the smallest error.",
                 "--from-list": "Write the joints into a plan (robot, mount, poses) and `--check` it.",
             },

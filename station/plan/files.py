@@ -1,8 +1,7 @@
-"""Plans as files: strict `plan.yaml`, and the taught poses of a recording."""
+"""Plans as files: strict `plan.yaml`."""
 
 from __future__ import annotations
 
-import errno
 import math
 from pathlib import Path
 
@@ -13,11 +12,8 @@ import yaml
 from calibrate.kinematics import MODELS
 from recordings import strict_yaml
 from recordings.files import ASKED_FOR, read_file, write_atomically
-from recordings.reader import open_recording
-from recordings.schema.messages import Mount
 from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2
 from station.cell.errors import ConfigError
-from station.cell.layout import pose_at
 from station.cell.pose_plan import Plan
 
 _POSE_LIMIT = 200
@@ -48,35 +44,17 @@ def save_plan(plan: Plan, path: Path) -> None:
 
 def load_plan(path: Path) -> Plan:
     """Read and check a plan file. ConfigError lists all problems with their lines."""
-    return parse_plan(_read(path), str(path))
-
-
-def parse_plan(content: bytes, name: str = "plan") -> Plan:
-    """Parse and check the content of a plan file, such as an attachment of a recording."""
     try:
-        plan = strict_yaml.load(content, Plan)
-    except strict_yaml.StrictYamlError as error:
-        raise _report(name, [str(problem) for problem in error.problems]) from None
-    return _checked(plan, name)
-
-
-def _checked(plan: Plan, name: str) -> Plan:
-    if problems := _value_problems(plan):
-        raise _report(name, problems)
-    return plan
-
-
-def _report(name: str, problems: list[str]) -> ConfigError:
-    listed = "".join(f"\n  {problem}" for problem in problems)
-    return ConfigError("invalid-plan", path=name, problems=len(problems), listed=listed)
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return read_file(path, strict_yaml.LIMIT_BYTES)
+        plan = strict_yaml.load(read_file(path, strict_yaml.LIMIT_BYTES), Plan)
+        problems = _value_problems(plan)
     except OSError as error:
-        code = "plan-too-large" if error.errno == errno.EFBIG else "unreadable-plan"
-        raise ConfigError(code, path=path, reason=error.strerror) from None
+        raise ConfigError("unreadable-plan", path=path, reason=error.strerror) from None
+    except strict_yaml.StrictYamlError as error:
+        problems = [str(problem) for problem in error.problems]
+    if problems:
+        listed = "".join(f"\n  {problem}" for problem in problems)
+        raise ConfigError("invalid-plan", path=path, problems=len(problems), listed=listed)
+    return plan
 
 
 def _value_problems(plan: Plan) -> list[str]:
@@ -108,26 +86,3 @@ def _value_problems(plan: Plan) -> list[str]:
         if matrix is not None and np.shape(np.array(matrix, dtype=object)) != (4, 4):
             problems.append(f"{where}: base_from_flange must have 4 rows of 4 numbers")
     return problems
-
-
-def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
-    """Make a plan of the poses at which a recording's images were taken, in their order.
-
-    ConfigError for another arm or mounting, or without joints; RecordingError for an unfinished recording.
-    """
-    recording = open_recording(path)
-    of = recording.info
-    if (of.robot.model, of.mount) != (robot, mount):
-        raise ConfigError(
-            "other-cell",
-            path=path,
-            recorded=f"{of.robot.model or 'nameless arm'}, {of.mount}",
-            configured=f"{robot}, {mount}",
-        )
-    views = recording.views()
-    taught = [(view.name, view.joints_rad) for view in views if view.joints_rad is not None]
-    if not taught or len(taught) < len(views):
-        raise ConfigError("no-joints", path=path, poses=len(views), with_joints=len(taught))
-    poses = tuple(pose_at(MODELS[robot], name, joints, "as taught") for name, joints in taught)
-    plan = Plan(robot=robot, mount=mount, poses=poses, note=f"taught: the poses of {path.name}")
-    return _checked(plan, str(path))

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import msgspec
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, transform_points
+from calibrate.geometry import Array
 from calibrate.handeye.information import USUAL_NOISE, MeasurementNoise, sigma_of
 from calibrate.kinematics import forward
-from station.cell.collision import margins
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
 from station.cell.layout import CellLayout, layout_of, require_kept_clear
@@ -36,7 +34,12 @@ POOL_SIZE = 1200
 """Size of the pool. Compared with 480, both predicted errors are 4 to 6 % smaller (random cells)."""
 _TRIES = 12
 """Views drawn per wanted member of the pool; most are rejected for the uncertainty of the initial poses."""
+_LOOKS_BACK = "the camera looks back at the arm, which hides the board"
+_CUT_OFF = "free direct moves from where the arm stands"
 _REMEDIES = {
+    _LOOKS_BACK: "Turn camera_guess by 180° about its x or y axis: z points out of the lens.",
+    _CUT_OFF: "Bring the arm to where the camera looks at the board from the middle of the arm's room.",
+    OUT_OF_REACH: "Bring the board (eye-to-hand: the camera) nearer, or correct its guess.",
     NOT_IN_PICTURE: "Measure camera_guess and board_guess better, use a smaller board or a wider lens.",
     "the joint range": "Widen limits.joints_min_rad and joints_max_rad, or turn the board.",
     "singular postures": "Move the board sideways, so that the arm need not stretch or fold.",
@@ -47,6 +50,10 @@ _REMEDIES = {
     "the board": "Lower limits.board_clearance_m, measure board_guess better (its sigma counts), or turn it.",
     "the camera": "Work further from the camera, or measure camera_guess better (its sigma counts).",
 }
+_KEPT_CLEAR = (
+    "Move the board away from what the arm would touch, or correct limits.planes and board_guess (the "
+    "board's z axis points into the board)."
+)
 
 _BACKWARDS = -0.3
 """Cosine between the flange's axis and the line of sight of a camera that looks back at the arm."""
@@ -58,78 +65,30 @@ def explain_shortage(
     layout: CellLayout, wanted: int, group: CandidateSet, found: CandidateSet, start: Array | None
 ) -> LimitError:
     """Make the error that says why there is no plan. `group`: usable candidates; `found`: all."""
-    counts: dict[str, Any] = {"possible": len(group), "wanted": wanted}
-    if looks_back(layout, found):
-        angle_rad = float(np.arccos(np.clip(layout.X[2, 2], -1.0, 1.0)))
-        hidden = found.alone[ARM_IN_SIGHT]
-        return LimitError("camera-looks-back", angle_rad=angle_rad, hidden=hidden, **counts)
-    if start is not None and len(found) >= wanted and len(group) < wanted:
-        return _start_is_cut_off(layout, counts, len(found), start)
-    few = f"Only {len(group)} of the wanted {wanted} poses are possible"
-    few = few if len(group) else "No pose is possible"
     lost, alone = found.lost, found.alone
-    if lost[OUT_OF_REACH] > 2 * len(found) and lost[OUT_OF_REACH] >= alone.total():
-        return _out_of_reach(layout, few, counts, lost[OUT_OF_REACH])
-    binding = []
-    if not alone.total() and lost[NOT_IN_PICTURE] > max(lost.values(), default=0) / 2:
-        binding.append(NOT_IN_PICTURE)
-    ranked = alone if alone.total() else lost
-    binding += [
-        limit
-        for limit, count in ranked.most_common(2)
-        if count and limit not in (NOT_IN_PICTURE, OUT_OF_REACH)
-    ]
-    gains = [
-        f"{limit} ({'costs' if alone.total() else 'forbids'} {ranked[limit]} poses)" for limit in binding
-    ]
+    ranked = (alone if alone.total() else lost).most_common(2)
+    limiting = [limit for limit, count in ranked if count and limit not in (NOT_IN_PICTURE, OUT_OF_REACH)]
+    if looks_back(layout, found):
+        limiting = [_LOOKS_BACK]
+    elif start is not None and len(group) < wanted <= len(found):
+        limiting = [_CUT_OFF]
+    elif lost[OUT_OF_REACH] > 2 * len(found) and lost[OUT_OF_REACH] >= alone.total():
+        limiting = [OUT_OF_REACH]
+    elif not alone.total() and lost[NOT_IN_PICTURE] > max(lost.values(), default=0) / 2:
+        limiting.insert(0, NOT_IN_PICTURE)
     return LimitError(
         "too-few-poses",
-        few=few,
-        limiting=", ".join(gains) or "none alone",
-        advice=" ".join(_remedy(limit) for limit in binding),
-        constraints=", ".join(binding),
-        **counts,
+        possible=len(group),
+        wanted=wanted,
+        limiting=", ".join(limiting) or "none alone",
+        advice=" ".join(_REMEDIES.get(limit, _KEPT_CLEAR) for limit in limiting),
     )
-
-
-def _remedy(limit: str) -> str:
-    other = (
-        f"Move the board away from {limit}, or correct limits.planes and board_guess (the board's z axis "
-        "points into the board)."
-    )
-    return _REMEDIES.get(limit, other)
 
 
 def looks_back(layout: CellLayout, found: CandidateSet) -> bool:
     """Tell whether the configured camera looks back at the arm, which then hides the board in most views."""
     backwards = layout.mount == "eye-in-hand" and layout.X[2, 2] < _BACKWARDS
     return bool(backwards and found.alone[ARM_IN_SIGHT] > _KEYHOLE * len(found))
-
-
-def _out_of_reach(layout: CellLayout, few: str, counts: dict[str, Any], beyond: int) -> LimitError:
-    model = layout.geometry.model
-    arm_m = abs(model.a_m[1]) + abs(model.a_m[2]) + model.d_m[4]
-    thing, centre = "camera", layout.X[:3, 3]
-    if layout.mount == "eye-in-hand":
-        thing, centre = "board", transform_points(layout.Y, board_points(layout.board).mean(axis=0))
-    away_m = float(np.linalg.norm(centre - [0.0, 0.0, model.d_m[0]]))
-    return LimitError(
-        "out-of-reach",
-        few=few,
-        beyond=beyond,
-        thing=thing,
-        arm=model.name,
-        distance_m=away_m,
-        limit_m=float(arm_m),
-        **counts,
-    )
-
-
-def _start_is_cut_off(layout: CellLayout, counts: dict[str, Any], passing: int, start: Array) -> LimitError:
-    gaps, contacts = margins(layout.geometry, start)
-    worst = int(gaps[0].argmin())
-    near = f"; {contacts[worst]}, {-1000 * gaps[0, worst]:.0f} mm too close" if gaps.min() < 0 else ""
-    return LimitError("start-cut-off", passing=passing, near=near, **counts)
 
 
 @dataclass(frozen=True)

@@ -1,101 +1,24 @@
-"""Predicted error of X from a plan or after captured poses, and the most useful next pose."""
+"""The most useful next pose after captured ones, and how many are missing."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
-import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.handeye.arm import PARAMETERS
-from calibrate.handeye.information import USUAL_NOISE, MeasurementNoise, covariance_of, sigma_of
-from calibrate.handeye.solution import MEASURED
+from calibrate.handeye.information import sigma_of
 from station.cell.config import StationConfig
 from station.cell.errors import StationError
-from station.cell.layout import CellLayout, flange_poses, layout_of
+from station.cell.layout import CellLayout, layout_of
 from station.cell.limits import check_path
-from station.cell.pose_plan import Plan, PlannedPose
+from station.cell.pose_plan import PlannedPose
 from station.plan.candidates import find_candidates
-from station.plan.choose import TABLE_MM, Objective, informations, objective_for
-from station.plan.visibility import planned_pose, view_range, visible
+from station.plan.choose import Objective, informations, objective_for
+from station.plan.visibility import planned_pose, view_range
 
 _FURTHER_POSES, _CANDIDATES, _TRIES = 60, 150, 12
-
-
-_OPEN = 0.7
-"""Share of its prior 1σ above which a parameter counts as not determined."""
-
-
-@dataclass(frozen=True)
-class ArmForecast:
-    """Errors expected after a plan if X and the arm's table are estimated from it."""
-
-    with_table_m: float
-    """1σ of a point over the arm's workspace, with the corrected table."""
-    if_measured_m: float
-    """The same if the board's length is known to `MEASURED`."""
-    open: tuple[str, ...]
-    """Parameters of the table that the plan does not determine."""
-
-
-def forecast_arm(layout: CellLayout, plan: Plan) -> ArmForecast:
-    """Predict errors with the arm's table, for usual noise and usual errors of the table."""
-    joints = np.array([pose.joints_rad for pose in plan.poses])
-    gains = informations(layout, flange_poses(layout, plan), joints)
-    total, expected = gains.sum(axis=0), []
-    for tolerance in (layout.board.square_tolerance, MEASURED):
-        board = msgspec.structs.replace(layout.board, square_tolerance=tolerance)
-        objective = objective_for(
-            replace(layout, board=board), "arm", free_intrinsics=True, joints_rad=joints
-        )
-        expected.append(float(np.exp(objective(total) / 2)))
-        if tolerance is layout.board.square_tolerance:
-            left = np.diag(covariance_of(total, objective.prior))[-len(PARAMETERS) :]
-    wide = np.sqrt(left) > _OPEN * 1e-3 * TABLE_MM
-    names = tuple(name for name, stays in zip(PARAMETERS, wide, strict=True) if stays)
-    return ArmForecast(expected[0], expected[1], names)
-
-
-def with_forecast(layout: CellLayout, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
-    """Add the expected sigma after each pose where it is missing, for usual noise.
-
-    The second value names the poses in which the board is expected to be cut off.
-    """
-    flange = flange_poses(layout, plan)
-    cut = tuple(pose.name for pose, seen in zip(plan.poses, _whole(layout, flange), strict=True) if not seen)
-    if all(pose.predicted_sigma_m is not None for pose in plan.poses):
-        return plan, cut
-    expected = forecast_views(layout, flange)
-    poses = tuple(
-        msgspec.structs.replace(pose, predicted_sigma_m=after)
-        for pose, after in zip(plan.poses, expected, strict=True)
-    )
-    return msgspec.structs.replace(plan, poses=poses), cut
-
-
-def forecast_views(
-    layout: CellLayout,
-    base_from_flange: Array,
-    free_intrinsics: bool = True,
-    noise: MeasurementNoise = USUAL_NOISE,
-) -> list[float]:
-    """Predict 1σ of X (m) after each of the views from these flange poses (n, 4, 4).
-
-    A view that is not expected to show the whole board adds nothing.
-    """
-    objective = objective_for(layout, "A", free_intrinsics)
-    gains = informations(layout, base_from_flange, noise=noise)
-    gains[~_whole(layout, base_from_flange)] = 0.0
-    return [sigma_of(information, objective.prior)[0] for information in gains.cumsum(axis=0)]
-
-
-def _whole(layout: CellLayout, base_from_flange: Array) -> NDArray[np.bool_]:
-    """Tell for each pose whether all points of the board are expected in the image, (n,)."""
-    return visible(layout.camera, layout.seen(base_from_flange, board_points(layout.board)), 0.0)
 
 
 def next_best(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 from pathlib import Path
 
 import msgspec
@@ -11,7 +10,6 @@ import pytest
 import typer
 from rich.console import Console
 
-import recordings
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import Event, MotionPreview, PoseStatus, SessionStatus, StationStatus
 from station.cli import control as cli_control
@@ -25,7 +23,6 @@ from tests.command_line import call
 
 NAMES = ("[red]x[/]", "[/]", "a :bug: [bold]", "end\\")
 ALL = " ".join(NAMES)
-SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 
 
 @pytest.fixture
@@ -46,14 +43,12 @@ def test_a_plan_and_its_poses(folder: Path) -> None:
     start = make_cell("paper", 0, "low", "eye-in-hand").start_joints_rad
     joints = [tuple(q + 0.02 * k for q in start) for k in range(len(NAMES))]
     poses = tuple(PlannedPose(name, q, why=f"why {name}") for name, q in zip(NAMES, joints, strict=True))
-    made, shown = folder / "].yaml", folder / "]shown.yaml"
+    made = folder / "].yaml"
     save_plan(Plan("UR10", "eye-in-hand", poses, note=ALL), made)
     done = call(main, "plan", "--check", made)
     for name in NAMES:
         assert f"why {name}" in done.stdout
     assert f"note: {ALL}" in done.stdout
-    taught = Path(shutil.copy(SAMPLE, folder / "].mcap"))
-    assert f"written to {shown}" in call(main, "plan", "--taught", taught, "-o", shown).stdout
 
 
 def test_a_plan_that_breaks_a_limit(folder: Path) -> None:

@@ -21,11 +21,10 @@ from calibrate.load import Progress, load_views
 from calibrate.projection import project_pixels
 from calibrate.views import board_in_camera
 from recordings.exporters.excerpt import copied
-from recordings.images import viewable
 from recordings.reader import Recording
 from recordings.scene import Entity, Polyline
 from recordings.schema.messages import CameraModel, Matrix4, View
-from recordings.schema.viewing import DETECTED, Marks, drawn
+from recordings.schema.viewing import DETECTED, Marks
 from recordings.writer import derived_recording
 
 USED, REJECTED, PREDICTED = DETECTED, (0.95, 0.1, 0.1), (1.0, 0.8, 0.1)
@@ -83,10 +82,7 @@ def annotate(
             writer.frame(place.parent_frame, place.child_frame, T)
         copies = copied(recording, writer, replaced=["calibration.yaml"])
         for (_, image), of_view, residual in zip(copies, marks, found, strict=True):
-            text = _text(residual)
-            writer.marks(image.sequence, of_view, text)
-            shown = viewable(image.pixels, image.pixel_format)
-            writer.drawn_image(image.sequence, drawn(shown, of_view, text))
+            writer.marks(image.sequence, of_view, _text(residual))
         pairs = zip(recording.views(), found, strict=True)
         cameras = [_camera_entity(calibration, camera, view, residual) for view, residual in pairs]
         writer.scene(0, [_board_entity(calibration), *cameras])

@@ -30,17 +30,14 @@ from recordings.schema.definitions import (
     schema_difference,
 )
 from recordings.schema.messages import (
-    CameraModel,
     CaptureEvent,
     ClockReading,
     Image,
-    Matrix4,
     RobotState,
     SessionInfo,
     View,
 )
 from recordings.schema.topics import Topic, parse, schema_bytes, schema_name
-from recordings.schema.viewing import camera_model_of, matrix_of
 
 VIEWS_LIMIT = 10_000
 _RIGID_TOLERANCE = 1e-6
@@ -87,23 +84,6 @@ class RecordingSegment:
 
     def robot_states(self) -> Iterator[RobotState]:
         return self._decoded(Topic.ROBOT_STATE, RobotState)
-
-    @property
-    def camera_model(self) -> CameraModel | None:
-        """The newest intrinsics for viewers: the solved ones in an annotated recording."""
-        last = None
-        for message in self.parsed(Topic.CAMERA_CALIBRATION):
-            last = camera_model_of(message)
-        return last
-
-    @property
-    def fixed_frames(self) -> dict[tuple[str, str], Matrix4]:
-        """(parent, child) → parent_from_child of what does not move, as it was known last."""
-        found = {}
-        for topic in (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM):
-            for frame in self.parsed(topic):
-                found[frame.parent_frame_id, frame.child_frame_id] = matrix_of(frame)
-        return found
 
     def events(self) -> Iterator[CaptureEvent]:
         return self._decoded(Topic.EVENT, CaptureEvent)

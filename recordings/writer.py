@@ -163,11 +163,6 @@ class RecordingWriter:
         if (time_ns := self._images.get(sequence)) is not None:
             self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
 
-    def drawn_image(self, sequence: int, jpeg: bytes) -> None:
-        """A recorded image with something drawn into it, for viewers that draw nothing over images."""
-        time_ns = self._images[sequence]
-        self._show(Topic.DRAWN_IMAGE, viewing.compressed_image(jpeg, "jpeg", time_ns), time_ns)
-
     def scene(self, sequence: int, entities: Sequence[Entity]) -> None:
         """Shapes in space as they are at a recorded image's time, for viewers."""
         time_ns = self._images[sequence]

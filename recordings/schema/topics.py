@@ -37,7 +37,6 @@ class Topic(StrEnum):
     JOINTS = "/joint_states"
     ANNOTATIONS = "/camera/annotations"
     SCENE = "/scene"
-    DRAWN_IMAGE = "/camera/annotated"
     LOG = "/log"
 
 
@@ -56,7 +55,6 @@ _MESSAGES: dict[Topic, Any] = {
     Topic.JOINTS: JointStates,
     Topic.ANNOTATIONS: ImageAnnotations,
     Topic.SCENE: SceneUpdate,
-    Topic.DRAWN_IMAGE: CompressedImage,
     Topic.LOG: Log,
 }
 
@@ -84,7 +82,7 @@ def identify(samples: list[bytes]) -> tuple[str, str, str, bytes] | None:
     topic's message has, and it says again the same number of bytes.
     """
     fitting = [topic for topic in Topic if all(_fits(topic, data) for data in samples)]
-    for twin in (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM, Topic.DRAWN_IMAGE):  # of /tf and of images
+    for twin in (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM):  # of /tf
         if len(fitting) > 1 and twin in fitting:
             fitting.remove(twin)
     if len(fitting) != 1 or not samples:

@@ -27,7 +27,6 @@ from recordings.schema.messages import (
     Matrix4,
     RobotState,
     Vector6,
-    matrix_from_quaternion,
 )
 
 CAMERA_FRAME = "camera"
@@ -85,17 +84,12 @@ def camera_calibration(model: CameraModel, time_ns: int) -> Any:
         distortion_model=_FISHEYE.get(model.distortion_model, model.distortion_model),
         D=model.distortion,
     )
-    K = camera_matrix(model)
+    K = np.array(model.matrix or np.zeros((3, 3)), float)  # zeros, as Foxglove expects it: not calibrated
     message.K.extend(K.ravel())
     message.R.extend(np.eye(3).ravel())
     message.P.extend(np.column_stack([K, np.zeros(3)]).ravel())
     _stamp(message, time_ns)
     return message
-
-
-def camera_matrix(model: CameraModel) -> NDArray[np.float64]:
-    """(3, 3), all zero of a camera that nobody calibrated: so Foxglove and ROS expect it."""
-    return np.array(model.matrix or np.zeros((3, 3)), float)
 
 
 def camera_model_of(message: Any) -> CameraModel:
@@ -115,12 +109,6 @@ def intrinsics(width: int, height: int, K: Any, D: Any, distortion_model: str) -
         tuple(float(number) for number in D),
         _OURS.get(distortion_model, "plumb_bob"),
     )
-
-
-def matrix_of(message: Any) -> Matrix4:
-    """parent_from_child of a `foxglove.FrameTransform`."""
-    t, q = message.translation, message.rotation
-    return matrix_from_quaternion([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
 
 
 def frame_transform(parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
@@ -191,26 +179,6 @@ def image_annotations(marks: Sequence[Marks], text: str, time_ns: int) -> Any:
         _paint(label.text_color, marks[-1].colour if marks else (1.0, 1.0, 1.0))
         label.background_color.a = 0.6
     return message
-
-
-def drawn(image: Pixels, marks: Sequence[Marks], text: str) -> bytes:
-    """The image as JPEG with marks and text in its pixels."""
-    if image.dtype == np.uint16:
-        image = np.asarray(image / max(1, int(image.max()) >> 8), np.uint8)
-    canvas = image.copy() if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    for mark in marks:
-        colour = [255 * part for part in mark.colour[::-1]]
-        fixed = np.rint(mark.points * 16).astype(int)
-        if mark.ends is None:
-            for x, y in fixed.tolist():
-                cv2.circle(canvas, (x, y), 80, colour, 2, cv2.LINE_AA, 4)
-        else:
-            for start, end in zip(fixed.tolist(), np.rint(mark.ends * 16).astype(int).tolist(), strict=True):
-                cv2.line(canvas, start, end, colour, 3, cv2.LINE_AA, 4)
-    colour = [255 * part for part in marks[0].colour[::-1]] if marks else [255, 255, 255]
-    text = text.encode("ascii", "replace").decode()  # OpenCV's letters
-    cv2.putText(canvas, text, (12, 32), cv2.FONT_HERSHEY_SIMPLEX, 0.8, colour, 2, cv2.LINE_AA)
-    return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
 
 
 def _paint(colour: Any, rgb: tuple[float, float, float]) -> None:

@@ -7,8 +7,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_protobuf.decoder import DecoderFactory
 
 from calibrate.annotate import AnnotateError, annotate
 from calibrate.cli import main
@@ -16,6 +14,7 @@ from calibrate.files.calibration import Calibration, FramePose, read_calibration
 from calibrate.results import RejectedView
 from recordings.reader import open_recording
 from tests.command_line import call
+from tests.recordings.small_recording import shown
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "samples" / "paper-640.mcap"
 
@@ -28,33 +27,25 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def messages(path: Path, topic: str) -> list:
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [decoded for _, _, _, decoded in reader.iter_decoded_messages(topics=[topic])]
-
-
 def test_the_command_writes_the_result_beside_the_pictures(tmp_path: Path, solved: Path) -> None:
     path = tmp_path / "seen.mcap"
     result = call(main, "annotate", SAMPLE, solved, "-o", path)
     assert result.returncode == 0, result.stderr
     calibration = read_calibration(solved)
-    part = open_recording(path).segments[0]
-    assert part.camera_model == calibration.intrinsics.model
-    np.testing.assert_allclose(
-        part.fixed_frames["flange", "camera"], calibration.transform.matrix, atol=1e-12
-    )
-    assert ("base", "board") in part.fixed_frames
-    for topic in ("/tf_static", "/tf_static/board"):
-        assert len(messages(path, topic)) == 1, (
-            "viewers that jump to a time take a topic's last message alone"
-        )
-    marks = messages(path, "/camera/annotations")
+    (lens,) = (message for _, message in shown(path, "/camera/calibration"))
+    np.testing.assert_array_equal(lens.K, np.ravel(calibration.intrinsics.matrix))
+    # Viewers that jump to a time take a topic's last message alone.
+    (camera,), (board,) = ([m for _, m in shown(path, topic)] for topic in ("/tf_static", "/tf_static/board"))
+    assert [(m.parent_frame_id, m.child_frame_id) for m in (camera, board)] == [
+        ("flange", "camera"),
+        ("base", "board"),
+    ]
+    assert camera.translation.x == calibration.result.translation_m[0]
+    marks = [message for _, message in shown(path, "/camera/annotations")]
     assert len(marks) == 25
     assert len(marks[0].points[0].points) == 42, "every corner"
     assert len(marks[0].points[1].points) == 84, "and a line from each"
-    assert len(messages(path, "/camera/annotated")) == 25
-    (scene,) = messages(path, "/scene")
+    ((_, scene),) = shown(path, "/scene")
     assert len(scene.entities) == 26, "the board, and where the camera was in each view"
     again, original = open_recording(path), open_recording(SAMPLE)
     assert list(again.robot_states()) == list(original.robot_states())
@@ -93,7 +84,7 @@ def test_rejected_views_are_red_and_say_why(tmp_path: Path, solved: Path) -> Non
     )
     assert [view.index for view in found if view.rejected] == [3]
     colours = [
-        marks.points[0].outline_color for marks in messages(tmp_path / "a.mcap", "/camera/annotations")
+        marks.points[0].outline_color for _, marks in shown(tmp_path / "a.mcap", "/camera/annotations")
     ]
     assert [n for n, colour in enumerate(colours) if colour.r > colour.g] == [3]
 

@@ -49,10 +49,6 @@ def mcap_python(path: Path) -> list[str]:
     channels: dict[int, Channel] = {}
     schemas: dict[int, Schema] = {}
     streamed = []
-    factories = {
-        "protobuf": DecoderFactory(),
-        "cdr": library("mcap_ros2.decoder", "mcap-ros2-support").DecoderFactory(),
-    }
     with path.open("rb") as stream:
         for record in StreamReader(stream, validate_crcs=True).records:
             if isinstance(record, Schema):
@@ -63,7 +59,7 @@ def mcap_python(path: Path) -> list[str]:
                 channel = channels[record.channel_id]
                 streamed.append((channel.topic, record.log_time, record.sequence))
                 encoding, schema = channel.message_encoding, schemas.get(channel.schema_id)
-                decode = factories[encoding].decoder_for(encoding, schema)
+                decode = DecoderFactory().decoder_for(encoding, schema)
                 if decode is None or decode(record.data) is None:
                     findings.append(f"{channel.topic} cannot be decoded by its own schema")
     with path.open("rb") as stream:

@@ -97,7 +97,6 @@ def test_offline_work_runs_from_the_wheel_alone(installed: Path, tmp_path: Path)
     ("program", "arguments", "extra"),
     [
         ("calibrate", ("solve", "{sample}", "-o", "{out}/c.yaml", "--report", "{out}/r.html"), "report"),
-        ("recordings", ("export", "{sample}", "--to", "ros2", "-o", "{out}/bag"), "ros"),
         ("calibrate", ("board", "-o", "{out}/board.pdf"), "report"),
     ],
 )

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from recordings.exporters.excerpt import write_excerpt
-from recordings.exporters.folder import export_recording
 from recordings.reader import open_recording
 from recordings.recover import recover_recording
+from recordings.scene import Entity, Polyline
 from recordings.schema.messages import CaptureEvent, Stamps
+from recordings.schema.viewing import DETECTED, Marks
 from recordings.writer import RecordingWriter
 from tests.foreign.judges import JUDGES, rerun
-from tests.recordings.small_recording import START_NS, make_info, make_picture, make_state, make_view
+from tests.recordings.small_recording import START_NS, TURNED, make_info, make_picture, make_state, make_view
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "samples" / "paper-640.mcap"
 POSES, STATES_A_POSE = 8, 120
@@ -31,8 +33,12 @@ def fresh(folder: Path) -> Path:
             now_ns = (index + 1) * STATES_A_POSE * 2_000_000
             stamps = Stamps(now_ns, START_NS + now_ns, device_ns=now_ns)
             writer.image(_at(make_picture(index), stamps))
+            writer.marks(index, [Marks(np.zeros((2, 2)), DETECTED, np.ones((2, 2)))], "0.1 px")
             writer.view(_at(make_view(index), Stamps(now_ns, START_NS + now_ns - 5_000_000)))
             writer.event(CaptureEvent(stamps, "captured", pose_index=index))
+        line = Polyline(np.zeros((2, 3)), (1.0, 0.0, 0.0, 1.0))
+        writer.scene(0, [Entity("board", "base", (line,), "board")])
+        writer.frame("flange", "camera", TURNED)
         return writer.finish()
 
 
@@ -54,17 +60,11 @@ def recovered(folder: Path) -> Path:
     return recover_recording(path, folder / "saved.mcap")[0].path
 
 
-def ros2_export(folder: Path) -> Path:
-    bag = export_recording(open_recording(fresh(folder)), folder / "bag", "ros2")
-    return next(bag.glob("*.mcap"))
-
-
 FILES = {
     "fresh": fresh,
     "sample": lambda folder: SAMPLE,
     "excerpt": excerpt,
     "recovered": recovered,
-    "ROS 2 export": ros2_export,
 }
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import CompressionType
+from scipy.spatial.transform import Rotation
 
 from recordings.cli import main
 from recordings.images import viewable
@@ -101,8 +102,10 @@ def test_the_stops_come_with_their_picture_and_the_right_pose(
         time_s = (view.stamps.host_wall_ns - START_NS) / 1e9
         assert 2 * number + 0.3 < time_s < 2 * number + 1, "the last picture of the stop"
         assert np.unique(image.pixels) == 10 + 40 * number
-        position, _ = pose(2.0 * number)
-        np.testing.assert_allclose(np.array(view.base_from_flange)[:3, 3], position, atol=1e-9)
+        position, q = pose(2.0 * number)
+        T = np.array(view.base_from_flange)
+        np.testing.assert_allclose(T[:3, 3], position, atol=1e-9)
+        np.testing.assert_allclose(T[:3, :3], Rotation.from_quat(q).as_matrix(), atol=1e-9)
         assert view.time_bound_s is not None
         assert view.time_bound_s < 0.005
         if not kind.startswith("foxglove schemas"):

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 
 from recordings.errors import RecordingError
 from recordings.schema.messages import (
@@ -36,6 +39,13 @@ def refused(code: str, **values: object) -> Iterator[pytest.ExceptionInfo[Record
     with pytest.raises(RecordingError) as caught:
         yield caught
     assert (caught.value.code, caught.value.values) == (code, caught.value.values | values)
+
+
+def shown(path: Path, topic: str) -> list[tuple[int, Any]]:
+    """(time, message) of what viewers are given on a topic."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [(m.log_time, decoded) for _, _, m, decoded in reader.iter_decoded_messages(topics=[topic])]
 
 
 def make_info(**changes: object) -> SessionInfo:

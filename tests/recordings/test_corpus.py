@@ -1,4 +1,4 @@
-"""Inputs that the fuzzer found worth keeping, read again with checksums off, as it read them."""
+"""Inputs that a fuzzer found worth keeping, read again with checksums off, as it read them."""
 
 from __future__ import annotations
 

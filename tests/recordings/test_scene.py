@@ -7,20 +7,20 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_protobuf.decoder import DecoderFactory
 
 from recordings.recorder import Recorder
 from recordings.schema.messages import RobotIdentity, Stamps
 from recordings.schema.viewing import DETECTED, Marks
 from recordings.writer import RecordingWriter
-from tests.recordings.small_recording import START_NS, TURNED, make_info, make_picture, make_state, make_view
-
-
-def shown(path: Path, topic: str) -> list:
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [(m.log_time, decoded) for _, _, m, decoded in reader.iter_decoded_messages(topics=[topic])]
+from tests.recordings.small_recording import (
+    START_NS,
+    TURNED,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+    shown,
+)
 
 
 def test_the_arm_is_shown_at_25_hz_without_its_tool(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """News from a simulated robot, late by 120, 300 and 800 ms: does a resting arm wait, does a moving one stop?
 
 Who is late is made so: the controller is halted (SIGSTOP), its link carries nothing (the simulated cable is
-pulled), this computer does not read (the reader's thread is held), or the control process is halted.
+pulled), this computer does not read (its event loop is held), or the control process is halted.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ class Rig:
     cable: AdminClient
     robot: UrRobot
     hold_s: float = 0.0
-    """The reader's thread sleeps for so long at the next state."""
+    """The event loop sleeps for so long at the next state."""
+    lag_s: float = 0.0
+    """Longest delay of a heartbeat since a trial began."""
 
     def on_state(self, _: object) -> None:
         held, self.hold_s = self.hold_s, 0.0
@@ -49,7 +51,9 @@ class Rig:
     async def beat(self) -> None:
         while True:
             self.robot.heartbeat()
+            due_s = time.monotonic() + BEAT_S
             await asyncio.sleep(BEAT_S)
+            self.lag_s = max(self.lag_s, time.monotonic() - due_s)
 
     async def halt(self, pid: int | None, late_s: float) -> None:
         assert pid is not None
@@ -112,7 +116,7 @@ async def rig(folder: Path) -> AsyncIterator[Rig]:
 
 async def at_rest(made: Rig, fault: Fault, late_s: float) -> tuple[str, str]:
     """What became of a decision in the middle of it, and what was named."""
-    began_s = time.monotonic()
+    began_s, made.lag_s = time.monotonic(), 0.0
     faulty = asyncio.create_task(fault(made, late_s))
     await asyncio.sleep(min(0.11, late_s / 2))
     said = "waited"
@@ -122,7 +126,7 @@ async def at_rest(made: Rig, fault: Fault, late_s: float) -> tuple[str, str]:
         said = f"fault: {error.code}"
     await faulty
     await asyncio.sleep(0.15)
-    cause = made.robot.delay(0.0, began_s - 0.05)
+    cause = made.robot.delay(made.lag_s, began_s - 0.05)
     await asyncio.sleep(0.1)
     return said, cause.code if cause else "–"
 

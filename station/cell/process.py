@@ -27,13 +27,6 @@ _LOCK_PAGES_IN_USE = 1 | 2 | 4
 """MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT: pages once used stay in memory."""
 
 
-def waited_share(pressure: Path = Path("/proc/pressure/cpu")) -> float:
-    """Read the share of the last 10 s in which programs waited for a processor (Linux PSI); 0: not known."""
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        return float(pressure.read_text().split("avg10=")[1].split()[0]) / 100
-    return 0.0
-
-
 def die_with_parent(parent_pid: int) -> None:
     """Make the kernel kill this process when the thread that started it ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -120,7 +120,7 @@ class Robot(ArmNews, Protocol):
         """Read the identity and start the state stream. Raises RobotError."""
 
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
-        """Call back with every state in order, from the reader's thread: the callback must be quick."""
+        """Call back with every state in order: the callback must be quick."""
 
     def at(self, host_monotonic_ns: int) -> RobotState:
         """Interpolate the state at a host time within the last 10 s; StaleStateError outside."""

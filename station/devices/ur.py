@@ -26,9 +26,10 @@ from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import arm_held, control_ended, foreign_program, local_control
 from station.devices.ur_dashboard import STOP, Dashboard, DashboardError, came
 from station.devices.ur_end_cause import cause_of_end
-from station.devices.ur_link import POLL_S, UrLink, link_lost
+from station.devices.ur_link import UrLink, link_lost
 from station.devices.ur_moves import MoveWatch, check_goal
 from station.devices.ur_probe import SCRIPT_PORT, check_port
+from station.devices.ur_state import POLL_S
 
 log = logging.getLogger(__name__)
 
@@ -325,6 +326,7 @@ class UrRobot(UrLink):
 
     def on_link_lost(self, why: str) -> None:
         """End the control process at once: ur_rtde would reconnect by itself and load its program again."""
+        super().on_link_lost(why)
         self._link_loss = why
         if self._child is not None and not self._moving:
             self._later(self.stop(f"connection to the robot lost ({why})"))

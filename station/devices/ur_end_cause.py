@@ -18,7 +18,8 @@ from station.devices.news import RESTING_S, Evidence, longest_silence_s
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import arm_held, local_control, program_ended, program_replaced
-from station.devices.ur_link import POLL_S, UrLink
+from station.devices.ur_link import UrLink
+from station.devices.ur_state import POLL_S
 
 OUTLIVED_S = 0.6
 """If the control program still plays so long after a pause of this computer began, that pause did not stop
@@ -41,10 +42,6 @@ async def cause_of_end(link: UrLink, child: ControlChild, error: RobotError) -> 
     states = link.states()
     if states and (held := arm_held(states[-1])) is not None:
         return held
-    if late and after is not None:
-        error = link.evidence(0.0, begun_s - OUTLIVED_S, time.monotonic()).error() or error
-    elif ended:
-        error = _evidence_of_end(link, child, states).error() or error
     if link.remote and link.dashboard is not None:
         with contextlib.suppress(RobotError, TimeoutError):
             async with asyncio.timeout(REMOTE_WAIT_S):
@@ -55,6 +52,10 @@ async def cause_of_end(link: UrLink, child: ControlChild, error: RobotError) -> 
         other = await _other_program(link, child.started_s, REPLACED_S if ended else 0.0)
         if other is not None:
             return program_replaced(other)
+    if late and after is not None:
+        return link.evidence(0.0, begun_s - OUTLIVED_S, time.monotonic()).error() or error
+    if ended and (delayed := _evidence_of_end(link, child, states).error()) is not None:
+        return delayed
     return program_ended(RuntimeState.STOPPED) if error.code == "watchdog" else error
 
 

@@ -17,7 +17,6 @@ from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.cell.layout import arm_model
-from station.cell.process import waited_share
 from station.cell.status import ArmCondition
 from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_loopback, largest_gap
 from station.devices.ur_condition import condition, safety_stop
@@ -33,16 +32,12 @@ from station.devices.ur_probe import (
     unsupported_model,
     why_no_dashboard,
 )
-from station.devices.ur_state import Payload, Sample, StateReader, state_at
+from station.devices.ur_state import POLL_S, Payload, Sample, StateReader, state_at
 from station.devices.ur_tool import Installation, PrimaryReader, TcpCheck, check_payload
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.005
-FIRST_STATE_S = 4.0
 SUPERVISE_S = 0.2
-_BUSY_SHARE = 0.5
-"""Share of time waiting for a processor above which a gap is blamed on this computer, not the network."""
 RETRY_S = 0.5
 
 
@@ -57,12 +52,9 @@ class UrLink:
         """Reader of the state stream, with its counters; a new one after a lost connection."""
         self._arrived_ns = 0
         """Arrival of the newest state, of this connection or an earlier one (host monotonic); 0: none."""
-        self._unread_s = 0.0
-        """When this computer last had no processor to read late news (host monotonic)."""
         self.guided = False
         """True while a person moves the arm by hand."""
         self.dashboard: Dashboard | None = None
-        self._ended_reader: StateReader | None = None
         self._lock: RobotLock | None = None
         self.identity = RobotIdentity(model=config.model)
         self._subscribers: list[Callable[[RobotState], None]] = []
@@ -105,15 +97,8 @@ class UrLink:
         if self._lock is None:
             self._lock = RobotLock(lock_name(host, found.serial))
         await check_port(host, SCRIPT_PORT)
-        loop = asyncio.get_running_loop()
-        reader = StateReader(host, self._deliver, lambda why: _call(loop, self._reader_ended, reader, why))
-        self.reader = reader
-        reader.start()
-        try:
-            async with asyncio.timeout(FIRST_STATE_S):
-                first = await asyncio.wrap_future(reader.started)
-        except TimeoutError:
-            raise RobotError("no-state", host=host, limit_s=FIRST_STATE_S) from None
+        reader = self.reader = StateReader(host, self._deliver, self.on_link_lost)
+        first = await reader.open()
         self._primary = PrimaryReader(host)
         installation = await self._primary.first()
         if installation.tcp_offset is None:
@@ -171,7 +156,7 @@ class UrLink:
     async def _close_link(self) -> None:
         reader, self.reader = self.reader, None
         if reader is not None:
-            await asyncio.to_thread(reader.close)
+            reader.close()
         primary, self._primary = self._primary, None
         if primary is not None:
             await primary.close()
@@ -180,7 +165,7 @@ class UrLink:
             await dashboard.close()
 
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
-        """Call back with every state in order, from the reader's thread: the callback must be quick."""
+        """Call back with every state in order: the callback must be quick."""
         self._subscribers.append(callback)
 
     def _deliver(self, state: RobotState) -> None:
@@ -222,8 +207,7 @@ class UrLink:
         """
         age_s = self._age_s()
         if age_s > CURRENT_S and self.reader is not None:
-            if not self.reader.read_waiting():
-                self._unread_s = time.monotonic()
+            self.reader.read()
             age_s = self._age_s()
         return age_s
 
@@ -258,8 +242,6 @@ class UrLink:
         """What was late in a span (host monotonic). `pause_s`: for how long this computer kicked nothing."""
         period_s = 1 / self.reader.rate_hz if self.reader is not None and self.reader.rate_hz else 0.0
         gap_s, clock_gap_s = largest_gap(self.states(), since_s, until_s, period_s)
-        if self._unread_s > since_s:
-            pause_s = max(pause_s, gap_s)
         return Evidence(pause_s, gap_s, clock_gap_s, is_loopback(self.config.host))
 
     def stale(self, age_s: float, limit_s: float) -> StaleStateError:
@@ -272,8 +254,8 @@ class UrLink:
         cause, remedy = "", "Check cable and network."
         if reader.stands_still:
             cause, remedy = ": the controller's clock stands still", "Restart the controller."
-        elif (waited := waited_share()) >= _BUSY_SHARE:
-            cause, remedy = f": programs wait {waited:.0%} of the time for this computer", "Reduce its load."
+        elif is_loopback(self.config.host):
+            cause, remedy = ", which runs on this computer", "Reduce its load."
         return StaleStateError(age_s=age_s, limit_s=limit_s, cause=cause, advice=remedy)
 
     def at(self, host_monotonic_ns: int) -> RobotState:
@@ -340,15 +322,9 @@ class UrLink:
         if self._payload is not None:
             check_payload(sample.payload, self._payload)
 
-    def _reader_ended(self, reader: StateReader, why: str) -> None:
-        """Handle the end of a reader, once: reader and supervision may both report it."""
-        if reader is self.reader and reader is not self._ended_reader and self._supervisor is not None:
-            self._ended_reader = reader
-            log.warning("robot state of %s: %s", self.config.host, why)
-            self.on_link_lost(why)
-
     def on_link_lost(self, why: str) -> None:
-        """Hook for the subclass that controls the arm: called when the connection is lost."""
+        """Called once when the connection is lost; to be extended by the subclass that controls the arm."""
+        log.warning("robot state of %s: %s", self.config.host, why)
 
     async def _supervise(self) -> None:
         failed = False
@@ -358,8 +334,6 @@ class UrLink:
             reader = self.reader
             try:
                 if reader is None or reader.ended is not None:
-                    if reader is not None and reader.ended is not None:
-                        self._reader_ended(reader, reader.ended)
                     await self._close_link()
                     await self._open()
                 await self.supervise_more()
@@ -397,8 +371,3 @@ def not_connected(host: str) -> StaleStateError:
 
 def link_lost(why: str) -> StaleStateError:
     return StaleStateError("link-lost", why=why)
-
-
-def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: object) -> None:
-    with contextlib.suppress(RuntimeError):  # the loop is closed
-        loop.call_soon_threadsafe(function, *arguments)

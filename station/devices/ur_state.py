@@ -1,23 +1,18 @@
-"""Reader of the controller's state at its full rate, in its own thread, keeping every sample. Read-only.
+"""Reader of the controller's state at its full rate, keeping every sample. Read-only.
 
-A reader lasts as long as its connection; for the next connection a new one is made.
+The kernel stamps and keeps what comes while the event loop is busy. A reader lasts as long as its connection;
+for the next connection a new one is made.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import logging
-import select
 import socket
 import struct
-import threading
 import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
-from functools import partial
 from typing import NamedTuple
 
 import msgspec
@@ -33,8 +28,6 @@ from station.cell.layout import pose_vector
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, Recipe, RtdeError, RtdeLink
 from station.devices.ur_dashboard import connect_trouble
 
-log = logging.getLogger(__name__)
-
 HISTORY_S = 10.0
 SILENCE_S = 2.0
 """Time without data after which the connection is closed."""
@@ -44,8 +37,7 @@ RECEIVE_BUFFER_BYTES = 1 << 20
 ROUND_TRIPS, QUICK_S = 10, 0.002
 """So often the controller is asked for a quick answer: half of it bounds the time of every state."""
 READ_BYTES = 1 << 16
-READING_WAIT_S = 0.02
-"""Longest wait for waiting data to be read; a full buffer takes less."""
+POLL_S = 0.005
 WALL_STEP_NS = 1_000_000
 """Change of the wall clock between two packets above which it was set, not slewed."""
 _TIMESPEC = struct.Struct("@qq")
@@ -75,22 +67,19 @@ class Sample(NamedTuple):
     payload: Payload
 
 
-class StateReader(threading.Thread):
-    """Thread that reads the state stream of one connection.
+class StateReader:
+    """Reader of the state stream of one connection, in the event loop.
 
-    `on_state` is called for every sample, in order, one at a time, from this thread or one that calls
-    `read_waiting`; it must be quick. `on_end` is called once, at the end, with the reason.
+    `on_state` is called for every state, in order; it must be quick. `on_end` is called once with the reason
+    when the connection ends, unless it was never open or is closed here.
     """
 
     def __init__(
         self, host: str, on_state: Callable[[RobotState], None], on_end: Callable[[str], None]
     ) -> None:
-        super().__init__(name=f"state of {host}", daemon=True)
         self.host = host
         self.version: tuple[int, int, int, int] = (0, 0, 0, 0)
         self.rate_hz = 0.0
-        self.started: Future[Sample] = Future()
-        """The first sample, or the RobotError that prevented it."""
         self.newest: Sample | None = None
         self.history: deque[RobotState] = deque(maxlen=1)
         self.clock = ClockEstimator()
@@ -100,63 +89,72 @@ class StateReader(threading.Thread):
         """Why the connection is over; None while it lives."""
         self._on_state = on_state
         self._on_end = on_end
-        self._reading = threading.Lock()
-        self._read: Callable[[], None] = lambda: None
-        """Reads all waiting data while connected, else does nothing. Call with the lock held."""
-        self._broken: OSError | RtdeError | None = None
-        self._stop_read, self._stop_write = socket.socketpair()
+        self._link = socket.socket()
+        self._heard_s = 0.0
+        """When data came last (host monotonic)."""
         self._wall_ahead_ns = _wall_ahead_ns()
         self._wall_set_ns = 0
         """When the wall clock was last seen to have been set (host monotonic)."""
 
-    def run(self) -> None:
-        why = "closed here"
+    async def open(self) -> Sample:
+        """Connect and return the first state. Raises RobotError."""
         try:
-            with socket.socket() as link:
-                # A controller skips samples when the receiver's buffer is full; this one holds seconds.
-                link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-                link.settimeout(HANDSHAKE_S)
-                link.connect((self.host, PORT))
-                rtde = RtdeLink(link)
-                recipe = self._handshake(rtde)
-                self._follow(link, rtde, recipe)
-        except TimeoutError:
-            why = f"no answer from {self.host}:{PORT} within {HANDSHAKE_S:g} s"
-        except ConnectionResetError:
-            why = "the robot reset the connection"
-        except ConnectionRefusedError as error:
-            why = connect_trouble(error, "RTDE service")
-        except (OSError, RtdeError) as error:
-            why = str(error)
-        finally:
-            with contextlib.suppress(OSError):
-                self._stop_read.close()
+            self._rtde, self._recipe = await asyncio.to_thread(self._connect)
+            self._follow()
+            while self.newest is None and self.ended is None:
+                await asyncio.sleep(POLL_S)
+        except BaseException as error:
+            self.close(_reason(error, self.host))
+            if not isinstance(error, OSError | RtdeError):
+                raise
+        if self.newest is None:
+            raise RtdeError(reason=f"robot state of {self.host}: {self.ended}")
+        return self.newest
+
+    def close(self, why: str = "closed here") -> None:
+        self._on_end = lambda _: None
+        self._end(why)
+
+    def _end(self, why: str) -> None:
+        if self.ended is None:
             self.ended = why
-            if not self.started.done():
-                self.started.set_exception(RtdeError(reason=f"robot state of {self.host}: {why}"))
+            asyncio.get_running_loop().remove_reader(self._link)
+            self._link.close()
             self._on_end(why)
 
-    def close(self) -> None:
-        """End the thread; return when it has ended (milliseconds, or the connect time-out)."""
-        with contextlib.suppress(OSError):
-            self._stop_write.close()
-        self.join(HANDSHAKE_S + 1.0)
+    def read(self) -> None:
+        """Read all that has arrived.
 
-    def read_waiting(self) -> bool:
-        """Read waiting data at once, in case the reader's thread got no processor yet. From any thread.
-
-        An error that ends the connection is kept for the reader's own thread to report. False: that thread is
-        reading, and has no processor to go on.
+        To be called before the age of the newest state is judged: what this computer had no time to read
+        counts as come.
         """
-        if not self._reading.acquire(timeout=READING_WAIT_S):
-            return False
         try:
-            self._read()
+            for _ in range(RECEIVE_BUFFER_BYTES // READ_BYTES):
+                if self.ended is not None or self._read_once() < READ_BYTES:
+                    return
+        except BlockingIOError:
+            pass
         except (OSError, RtdeError) as error:
-            self._broken = error
-        finally:
-            self._reading.release()
-        return True
+            self._end(_reason(error, self.host))
+
+    def _read_once(self) -> int:
+        data, ancillary, _, _ = self._link.recvmsg(READ_BYTES, _ANCILLARY_BYTES)
+        if not data:
+            raise RtdeError(reason="the robot closed the connection")
+        self._heard_s = time.monotonic()
+        monotonic_ns, wall_ns = self._arrival(ancillary)
+        for kind, payload in self._rtde.packets.feed(data):
+            self._take(kind, payload, monotonic_ns, wall_ns)
+        return len(data)
+
+    def _connect(self) -> tuple[RtdeLink, Recipe]:
+        """Connect and agree on the variables; blocking."""
+        # A controller skips samples when the receiver's buffer is full; this one holds seconds.
+        self._link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        self._link.settimeout(HANDSHAKE_S)
+        self._link.connect((self.host, PORT))
+        link = RtdeLink(self._link)
+        return link, self._handshake(link)
 
     def _handshake(self, link: RtdeLink) -> Recipe:
         trips_s: list[float] = []
@@ -174,48 +172,27 @@ class StateReader(threading.Thread):
         link.start()
         return recipe
 
-    def _follow(self, link: socket.socket, rtde: RtdeLink, recipe: Recipe) -> None:
-        link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        link.setblocking(False)
-        for kind, payload in rtde.pending:
-            self._take(kind, payload, recipe, time.monotonic_ns(), time.time_ns())
-        self._read = partial(self._read_all, link, rtde, recipe)
-        poller = select.poll()
-        poller.register(link, select.POLLIN)
-        poller.register(self._stop_read, select.POLLIN)
-        try:
-            while True:
-                ready = poller.poll(SILENCE_S * 1000)
-                if not ready:
-                    raise RtdeError(reason=f"no data from the robot for {SILENCE_S:g} s")
-                if any(fd == self._stop_read.fileno() for fd, _ in ready):
-                    return
-                with self._reading:
-                    if self._broken is not None:
-                        raise self._broken
-                    self._read()
-        finally:
-            with self._reading:
-                self._read = lambda: None
+    def _follow(self) -> None:
+        self._link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self._link.setblocking(False)
+        self._heard_s = time.monotonic()
+        for kind, payload in self._rtde.pending:
+            self._take(kind, payload, time.monotonic_ns(), time.time_ns())
+        asyncio.get_running_loop().add_reader(self._link, self.read)
+        self._expect()
 
-    def _read_all(self, link: socket.socket, rtde: RtdeLink, recipe: Recipe) -> None:
-        for _ in range(RECEIVE_BUFFER_BYTES // READ_BYTES):
-            try:
-                data, ancillary, _, _ = link.recvmsg(READ_BYTES, _ANCILLARY_BYTES)
-            except BlockingIOError:
-                return
-            if not data:
-                raise RtdeError(reason="the robot closed the connection")
-            monotonic_ns, wall_ns = self._arrival(ancillary)
-            for kind, payload in rtde.packets.feed(data):
-                self._take(kind, payload, recipe, monotonic_ns, wall_ns)
-            if len(data) < READ_BYTES:
-                return
+    def _expect(self) -> None:
+        """End a connection that is silent for `SILENCE_S`."""
+        self.read()
+        if self.ended is None and time.monotonic() > self._heard_s + SILENCE_S:
+            self._end(f"no data from the robot for {SILENCE_S:g} s")
+        elif self.ended is None:
+            asyncio.get_running_loop().call_later(SILENCE_S / 4, self._expect)
 
-    def _take(self, kind: int, payload: bytes, recipe: Recipe, monotonic_ns: int, wall_ns: int) -> None:
+    def _take(self, kind: int, payload: bytes, monotonic_ns: int, wall_ns: int) -> None:
         if kind != PacketType.DATA:
             return
-        v = recipe.unpack_elements(payload)
+        v = self._recipe.unpack_elements(payload)
         controller_s = v[0]
         before = self.newest
         if before is not None:
@@ -245,8 +222,6 @@ class StateReader(threading.Thread):
             state, int(v[32]), Payload(v[33], (v[34], v[35], v[36])) if len(v) > 33 else Payload()
         )
         self._on_state(state)
-        if not self.started.done():
-            self.started.set_result(self.newest)
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> tuple[int, int]:
         """Return host monotonic and wall time of the newest bytes, from the kernel's stamp.
@@ -266,6 +241,17 @@ class StateReader(threading.Thread):
                 if self._wall_set_ns < arrived_ns <= time.monotonic_ns():
                     return arrived_ns, wall_ns
         return time.monotonic_ns(), time.time_ns()
+
+
+def _reason(error: BaseException, host: str) -> str:
+    """Say why a connection failed or ended."""
+    if isinstance(error, TimeoutError):
+        return f"no answer from {host}:{PORT} within {HANDSHAKE_S:g} s"
+    if isinstance(error, ConnectionResetError):
+        return "the robot reset the connection"
+    if isinstance(error, ConnectionRefusedError):
+        return connect_trouble(error, "RTDE service")
+    return str(error)
 
 
 def _wall_ahead_ns() -> int:
@@ -321,11 +307,10 @@ class TraceRecorder:
         """Begin recording; return once samples come. RobotError when none do."""
         self._states = []
         self._reader = StateReader(self._host, self._states.append, lambda _: None)
-        self._reader.start()
-        await asyncio.wrap_future(self._reader.started)
+        await self._reader.open()
 
     async def end(self) -> list[RobotState]:
         """End recording; return all samples since `begin`, in order, as long as the connection lasted."""
         if self._reader is not None:
-            await asyncio.to_thread(self._reader.close)
+            self._reader.close()
         return self._states

@@ -99,7 +99,7 @@ class SessionContext:
         return recording.recorder if recording is not None else None
 
     def record_state(self, state: RobotState) -> None:
-        """Record a state of the arm while a recording is open; called in the reader's thread."""
+        """Record a state of the arm while a recording is open."""
         if (recorder := self.recorder) is not None:
             recorder.robot_state(state)
 

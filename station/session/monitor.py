@@ -42,7 +42,7 @@ class Monitor:
         context.cell.robot.subscribe(self._count)
 
     def _count(self, state: RobotState) -> None:
-        """Count a state; called in the reader's thread, so kept minimal."""
+        """Count a state."""
         self._states_seen += 1
 
     def refresh(self, lag_ms: float) -> None:

@@ -35,10 +35,9 @@ class Reader:
         self.newest = SimpleNamespace(state=arrived(time.monotonic() - age_s))
         self._link._deliver(self.newest.state)
 
-    def read_waiting(self) -> bool:
+    def read(self) -> None:
         if self._unread:
             self._come(0.0)
-        return True
 
 
 def link(age_s: float, *, moving: bool = False, **how: Any) -> UrLink:

@@ -15,7 +15,6 @@ import msgspec
 import pytest
 
 from station.cell.config import RobotConfig
-from station.cell.process import waited_share
 from station.devices.rtde import HEADER, PORT, PacketType, packet
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import ProbeResult, RobotLock
@@ -111,13 +110,6 @@ async def test_a_controller_that_has_no_dashboard_server_is_told_from_one_that_d
     async with await asyncio.start_server(talk, host, PORT):
         with raises(code):
             await UrLink(RobotConfig(model="UR10e", host=host)).connect()
-
-
-def test_the_share_of_time_that_programs_wait_is_the_kernels(tmp_path: Path) -> None:
-    pressure = tmp_path / "cpu"
-    assert waited_share(pressure) == 0.0
-    pressure.write_text("some avg10=97.54 avg60=91.66 avg300=80.04 total=10610028320\n")
-    assert waited_share(pressure) == 0.9754
 
 
 @pytest.mark.parametrize(

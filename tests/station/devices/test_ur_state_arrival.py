@@ -38,8 +38,7 @@ def clocks(monkeypatch: pytest.MonkeyPatch) -> Clocks:
 def reader(clocks: Clocks) -> Iterator[StateReader]:
     made = StateReader("127.0.0.1", lambda state: None, lambda why: None)
     yield made
-    made._stop_write.close()
-    made._stop_read.close()
+    made._link.close()
 
 
 def test_bytes_that_waited_came_when_the_kernel_says(reader: StateReader, clocks: Clocks) -> None:

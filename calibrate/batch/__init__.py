@@ -4,14 +4,13 @@
 is there already.
 """
 
-from calibrate.batch.cluster import Cluster, cluster_workers, dask_workers
+from calibrate.batch.cluster import cluster_workers, dask_workers
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import BatchError, pool
 
 __all__ = [
     "BatchError",
     "BatchResult",
-    "Cluster",
     "cluster_workers",
     "dask_workers",
     "pool",

@@ -37,7 +37,7 @@ COMMANDS = {
         gone={
             **dict.fromkeys(("json", "arm-json"), "Use `calibrate show --json`."),
             "arm-urdf": "Give ur-kinematics to ur_description, which makes the URDF.",
-            "ros-static-transform": "Use ros-launch, which sends it.",
+            **dict.fromkeys(("ros-static-transform", "easy-handeye2"), "Use ros-launch, which sends it."),
             **dict.fromkeys(("xacro", "mjcf"), "Use urdf."),
             **dict.fromkeys(
                 ("kalibr", "nerfstudio", "matlab"), "Use opencv: it holds transform and intrinsics."
@@ -93,6 +93,13 @@ COMMANDS = {
             "calibrate batch monday.mcap tuesday.mcap -o results",
             "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",
         ),
+        gone={
+            "--scheduler-file": "Give --scheduler the address in it.",
+            **dict.fromkeys(
+                ("--tls-ca", "--tls-cert", "--tls-key"),
+                "Name it in Dask's configuration: distributed.comm.tls.",
+            ),
+        },
     ),
 }
 CALIBRATE = LazyGroup(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import sys
 from collections.abc import Iterator
@@ -13,67 +12,38 @@ from typing import Annotated
 import msgspec
 import typer
 
-from calibrate.batch.cluster import Cluster, cluster_workers
+from calibrate.batch.cluster import cluster_workers
 from calibrate.batch.run import BatchResult, run_batch
-from calibrate.batch.workers import BatchWorkers, pool
+from calibrate.batch.workers import pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.output import AsJson, err, out
-from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit, takes
+from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit
 from calibrate.errors import UsageError
 from calibrate.job import JobOptions
 from calibrate.load import Progress as LoadProgress
 from calibrate.quality.gates import GateLimits, read_limits
 from recordings.cli.console import progress_bar
-from recordings.cli.lazy import GoneError
 
 DONE_WITH_LOSS = 3
-OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder of the results")]
 
 
-def chosen_workers(
+def batch(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings or session folders")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the results")] = Path("batch"),
+    profile: ProfileName = "robust",
+    seed: Seed = 0,
+    gates: GatesFile = None,
+    time_limit_s: TimeLimit = TIME_LIMIT_S,
+    memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core")] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
             help="Work on this Dask cluster, tcp://HOST:PORT or tls://HOST:PORT, not in processes here. Its "
             "workers see the files under the same paths. Whoever reaches a tcp:// scheduler can run code on "
-            "it: use tls:// outside a closed network"
+            "it: use tls:// outside a closed network. Certificates: Dask's own configuration"
         ),
     ] = None,
-    scheduler_file: Annotated[
-        Path | None, typer.Option(help="The same, by the file of `dask scheduler --scheduler-file`")
-    ] = None,
-    tls_ca: Annotated[Path | None, typer.Option(help="The cluster's certificate authority, PEM")] = None,
-    tls_cert: Annotated[Path | None, typer.Option(help="Your certificate, PEM")] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="Your private key, PEM")] = None,
-) -> BatchWorkers:
-    """Processes here, or a cluster."""
-    tls = (tls_ca, tls_cert, tls_key)
-    if scheduler is None and scheduler_file is None:
-        if any(tls):
-            raise UsageError("options", why="--tls-ca, --tls-cert and --tls-key need --scheduler", advice="")
-        return pool(workers)
-    if workers is not None:
-        raise UsageError("options", why="--workers counts processes here, not on a cluster", advice="")
-    if scheduler_file is None:
-        return cluster_workers(Cluster(scheduler or "", *tls))
-    if scheduler is not None:
-        raise UsageError(
-            "options", why="--scheduler and --scheduler-file exclude each other", advice="Give one."
-        )
-    return cluster_workers(Cluster.from_file(scheduler_file, *tls))
-
-
-@takes(chosen_workers, "workers")
-def batch(
-    recordings: Annotated[list[Path], typer.Argument(help="Recordings or session folders")],
-    workers: BatchWorkers,
-    output: OutputFolder = Path("batch"),
-    profile: ProfileName = "robust",
-    seed: Seed = 0,
-    gates: GatesFile = None,
-    time_limit_s: TimeLimit = TIME_LIMIT_S,
-    memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
     as_json: AsJson = False,
 ) -> None:
     """Solve many recordings; resumable.
@@ -84,17 +54,15 @@ def batch(
     """
     if output.is_file():
         raise UsageError("target-exists", path=output, by="a folder of results")
-    for place in map(str, (*recordings, output)):
-        if re.match("[a-z0-9+]+:/", place):
-            raise GoneError(
-                word=place.partition("/")[0] + "//", instead="Copy the files here, or mount their store."
-            )
+    if scheduler is not None and workers is not None:
+        raise UsageError("options", why="--workers counts processes here, not on a cluster", advice="")
+    work = pool(workers) if scheduler is None else cluster_workers(scheduler)
     gate_limits = GateLimits() if gates is None else read_limits(gates)
     options = JobOptions(profile=profile, seed=seed, limits=gate_limits)
     limits = Limits(time_limit_s, memory_limit_mib)
     with _stoppable("solving") as bar:
         told = None if bar is None else lambda done, total, result: bar(done, total, result.session)
-        results = run_batch(recordings, output, options, workers, told, limits)
+        results = run_batch(recordings, output, options, work, told, limits)
     if as_json:
         for result in results:
             typer.echo(msgspec.json.encode(result).decode())

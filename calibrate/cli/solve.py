@@ -15,9 +15,9 @@ from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.cli.contracts import CompareJson, SolveJson
 from calibrate.cli.output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.cli.solve_options import MemoryLimit, TimeLimit, job_options, picture_options, takes
-from calibrate.errors import CalibrationError, UsageError
+from calibrate.errors import UsageError
 from calibrate.files.calibration import write_calibration, write_output
-from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
+from calibrate.files.formatting import summary
 from calibrate.files.install import install_line
 from calibrate.geometry import rotation_log
 from calibrate.handeye.solution import camera_frames
@@ -61,7 +61,9 @@ def solve(
         job = solve_recording(recording, options, progress, verify)
     write_calibration(job.calibration, target)
     if report is not None:
-        _write_report(job, report, options)
+        from calibrate.report.page import report_page  # like matplotlib, slow to load
+
+        write_output(report, report_page(job).encode())
     if as_json:
         print_json(solve_json(job))
     else:
@@ -94,17 +96,6 @@ def _root_of(target: Path) -> Path | None:
     return sessions.parent if sessions.name == "sessions" else None
 
 
-def _write_report(job: SolvedRecording, target: Path, options: JobOptions) -> None:
-    from calibrate.handeye.peers import compare_all  # like matplotlib, slow to load
-    from calibrate.report.page import report_page
-
-    try:
-        peers = compare_all(job.views, solver_options(options, job))
-    except CalibrationError:  # the report stands without the comparison
-        peers = []
-    write_output(target, report_page(job, peers).encode())
-
-
 @takes(picture_options)
 def compare(recording: Rec, options: JobOptions, as_json: AsJson = False) -> None:
     """Compare all methods on the same views.
@@ -122,12 +113,30 @@ def compare(recording: Rec, options: JobOptions, as_json: AsJson = False) -> Non
         answer = CompareJson(prepared.views.mount, views, results)
         print_json(msgspec.to_builtins(answer, enc_hook=np.ndarray.tolist))
         return
-    table = Table(*PEER_HEAD, box=None)
+    table = Table(*_PEER_HEAD, box=None)
     for peer in results:
-        table.add_row(*peer_cells(peer))
+        table.add_row(*_peer_cells(peer))
     out.print(table)
     out.print(f"\nX, {' from '.join(camera_frames(prepared.views.mount))}:")
     out.print(_table_of_X(results))
+
+
+_PEER_HEAD = ("method", "e_t mm", "e_R", "spread mm", "spread °", "px", "σ from ours", "ms", "")
+
+
+def _peer_cells(peer: PeerResult) -> tuple[str, ...]:
+    """Make the cells of a method's row below `_PEER_HEAD`."""
+    numbers = (
+        (peer.e_t_m, 1e3, 3),
+        (peer.e_R, 1.0, 5),
+        (peer.board_spread_m, 1e3, 3),
+        (peer.board_spread_rad, float(np.degrees(1)), 4),
+        (peer.reprojection_px, 1.0, 3),
+        (peer.distance_sigma, 1.0, 1),
+        (peer.time_ms, 1.0, 1),
+    )
+    cells = ("–" if value is None else f"{value * factor:.{digits}f}" for value, factor, digits in numbers)
+    return (peer.name, *cells, peer.note)
 
 
 def _table_of_X(results: list[PeerResult]) -> Table:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -19,9 +17,6 @@ from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import MEASURED
 from calibrate.results import BoardShape
-
-if TYPE_CHECKING:
-    from calibrate.results import PeerResult
 
 
 @dataclass(frozen=True)
@@ -256,21 +251,3 @@ def _board(board: BoardShape, square_mm: float) -> Iterator[str]:
     bends = [b for b, sigma in zip(board.bend_m, board.sigma[2:], strict=True) if abs(b) > _SAID * sigma]
     if bends:
         yield f"The board is bent by {max(map(abs, bends)) * 1e3:.2f} mm."
-
-
-PEER_HEAD = ("method", "e_t mm", "e_R", "spread mm", "spread °", "px", "σ from ours", "ms", "")
-
-
-def peer_cells(peer: PeerResult) -> tuple[str, ...]:
-    """Make the cells of a method's row in the table with the head PEER_HEAD."""
-    numbers = (
-        (peer.e_t_m, 1e3, 3),
-        (peer.e_R, 1.0, 5),
-        (peer.board_spread_m, 1e3, 3),
-        (peer.board_spread_rad, float(np.degrees(1)), 4),
-        (peer.reprojection_px, 1.0, 3),
-        (peer.distance_sigma, 1.0, 1),
-        (peer.time_ms, 1.0, 1),
-    )
-    cells = ("–" if value is None else f"{value * factor:.{digits}f}" for value, factor, digits in numbers)
-    return (peer.name, *cells, peer.note)

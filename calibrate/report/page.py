@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import cv2
 import numpy as np
 
+from calibrate.annotate import MAGNIFIED
 from calibrate.boards.corners import to_grey
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import source_stamp
 from calibrate.files.formatting import (
-    PEER_HEAD,
     arm_sentences,
     cell_sentences,
     figures,
     noise_text,
-    peer_cells,
     pose_text,
     shares_text,
     verdict_text,
@@ -30,17 +28,17 @@ from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_at
 from calibrate.report import html, plots
-from calibrate.results import SHAPE, PeerResult
+from calibrate.results import SHAPE
 from calibrate.views import observe_views
-from recordings.images import viewable
+from recordings.images import Pixels, viewable
 
 _PICTURES_LIMIT = 60
 _WIDTHS_PX = ((12, 480), (30, 320), (_PICTURES_LIMIT, 240))
 """Up to so many views, their pictures are so wide: a page stays below a megabyte."""
 
 
-def report_page(job: SolvedRecording, peers: Sequence[PeerResult] = ()) -> str:
-    """Make the whole page; `peers`: other methods on the same views."""
+def report_page(job: SolvedRecording) -> str:
+    """Make the whole page."""
     modelled = _modelled_pixels(job)
     return html.page(
         f"Calibration of {job.recording.info.name}",
@@ -50,9 +48,7 @@ def report_page(job: SolvedRecording, peers: Sequence[PeerResult] = ()) -> str:
             html.folded("Camera pose", _result(job), printed=True),
             html.folded("Residuals", _residuals(job, modelled), printed=True),
             html.folded("Error sources", _error(job)),
-            html.folded("Held-out error", _holdout(job, peers)),
             html.folded("Arm", _arm(job)),
-            html.folded("All methods on the same views", _methods(peers)),
             html.folded("Intrinsics", _lens(job)),
             html.folded("Views", _views(job, modelled)),
             html.folded("Provenance", _provenance(job), printed=True),
@@ -171,27 +167,6 @@ def _residuals(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
         )
 
 
-def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]:
-    score = job.solution.holdout
-    if score is None:
-        return
-    methods = [("this calibration", np.asarray(score.samples_e_t_m), np.asarray(score.samples_e_R))]
-    methods += [
-        (peer.name, peer.samples_e_t_m, peer.samples_e_R)
-        for peer in peers
-        if (peer.name != "ours" or job.solution.profile == "paper")
-        and peer.samples_e_t_m is not None
-        and peer.samples_e_R is not None
-    ]
-    yield html.figure(
-        plots.holdout_samples(methods),
-        f"Mean e_t {score.e_t_m * 1000:.4f} mm, e_R {score.e_R:.6f} over {len(score.pairs)} samples. These "
-        "numbers are dominated by the noise of the held-out views: good methods cannot be ranked by them. "
-        "Curves of methods far worse than most leave the plot.",
-    )
-    yield html.paragraph(score.note, "note")
-
-
 def _arm(job: SolvedRecording) -> Iterator[str]:
     sentences = list(arm_sentences(job.calibration))
     if not sentences:
@@ -222,12 +197,6 @@ def _arm(job: SolvedRecording) -> Iterator[str]:
     yield html.paragraph(
         f"Held at the {table.nominal_source} value, because others take them: {held}.", "note"
     )
-
-
-def _methods(peers: Sequence[PeerResult]) -> Iterator[str]:
-    if not peers:
-        return
-    yield html.table(PEER_HEAD, map(peer_cells, peers), range(1, 8))
 
 
 def _lens(job: SolvedRecording) -> Iterator[str]:
@@ -286,7 +255,7 @@ def _views(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
         found = detection.pixels
         ours = modelled.get(view.index, (found, None))[1]
         image = job.recording.image(view)
-        jpeg = drawn_view(viewable(image.pixels, image.pixel_format), found, ours, width_px)
+        jpeg = _drawn_view(viewable(image.pixels, image.pixel_format), found, ours, width_px)
         px = job.solution.residual_px.get(view.index)
         name = "" if view.name == str(view.index) else f": {view.name}"
         caption = f"pose {view.index + 1}{name}" + (f", {px:.2f} px" if px is not None else "")
@@ -297,7 +266,7 @@ def _views(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
         mark = "out" if view.index in rejected else "in"
         cells.append(f'<div class="{mark}">{html.figure(html.picture(jpeg, caption), caption)}</div>')
     yield html.paragraph(
-        "Orange: detected corners, the first in red. Blue rings: corners by board pose and intrinsics.",
+        f"Lines lead to the corners by board pose and intrinsics, {MAGNIFIED:.0f} times as long.",
         "note",
     )
     yield '<div class="views">' + "\n".join(cells) + "</div>"
@@ -322,26 +291,19 @@ def _provenance(job: SolvedRecording) -> Iterator[str]:
     yield html.table(("", ""), rows)
 
 
-def drawn_view(image: Any, found: Array, modelled: Array | None, width_px: int = 480) -> bytes:
-    """JPEG of the picture, brightened, with the found corners (orange) and the modelled ones (blue rings)."""
+def _drawn_view(image: Pixels, found: Array, modelled: Array | None, width_px: int) -> bytes:
+    """JPEG of the image, brightened, with the found corners and lines towards the modelled ones."""
     grey = to_grey(image)
     scale = width_px / grey.shape[1]
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    top = max(float(np.percentile(small, 99.5)), 1.0)
-    canvas = cv2.cvtColor(np.clip(small * (245.0 / top), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
-    if modelled is not None:
-        for x, y in _places(modelled, scale):
-            cv2.circle(
-                canvas, (x, y), max(4, width_px // 68), (218, 105, 9), 1 + width_px // 400, cv2.LINE_AA
-            )
-    for k, (x, y) in enumerate(_places(found, scale)):
-        colour = (0, 0, 255) if k == 0 else (0, 140, 255)
-        cv2.drawMarker(canvas, (x, y), colour, cv2.MARKER_CROSS, 8 if k else 18, 1 + width_px // 400)
-    _, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 65])
-    return jpeg.tobytes()
-
-
-def _places(pixels: Array, scale: float) -> list[tuple[int, int]]:
-    scaled = (pixels + 0.5) * scale - 0.5
-    finite = np.isfinite(scaled).all(axis=1) & (np.abs(scaled) < 10_000).all(axis=1)
-    return [(round(x), round(y)) for x, y in scaled[finite].tolist()]
+    bright = np.clip(small * (245.0 / max(float(np.percentile(small, 99.5)), 1.0)), 0, 255).astype(np.uint8)
+    canvas = cv2.cvtColor(bright, cv2.COLOR_GRAY2BGR)
+    misses = np.zeros(found.shape) if modelled is None else np.nan_to_num(modelled - found)
+    corners = (found + 0.5) * scale - 0.5
+    ends = corners + np.clip(MAGNIFIED * scale * misses, -width_px, width_px)
+    for corner, end in zip(
+        *(np.rint(16 * ways).astype(int).tolist() for ways in (corners, ends)), strict=True
+    ):
+        cv2.circle(canvas, corner, 16 * width_px // 80, (51, 230, 26), 1, cv2.LINE_AA, 4)
+        cv2.line(canvas, corner, end, (26, 204, 255), 2, cv2.LINE_AA, 4)
+    return cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 65])[1].tobytes()

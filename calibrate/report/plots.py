@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeAlias
 
@@ -20,7 +20,6 @@ from calibrate.views import ViewSet
 from recordings.schema.messages import CameraModel
 
 _BLUE, _RED, _GREY, _ORANGE = "#0969da", "#b42318", "#8c959f", "#bc4c00"
-_FAR_WORSE = 3.0
 _DPI = 120
 """Resolution of clouds of points, which would be most of the page as lines."""
 STYLE: Any = {
@@ -125,30 +124,6 @@ def residual_scatter(axes: Axes, misses: Array, pixels: Array, camera: CameraMod
     )
     axes[1].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
     axes[1].set_aspect("equal")
-
-
-@drawn(10, 3.0, 2)
-def holdout_samples(axes: Axes, methods: Sequence[tuple[str, Array, Array]]) -> None:
-    """Error per held-out sample, translation (mm) and rotation; ours first. The paper's figures 4 and 5."""
-    colours = matplotlib.colormaps["tab20"].colors  # type: ignore[attr-defined]
-    for place, (name, e_t_m, e_R) in enumerate(methods):
-        look: dict[str, Any] = {"linewidth": 0.8, "marker": ".", "alpha": 0.7}
-        look["color"] = colours[place % len(colours)]
-        if place == 0:
-            look = {"linewidth": 2, "marker": "o", "color": _RED, "zorder": 5}
-        samples = np.arange(1, len(e_t_m) + 1)
-        axes[0].plot(samples, e_t_m * 1000, label=name, **look)
-        axes[1].plot(samples, e_R, **look)
-    tops = (_top([1000 * e_t for _, e_t, _ in methods]), _top([e_R for _, _, e_R in methods]))
-    axes[0].set(xlabel="held-out sample", ylabel="translation error, mm", ylim=(0, tops[0]))
-    axes[1].set(xlabel="held-out sample", ylabel="rotation error e_R", ylim=(0, tops[1]))
-    axes[0].figure.legend(loc="outside lower center", ncols=5, fontsize=7, frameon=False)
-
-
-def _top(curves: Sequence[Array]) -> float:
-    """Choose a top that shows all but those several times worse than most: one would flatten all others."""
-    peaks = np.array([float(np.max(curve)) for curve in curves])
-    return 1.05 * float(peaks[peaks <= _FAR_WORSE * np.median(peaks)].max())
 
 
 @drawn(10, 0.95, grid=False)

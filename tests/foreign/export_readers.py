@@ -84,15 +84,6 @@ def ros_launch(path, points, parent):
     return static_transform(ast.literal_eval(listed), points, parent)
 
 
-def easy_handeye2(path, points, parent):
-    read = yaml.safe_load(path.read_text())
-    moved, turned = read["transform"]["translation"], read["transform"]["rotation"]
-    frame = {"eye_in_hand": "robot_effector_frame", "eye_on_base": "robot_base_frame"}
-    assert read["parameters"][frame[read["parameters"]["calibration_type"]]] == parent
-    R = Rotation.from_quat([turned[axis] for axis in "xyzw"]).as_matrix()
-    return {"camera": into_camera(points, R, [moved[axis] for axis in "xyz"])}
-
-
 def halcon(path, points, parent):
     """read_pose: f 2 is 'Rp+T', 'abg', 'point': R = Rz Ry Rx, degrees and metres; points into the camera."""
     read = {
@@ -117,7 +108,6 @@ def ur_tool(path, points, parent):
 READERS = {
     "ros-camera-info": ros_camera_info,
     "ros-launch": ros_launch,
-    "easy-handeye2": easy_handeye2,
     "urdf": urdf,
     "opencv": opencv,
     "halcon": halcon,

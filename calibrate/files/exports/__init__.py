@@ -29,7 +29,6 @@ FORMATS: dict[str, Format] = {
     "ros-launch-follow": Format(
         ".launch.py", "ROS 2 launch file that follows what is installed", ros.ros_launch_follow
     ),
-    "easy-handeye2": Format(".calib", "easy_handeye2 calibration", ros.easy_handeye2, True),
     "urdf": Format(".urdf", "URDF: camera body and optical frame", models.urdf, True),
     "opencv": Format(".yml", "OpenCV FileStorage: transform and intrinsics", vision.opencv),
     "halcon": Format(".dat", "HALCON pose: tool_in_cam_pose or base_in_cam_pose", vision.halcon),

@@ -1,4 +1,4 @@
-"""Exports for ROS: camera_info, static transforms, a launch file that follows, easy_handeye2."""
+"""Exports for ROS: camera_info, static transforms, a launch file that follows."""
 
 from __future__ import annotations
 
@@ -30,29 +30,6 @@ def ros_camera_info(calibration: Calibration, frames: FrameNames) -> str:
 def _matrix(values: Array) -> dict[str, object]:
     rows, cols = values.shape
     return {"rows": rows, "cols": cols, "data": values.ravel().tolist()}
-
-
-def easy_handeye2(calibration: Calibration, frames: FrameNames) -> str:
-    """Make easy_handeye2's `.calib` YAML: parent effector (in hand) or base, child tracking_base_frame."""
-    in_hand = calibration.mount == "eye-in-hand"
-    plain = {
-        "parameters": {
-            "name": calibration.provenance.session,
-            "calibration_type": "eye_in_hand" if in_hand else "eye_on_base",
-            "tracking_base_frame": frames.camera,
-            "tracking_marker_frame": "board",
-            "robot_base_frame": frames.base,
-            "robot_effector_frame": frames.flange,
-            "freehand_robot_movement": True,
-            "move_group_namespace": "/",
-            "move_group": "manipulator",
-        },
-        "transform": {
-            "translation": dict(zip("xyz", calibration.result.translation_m, strict=True)),
-            "rotation": dict(zip("xyzw", calibration.result.rotation_xyzw, strict=True)),
-        },
-    }
-    return commented_yaml(calibration, frames, plain)
 
 
 def _publisher_arguments(calibration: Calibration, frames: FrameNames) -> list[str]:

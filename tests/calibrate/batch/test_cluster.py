@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.batch.cluster import Cluster, cluster_workers, dask_workers
+from calibrate.batch.cluster import cluster_workers, dask_workers
 from calibrate.batch.run import BatchResult, run_batch
 from calibrate.batch.workers import BatchError, pool
 from calibrate.errors import UsageError
@@ -66,8 +65,7 @@ def dask_cluster(folder: Path, workers: int, tls: list[str] | None = None) -> It
             stack.callback(process.kill)
             return process
 
-        file = ["--scheduler-file", str(folder / "scheduler.json")]
-        scheduler = start("scheduler", *place, *common, *file).pid
+        scheduler = start("scheduler", *place, *common).pid
         alone = ["--no-nanny", "--nthreads", "1", "--host", "127.0.0.1", "--local-directory", str(folder)]
         yield address, [scheduler, *(start("worker", address, *alone, *common).pid for _ in range(workers))]
 
@@ -85,15 +83,14 @@ def test_a_killed_worker_loses_nothing_and_the_bits_are_the_pools(
     pooled = run_batch(recordings, tmp_path / "pool", workers=pool(2))
     before = listening_inodes(os.getpid())
     opened: set[str] = set()
-    with dask_cluster(tmp_path, workers=2) as (_, pids):
+    with dask_cluster(tmp_path, workers=2) as (address, pids):
 
         def kill_one(done: int, total: int, result: BatchResult) -> None:
             if done == 1:
                 os.kill(pids[1], signal.SIGKILL)
             opened.update(listening_inodes(os.getpid()) - before)
 
-        wait_until(lambda: _is_written(tmp_path / "scheduler.json"))
-        workers = cluster_workers(Cluster.from_file(tmp_path / "scheduler.json"))
+        workers = cluster_workers(address)
         spread = run_batch(recordings, tmp_path / "dask", progress=kill_one, workers=workers)
     assert [result.error for result in spread] == [""] * 4
     assert [r.content_sha256 for r in spread] == [r.content_sha256 for r in pooled]
@@ -113,7 +110,7 @@ def test_a_lost_scheduler_is_said_and_finished_results_are_kept(
             os.kill(pids[0], signal.SIGKILL)
 
         with raises_code(BatchError, "cluster-lost"):
-            workers = cluster_workers(Cluster(address))
+            workers = cluster_workers(address)
             run_batch(recordings, tmp_path / "out", progress=kill_scheduler, workers=workers)
     kept = [result.recording for result in read_results(tmp_path / "out") if result.solved]
     assert kept
@@ -131,13 +128,16 @@ def test_over_tls_and_without_the_key_nobody_answers(recordings: list[Path], tmp
     make = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -subj /CN=test"
     subprocess.run([*make.split(), "-keyout", key, "-out", cert], check=True, capture_output=True)
     tls = [f"--tls-ca-file={cert}", f"--tls-cert={cert}", f"--tls-key={key}"]
+    files = {"ca-file": str(cert), "client.cert": str(cert), "client.key": str(key)}
+    pytest.importorskip("distributed")  # brings the defaults of the configuration
+    dask = pytest.importorskip("dask")
     with dask_cluster(tmp_path, 1, tls) as (address, _):
-        there = Cluster(address, cert, cert, key)
-        solved = run_batch(recordings[:1], tmp_path / "tls", workers=cluster_workers(there))
+        with dask.config.set({f"distributed.comm.tls.{name}": file for name, file in files.items()}):
+            solved = run_batch(recordings[:1], tmp_path / "tls", workers=cluster_workers(address))
         assert [result.error for result in solved] == [""]
-        plain = Cluster(address.replace("tls", "tcp"))
-        with raises_code(BatchError, "cluster-silent"):
-            run_batch(recordings[1:2], tmp_path / "plain", workers=cluster_workers(plain))
+        for nobody in (address, address.replace("tls", "tcp"), "somewhere", "http://a:1"):
+            with raises_code(BatchError, "cluster-silent"):
+                run_batch(recordings[1:2], tmp_path / "plain", workers=cluster_workers(nobody))
 
 
 @needs_distributed
@@ -157,40 +157,13 @@ def test_a_client_that_is_there_is_used_and_stays_open(recordings: list[Path], t
         assert client.status == "running"
 
 
-def test_a_scheduler_file_that_is_none_is_named(tmp_path: Path) -> None:
-    (tmp_path / "other.json").write_text("[]")
-    for name in ("other.json", "missing.json"):
-        with raises_code(UsageError, "cluster-file"):
-            Cluster.from_file(tmp_path / name)
-
-
-def test_what_cannot_be_meant_is_refused_with_the_next_step(tmp_path: Path) -> None:
-    for address in ("somewhere", "http://a:1", "tcp://host"):
-        with raises_code(UsageError, "cluster-address"):
-            Cluster(address).check()
-    with raises_code(UsageError, "cluster-tls"):
-        Cluster("tls://host:8786", tls_ca=tmp_path).check()
-    with raises_code(UsageError, "cluster-tls"):
-        Cluster("tcp://host:8786", tmp_path, tmp_path, tmp_path).check()
-    with raises_code(UsageError, "cluster-file"):
-        Cluster("tls://host:8786", *[tmp_path / "no.pem"] * 3).check()
-
-
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with raises_code(UsageError, "package-missing"):
-        cluster_workers(Cluster("tcp://127.0.0.1:8786"))
+        cluster_workers("tcp://127.0.0.1:8786")
 
 
 def test_nothing_left_to_solve_needs_no_cluster(recordings: list[Path], tmp_path: Path) -> None:
     run_batch(recordings[:1], tmp_path / "out", workers=in_this_process)
-    nobody = cluster_workers(Cluster("tcp://127.0.0.1:9")) if shutil.which("dask") else in_this_process
+    nobody = cluster_workers("tcp://127.0.0.1:9") if shutil.which("dask") else in_this_process
     assert run_batch(recordings[:1], tmp_path / "out", workers=nobody)[0].solved
-
-
-def _is_written(path: Path) -> bool:
-    """Its program is not in the middle of it."""
-    try:
-        return bool(json.loads(path.read_text()))
-    except (FileNotFoundError, json.JSONDecodeError):
-        return False

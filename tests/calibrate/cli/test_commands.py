@@ -224,7 +224,7 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(session_file: Path, tmp_
     again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)
     assert again.returncode == 0
     assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
-    refused(run("batch", "s3://robots/a.mcap", cwd=tmp_path), 2, "gone")
+    refused(run("batch", "a.mcap", "--tls-key", "k.pem", cwd=tmp_path), 2, "gone", "distributed.comm.tls")
     refused(run("fleet", "cells", cwd=tmp_path), 2, "gone", "calibrate metrics")
     refused(run("sweep", "sweep.mcap", cwd=tmp_path), 2, "gone", "station doctor")
     refused(run("diff", "a.yaml", "b.yaml", cwd=tmp_path), 2, "gone", "calibrate show")

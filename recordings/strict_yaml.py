@@ -15,7 +15,7 @@ from enum import Enum
 from functools import cache
 from itertools import islice
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -128,45 +128,14 @@ def _float(text: str) -> float:
 
 
 @dataclass(frozen=True)
-class Examined:
-    """A file's data as far as they can be read."""
+class Loaded(Generic[T]):
+    """A file's content, and what its reader may say of it."""
 
-    plain: Any
-    """Without the keys, at most two deep, in which something is wrong."""
+    value: T
     lines: dict[str, int]
     """'limits.speed_m_s' to its line"""
-    problems: list[YamlProblem]
     ignored: list[YamlProblem]
     """Keys of earlier releases that are without effect."""
-
-
-def examine(content: bytes, kind: type[Any]) -> Examined:
-    """Read what can be read, for a report that does not end at the first kind of problem.
-
-    Raises StrictYamlError where the file is no YAML at all.
-    """
-    problems = []
-    try:
-        load(content, kind)
-    except StrictYamlError as error:
-        problems = error.problems
-    try:
-        loader = _loader()(content)
-        node = loader.get_single_node()
-        ignored = [problem for problem in _problems(node, kind, "") if problem.harmless] if node else []
-        plain = loader.construct_document(node)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, OverflowError):
-        raise StrictYamlError(problems) from None
-    if not isinstance(plain, dict) or len(content) > LIMIT_BYTES:
-        raise StrictYamlError(problems)
-    for problem in problems:
-        section, _, key = re.sub(r"\[.*", "", problem.where).partition(".")
-        inside = plain.get(section)
-        if key and isinstance(inside, dict):
-            inside.pop(key.partition(".")[0], None)
-        else:
-            plain.pop(section, None)
-    return Examined(plain, dict(_lines(node, "")), problems, ignored)
 
 
 def _lines(node: yaml.Node, where: str) -> Iterator[tuple[str, int]]:
@@ -182,7 +151,12 @@ def _lines(node: yaml.Node, where: str) -> Iterator[tuple[str, int]]:
 
 
 def load(content: bytes, kind: type[T], under: str = "") -> T:
-    """The file's content as `kind`, a msgspec struct. Raises StrictYamlError with all problems and lines.
+    """The file's content as `kind`; see `read`."""
+    return read(content, kind, under).value
+
+
+def read(content: bytes, kind: type[T], under: str = "") -> Loaded[T]:
+    """Read the content as `kind`, a msgspec struct. Raises StrictYamlError with all problems and lines.
 
     A struct's `GONE` names keys of earlier releases, which are ignored. `under`: where the file has this key,
     only what stands below it is read.
@@ -201,6 +175,7 @@ def load(content: bytes, kind: type[T], under: str = "") -> T:
         )
         if wrong := [problem for problem in problems if not problem.harmless]:
             raise StrictYamlError(wrong)
+        lines = dict(_lines(node, where))
         plain = loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 0
@@ -210,7 +185,7 @@ def load(content: bytes, kind: type[T], under: str = "") -> T:
             raise
         raise StrictYamlError([YamlProblem(0, "", f"not YAML: {' '.join(str(error).split())}")]) from None
     try:
-        return msgspec.convert(plain, kind)
+        return Loaded(msgspec.convert(plain, kind), lines, problems)
     except msgspec.ValidationError as error:
         raise StrictYamlError([YamlProblem(0, "", str(error))]) from None
 

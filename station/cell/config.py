@@ -19,7 +19,12 @@ from recordings.schema.messages import (
 )
 
 Vector3 = tuple[float, float, float]
+LARGEST_REACH_M = 5.0
+"""Largest plausible length; a larger one was written in millimetres."""
+_Metres = Annotated[float, msgspec.Meta(ge=-LARGEST_REACH_M, le=LARGEST_REACH_M)]
+Place = tuple[_Metres, _Metres, _Metres]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+Length = Annotated[float, msgspec.Meta(gt=0, le=LARGEST_REACH_M)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 
@@ -47,7 +52,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
 class PoseGuess(Section, frozen=True):
     """Rough rigid transform with its 1σ per axis, `sigma_m` and `sigma_rad`."""
 
-    translation_m: Vector3
+    translation_m: Place
     rotation_xyzw: tuple[float, float, float, float]
     sigma_m: NotNegative = 0.02
     sigma_rad: NotNegative = 0.1
@@ -83,7 +88,7 @@ REAL_DRIVERS = ("aravis", "webcam")
 class CameraConfig(Section, frozen=True):
     GONE: ClassVar = frozenset({"playback_pace", "ptp", "time_offset"})
 
-    name: str = MAIN_CAMERA
+    name: Annotated[str, msgspec.Meta(pattern="^[a-z0-9-]{1,40}$")] = MAIN_CAMERA
     """Name among the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""
     driver: Literal["aravis", "webcam", "playback", "rendered"] = "aravis"
     device: str = ""
@@ -129,9 +134,9 @@ class Capsule(Section, frozen=True):
     """Capsule for a solid on the flange (tool, camera, cable guard): a segment from–to with a radius."""
 
     name: str
-    from_m: Vector3
-    to_m: Vector3
-    radius_m: Positive
+    from_m: Place
+    to_m: Place
+    radius_m: Length
 
 
 class Plane(Section, frozen=True):
@@ -152,7 +157,7 @@ are writing errors, and the driver could not tell the arm from one that does not
 
 
 class LimitsConfig(Section, frozen=True):
-    speed_m_s: float = 0.25
+    speed_m_s: Annotated[float, msgspec.Meta(gt=0, le=SPEED_CAP_M_S)] = 0.25
     """Largest speed of any modelled point of arm, tool or camera; at most 0.25."""
     joint_speed_rad_s: Positive = 0.6
     joint_acceleration_rad_s2: Positive = 1.0
@@ -174,7 +179,7 @@ class PointerConfig(Section, frozen=True):
     """Pointer whose tip a person puts on a corner (`station touch-test`), in `flange`."""
 
     GONE: ClassVar = frozenset({"along", "radius_m"})
-    tip_m: Vector3
+    tip_m: Place
 
 
 class StillnessConfig(Section, frozen=True):
@@ -230,7 +235,7 @@ class StationConfig(Section, frozen=True):
     capture: CaptureConfig = CaptureConfig()
     approval: ApprovalConfig = ApprovalConfig()
     validity: ValidityConfig = ValidityConfig()
-    working_distance_m: float = 0.5
+    working_distance_m: Length = 0.5
     pointer: PointerConfig | None = None
     """Pointer for the touch test; None: the pendant's tool centre point."""
 

@@ -5,19 +5,19 @@ from __future__ import annotations
 import asyncio
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import typer
 from rich.text import Text
 
 from station.cell.socket_folder import default_socket
-from station.cell.status import StationState, StationStatus
+from station.cell.status import StationStatus
 from station.cli.console import AsJson, Socket, out, print_json
 from station.operate.motion import status_now
 from station.protocol.client import ask
 from station.protocol.stop_client import stop_and_tell
-from station.protocol.verbs import Acknowledge, Check, Doctor, Finish, Pause, Retake, Skip
+from station.protocol.verbs import Acknowledge, Check, Doctor, Finish, Pause, Retake, Skip, Verb
 
 PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
 _MARKS = {
@@ -98,11 +98,7 @@ def acknowledge_command(socket: Socket = None) -> None:
 
     Next: `station resume` continues the session, `station finish` finishes it.
     """
-    ask(socket or default_socket(), Acknowledge())
-    status = status_of(socket)
-    _print_state(status)
-    if status.state is StationState.PAUSED:
-        out.print("Next: `station resume` continues, `station finish` finishes")
+    _print_state(_after(Acknowledge(), socket))
 
 
 def pause_command(socket: Socket = None) -> None:
@@ -119,8 +115,7 @@ def finish_command(socket: Socket = None) -> None:
 
     A pose under way is captured first. Next: `calibrate solve RECORDING`; `station status` names it.
     """
-    ask(socket or default_socket(), Finish())
-    status = status_of(socket)
+    status = _after(Finish(), socket)
     _print_state(status)
     if status.session.recording:
         out.print(f"recording {status.session.recording}")
@@ -128,8 +123,7 @@ def finish_command(socket: Socket = None) -> None:
 
 def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
     """Mark a pose to be captured again by the next run."""
-    ask(socket or default_socket(), Retake(pose - 1))
-    out.print(f"pose {pose}: {_why(socket, pose)}. Next: `station resume`")
+    _print_pose(_after(Retake(pose - 1), socket), pose, "Next: `station resume`")
 
 
 def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
@@ -137,13 +131,18 @@ def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
 
     `station retake` brings it back. A pose that has a view keeps it: only its retake is left out.
     """
-    ask(socket or default_socket(), Skip(pose - 1))
-    out.print(f"pose {pose}: {_why(socket, pose)}; `station retake {pose}` plans it")
+    _print_pose(_after(Skip(pose - 1), socket), pose, f"`station retake {pose}` plans it")
 
 
-def _why(socket: Path | None, pose: int) -> str:
-    """The daemon's words on a pose."""
-    return next((p.reason for p in status_of(socket).session.poses if p.index == pose - 1), "")
+def _after(request: Verb[Any], socket: Path | None) -> StationStatus:
+    """Send a request; the status after it."""
+    ask(socket or default_socket(), request)
+    return status_of(socket)
+
+
+def _print_pose(status: StationStatus, pose: int, then: str) -> None:
+    reason = next((p.reason for p in status.session.poses if p.index == pose - 1), "")
+    out.print(f"pose {pose}: {reason}. {then}")
 
 
 class DoctorJson(msgspec.Struct, frozen=True):
@@ -170,26 +169,7 @@ def doctor_command(
         print((Path(__file__).parents[1] / "example.yaml").read_text(), end="")
         return
     if config is not None:
-        from station.cell.config_file import config_error, examine_config
-        from station.devices.ur import control_path, control_trouble
-
-        report = examine_config(config)
-        if report.config is None:
-            raise config_error(config, (*report.wrong, *report.missing))
-        found = report.config
-        path = control_path(found.robot)
-        state = "incomplete" if report.missing else "good"
-        out.print(
-            f"{config}: {state}; {found.robot.model} at {found.robot.host}, {found.mount}, control by {path}"
-        )
-        for problem in report.ignored:
-            out.print(Text.assemble(("IGNORED", "yellow"), f" {problem}"))
-        for problem in report.missing:
-            out.print(Text.assemble(("MISSING", "red"), f" {problem}"))
-        if words := ": ".join(filter(None, control_trouble(path))):
-            out.print(words)
-        out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
-        if report.missing:
+        if _incomplete(config):
             raise typer.Exit(1)
         return
     checks = ask(socket or default_socket(), Doctor())
@@ -206,3 +186,20 @@ def doctor_command(
         out.print(table)
     if not good:
         raise typer.Exit(1)
+
+
+def _incomplete(config: Path) -> bool:
+    """Check a file, say what it is of, and list what a planned capture lacks; False: nothing."""
+    from station.cell.config_file import load_config, missing_for_capture
+    from station.devices.ur import control_path, control_trouble
+
+    found, _ = load_config(config)
+    missing, path = list(missing_for_capture(found)), control_path(found.robot)
+    what = f"{found.robot.model} at {found.robot.host}, {found.mount}, control by {path}"
+    out.print(f"{config}: {'incomplete' if missing else 'good'}; {what}")
+    for problem in missing:
+        out.print(Text.assemble(("MISSING", "red"), f" {problem}"))
+    if words := ": ".join(filter(None, control_trouble(path))):
+        out.print(words)
+    out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
+    return bool(missing)

@@ -28,7 +28,7 @@ from station.cell.config import (
     Vector3,
     vector3,
 )
-from station.cell.config_file import config_error, examine_config
+from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, RefusedError
 from station.cell.layout import guess_from, layout_of
 from station.operate.draft import STEPS, CellStep, Draft
@@ -228,8 +228,6 @@ def write_config(draft: Draft, path: Path) -> StationConfig:
     if path.exists():
         path.replace(path.with_name(path.name + ".before"))
     write_atomically(path, config_text(config).encode(), ASKED_FOR)
-    report = examine_config(path)
-    if report.config is None:
-        raise config_error(path, report.wrong)
-    layout_of(report.config)
-    return report.config
+    written, _ = load_config(path)
+    layout_of(written)
+    return written

@@ -28,7 +28,7 @@ from calibrate.geometry import (
     rotation_exp,
     transform_points,
 )
-from calibrate.handeye.arm import RELATIVE_SIGMA, by_parameters
+from calibrate.handeye.arm import chain_of
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.axxb.peer_methods import HAND_EYE, opencv_hand_eye
 from calibrate.handeye.information import MeasurementNoise, prior_information, view_information
@@ -45,6 +45,7 @@ from station.cell.pose_plan import Criterion
 from station.plan.choose import TABLE_MM, Objective, choose
 
 ARM = MODELS["UR10e"]
+CHAIN = chain_of(ARM)
 LENS, POINTS = LENSES["plumb_bob"], grid(9, 7, 0.025)
 CORNER_PX, ROBOT_M, ROBOT_RAD = 0.15, 5e-5, float(np.radians(0.003))
 POOL = 600
@@ -156,15 +157,13 @@ def planned(
     """Joints (count, 6) chosen as `station plan --for arm` does: from the nominal cell alone."""
     nominal = replace(truth, errors=np.zeros((5, 6)))
     flange = nominal.flange(pool)
-    motion = by_parameters(ARM, pool) * RELATIVE_SIGMA
+    motion = CHAIN.by_links(pool)
     noise = MeasurementNoise(CORNER_PX, ROBOT_M, ROBOT_RAD)
     gains = view_information(truth.mount, LENS, flange, truth.X, truth.Y, POINTS, noise, motion)
     board = BoardTolerance(truth.told.board, _BENT_M)
     prior = prior_information(LENS, True, board, TABLE_MM, LensPrior.given(LENS, lens_sigma(truth.told)))
     room_q = sample_workspace(ARM, pool)
-    room = Workspace.of(
-        truth.mount, forward(ARM, room_q), by_parameters(ARM, room_q), truth.X, truth.Y, _AHEAD_M
-    )
+    room = Workspace.of(truth.mount, forward(ARM, room_q), CHAIN.by_links(room_q), truth.X, truth.Y, _AHEAD_M)
     objective = Objective(criterion, _AHEAD_M, prior, None, room.among(len(prior)))
     best = choose(gains, count, objective, rng, sweeps=2)
     return np.asarray(pool[best])
@@ -275,7 +274,7 @@ def measure(
         found[f"inside {way}"] = float(square <= solution.confidence_threshold)
     q = everywhere.joints[:100]
     delta = difference(corrected(q), truth.flange(q))
-    S = (T := by_parameters(ARM, q)) @ result.covariance[6:, 6:] @ np.swapaxes(T, 1, 2)
+    S = (T := CHAIN.by_links(q)) @ result.covariance[6:, 6:] @ np.swapaxes(T, 1, 2)
     square = np.einsum("ni,nij,nj->n", delta, np.linalg.inv(S), delta)
     found["inside flange"] = float((square <= result.flange_threshold).mean())
     gates = judge(with_table, GateInputs(None, None), GateLimits())

@@ -60,6 +60,34 @@ class Chain:
         """Compute base_from_flange (m, 4, 4) of joints (m, n)."""
         return np.asarray(self.motions(joints_rad)[:, -1] @ self.flange)
 
+    def at(self, joints_rad: Array) -> Chain:
+        """Return the same arm as it stands at joints (n,)."""
+        return self._moved(self.motions(joints_rad[None])[0], joints_rad)
+
+    def with_errors(self, errors: Array) -> Chain:
+        """Return the arm whose links have these errors (6(n - 1),), as in `by_links`."""
+        moved = [np.eye(4)]
+        for point, error in zip(self._towards_next(), errors.reshape(-1, 6), strict=True):
+            R = rotation_exp(error[3:])
+            moved.append(moved[-1] @ pose(R, point + error[:3] - R @ point))
+        return self._moved(np.array([*moved, moved[-1]]), self.posture_rad)
+
+    def _moved(self, moved: Array, posture_rad: Array) -> Chain:
+        """Move each axis and the flange by its motion (n + 1, 4, 4)."""
+        R, t = moved[:-1, :3, :3], moved[:-1, :3, 3]
+        axes, points = (np.einsum("nij,nj->ni", R, of) for of in (self.axes, self.points))
+        return Chain(axes, points + t, posture_rad, moved[-1] @ self.flange)
+
+    @property
+    def link_errors(self) -> tuple[str, ...]:
+        """Names of the errors of `by_links`, true minus nominal: shifts in metres, turns in radians."""
+        return tuple(
+            f"link {link} {kind} {axis}"
+            for link in range(1, len(self.axes))
+            for kind in ("shift", "turn")
+            for axis in "xyz"
+        )
+
     def by_links(self, joints_rad: Array) -> Array:
         """Compute the motion [δt, δφ] (m, 6, 6(n - 1)) of the flange, in base, by small errors of the links.
 

@@ -32,7 +32,6 @@ from calibrate.files.calibration import (
 )
 from calibrate.files.gate import Gate
 from calibrate.geometry import Transform
-from calibrate.handeye.arm import HELD, PARAMETERS
 from calibrate.handeye.solution import Solution, TableResult, Verification
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
@@ -118,8 +117,6 @@ def _arm_table(solution: Solution, arm: TableResult, verified: Verification | No
         model=arm.nominal.name,
         nominal=DhTable.of(arm.nominal),
         nominal_source="factory" if arm.factory else "published",
-        errors=[TableError(name, *solution.arm.errors[name]) for name in PARAMETERS],
-        held=HELD,
         covariance=tuple(tuple(row) for row in arm.covariance.tolist()),
         with_table_mm=1e3 * arm.with_table_m,
         without_table_mm=1e3 * solution.arm.uncorrected.error_m,

@@ -175,11 +175,8 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     nominal: DhTable
     """Table that the recorded flanges follow."""
     nominal_source: Literal["published", "factory"]
-    errors: list[TableError]
-    held: dict[str, str]
-    """Parameter that keeps its nominal value → the reason."""
     covariance: tuple[tuple[float, ...], ...]
-    """(24, 24) of X's [δt, δφ] and of `errors`, in that order; metres, radians."""
+    """Of X's [δt, δφ] and of the errors of the arm's links, as in `quality.arm.table`; metres, radians."""
     with_table_mm: float
     """1σ of a point at the working distance, averaged over the arm's workspace."""
     without_table_mm: float

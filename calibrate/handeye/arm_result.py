@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb
-from calibrate.handeye.arm import RELATIVE_SIGMA, ArmPostures, corrected_model
+from calibrate.handeye.arm import ArmPostures, corrected_model
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.estimate import CellFit
@@ -22,7 +22,7 @@ from calibrate.handeye.solution import (
     Verification,
 )
 from calibrate.handeye.workspace import SPREAD, Workspace, sample_range, sample_workspace
-from calibrate.kinematics import RobotModel, forward
+from calibrate.kinematics import forward
 from calibrate.projection import intrinsics_vector
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, ViewSet, observe_views
@@ -38,16 +38,16 @@ def arm_results(
 
     missed: (2, n), as `TableResult.held_out_m`.
     """
-    found, state = fit.estimate, fit.estimate.state
-    places = Layout.of(state).table.start + np.arange(len(arm.names))
-    errors = arm.unit * state.table[: len(arm.names)]
-    covariance = _of_X_and_errors(found.covariance, places, arm.unit)
-    table = arm.arm if isinstance(arm.arm, RobotModel) else None
+    found, state, chain, table = fit.estimate, fit.estimate.state, arm.chain, arm.table
+    count = len(chain.link_errors)
+    errors = state.table[:count]
+    places = np.append(np.arange(6), Layout.of(state).table.start + np.arange(count))
+    covariance = found.covariance[np.ix_(places, places)]
     joints = sample_range(arm.joints_rad) if table is None else sample_workspace(table, arm.joints_rad)
 
     def over(q: Array, spread: Array) -> Workspace:
         return Workspace.of(
-            fit.views.mount, arm.flanges(q), arm.motion(q), state.X, state.Y, distance_m, spread
+            fit.views.mount, chain.forward(q), chain.by_links(q), state.X, state.Y, distance_m, spread
         )
 
     room = over(joints, SPREAD[:1])
@@ -116,20 +116,13 @@ def _stands_elsewhere(view: BoardView, fitted: Sequence[Array]) -> bool:
     return all(np.abs(view.joints_rad - joints).max() > _ELSEWHERE_RAD for joints in fitted)
 
 
-def _of_X_and_errors(covariance: Array, places: NDArray[np.intp], unit: Array) -> Array:
-    """Extract the covariance of [X, the arm's errors (metres, radians)] from that of all unknowns."""
-    scale = np.concatenate([np.ones(6), unit])
-    picked = np.concatenate([np.arange(6), places])
-    return np.asarray(covariance[np.ix_(picked, picked)] * scale * scale[:, None])
-
-
 def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | None) -> TableRefusal | None:
     if not detected:
         return "no-evidence"
     if not arm.recorded:
         return "no-joints"
-    off = np.linalg.norm(difference(arm.flanges(arm.joints_rad), fit.views.base_from_flange)[:, :3], axis=1)
-    if np.sqrt(np.mean(off**2)) > max(_NOMINAL_M, 3 * float(fit.estimate.scales.robot[0])):
+    off = difference(arm.chain.forward(arm.joints_rad), fit.views.base_from_flange)[:, :3]
+    if np.sqrt(np.mean((off**2).sum(axis=1))) > max(_NOMINAL_M, 3 * float(fit.estimate.scales.robot[0])):
         return "not-nominal"
     if missed is not None and not np.nanmean(missed[1] ** 2) < np.nanmean(missed[0] ** 2):
         return "not-better"
@@ -148,5 +141,5 @@ def _if_measured(fit: CellFit, room: Workspace, places: NDArray[np.intp]) -> dic
     for name, (which, sigma) in known.items():
         C = found.covariance
         gain = C[:, which] @ np.linalg.inv(C[np.ix_(which, which)] + np.diag(sigma**2))
-        errors[name] = room.rms_m(_of_X_and_errors(C - gain @ C[which], places, RELATIVE_SIGMA))
+        errors[name] = room.rms_m((C - gain @ C[which])[np.ix_(places, places)])
     return errors

@@ -59,7 +59,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
         flex = flex_motion(views.mount, views.base_from_flange, held)
         motion = flex
         if arm is not None:
-            by_arm = arm.motion(arm.joints_rad) * arm.unit
+            by_arm = arm.chain.by_links(arm.joints_rad)
             motion = np.concatenate([by_arm, flex], axis=2)
         try:
             errors_of_table = motion.shape[2] - flex.shape[2]

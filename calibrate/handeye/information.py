@@ -2,8 +2,8 @@
 
 The model is that of the estimate (`handeye.linear`): corner noise, and an independent error of every robot
 pose. Parameter order: δX (6), δY (6), the lens (`projection.intrinsics_names`),
-the board's shape (`results.SHAPE`), and the errors of the arm's table (`handeye.arm.PARAMETERS`,
-over `RELATIVE_SIGMA`) where their motion is given. Deltas are those of `geometry.perturb`.
+the board's shape (`results.SHAPE`), and the errors of the arm's links (`Chain.by_links`) where their motion
+is given. Deltas are those of `geometry.perturb`.
 X = flange_from_camera, Y = base_from_board (eye-in-hand), or X = base_from_camera, Y = flange_from_board
 (eye-to-hand).
 """
@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calibrate.geometry import Array
-from calibrate.handeye.arm import PARAMETERS
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
@@ -27,6 +26,8 @@ from recordings.schema.messages import CameraModel, Mount
 
 _FOCAL_SHARE = 0.05
 """Prior 1σ of an unknown focal length, relative: keeps the prediction finite with few views."""
+_LINK_ERRORS = 30
+"""Errors of the links of an arm with six joints, as in `Chain.by_links`."""
 _POSE_PRECISION = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 """Prior of a pose, 1 m and about 3 rad: practically none, but the first few views get a finite sigma."""
 
@@ -98,7 +99,7 @@ def prior_information(
     `table_mm`: 1σ, mm and mrad, of errors of the arm's table; 0: none are modelled. `lens`: what is known of
     the lens; None: the defaults for a known or an unknown one.
     """
-    errors = np.zeros(len(PARAMETERS) if table_mm else 0)
+    errors = np.zeros(_LINK_ERRORS if table_mm else 0)
     state = CellState(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), errors)
     lens = lens or (LensPrior.given(camera) if lens_known else LensPrior.unknown(camera))
     N = Priors(lens, board).linearise(state, table_mm).N

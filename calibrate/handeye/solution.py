@@ -97,7 +97,7 @@ class TableResult:
     """`nominal` is the maker's calibration of this arm, not the published table."""
     corrected: RobotModel
     covariance: Array
-    """(24, 24) of X, as in `Solution.parent_from_child`, and of the errors in the order of `PARAMETERS`."""
+    """(36, 36) of X, as in `Solution.parent_from_child`, and of the links' errors, as in `Chain.by_links`."""
     flange_threshold: float
     """As `Solution.confidence_threshold`, for the error (6,) of a flange computed with the table."""
     with_table_m: float

@@ -200,13 +200,11 @@ def _board(fit: CellFit, covariance: Array) -> BoardShape:
 def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: float) -> ArmTable | None:
     if fit.log_bayes is None:
         return None
-    names = FLEX if fit.arm is None else (*fit.arm.names, *FLEX)
-    unit = np.ones(len(names))
-    if fit.arm is not None:
-        unit[: len(fit.arm.unit)] = fit.arm.unit
-    value = unit * fit.estimate.state.table
-    sigma = unit * np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    errors = dict(zip(names, zip(value.tolist(), sigma.tolist(), strict=True), strict=True))
+    names = FLEX if fit.arm is None else (*fit.arm.chain.link_errors, *FLEX)
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    errors = dict(
+        zip(names, zip(fit.estimate.state.table.tolist(), sigma.tolist(), strict=True), strict=True)
+    )
     found = ArmTable(fit.log_bayes, float(fit.estimate.scales.table[0]), errors)
     if fit.arm is None:
         return found

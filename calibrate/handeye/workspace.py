@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, matrix_from_quaternion, pose, skew
-from calibrate.handeye.arm import PARAMETERS, RELATIVE_SIGMA
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many
 from recordings.schema.messages import Mount
 
@@ -130,9 +129,9 @@ class Workspace:
 
     def among(self, size: int) -> Array:
         """Embed `quadratic` into (size, size), in `handeye.information`'s order: X first, the table last."""
-        K, unit = np.zeros((size, size)), np.concatenate([np.ones(6), RELATIVE_SIGMA])
-        places = np.concatenate([np.arange(6), np.arange(size - len(PARAMETERS), size)])
-        K[np.ix_(places, places)] = self.quadratic() * unit * unit[:, None]
+        K = np.zeros((size, size))
+        places = np.concatenate([np.arange(6), np.arange(size - self.by_table.shape[1], size)])
+        K[np.ix_(places, places)] = self.quadratic()
         return K
 
     def rms_m(self, covariance: Array) -> float:

@@ -173,8 +173,8 @@ def _arm(job: SolvedRecording) -> Iterator[str]:
         return
     for sentence in sentences:
         yield html.paragraph(sentence)
-    arm, table = job.solution.arm, job.calibration.arm_table
-    if arm is None or arm.result is None or table is None:
+    arm = job.solution.arm
+    if arm is None or arm.result is None:
         return
     if job.verified is not None:
         yield html.figure(
@@ -189,14 +189,6 @@ def _arm(job: SolvedRecording) -> Iterator[str]:
             "Each view predicted from views taken elsewhere: by how much the board's middle is missed, where "
             "the flange stood.",
         )
-    rows = [
-        (error.parameter, f"{1e3 * error.value:+.3f}", f"{1e3 * error.sigma:.3f}") for error in table.errors
-    ]
-    yield html.table(("parameter", "error, mm or mrad", "1σ"), rows, (1, 2))
-    held = ", ".join(table.held)
-    yield html.paragraph(
-        f"Held at the {table.nominal_source} value, because others take them: {held}.", "note"
-    )
 
 
 def _lens(job: SolvedRecording) -> Iterator[str]:

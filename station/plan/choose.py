@@ -10,7 +10,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.handeye.arm import RELATIVE_SIGMA, by_parameters
+from calibrate.handeye.arm import chain_of
 from calibrate.handeye.information import (
     USUAL_NOISE,
     MeasurementNoise,
@@ -20,7 +20,6 @@ from calibrate.handeye.information import (
 )
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.workspace import Workspace, sample_workspace
-from calibrate.kinematics import forward, with_near_axes
 from calibrate.projection import intrinsics_names
 from station.cell.layout import CellLayout
 from station.cell.pose_plan import Criterion
@@ -94,7 +93,7 @@ def informations(
     """Compute the information (n, p, p) of each pose; with joints (n, 6) also about the arm's table."""
     points, motion = board_points(layout.board), None
     if joints_rad is not None:
-        motion = by_parameters(with_near_axes(layout.geometry.model), joints_rad) * RELATIVE_SIGMA
+        motion = chain_of(layout.geometry.model).by_links(joints_rad)
     return view_information(
         layout.mount, layout.camera, base_from_flange, layout.X, layout.Y, points, noise, motion
     )
@@ -112,12 +111,11 @@ def objective_for(
     lens = slice(12, 12 + len(intrinsics_names(layout.camera))) if free_intrinsics else None
     K = None
     if joints_rad is not None and table_mm:
-        model = with_near_axes(layout.geometry.model)
-        room = sample_workspace(model, joints_rad)
+        chain, room = chain_of(layout.geometry.model), sample_workspace(layout.geometry.model, joints_rad)
         over = Workspace.of(
             layout.mount,
-            forward(model, room),
-            by_parameters(model, room),
+            chain.forward(room),
+            chain.by_links(room),
             layout.X,
             layout.Y,
             layout.working_distance_m,

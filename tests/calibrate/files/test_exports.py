@@ -25,7 +25,6 @@ from calibrate.files.calibration import (
     CorrectedArm,
     DhTable,
     FramePose,
-    TableError,
     decode_calibration,
     encode_calibration,
     write_calibration,
@@ -35,7 +34,7 @@ from calibrate.files.loader import InstalledCalibration
 from calibrate.files.proof import check_result, proven_plain
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, unrecorded
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_from_rotvec, rotation_exp
-from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
+from calibrate.handeye.arm import corrected_model
 from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, forward, with_near_axes
 from calibrate.load import arm_of_ros
@@ -64,18 +63,14 @@ def calibration(request: pytest.FixtureRequest, solved_real: SolvedRecording) ->
 
 
 def offered_arm(X: FramePose) -> CorrectedArm:
-    errors = 5e-4 * np.random.default_rng(3).normal(size=len(PARAMETERS))
+    errors = 5e-4 * np.random.default_rng(3).normal(size=30)
     nominal = MODELS["UR10e"]
     return CorrectedArm(
         offered=True,
         model=nominal.name,
         nominal=DhTable.of(nominal),
         nominal_source="published",
-        errors=[
-            TableError(name, value, 1e-4) for name, value in zip(PARAMETERS, errors.tolist(), strict=True)
-        ],
-        held=HELD,
-        covariance=tuple(tuple(row) for row in (1e-8 * np.eye(24)).tolist()),
+        covariance=tuple(tuple(row) for row in (1e-8 * np.eye(36)).tolist()),
         with_table_mm=0.3,
         without_table_mm=0.9,
         corrected=DhTable.of(corrected_model(nominal, errors)),

@@ -37,7 +37,7 @@ PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
         (priors._KNOWN_SHARE, 0.002, "0.2 % of focal length and width"),
         (priors.ASPECT_SIGMA, 0.001, "pixels square to 0.1 %"),
         (linear.MAX_STEPS, 15, "At most 15 linearisations"),
-        ([len(arm.PARAMETERS), len(arm.FLEX)], [18, 9], "18 errors of the Denavit-Hartenberg table and 9 of"),
+        (len(arm.FLEX), 9, "and 9 numbers of a bracket's compliance"),
         (fit._SIZES[[0, -1]], [0.03, 1.0], "over six sizes from 0.03 to 1 mm and mrad"),
         (
             [fit._BENDS_BEFOREHAND[0], fit._BENDS[-1]],

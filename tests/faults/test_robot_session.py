@@ -65,7 +65,7 @@ async def test_07_an_arm_jogged_while_paused_voids_the_go(cell: tuple[Rig, Admin
     summary = await rig.session.prepare(1, Purpose.RESUME)
     await asyncio.sleep(0.3)  # it was seen at rest
     state = joints(admin)
-    admin.ask("jog", joints_rad=(state + 0.1).tolist())
+    admin.ask("hand_move", path=[(state + 0.1).tolist()])
     await until(lambda: bool(rig.told("jogged")))
     uploads = asked(admin, "upload")
     with raises("approval-used"):

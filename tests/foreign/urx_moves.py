@@ -29,10 +29,6 @@ try:
     before = robot.getl()
     robot.translate((0, 0, -0.05), acc=1.0, vel=0.2)
     seen["translated"] = [b - a for a, b in zip(before, robot.getl(), strict=True)]
-    via, to = list(robot.getl()), list(robot.getl())
-    via[1], via[2], to[1] = via[1] + 0.03, via[2] + 0.03, to[1] + 0.06
-    robot.movec(via, to, acc=1.0, vel=0.2)
-    seen["arc"] = [b - a for a, b in zip(before, robot.getl(), strict=True)]
     robot.send_program("speedl([0, 0, 0.05, 0, 0, 0], 0.5, 5)")
     for _ in range(20):
         robot.secmon.wait()

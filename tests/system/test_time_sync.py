@@ -108,7 +108,7 @@ async def jog(host: str, truth: CellTruth) -> None:
         for turn in range(10_000):
             target = start + (np.array(_JOG_RAD) if turn % 2 == 0 else 0.0)
             await asyncio.to_thread(
-                admin.ask, "jog", joints_rad=target.tolist(), speed_rad_s=_JOG_SPEED_RAD_S
+                admin.ask, "hand_move", path=[target.tolist()], speed_rad_s=_JOG_SPEED_RAD_S
             )
             await asyncio.sleep(0.5 + float(np.max(np.abs(_JOG_RAD))) / _JOG_SPEED_RAD_S)
 

@@ -94,5 +94,5 @@ async def produce(rig: SystemRig) -> None:
     postures = np.array(TRUTH.start_joints_rad) + rng.normal(size=(6, 6)) * 0.06
     while True:
         for joints in postures:
-            await asyncio.to_thread(rig.admin.ask, "jog", joints_rad=joints.tolist(), speed_rad_s=0.5)
+            await asyncio.to_thread(rig.admin.ask, "hand_move", path=[joints.tolist()], speed_rad_s=0.5)
             await asyncio.sleep(1.0)

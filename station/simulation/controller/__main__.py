@@ -88,10 +88,8 @@ def _parser() -> argparse.ArgumentParser:
     text = "listen on an address that is not this computer's own: whoever reaches it can run programs here"
     add("--allow-other-computers", action="store_true", help=text)
     add("--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors, drift")
-    add(
-        "--program", action="append", default=[], metavar="NAME[=SCRIPT]",
-        help="a program that the dashboard can load; without a file of URScript it only waits",
-    )  # fmt: skip
+    text = "a program that the dashboard can load; it only waits"
+    add("--program", dest="programs", action="append", metavar="NAME", help=text)
     text = "answer with another version, for example 5.25.1"
     add("--software", type=version_of, metavar="VERSION", help=text)
     add("--joints", dest="start_joints_rad", type=float, nargs=6, metavar="RAD", help="start joints")
@@ -105,12 +103,10 @@ def _parser() -> argparse.ArgumentParser:
 def _settings(options: argparse.Namespace) -> Settings:
     """Raises OSError for a file that cannot be read, MsgspecError for what is no setting."""
     truth = msgspec.json.decode(options.truth.read_bytes(), type=dict) if options.truth is not None else {}
-    named = (text.partition("=") for text in options.program)
-    programs = {name: Path(file).read_text() if file else None for name, _, file in named}
     given = {name: value for name, value in vars(options).items() if value is not None}
     if options.truth is not None:
         msgspec.convert(truth, ArmTruth)  # refuses what is no truth
-    return msgspec.convert({**truth, **given, "programs": programs}, Settings)
+    return msgspec.convert(truth | given, Settings)
 
 
 async def _serve(host: str, settings: Settings, parent: int | None) -> None:

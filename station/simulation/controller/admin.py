@@ -83,11 +83,6 @@ def in_use(machine: Machine, inputs: list[str], on: bool = True) -> None:
             raise ValueError(f"{name} is owned by a client already")
 
 
-def contact(machine: Machine, cycles: Count = 10) -> None:
-    """The tool touches something: `tool_contact` answers that it has for so many cycles (0: nothing)."""
-    machine.robot.contact_cycles = cycles
-
-
 def foreign(machine: Machine, name: str = "palletising.urp") -> None:
     """Somebody else's program starts."""
     machine.robot.start_program(InterpretedProgram(machine.robot, name, WAITS))
@@ -117,13 +112,9 @@ def payload(machine: Machine, kg: NotNegative, cog_m: Three = (0.0, 0.0, 0.0)) -
     machine.robot.payload_cog = cog_m
 
 
-def jog(machine: Machine, joints_rad: Six, speed_rad_s: JointSpeed = 0.5) -> Json:
-    """Moves the arm with the pendant's arrows. Refused while a program plays or the arm has no power."""
-    return hand_move(machine, [joints_rad], speed_rad_s)
-
-
 def hand_move(machine: Machine, path: list[Six], speed_rad_s: JointSpeed = 0.5) -> Json:
-    """A person leads the arm through these joints (free-drive), the fastest joint at speed_rad_s."""
+    """A person leads the arm through these joints (free-drive, or the pendant's arrows), the fastest joint at
+    speed_rad_s."""
     robot = machine.robot
     length_rad = JointPath(robot.arm.command, *path).length
     if not robot.lead(lambda start: JointPath(start, *path), speed_rad_s, HAND_RAD_S2):

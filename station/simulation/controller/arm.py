@@ -273,7 +273,3 @@ class History:
                 t1, q1, m1 = t0, q0, m0
         oldest_ns = self._samples[0][0] if self._samples else 0
         raise LookupError(f"time {monotonic_ns} is outside the history {oldest_ns}…{self.newest_ns} ns")
-
-    def before(self, cycles: int) -> Vector:
-        """Joints so many cycles ago, or as long ago as is known."""
-        return self._samples[max(-1 - cycles, -len(self._samples))][1]

@@ -119,8 +119,6 @@ class DashboardConnection(Connection):
                 robot.run()
             case "unlock protective stop":
                 return "Protective stop releasing" if robot.unlock() else UNLOCK_TOO_EARLY
-            case "popup" | "close popup":
-                robot.popup = argument if verb == "popup" else None
             case "generate flight report" if not argument:
                 return "Flight Report generated with id: system"
             case "is in remote control":

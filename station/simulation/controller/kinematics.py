@@ -71,14 +71,6 @@ def plus(a: Vector, b: Vector, times: float = 1.0) -> Vector:
     return (a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2])
 
 
-def dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def cross(a: Vector, b: Vector) -> Vector:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
 def compose(A: Rigid, B: Rigid) -> Rigid:
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11 = A
     b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11 = B
@@ -147,21 +139,16 @@ def to_pose(A: Rigid) -> Vector:
     return (A[3], A[7], A[11], *to_rotvec(A))
 
 
-def frames(table: ArmGeometry, joints_rad: Vector) -> list[Rigid]:
-    """The base's own frame, then that of every link, in base; the last is the flange's."""
-    found = [IDENTITY]
+def forward(table: ArmGeometry, joints_rad: Vector) -> Rigid:
+    """base_from_flange."""
+    found = IDENTITY
     for q, theta, a, d, alpha in zip(
         joints_rad, table.theta_rad, table.a_m, table.d_m, table.alpha_rad, strict=True
     ):
         ct, st, ca, sa = cos(q + theta), sin(q + theta), cos(alpha), sin(alpha)
         step = (ct, -st * ca, st * sa, a * ct, st, ct * ca, -ct * sa, a * st, 0.0, sa, ca, d)
-        found.append(compose(found[-1], step))
+        found = compose(found, step)
     return found
-
-
-def forward(table: ArmGeometry, joints_rad: Vector) -> Rigid:
-    """base_from_flange."""
-    return frames(table, joints_rad)[-1]
 
 
 def inverse_all(table: ArmGeometry, base_from_flange: Rigid) -> list[Vector]:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from station.simulation.controller.dashboard import dashboard_service
 from station.simulation.controller.network import Cut, Service
-from station.simulation.controller.primary import real_time, say_to_all, script_services
+from station.simulation.controller.primary import script_services
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.rtde_server import RtdeServer
 from station.simulation.controller.state import Journal, Settings
@@ -85,9 +85,7 @@ class Machine:
         self.clock = Clock(self.robot.dt_s / (1 + settings.controller_clock_drift_ppm * 1e-6), self._tick)
         self.rtde = RtdeServer(host, self.robot)
         self.dashboard = dashboard_service(host, self.robot)
-        scripts = script_services(host, self.robot)
-        self._real_time = scripts[-1]
-        self.services = [self.rtde.service, *scripts, self.dashboard]
+        self.services = [self.rtde.service, *script_services(host, self.robot), self.dashboard]
         self.lose_packets = 0
         self._rebooting: asyncio.Task[None] | None = None
 
@@ -109,8 +107,6 @@ class Machine:
             self.rtde.skipped += 1
         else:
             self.rtde.send_states()
-        if self._real_time.connections:
-            say_to_all(self._real_time, real_time(self.robot))
 
     def chosen(self, ports: list[str] | None) -> list[Service]:
         """Services whose name begins with one of these words; all for None. ValueError for none, and while

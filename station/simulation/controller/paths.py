@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import atan2, cos, hypot, pi, sin, sqrt
+from math import hypot, sqrt
 
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
@@ -17,8 +17,6 @@ from station.simulation.controller.kinematics import (
     Vector,
     between,
     compose,
-    cross,
-    dot,
     forward,
     from_rotvec,
     inverse_nearest,
@@ -73,53 +71,17 @@ class LinePath:
         if goal is None:
             raise UnreachableError(f"no joints reach {base_from_goal}")
 
-    def _place(self, u: float) -> Vector:
-        """The tool's point at this share of the way."""
-        return plus(place(self._first), self._way, u)
-
     def at(self, s: float) -> Vector:
         u = min(s / self.length, 1.0) if self.length > 0 else 1.0
         x, y, z = self._turn
         turned = compose(self._first, from_rotvec(u * x, u * y, u * z))
-        px, py, pz = self._place(u)
+        px, py, pz = plus(place(self._first), self._way, u)
         tcp = (*turned[:3], px, *turned[4:7], py, *turned[8:11], pz)
         joints = inverse_nearest(self._table, compose(tcp, self._tcp_from_flange), self._joints)
         if joints is None:
             raise UnreachableError("the straight line leaves the arm's reach")
         self._joints = joints
         return joints
-
-
-class ArcPath(LinePath):
-    """The tool's point on a circle through a second point, the tool turning as on a line."""
-
-    def __init__(
-        self,
-        table: ArmGeometry,
-        flange_from_tcp: Rigid,
-        start: Vector,
-        base_from_via: Rigid,
-        base_from_goal: Rigid,
-    ) -> None:
-        super().__init__(table, flange_from_tcp, start, base_from_goal)
-        begin, via, end = map(place, (self._first, base_from_via, base_from_goal))
-        a, b = plus(via, begin, -1), plus(end, begin, -1)
-        normal = cross(a, b)
-        area2 = dot(normal, normal)
-        if area2 < 1e-12:
-            raise UnreachableError("three points on a line make no arc")
-        # the circumcentre of a triangle, seen from its first corner
-        away = cross(tuple(dot(a, a) * y - dot(b, b) * x for x, y in zip(a, b, strict=True)), normal)
-        self._centre = tuple(p + w / (2 * area2) for p, w in zip(begin, away, strict=True))
-        self._u = plus(begin, self._centre, -1)
-        self._v = tuple(x / sqrt(area2) for x in cross(normal, self._u))
-        last = plus(end, self._centre, -1)
-        self._angle = atan2(dot(last, self._v), dot(last, self._u)) % (2 * pi)
-        self.length = sqrt(dot(self._u, self._u)) * self._angle
-
-    def _place(self, u: float) -> Vector:
-        c, s = cos(u * self._angle), sin(u * self._angle)
-        return tuple(m + c * x + s * y for m, x, y in zip(self._centre, self._u, self._v, strict=True))
 
 
 Path = JointPath | LinePath

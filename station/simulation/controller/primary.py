@@ -1,7 +1,7 @@
-"""Ports 30001–30003: programs as text come in; the robot's state, its messages and real-time data go out.
+"""Ports 30001–30003: programs as text come in; of the first two, state and messages go out.
 
 Every message is an int32 size (of all of it) and more, big-endian. Source: Universal Robots, "Remote Control
-via TCP/IP" and its tables of the client interfaces (robot state and messages; RealTime 3.10 and 5.10).
+via TCP/IP" and its tables of the client interfaces (robot state and messages).
 """
 
 from __future__ import annotations
@@ -19,22 +19,10 @@ from station.simulation.controller.robot import SimulatedRobot
 PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT = 30001, 30002, 30003
 STATE_PERIOD_S = 0.1
 _ROBOT_STATE, _ROBOT_MESSAGE = 16, 20
-_TEXT, _POPUP, _VERSION, _KEY, _RUNTIME_EXCEPTION = 0, 2, 3, 7, 10
+_TEXT, _VERSION, _KEY, _RUNTIME_EXCEPTION = 0, 3, 7, 10
 _SOURCE_CONTROLLER = 7
 _KINEMATICS, _CONFIGURATION = 5, 6
 _ROBOT_TYPES = {"UR5": 1, "UR10": 2, "UR3": 3, "UR16": 4}
-_REAL_TIME = (
-    "timestamp target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current "
-    "joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose target_TCP_speed "
-    "actual_digital_input_bits joint_temperatures actual_execution_time - robot_mode joint_mode safety_mode "
-    "------ actual_tool_accelerometer ------ speed_scaling actual_momentum - - actual_main_voltage "
-    "actual_robot_voltage actual_robot_current actual_joint_voltage actual_digital_output_bits runtime_state "
-    "elbow_position elbow_velocity safety_status"
-)
-"""RTDE variables in the order of the real-time message; a dash for each number that is not published."""
-_REAL_TIME_5_10 = f"{_REAL_TIME} - - - payload payload_cog payload_inertia"
-
-
 _JOINTS = (
     "actual_q", "target_q", "actual_qd", "actual_current", "actual_joint_voltage", "joint_temperatures",
     "joint_mode",
@@ -62,15 +50,12 @@ def version_message(robot: SimulatedRobot) -> bytes:
 
 
 def messages(robot: SimulatedRobot, kind: str, details: dict[str, object]) -> bytes:
-    """Encode a message of a program: text, popup, key (title, text) or exception (line, text)."""
+    """Encode a message of a program: text, key (title, text) or exception (line, text)."""
     text = str(details.get("text", "")).encode()
     title = str(details.get("title", "")).encode()[:255]
     titled = bytes([len(title)]) + title + text
     if kind == "text":
         return _message(robot, _TEXT, text)
-    if kind == "popup":
-        flags = struct.pack(">iBB", 0, bool(details.get("warning")), bool(details.get("error")))
-        return _message(robot, _POPUP, flags + titled)
     if kind == "key":
         return _message(robot, _KEY, struct.pack(">ii", 0, 0) + titled)
     line = details.get("line")
@@ -96,7 +81,7 @@ def _sub_packages(robot: SimulatedRobot) -> dict[int, bytes]:
     powered = int(get("robot_status_bits")) & 1
     running, paused = robot.runtime_state == RuntimeState.PLAYING, robot.runtime_state == RuntimeState.PAUSED
     flags = (True, True, powered, bits >> 7 & 1, bits >> 2 & 1, running, paused)
-    modes = (robot.robot_mode & 0xFF, 2 if robot.freedrive else 3 if robot.force_mode else 0)
+    modes = (robot.robot_mode & 0xFF, 2 if robot.freedrive else 0)
     joints = zip(*map(vector, _JOINTS), strict=True)
     types = int(get("analog_io_types"))
     inputs = [get(f"standard_analog_input{i}") for i in (0, 1)]
@@ -150,19 +135,11 @@ def _configuration(robot: SimulatedRobot) -> bytes:
     )
 
 
-def real_time(robot: SimulatedRobot) -> bytes:
-    """The message of port 30003: 1116 bytes on CB3, 1220 on e-Series."""
-    out, numbers = robot.outputs, list[float]()
-    for name in (_REAL_TIME_5_10 if robot.settings.is_e_series else _REAL_TIME).split():
-        numbers += (0.0,) * len(name) if name.startswith("-") else out.vector(name)
-    return struct.pack(f">i{len(numbers)}d", 4 + 8 * len(numbers), *numbers)
-
-
 # -- ports ----------------------------------------------------------------------------------------------
 
 
 class ScriptConnection(Connection):
-    """Takes programs; states version and state, the real-time port only what is said to all of it."""
+    """Takes programs; states version and state, but not on the real-time port."""
 
     def __init__(self, robot: SimulatedRobot, port: int) -> None:
         self._robot, self._port = robot, port
@@ -202,13 +179,9 @@ def script_services(host: str, robot: SimulatedRobot) -> list[Service]:
     services = [service(port) for port in (PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT)]
 
     def tell(kind: str, **details: object) -> None:
-        say_to_all(services[0], messages(robot, kind, details))
+        for connection in services[0].connections:
+            assert isinstance(connection, ScriptConnection)
+            connection.say(messages(robot, kind, details))
 
     robot.tell = tell
     return services
-
-
-def say_to_all(service: Service, data: bytes) -> None:
-    for connection in service.connections:
-        assert isinstance(connection, ScriptConnection)
-        connection.say(data)

@@ -19,7 +19,6 @@ class Upload:
     name: str
     """'' for a bare line."""
     text: str
-    secondary: bool = False
 
 
 class UploadReader:
@@ -38,7 +37,7 @@ class UploadReader:
                 if end is None:
                     break
                 text, self._text = self._text[: end.end()], self._text[end.end() :]
-                uploads.append(Upload(begin.group(1), text, secondary=text.startswith("sec")))
+                uploads.append(Upload(begin.group(1), text))
                 continue
             line, newline, rest = self._text.partition("\n")
             if not newline:

@@ -6,7 +6,6 @@ Knows no socket, so that every rule here can be tested without one.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from math import inf
 
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
@@ -36,8 +35,6 @@ class SimulatedRobot(ControllerState):
     def __init__(self, settings: Settings, journal: Journal) -> None:
         super().__init__(settings, journal)
         self.program: InterpretedProgram | None = None
-        self._secondary: list[InterpretedProgram] = []
-        """Run beside the program, without moving."""
         self._starting: tuple[int, InterpretedProgram] | None = None
         self._safety_since_s = -inf
         self._silence_s = 0.0
@@ -52,9 +49,6 @@ class SimulatedRobot(ControllerState):
             self._count_down()
         if self.program is not None and self.runtime_state == RuntimeState.PLAYING:
             self._step_program(late)
-        for secondary in list(self._secondary):
-            if not self._step(secondary):
-                self._secondary.remove(secondary)
         held = self.robot_mode != RobotMode.RUNNING or not self.safe
         by_hand = self._hands is not None and not self._hands.done
         held |= self.runtime_state == RuntimeState.PAUSED and not by_hand
@@ -89,24 +83,13 @@ class SimulatedRobot(ControllerState):
                 else:
                     self.stop_program(f"watchdog: {self.watched} was silent")
                 return
-        if not late and not self._step(self.program):
-            self.stop_program("the program ended")
-
-    def _step(self, program: InterpretedProgram) -> bool:
-        """False when it has ended, by itself or by an error."""
         try:
-            if program.step():
-                return True
+            if not late and not self.program.step():
+                self.stop_program("the program ended")
         except (ScriptError, UnreachableError) as error:
             line = error.line if isinstance(error, ScriptError) else 0
             self.tell("exception", text=getattr(error, "text", str(error)), line=line)
-            if program is self.program:
-                self.stop_program(f"runtime error: {error}")
-            else:
-                self.journal.note("controller", "secondary program", error=str(error))
-        if program in self._secondary:
-            program.end()
-        return False
+            self.stop_program(f"runtime error: {error}")
 
     def receive_inputs(self, names: tuple[str, ...], elements: tuple[float, ...]) -> None:
         """A data packet: it acts in the next cycle."""
@@ -126,15 +109,6 @@ class SimulatedRobot(ControllerState):
                 mask, wanted = int(get(f"{output}_mask")), int(get(output))
                 self.set_digital_outputs(mask << first_bit, wanted << first_bit)
                 self.journal.note("rtde", output, mask=mask, value=wanted)
-        if "standard_analog_output_mask" in names:
-            mask = int(get("standard_analog_output_mask"))
-            kept = int(self.outputs.get("analog_io_types")) & ~(mask << 2)
-            kinds = int(get("standard_analog_output_type")) & mask
-            self.outputs.set("analog_io_types", kept | kinds << 2)
-            for n in (0, 1):
-                if mask >> n & 1:
-                    self.set_analog_output(n, get(f"standard_analog_output_{n}"))
-            self.journal.note("rtde", "standard_analog_output", mask=mask)
 
     @property
     def safe(self) -> bool:
@@ -166,26 +140,11 @@ class SimulatedRobot(ControllerState):
         self.journal.note(
             "upload", upload.name or upload.text[:200], characters=len(upload.text), accepted=accepted
         )
-        if upload.text in self._bare:
-            self._bare[upload.text]()
-        elif accepted:
+        if accepted:
             self._start_upload(upload)
 
-    @property
-    def _bare(self) -> dict[str, Callable[[], object]]:
-        """Lines that are no script but commands to the controller, as the dashboard has them."""
-        return {
-            "power on": self.power_on,
-            "power off": self.power_off,
-            "set robotmode run": self.run,
-            "set unlock protective stop": self.unlock,
-            "stop program": lambda: self.stop_program("a line on a script port"),
-            "pause program": self.pause_program,
-            "resume program": self.play_program,
-        }
-
-    def _start_upload(self, upload: Upload) -> bool:
-        """False for one that cannot start; its clients are told why."""
+    def _start_upload(self, upload: Upload) -> None:
+        """Where it cannot start, its clients are told why."""
         name = upload.name or "line"
         try:
             program = InterpretedProgram(self, name, upload.text)
@@ -195,14 +154,10 @@ class SimulatedRobot(ControllerState):
             log.warning("%s: %s", name, error)
             # A bare line that means nothing leaves the program alone, as on URSim 1.8 to 3.1
             # (ros-industrial/universal_robot, pull request 165): many clients send `f()` behind a `def f()`.
-            if upload.name and not upload.secondary:
+            if upload.name:
                 self.stop_program("replaced by a program that cannot start")
-            return False
-        if upload.secondary:
-            self._secondary.append(program)
         else:
             self.start_program(program)
-        return True
 
     def start_program(self, program: InterpretedProgram) -> None:
         self.stop_program(f"replaced by {program.name}")
@@ -231,7 +186,8 @@ class SimulatedRobot(ControllerState):
         """Resumes a paused program, or starts the loaded one."""
         ready = self.safe and self.robot_mode == RobotMode.RUNNING
         if ready and self.runtime_state == RuntimeState.STOPPED and self.loaded:
-            return self._start_upload(Upload(self.loaded, self.settings.programs[self.loaded] or WAITS))
+            self.start_program(InterpretedProgram(self, self.loaded, WAITS))
+            return True
         if not ready or self.program is None or self.runtime_state != RuntimeState.PAUSED:
             return False
         self.runtime_state = RuntimeState.PLAYING

@@ -91,8 +91,8 @@ class Settings(ArmTruth, frozen=True, kw_only=True):
     time_scale: Annotated[float, Meta(gt=0)] = 1.0
     """The arm moves this many times faster than it says; clocks stay real. For tests."""
     remote: bool = True
-    programs: dict[str, str | None] = {}
-    """That the dashboard can load: name → URScript; None: one that only waits."""
+    programs: tuple[str, ...] = ()
+    """That the dashboard can load. Each only waits."""
     software: tuple[int, ...] = ()
     """Another version than the usual one."""
 
@@ -231,14 +231,10 @@ class ControllerState(ABC):
         self.safety_mode = SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.remote = settings.remote
-        self.payload_inertia: Vector = (0.0,) * 6
-        self.freedrive = self.force_mode = False
-        self.popup: str | None = None
+        self.freedrive = False
         self.loaded = ""
         """The program that the dashboard loaded."""
         self.user_role, self.operational_mode = "PROGRAMMER", "NONE"
-        self.contact_cycles = 0
-        """Answer of `tool_contact`: for so many cycles the tool has been touching something."""
         self.watchdog_s = 0.0
         """Longest silence of `watched`, an input variable, that is allowed; 0 = none."""
         self.watched = ""
@@ -270,14 +266,6 @@ class ControllerState(ABC):
         before = int(self.outputs.get("actual_digital_output_bits"))
         self.outputs.set("actual_digital_output_bits", before & ~mask | values & mask)
 
-    def set_analog_output(self, n: int, f: float) -> None:
-        """f: share of 10 V, or of 4–20 mA, whichever its domain is."""
-        if n not in (0, 1):
-            raise ValueError(f"there is no analog output {n}")
-        share = max(0.0, min(1.0, float(f)))
-        volts = int(self.outputs.get("analog_io_types")) >> 2 + int(n) & 1
-        self.outputs.set(f"standard_analog_output{int(n)}", 10 * share if volts else 0.004 + 0.016 * share)
-
     def _draw_miss(self) -> Vector:
         m, rad = self.settings.robot_sigma_m, self.settings.robot_sigma_rad
         return tuple(self._random.gauss(0.0, sigma) for sigma in (m, m, m, rad, rad, rad))
@@ -296,7 +284,6 @@ class ControllerState(ABC):
         out.set("speed_scaling", min(1.0, arm.scale / self.slider) if self.slider > 0 else 1.0)
         out.set("payload", self.payload_kg)
         out.set("payload_cog", *self.payload_cog)
-        out.set("payload_inertia", *self.payload_inertia)
         out.set("tcp_offset", *self.tcp)
         out.set("robot_mode", self.robot_mode)
         out.set("safety_mode", self.safety_mode)

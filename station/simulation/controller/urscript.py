@@ -4,33 +4,30 @@
 thread goes on until it waits. What a call does is one table of builtins: a Python function each, with the
 script's own argument names. One that takes controller time is a generator which yields once per cycle.
 
-Rules (Universal Robots, "The URScript Programming Language"): a name without `local` or `global` is that of
-the nearest function around that has it, else the global one where there is one, else local. (The manual does
-not speak of functions around; Universal Robots' script for outside control relies on it.)
-Lists are copied by assignment. That a division of integers gives a float was not checked on a real
-controller. Imports nothing of the station and knows no robot.
+Rules (Universal Robots, "The URScript Programming Language"): a name without `local` or `global` is the
+global one where the program has one, else that of the nearest function around that sets it. Lists are copied
+by assignment. That a division of integers gives a float was not checked on a real controller.
+Imports nothing of the station and knows no robot.
 """
 
 from __future__ import annotations
 
-import operator
-from collections import ChainMap
 from collections.abc import Callable, Generator, Mapping
-from functools import reduce
 from traceback import walk_tb
 from types import GeneratorType
 from typing import Any
 
-from station.simulation.controller.urscript_parser import SCRIPT, Builtin, ScriptError, parse
+from station.simulation.controller.urscript_parser import SCRIPT, ScriptError, parse
 
 Value = Any
 """bool, int, float, str, list, Pose, Thread; None is what a function without `return` gives."""
 Steps = Generator[None, None, Value]
 """Yields once for every cycle it takes, then returns a value."""
+Builtin = Callable[..., Any]
 
-STATEMENTS_PER_CYCLE = 20_000
+LOOPS_PER_CYCLE = 10_000
 _REFUSED = (TypeError, ValueError, ArithmeticError, LookupError, NameError)
-"""What Python raises where URScript stops the program: 1 / 0, 1 + "a", a function that is not known there."""
+"""What Python raises where URScript stops the program: 1 / 0, 1 + "a", a name that has no value."""
 
 
 class ScriptRuntimeError(ScriptError):
@@ -57,32 +54,6 @@ class Thread:
         self._steps.close()
 
 
-class Scope(ChainMap[str, Value]):
-    """The variables of a call, of those of the functions around, and the global ones."""
-
-    def __getitem__(self, name: str) -> Value:
-        for variables in self.maps:
-            if name in variables:
-                return variables[name]
-        raise ScriptRuntimeError(f"compile_error_name_not_found:{name}:")
-
-    def __setitem__(self, name: str, value: Value) -> None:
-        variables = next((found for found in self.maps if name in found), self.maps[0])
-        variables[name] = copied(value)
-
-    @property
-    def local_only(self) -> Scope:
-        return Scope(self.maps[0])
-
-    @property
-    def global_only(self) -> Scope:
-        return Scope(self.maps[-1])
-
-    def enter(self, values: Mapping[str, Value]) -> Scope:
-        """Make the scope of a function in this one."""
-        return Scope({name: copied(value) for name, value in values.items()}, *self.maps)
-
-
 class ScriptRun:
     """A program under way, one `step` per controller cycle."""
 
@@ -95,9 +66,9 @@ class ScriptRun:
         self._spent = 0
         code, program, self._lines = parse(text, builtins)
         names: dict[str, Any] = {
-            "_0": Scope({}), "List": List, "Pose": Pose, "call": _call, "halt": self._halt, "join": _join,
-            "kill": _kill, "spend": self._spend, "start": self._start, "truth": truth,
-        } | {f"f_{name}": _builtin(function) for name, function in builtins.items()}  # fmt: skip
+            "__builtins__": {}, "List": List, "Pose": Pose, "call": _call, "copied": copied,
+            "halt": self._halt, "join": _join, "kill": _kill, "spend": self._spend, "start": self._start,
+        } | {f"f_{name}": function for name, function in builtins.items()}  # fmt: skip
         exec(code, names)
         self._start(names[program])
 
@@ -137,25 +108,20 @@ class ScriptRun:
         self.halted = True
         yield
 
-    def _start(self, function: Callable[..., Steps], /, *arguments: Value, **named: Value) -> Thread:
-        self._threads.append(Thread(function(*arguments, **named)))
+    def _start(self, function: Builtin, /, *arguments: Value, **named: Value) -> Thread:
+        self._threads.append(Thread(_call(function, *arguments, **named)))
         return self._threads[-1]
 
     def _spend(self) -> None:
-        """Called before every statement. Raises ScriptRuntimeError for a program that never waits."""
+        """Called in every round of a loop. Raises ScriptRuntimeError for a program that never waits."""
         self._spent += 1
-        if self._spent > STATEMENTS_PER_CYCLE:
+        if self._spent > LOOPS_PER_CYCLE:
             raise ScriptRuntimeError("an infinite loop: it never waits")
 
 
-def _call(function: Callable[..., Value], /, *arguments: Value, **named: Value) -> Steps:
-    found = function(*arguments, **named)
+def _call(function: Builtin, /, *arguments: Value, **named: Value) -> Steps:
+    found = function(*map(copied, arguments), **{name: copied(value) for name, value in named.items()})
     return copied((yield from found) if isinstance(found, GeneratorType) else found)
-
-
-def _builtin(function: Builtin) -> Builtin:
-    """Take arguments by the names that they have in Python's text."""
-    return lambda *arguments, **named: function(*arguments, **{name[1:]: v for name, v in named.items()})
 
 
 def _kill(thread: Value) -> None:
@@ -171,56 +137,25 @@ def _join(thread: Value) -> Steps:
 # -- values ---------------------------------------------------------------------------------------------
 
 
-class _Items(list[Value]):
-    def _place(self, index: Value) -> int:
-        if not isinstance(index, int) or not 0 <= index < len(self):
-            raise ScriptRuntimeError(f"there is no item {index} of {len(self)}")
-        return index
+class List(list[Value]):
+    """No operator takes it here."""
+
+    __add__ = __iadd__ = __mul__ = __rmul__ = __imul__ = None  # type: ignore[assignment]
 
     def __getitem__(self, index: Value) -> Value:
-        """Several indices are those of a matrix, a list of its rows."""
-        if isinstance(index, tuple):
-            return reduce(operator.getitem, index, self)
         return super().__getitem__(self._place(index))
 
     def __setitem__(self, index: Value, value: Value) -> None:
         super().__setitem__(self._place(index), value)
 
-
-class Pose(_Items):
-    """p[x, y, z, rx, ry, rz]: metres and a rotation vector. No operator takes it."""
-
-    __add__ = __iadd__ = __mul__ = __rmul__ = __imul__ = None  # type: ignore[assignment]
-
-
-class List(_Items):
-    """Its arithmetic goes item by item; a number counts for each item."""
-
-    def __neg__(self) -> List:
-        return List(-value for value in self)
+    def _place(self, index: Value) -> int:
+        if not isinstance(index, int) or not 0 <= index < len(self):
+            raise ScriptRuntimeError(f"there is no item {index} of {len(self)}")
+        return index
 
 
-def _by_item(operate: Callable[[Value, Value], Value], swapped: bool) -> Callable[[List, Value], List]:
-    def method(left: List, right: Value) -> List:
-        others = right if isinstance(right, List) else [right] * len(left)
-        if len(others) != len(left):
-            raise ScriptRuntimeError(f"lists of {len(left)} and {len(others)} items")
-        pairs = zip(others, left, strict=True) if swapped else zip(left, others, strict=True)
-        return List(operate(a, b) for a, b in pairs)
-
-    return method
-
-
-for _sign in ("add", "sub", "mul", "truediv", "mod"):
-    setattr(List, f"__{_sign}__", _by_item(getattr(operator, _sign), swapped=False))
-    setattr(List, f"__r{_sign}__", _by_item(getattr(operator, _sign), swapped=True))
-
-
-def truth(value: Value) -> bool:
-    """Evaluate a condition; a number other than 0 is true (Universal Robots' own scripts rely on it)."""
-    if not isinstance(value, bool | int | float):
-        raise ScriptRuntimeError(f"{value!r} is no boolean")
-    return bool(value)
+class Pose(List):
+    """p[x, y, z, rx, ry, rz]: metres and a rotation vector."""
 
 
 def copied(value: Value) -> Value:

@@ -50,7 +50,7 @@ def test_the_arm_is_led_by_hand_only_when_it_is_free(controller, admin) -> None:
     ask.ask("foreign")
     wait_until(lambda: ask.ask("state")["runtime_state"] == "PLAYING")
     with raises("simulation-refused"):
-        ask.ask("jog", joints_rad=HOME)
+        ask.ask("hand_move", path=[HOME])
     ask.ask("stop_program")
     corners = [[0.1, *HOME[1:]], [0.1, -1.4, *HOME[2:]]]
     assert ask.ask("hand_move", path=corners, speed_rad_s=2.0)["length_rad"] == pytest.approx(0.1 + 0.1708)
@@ -68,10 +68,10 @@ def test_the_admin_port_explains_itself_and_survives_nonsense(controller, admin)
         ({"cmd": "slider", "fraction": 3}, "$.fraction"),
         ({"cmd": "late", "ms": float("nan")}, "lists the names"),
         ({"cmd": "late", "ms": -1}, "$.ms"),
-        ({"cmd": "jog", "joints_rad": HOME, "speed_rad_s": 0}, "$.speed_rad_s"),
+        ({"cmd": "hand_move", "path": [HOME], "speed_rad_s": 0}, "$.speed_rad_s"),
         ({"cmd": "tcp", "pose": "here"}, "$.pose"),
-        ({"cmd": "jog"}, "`joints_rad`"),
-        ({"cmd": "jog", "joint": HOME}, "`joint`"),
+        ({"cmd": "hand_move"}, "`path`"),
+        ({"cmd": "slider", "share": 1}, "`share`"),
         ({"cmd": "tcp", "pose": [1, 2]}, "$.pose"),
         ({"cmd": "drop", "ports": ["moon"]}, "not ['moon']"),
     ):

@@ -181,15 +181,3 @@ def test_a_client_that_does_not_read_loses_packets_and_slows_nobody(arm, rtde, a
     wait_until(lambda: [good.sample() for _ in range(100)] and ask.ask("stats")["packets_skipped"] > 0)
     stamps = [good.sample()["timestamp"] for _ in range(50)]
     assert max(b - a for a, b in pairwise(stamps)) < 0.0021
-
-
-@pytest.mark.parametrize(("model", "size"), [("UR10", 1116), ("UR10e", 1220)])
-def test_the_real_time_port_states_every_cycle(arm, model: str, size: int) -> None:
-    """Size and places by their table: the time is the first number, the actual joints the 32nd."""
-    with socket.create_connection((arm(model).host, 30003), 3) as link, link.makefile("rb") as stream:
-        messages = [stream.read(size) for _ in range(20)]
-    assert all(struct.unpack_from(">i", message) == (size,) for message in messages)
-    times = [struct.unpack_from(">d", message, 4)[0] for message in messages]
-    period = 0.002 if model.endswith("e") else 0.008
-    assert times[-1] - times[0] == pytest.approx(19 * period, abs=1e-9)
-    assert struct.unpack_from(">6d", messages[0], 4 + 8 * 31)[1] == pytest.approx(-1.5708)

@@ -35,7 +35,6 @@ def test_programs_are_found_in_any_segmentation(cuts: list[int]) -> None:
         stream = stream[cut:]
     assert [u.name for u in seen] == ["rtde_control", "", "note"]
     assert seen[0].text == SCRIPT and seen[1].text == "stopj(2.0)"
-    assert [u.secondary for u in seen] == [False, False, True]
 
 
 def test_a_program_without_end_is_bounded() -> None:

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import ast
-from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.simulation.controller import urscript, urscript_parser
-from station.simulation.controller.script_pure import PURE
+from station.simulation.controller.script_functions import PURE
 from station.simulation.controller.urscript import (
+    LOOPS_PER_CYCLE,
     List,
     Pose,
     ScriptRun,
     ScriptRuntimeError,
 )
-from station.simulation.controller.urscript_parser import ScriptSyntaxError, tokens
+from station.simulation.controller.urscript_parser import ScriptSyntaxError
 
 
 class Tape:
@@ -65,9 +63,6 @@ def said(text: str) -> list[Any]:
         ("not 1 < 2 or 2 <= 2 and 3 != 4", True),
         ("1 == 1.0", True),
         ("[1, 2, 3][1]", 2),
-        ("[1, 2] + [3, 4] * 2 - 1", List([6, 9])),
-        ("1 - [1, 2] / 2", List([0.5, 0.0])),
-        ("-[1, 2]", List([-1, -2])),
         ("p[0, 0, 1, 0, 0, 0]", Pose([0, 0, 1, 0, 0, 0])),
         ("norm([3.0, -4.0])", 5.0),
         ("norm(-3)", 3),
@@ -270,12 +265,9 @@ def test_halt_ends_everything_wherever_it_is_said(where: str) -> None:
         "say(1) say(2)",
         "1 = 2",
         "say(unknown_function())",
-        "say(1, 2)",
-        "say(stranger=1)",
         "x = 'open",
         "x = $",
         "run 3",
-        "x = run say(1)",
         "x = (1]",
         "x = True xor True",
         "(" * 5000 + "1" + ")" * 5000,
@@ -292,12 +284,13 @@ def test_a_text_that_is_no_program(text: str) -> None:
         "say(nobody)",
         "say([1, 2][2])",
         "say([1, 2][-1])",
-        "say([1, 2] + [1, 2, 3])",
+        "say([1, 2] + [1, 2])",
+        "say(1, 2)",
+        "say(stranger=1)",
         "say(1 + 'a')",
         "say(1 / 0)",
         "say(1 < [1])",
         "say(sqrt(-1))",
-        "if 'yes':\n say(1)\nend",
         "say(p[1, 2] + p[1, 2])",
         "def p():\n def f(x):\n return x\n end\n say(f(1, 2))\nend",
         "def p():\n def f(x):\n return x\n end\n f()\nend",
@@ -313,21 +306,10 @@ def test_what_stops_a_program(text: str) -> None:
 
 def test_a_name_may_be_a_word_of_python() -> None:
     text = "def lambda():\n def import(from, class=2):\n return from + class\n end\n None = import(1)\n"
-    assert said(text + " is = import(from=2, class=None)\n say(is)\n say(str_len(str='é'))\nend") == [5, 1]
+    assert said(text + " is = import(from=2, class=None)\n say(is)\n say(length('é'))\nend") == [5, 1]
 
 
 def test_a_loop_that_waits_is_none_that_never_ends() -> None:
     tape = Tape("while True:\n x = 1\n sync()\nend")
-    for _ in range(3 * urscript.STATEMENTS_PER_CYCLE // 2):
+    for _ in range(3 * LOOPS_PER_CYCLE // 2):
         assert tape.run.step()
-
-
-def test_tokens_know_their_line() -> None:
-    assert [t.line for t in tokens("a\n\n  b # c\n(\n)\nd") if t.kind == "name"] == [1, 3, 6]
-
-
-def test_it_imports_nothing_of_the_station() -> None:
-    for module, allowed in ((urscript_parser, set()), (urscript, {urscript_parser.__name__})):
-        tree = ast.parse(Path(module.__file__).read_text())
-        names = {n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
-        assert {n for n in names if n.startswith(("station", "calibrate", "recordings"))} == allowed

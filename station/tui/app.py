@@ -35,7 +35,6 @@ from station.tui.connect import ConnectScreen
 from station.tui.desk import Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion, Help
 from station.tui.disk_watch import DiskWatch
-from station.tui.frame import SESSION
 from station.tui.jobs import check_drift, solve_session
 from station.tui.log_screen import LogScreen
 from station.tui.plan_screen import PlanScreen
@@ -43,9 +42,9 @@ from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.task import DIGITS
-from station.tui.widgets.graphics import detect
-from station.tui.widgets.preview import PreviewPane
+from station.tui.widgets.preview import PreviewPane, sharp_widget
 
+GO_TO = Binding.Group("go to", compact=True)
 PREVIEW_PERIOD_S = 0.25
 SETTLED_S = 2.0
 ACKNOWLEDGE = "Leave STOPPED or FAULT after looking"
@@ -80,17 +79,16 @@ class StationApp(KnowingApp):
     DEFAULT_MODE = "capture"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", show=False, priority=True, tooltip="Stop the arm now"),
-        Binding("f1", "help", "Help", show=False, tooltip="What this screen is for, and all its keys"),
-        Binding("f5", "run", "Run", group=SESSION, tooltip="Check the path, show the motion, and ask"),
-        Binding("f6", "ask('pause')", "Pause", group=SESSION, tooltip="Stop after this pose"),
-        Binding("f7", "finish", "Finish", group=SESSION, tooltip="Finish with the poses so far"),
+        Binding("f5", "run", "Run", tooltip="Check the path, show the motion, and ask"),
+        Binding("f6", "ask('pause')", "Pause", tooltip="Stop after this pose"),
+        Binding("f7", "finish", "Finish", tooltip="Finish with the poses so far"),
         Binding("f8", "acknowledge", "Acknowledge", show=False, priority=True, tooltip=ACKNOWLEDGE),
-        Binding("f9", "solve_newest", "Solve", group=SESSION, tooltip="Solve the session just recorded"),
-        Binding("f3", "freedrive", "Freedrive", group=SESSION, tooltip="Freedrive: move the arm by hand"),
-        Binding("f2", "ask('record')", "Image", group=SESSION, tooltip="Capture an image here (freedrive)"),
+        Binding("f9", "solve_newest", "Solve", tooltip="Solve the session just recorded"),
+        Binding("f3", "freedrive", "Freedrive", tooltip="Freedrive: move the arm by hand"),
+        Binding("f2", "ask('record')", "Image", tooltip="Capture an image here (freedrive)"),
         Binding("f4", "release", "Release", show=False, tooltip="Release control of the arm"),
         *(
-            Binding(DIGITS[s.MODE], f"open('{s.MODE}')", s.MODE.title(), show=False, tooltip=s.TIP)
+            Binding(DIGITS[s.MODE], f"open('{s.MODE}')", s.MODE.title(), group=GO_TO, tooltip=s.TIP)
             for s in SCREENS
         ),
         Binding("ctrl+q", "leave", "Quit", show=False, tooltip="Close this screen; the daemon goes on"),
@@ -299,6 +297,5 @@ class StationApp(KnowingApp):
 
 def run(socket: Path, who: str = "") -> None:
     """Open the screen on the daemon that serves `socket` and returns when it is closed."""
-
-    PreviewPane.graphics = detect()
+    PreviewPane.sharp = sharp_widget()
     StationApp(Client(socket, who)).run()

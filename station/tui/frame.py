@@ -1,20 +1,18 @@
-"""The frame of every screen: state, task rail, the one next action, STOP; and the keys at the bottom."""
+"""The frame of every screen and question: state, task rail, the one next action, STOP."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import groupby
 from typing import ClassVar, TypeVar
 
 from textual import events
 from textual.app import ComposeResult
-from textual.binding import Binding
 from textual.containers import Container, Horizontal, Vertical
 from textual.content import Content
 from textual.markup import escape
 from textual.reactive import reactive
 from textual.screen import ModalScreen, Screen
-from textual.widgets import Static
+from textual.widgets import Footer, Static
 
 from station.cell.status import StationStatus
 from station.protocol.states import LATCHED
@@ -28,9 +26,6 @@ DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
 """How the bar names the way in which the arm is controlled."""
 RAIL_WIDE = 96
 """From this width on each step has a second line."""
-SESSION = Binding.Group("session")
-"""Group of the keys that act on the session."""
-GO_TO = (("1-4", "step"), ("5", "sessions"), ("6", "log"))
 ANSWER = Action(
     "", "Answer the question", "Enter alone is no; Tab marks the other answer. F12 stops.", look=True
 )
@@ -222,56 +217,6 @@ def next_line(action: Action, width: int) -> Content:
     return head + Content.styled(action.why if action.look else shortened(action.why, room), "$foreground")
 
 
-class Keys(Static):
-    """The keys in named groups: this screen's own, the session's, where to go, help."""
-
-    def __init__(self, own: str = "") -> None:
-        super().__init__(id="keys")
-        self._own = own
-
-    def on_mount(self) -> None:
-        self.screen.bindings_updated_signal.subscribe(self, lambda _: self.refresh())
-
-    def render(self) -> Content:
-        if not self.app.screen_stack:  # between two modes, or while the app closes: it is asked for again
-            return Content()
-        shown = [active.binding for active in self.screen.active_bindings.values() if active.binding.show]
-        common = [b for b in shown if b.group is SESSION]
-        ours = [b for b in shown if b.group is not SESSION]
-        display = self.app.get_key_display
-        groups = [(self._own, _pairs(ours, display))]
-        if not isinstance(self.screen, ModalScreen):
-            groups += [("session", _pairs(common, display)), ("go to", list(GO_TO))]
-        groups.append(("", [("F1", "help"), ("^P", "all actions")]))
-        return keys_line(groups, self.size.width)
-
-
-def _pairs(bindings: list[Binding], display: Callable[[Binding], str]) -> list[tuple[str, str]]:
-    alike = groupby(bindings, lambda binding: binding.description)
-    return [("".join(display(b) for b in same), name.lower()) for name, same in alike if name]
-
-
-def keys_line(groups: list[tuple[str, list[tuple[str, str]]]], width: int) -> Content:
-    """Draw the keys that fit: first the groups' names go, then where to go becomes short, then words."""
-    groups = [group for group in groups if group[1]]
-    short = [(name, [("1-6", "go to")] if name == "go to" else pairs) for name, pairs in groups]
-    short[-1] = ("", [("F1", "help")])
-    fewer = [(name, pairs) for name, pairs in short if name != "session"] if len(short) > 2 else short
-    line = Content()
-    for candidate, named in ((groups, True), (groups, False), (short, False), (fewer, False)):
-        line = Content.styled(" │ ", "$line").join(_group(name if named else "", p) for name, p in candidate)
-        if line.cell_length < width:
-            break
-    return Content(" ") + line
-
-
-def _group(name: str, pairs: list[tuple[str, str]]) -> Content:
-    parts: list[Content | tuple[str, str]] = [(f"{name} ", "$faint")] if name else []
-    for key, word in pairs:
-        parts += [(key, "bold $accent"), (f" {word}  ", "$foreground")]
-    return Content.assemble(*parts).rstrip()
-
-
 BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]
 """Style classes by the terminal's columns, and by its rows."""
 
@@ -315,7 +260,7 @@ class Question(ModalScreen[R], Framed[R]):
         yield Frame(self.NAME, "", self.NEXT)
         with Container(id="question"), Vertical(id=self.BOX):
             yield from self.body()
-        yield Keys("answer")
+        yield Footer(compact=True)
 
     def body(self) -> ComposeResult:
         yield from ()

@@ -169,7 +169,7 @@ class NewCell(ThemedApp[Ending]):
         self._pictures += 1
         corners = np.zeros((0, 2)) if found is None else found.pixels
         preview = preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures)
-        await pane.show(preview)
+        pane.show(preview)
 
     def _add_view(self) -> None:
         self.setup.take_view()

@@ -11,12 +11,12 @@ from textual.containers import Container, Vertical
 from textual.content import Content
 from textual.coordinate import Coordinate
 from textual.reactive import reactive
-from textual.widgets import DataTable
+from textual.widgets import DataTable, Footer
 
 from station.protocol.client import ANSWER_S
 from station.protocol.verbs import Verb
 from station.tui.desk import Desk, KnowingApp
-from station.tui.frame import Frame, Framed, Keys, Line
+from station.tui.frame import Frame, Framed, Line
 from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
 from station.tui.words import rich_text
@@ -89,6 +89,9 @@ class StationScreen(Framed[None]):
     """A screen below the frame; each has its own `body`."""
 
     AUTO_FOCUS = "Rows, #checklist-scroll, #log"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("f1", "app.help", "Help", tooltip="What this screen is for, and all its keys")
+    ]
     MODE: ClassVar[str] = ""
     """Its step of the rail, or its name."""
     TIP: ClassVar[str] = ""
@@ -117,7 +120,7 @@ class StationScreen(Framed[None]):
         yield Frame(self.heading, self.MODE)
         with Container(id="content"):
             yield from self.body()
-        yield Keys(self.heading.lower())
+        yield Footer(compact=True)
 
     def body(self) -> ComposeResult:
         yield from ()
@@ -126,10 +129,14 @@ class StationScreen(Framed[None]):
         if self.LOOK:
             await self.app.run_action(self.LOOK)
 
+    def on_screen_suspend(self) -> None:
+        for preview in self.query(PreviewPane):
+            preview.soften()
+
     def show(self, known: Known) -> None:
         self.set_class(known.old, "-old")
         for preview in self.query(PreviewPane):
-            preview.old = known.old
+            preview.old, preview.calm = known.old, not known.works
         super().show(known)
 
     @property

@@ -33,10 +33,6 @@ KEYS = {
 _TOKEN = re.compile(
     r"\x1b\[([0-9;?<>=]*)([A-Za-z~])|\x1b[P\]].*?(?:\x1b\\|\x07)|\x1b.|[\x00-\x1f]|[^\x00-\x1f\x1b]+"
 )
-CELL = (8, 17)
-"""Pixels of a letter, where pictures are drawn."""
-WHAT_ARE_YOU, SIXELS = b"\x1b[c", b"\x1b[?63;1;2;4;6;9;15;22c"
-"""The question for a terminal's attributes, and how a VT340 answers it."""
 _UNFINISHED = re.compile(r"\x1b(?:\[[0-9;?<>=]*|[P\]][^\x07]*)?$")
 
 
@@ -85,24 +81,17 @@ class Glass:
 
 
 class ScreenProcess:
-    """`station tui` in a terminal of its own; `sixels`: one that says it draws them.
-
-    `command`: another one of `station`'s.
-    """
+    """`station tui` in a terminal of its own; `command`: another one of `station`'s."""
 
     def __init__(
         self,
         socket: Path,
         columns: int = 100,
         rows: int = 34,
-        sixels: bool = False,
         command: tuple[str, ...] = (),
     ) -> None:
         self._master, slave = pty.openpty()
-        pixels = (columns * CELL[0], rows * CELL[1]) if sixels else (0, 0)
-        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, *pixels))
-        self._sixels, self.pictures = sixels, 0
-        """`pictures`: how many came."""
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
         self.process = subprocess.Popen(
             # The terminal controls it, as a person's does: the daemon asks for that before a real arm moves.
             [
@@ -116,9 +105,7 @@ class ScreenProcess:
             stdin=slave,
             stdout=slave,
             stderr=slave,
-            env=os.environ
-            | {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": str(rows)}
-            | ({"STATION_PICTURES": "sharp"} if sixels else {}),
+            env=os.environ | {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": str(rows)},
         )
         os.close(slave)
         self.glass = Glass(columns, rows)
@@ -129,9 +116,6 @@ class ScreenProcess:
         with contextlib.suppress(OSError):  # the other end is closed
             while data := os.read(self._master, 65536):
                 self.glass.write(data)
-                self.pictures += data.count(b"\x1bP")
-                if self._sixels and WHAT_ARE_YOU in data:
-                    os.write(self._master, SIXELS)
 
     def press(self, *keys: str) -> None:
         """One after the other, as a person would."""

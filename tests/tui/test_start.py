@@ -15,7 +15,6 @@ from station.tui.connect import ConnectScreen
 from station.tui.dialogs import Help
 from station.tui.plan_screen import NO_PLAN, PlanScreen
 from station.tui.themes import chosen_theme
-from station.tui.widgets.preview import PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 MISSING = [Check("robot", "failed", "no answer", "switch it on")]
@@ -67,7 +66,6 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
         ("3", "f7", "no session is running"),
         ("3", "f9", "Nothing is finished yet"),
         ("2", "r", "No plan is loaded"),
-        ("2", "ctrl+up", "No plan is loaded"),
         ("4", "i", "There is no result"),
         ("5", "c", "No session is recorded yet"),
     ]
@@ -124,19 +122,6 @@ async def test_the_highlighted_pose_is_told_in_full(link: FakeLink) -> None:
         await until(pilot, lambda: reason in text_of(pilot.app, "#plan-detail"))
         link.show(msgspec.structs.replace(status, session=msgspec.structs.replace(session, poses=())))
         await until(pilot, lambda: text_of(pilot.app, "#plan-detail") == NO_PLAN)
-
-
-@pytest.mark.parametrize(("theme", "marks"), [("terminal", "░▒▓█"), ("station-dark", "▀")])
-async def test_the_picture_needs_no_grey_background_on_a_console(
-    link: FakeLink, theme: str, marks: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TEXTUAL_THEME", theme)
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        preview = pilot.app.screen.query_one(PreviewPane)
-        await until(pilot, lambda: preview._image is not None)
-        text = "".join(preview.render_line(y).text for y in range(preview.size.height))
-        assert set(text) - {" ", "+"} <= set(marks)
-        assert "+" in text
 
 
 def test_every_key_has_a_tooltip() -> None:

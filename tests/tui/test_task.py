@@ -24,7 +24,7 @@ from station.operate.cell_setup import CellSetup
 from station.operate.draft import Hardware
 from station.protocol.verbs import Check
 from station.tui.dialogs import Confirm, ConfirmMotion, Help, Reason
-from station.tui.frame import StopBlock, bar_line, keys_line, next_line, rail_line
+from station.tui.frame import StopBlock, bar_line, next_line, rail_line
 from station.tui.new_cell import NewCell
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from station.tui.themes import THEMES
@@ -139,21 +139,6 @@ def test_what_a_person_should_look_at_is_never_cut(why: str, look: bool, width: 
     line = next_line(Action("F8", "Acknowledge", why, look=look), width).plain
     assert " F8  Acknowledge " in line
     assert why in line if look else len(line) <= width
-
-
-@pytest.mark.parametrize("width", [60, 80, 120, 160])
-def test_the_keys_fit_into_one_line(width: int) -> None:
-    own = [("n", "new"), ("m", "new+arm"), ("r", "retake"), ("s", "skip")]
-    common = [("F5", "run"), ("F6", "pause"), ("F7", "finish"), ("F9", "solve"), ("F3", "freedrive")]
-    groups = [
-        ("plan", own),
-        ("session", common),
-        ("go to", [("1-4", "step"), ("5", "sessions")]),
-        ("", [("F1", "help")]),
-    ]
-    line = keys_line(groups, width).plain
-    assert len(line) <= width
-    assert "retake" in line and "F1 help" in line
 
 
 WINDOWS = [

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
+import importlib
+import os
+import sys
+import termios
 import time
 from functools import lru_cache
 from itertools import groupby
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -15,18 +18,24 @@ from numpy.typing import NDArray
 from rich.color import Color
 from rich.segment import Segment
 from rich.style import Style
-from textual.geometry import Region, Size
+from textual.app import ComposeResult
+from textual.geometry import Size
 from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
 from station.protocol import verbs
 from station.protocol.client import Client
-from station.tui.widgets.graphics import PERIOD_S, SHARE, Graphics, SharpPicture
+from station.tui.themes import TERMINAL, chosen_theme
 
-Grey = NDArray[np.uint8]
+SWITCH = "STATION_PICTURES"
+"""`blocks`: never sharp; `sharp`: over ssh too, where STOP's key and every picture share one line."""
+SHARP_S = 1.0
+"""Between two sharp images at least: drawing one takes up to 0.1 s of the processor."""
 LEVELS = 20
 """Shades a terminal image is drawn with: fewer styles to send, and no eye sees more in half blocks."""
+GREYS = 16
+"""Shades of a sharp image: its bytes grow with them."""
 _CORNER = -1
 """A cell that shows a corner in place of shades."""
 CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_rgb(0, 0, 0), bold=True))
@@ -38,83 +47,131 @@ FEW_SHADES = " ░▒▓█"
 """Shades of a console with 16 colours, whose backgrounds have no greys: one a cell."""
 
 
-class PreviewPane(Widget):
-    """The last image it was given; scales with its own size, keeps the aspect ratio.
+def sharp_widget() -> Any:
+    """Return textual-image's widget; None where it is missing, not wanted, or the terminal draws no images.
 
-    Half blocks are drawn whenever something may stand over the image: a terminal's own graphics hide text.
+    The library asks the terminal when it is imported: only before the screen reads its keys.
+    """
+    wish = os.environ.get(SWITCH, "")
+    remote = "SSH_TTY" in os.environ or "SSH_CONNECTION" in os.environ
+    keys, glass = sys.__stdin__, sys.__stdout__
+    if wish == "blocks" or (remote and wish != "sharp") or chosen_theme() == TERMINAL:
+        return None
+    if keys is None or glass is None or not keys.isatty() or not glass.isatty():
+        return None
+    try:
+        drawn = importlib.import_module("textual_image.renderable")
+        widget = importlib.import_module("textual_image.widget").Image
+    except ImportError:
+        return None
+    finally:
+        termios.tcflush(keys, termios.TCIFLUSH)  # an answer that came late would be read as keys
+    return widget if drawn.Image in (drawn.SixelImage, drawn.TGPImage) else None
+
+
+class PreviewPane(Widget):
+    """The last image it was given; scales with its own size, keeps the aspect ratio."""
+
+    DEFAULT_CSS = """
+    PreviewPane { width: 1fr; height: 1fr; align: center top; }
+    PreviewPane > * { display: none; height: auto; }
     """
 
-    DEFAULT_CSS = "PreviewPane { width: 1fr; height: 1fr; }"
-
-    graphics: ClassVar[Graphics | None] = None
-    """The terminal's own graphics; None: half blocks only."""
+    sharp: ClassVar[Any] = None
+    """The widget for sharp images; None: half blocks only."""
     old: reactive[bool] = reactive(False)
     """The image is out of date; written across it."""
+    calm: reactive[bool] = reactive(True)
+    """The arm rests. While it works nothing that takes long to draw may make STOP wait."""
 
     def __init__(self, *, id: str | None = None) -> None:
         super().__init__(id=id)
-        self._image: Grey | None = None
+        self._image: NDArray[np.uint8] | None = None
         self._sequence: int | None = None
         self._corners: NDArray[np.float64] = np.zeros((0, 2))
         self._rows: list[Strip] = []
         self._rows_size = Size(0, 0)
-        self._sharp: SharpPicture | None = None
         self._next_s = 0.0
-        """Time before which no image is drawn, to bound the processor's load."""
+        """Time before which no sharp image is drawn."""
+
+    def compose(self) -> ComposeResult:
+        if self.sharp is not None:
+            yield self.sharp()
 
     async def fetch(self, link: Client) -> None:
         """Ask for an image and show it. What the daemon sees in it stands in the status, shown or not.
 
         Until the next one may be drawn the smallest will do: a large one is dear to send and to read.
         """
-        due = time.monotonic() >= self._next_s
+        due = not self._sharp() or time.monotonic() >= self._next_s
         width, height = self.wanted_pixels() if due else SMALLEST
         answer = await link.call(verbs.Preview(width, height))
         if due and answer.jpeg_base64:
-            await self.show(answer)
+            self.show(answer)
 
-    async def show(self, answer: verbs.PreviewImage) -> None:
+    def show(self, answer: verbs.PreviewImage) -> None:
         """Show an image, unless it stands there already."""
-        if answer.sequence == self._sequence:
-            return
         data = np.frombuffer(base64.b64decode(answer.jpeg_base64), dtype=np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-        if image is None:
+        if answer.sequence == self._sequence or image is None:
             return
         self._image, self._sequence = np.asarray(image, dtype=np.uint8), answer.sequence
         self._corners = np.array(answer.corners, dtype=float).reshape(-1, 2)
         self._rows_size = Size(0, 0)
-        await self._sharpen(self.size)
+        self._sharpen()
         self.refresh()
 
-    async def _sharpen(self, size: Size) -> None:
-        graphics, self._sharp = self._graphics(), None
-        if graphics is None or self._image is None:
-            return
-        self._sharp = await asyncio.to_thread(graphics.draw, self._image, self._corners, size)
-        self._next_s = time.monotonic() + max(PERIOD_S, self._sharp.spent_s / SHARE)
+    def _sharp(self) -> bool:
+        """Tell whether a sharp image may stand here: it would hide what is drawn over it."""
+        if self.sharp is None or self.old or not self.calm or not self.screen.is_active:
+            return False
+        return not any(part.display for part in self.screen.query("Toast, Tooltip, Stopped"))
 
-    def _graphics(self) -> Graphics | None:
-        """The terminal's own graphics; None while half blocks are due."""
-        graphics = self.graphics
-        if graphics is None or self.old or not self.screen.is_active or not graphics.ready():
-            return None
-        return (
-            None if any(part.display for part in self.screen.query("Toast, Tooltip, Stopped")) else graphics
-        )
+    def _sharpen(self) -> None:
+        if self._image is None or not self._sharp():
+            self.soften()
+            return
+        from PIL import Image  # comes with textual-image
+
+        shades = self._image.astype(int) * GREYS // 256 * (255 // (GREYS - 1))
+        coloured = cv2.cvtColor(shades.astype(np.uint8), cv2.COLOR_GRAY2RGB)
+        height, width = self._image.shape
+        for place in np.rint(self._corners * (width, height)).astype(int).tolist():
+            cv2.drawMarker(coloured, place, (0, 0, 0), cv2.MARKER_CROSS, 9, 3)
+            cv2.drawMarker(coloured, place, (0, 230, 0), cv2.MARKER_CROSS, 7, 1)
+        across, down = self._cell()
+        scale = min(self.size.width * across / width, self.size.height * down / height)
+        child: Any = self.children[0]
+        child.image = Image.fromarray(coloured)
+        child.styles.width, child.display = max(1, int(width * scale) // across), True
+        self._next_s = time.monotonic() + SHARP_S
+
+    def soften(self) -> None:
+        """Show half blocks: a sharp image would hide what is drawn over it."""
+        for child in self.children:
+            child.display = False
+
+    def watch_old(self) -> None:
+        self.soften()
+
+    def watch_calm(self) -> None:
+        self.soften()
+
+    def _cell(self) -> tuple[int, int]:
+        """Width and height of one character in pixels, or what stands for them in half blocks."""
+        if not self._sharp():
+            return 1, 2
+        cell: tuple[int, int] = importlib.import_module("textual_image._terminal").get_cell_size()
+        return cell
 
     def wanted_pixels(self) -> tuple[int, int]:
-        """Return width and height of the largest image that this widget can show: a cell is one by two."""
-        if (graphics := self._graphics()) is not None:
-            return graphics.pixels(self.size)
-        return max(16, self.size.width), max(16, 2 * self.size.height)
-
-    def render_lines(self, crop: Region) -> list[Strip]:
-        if self._sharp is not None and crop.size == self._sharp.size == self.size and self._graphics():
-            return self._sharp.strips(*self.region.offset, self.rich_style)
-        return super().render_lines(crop)
+        """Return width and height of the largest image that this widget can show."""
+        across, down = self._cell()
+        return max(16, across * self.size.width), max(16, down * self.size.height)
 
     def render_line(self, y: int) -> Strip:
+        if any(child.display for child in self.children):
+            return Strip.blank(self.size.width, self.rich_style)
         if self._rows_size != self.size:
             self._rows, self._rows_size = self._draw(self.size), self.size
         if self.old and self._image is not None and y == self.size.height // 2:
@@ -130,31 +187,29 @@ class PreviewPane(Widget):
         columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
         small = cv2.resize(self._image, (columns, rows), interpolation=cv2.INTER_AREA)
         shades = (small.astype(int) * LEVELS // 256).reshape(rows // 2, 2, columns)
-        few = self.app.current_theme.ansi
-        shades_of_a_cell = shades[:, 0] + shades[:, 1] if few else shades[:, 0] * LEVELS + shades[:, 1]
-        cells = shades_of_a_cell.tolist()
+        few = None
+        if self.app.current_theme.ansi:
+            # White on black, so that light is light on a white terminal too.
+            few = Style() if self.app.no_color else Style(color="white", bgcolor="black")
+        cells = (shades[:, 0] * LEVELS + shades[:, 1] if few is None else shades.sum(axis=1)).tolist()
         for x, y in self._corners:
             row, column = int(y * rows) // 2, int(x * columns)
             if 0 <= row < rows // 2 and 0 <= column < columns:
                 cells[row][column] = _CORNER
         left = (size.width - columns) // 2
-        sides = (
-            Segment(" " * left, self.rich_style),
-            Segment(" " * (size.width - columns - left), self.rich_style),
-        )
+        sides = [Segment(" " * room, self.rich_style) for room in (left, size.width - columns - left)]
         return [Strip([sides[0], *_runs(line, few), sides[1]], size.width) for line in cells]
 
 
-def _runs(line: list[int], few: bool) -> list[Segment]:
+def _runs(line: list[int], few: Style | None) -> list[Segment]:
     """Join equal neighbours: less to send over ssh."""
     runs: list[Segment] = []
     for cell, alike in groupby(line):
         count = len(list(alike))
         if cell == _CORNER:
             runs += [CORNER] * count
-        elif few:
-            shade = FEW_SHADES[cell * len(FEW_SHADES) // (2 * LEVELS - 1)]
-            runs.append(Segment(shade * count, Style()))
+        elif few is not None:
+            runs.append(Segment(FEW_SHADES[cell * len(FEW_SHADES) // (2 * LEVELS - 1)] * count, few))
         else:
             runs.append(Segment("▀" * count, _style(cell)))
     return runs

@@ -176,7 +176,7 @@ class LimitsConfig(Section, frozen=True):
 
 
 class PointerConfig(Section, frozen=True):
-    """Pointer whose tip a person puts on a corner (`station touch-test`), in `flange`."""
+    """Pointer whose tip a person puts on a corner (the touch test), in `flange`."""
 
     GONE: ClassVar = frozenset({"along", "radius_m"})
     tip_m: Place

@@ -56,13 +56,12 @@ async def _accept(socket: Path | None, joint: int, speed_m_s: float, quiet: bool
     from station.devices.ur_state import TraceRecorder
 
     async with attended(socket, headless=quiet, camera=False) as shell:
-        status = await shell.status()
-        if status.playback:
+        if (await shell.status()).playback:
             raise RefusedError("playback")
-        if quiet:
-            shell.require_simulated()
+        if quiet and not shell.simulated:
+            raise no_terminal("--json prompts nobody, and is for simulated cells only.")
         host = (await shell.client.call(Configuration())).robot.host
-        tester = _ShellTester(shell, status.simulated, quiet)
+        tester = _ShellTester(shell, quiet)
         root = shell.client.root
         assert root is not None
         test = AcceptanceTest(shell.client, tester, TraceRecorder(host), speed_m_s, joint)
@@ -98,12 +97,12 @@ def _keep(root: Path, found: Acceptance) -> None:
 class _ShellTester:
     """The person at this terminal, with the pendant in their hand; for a simulated arm also nobody."""
 
-    def __init__(self, shell: Attended, simulated: bool, quiet: bool) -> None:
-        self._shell, self._simulated, self._quiet = shell, simulated, quiet
+    def __init__(self, shell: Attended, quiet: bool) -> None:
+        self._shell, self._quiet = shell, quiet
 
     async def holds_emergency_stop(self) -> bool:
         if not self._shell.interactive:
-            if self._simulated:
+            if self._shell.simulated:
                 return True
             raise no_terminal()
         err.print("The arm will be stopped in mid-move, again and again, also by taking its control away.")

@@ -71,17 +71,6 @@ STATION = LazyGroup(
         "watch": LazyCommand(
             "station.cli.watch:watch_command", ("station watch --board tag.yaml", "station watch --every 10")
         ),
-        "touch-test": LazyCommand(
-            "station.cli.touch_test:touch_test_command",
-            (
-                "station touch-test --pointer-mm 120  # the installed one, over the four outermost corners",
-                "station touch-test cell.yaml --corner 0 --corner 20",
-            ),
-            gone={
-                "--standoff-mm": "Bring the tip onto the corner by hand.",
-                "--json": "It needs a person at the arm.",
-            },
-        ),
         "accept": LazyCommand(
             "station.cli.accept:accept_command",
             ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.25"),
@@ -98,6 +87,7 @@ STATION = LazyGroup(
         "bootstrap": "`station new` finds camera and board from views that you guide by hand.",
         "next-pose": "F3 on the screen adds views that you guide by hand.",
         "replan": "`station finish`, then `station plan` plans again.",
+        "touch-test": "Press h on Result of the screen: `station`.",
         "trace": "The simulated controller's limits are in the docs: The simulator.",
     },
     help="A calibration station for a robot cell. Without a command: the operator screen.",

@@ -8,19 +8,19 @@ import signal
 import sys
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from types import TracebackType
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
 from station.cell.errors import RefusedError, StationError
 from station.cell.socket_folder import default_socket
-from station.cell.status import Event, MotionPreview, StationStatus
+from station.cell.status import MotionPreview, StationStatus
 from station.cli.console import err
 from station.operate.motion import (
     HASH_DIGITS,
+    Watcher,
     carry_out,
     motion_facts,
     not_approved,
@@ -40,16 +40,25 @@ class Attended:
     def __init__(
         self, socket: Path, client: Client, simulated: bool, headless: bool, approved: str, quiet: bool
     ) -> None:
-        self.client, self.progress = client, SessionProgress(err, quiet=headless or quiet)
+        self.client, self.simulated = client, simulated
         self.interactive = not headless and sys.stdin.isatty()
         self.moving = False
         """A motion was approved: from now on Ctrl-C sends STOP."""
-        self._socket, self._simulated, self._approved = socket, simulated, approved
-        self._headless = headless
+        self._socket, self._approved = socket, approved
+        self._headless, self._quiet = headless, quiet
 
     async def approves(self, preview: MotionPreview) -> bool:
         """By the approved hash, by the person, or, for a simulated cell only, by nobody."""
-        yes = self._decides(preview)
+        if self._approved:
+            yes = preview.plan_sha256.startswith(self._approved) and len(self._approved) >= HASH_DIGITS
+            if not yes:
+                raise RefusedError("other-plan")
+        elif self.interactive:
+            yes = ask_person(preview)
+        elif self.simulated:
+            yes = True
+        else:
+            raise no_terminal("A person must review and approve the plan (docs: Safety).")
         await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the approval is sent
         self.moving = yes
         return yes
@@ -59,46 +68,29 @@ class Attended:
         err.print(refusal.text, style="yellow")
         return confirmed("Plan again from here? Nothing moves.", default=True)
 
-    def _decides(self, preview: MotionPreview) -> bool:
-        if self._approved:
-            if not preview.plan_sha256.startswith(self._approved) or len(self._approved) < HASH_DIGITS:
-                raise RefusedError("other-plan")
-            return True
-        if self.interactive:
-            return ask_person(preview)
-        if self._simulated:
-            return True
-        raise no_terminal("A person must review and approve the plan (docs: Safety).")
-
     async def status(self) -> StationStatus:
         """The status now, by a new connection: no status waited there while a person was asked."""
         return await status_now(self._socket)
 
-    def require_simulated(self) -> None:
-        """RefusedError on a real cell, where nothing moves without a person."""
-        if not self._simulated:
-            raise RefusedError("no-person", advice="--json prompts nobody, and is for simulated cells only.")
-
     async def carry_out(self, purpose: Purpose) -> StationStatus:
         """One session, until it rests."""
-        self.progress.skip(await self.status())
-        with self.progress:
+        with session_progress(err, self._quiet, await self.status()) as show:
             return await carry_out(
                 self.client,
                 purpose,
                 self.approves,
-                self.progress,
+                show,
                 finish_with_loss=self._headless,
                 headless=not self.interactive,
                 plans_here=self.plans_here if self.interactive else None,
             )
 
-    async def watch(self, started: object) -> StationStatus:
+    async def watch(self, started: object, before: StationStatus) -> StationStatus:
         """A session that was just started, until it rests. RefusedError when it was not `started`."""
         if not started:
             raise not_approved()
-        with self.progress:
-            return await watched(self.client, self.progress, finish_with_loss=self._headless)
+        with session_progress(err, self._quiet, before) as show:
+            return await watched(self.client, show, finish_with_loss=self._headless)
 
 
 @contextlib.asynccontextmanager
@@ -167,69 +159,38 @@ def ctrl_c_at_once() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-class SessionProgress:
-    """Context manager; call it with every status. Silent when `quiet`.
+@contextlib.contextmanager
+def session_progress(console: Console, quiet: bool, before: StationStatus) -> Iterator[Watcher]:
+    """Give what shows a session by each status; events of `before` are not told again.
 
-    The bar appears with the first status, so that a question before the go has the terminal to itself.
+    The bar appears with the first status, so that a question before it has the terminal to itself.
     """
+    bar = Progress(
+        TextColumn("{task.description:<34}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+        disable=quiet,
+    )
+    task = bar.add_task("", total=None)
+    told = before.events[-1:]
 
-    def __init__(self, console: Console, quiet: bool) -> None:
-        self._quiet = quiet
-        self._bar = Progress(
-            TextColumn("{task.description:<34}"),
-            BarColumn(bar_width=24),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=console,
-            disable=quiet,
-        )
-        self._task: TaskID | None = None
-        self._last: Event | None = None
-
-    def __enter__(self) -> SessionProgress:
-        return self
-
-    def say(self, text: str) -> None:
-        """One line about what is going on outside a session."""
-        if not self._quiet:
-            self._bar.console.print(Text(text, "dim"))
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._bar.stop()
-
-    def skip(self, status: StationStatus) -> None:
-        """Skip the events of this status: they happened before."""
-        if status.events:
-            self._last = status.events[-1]
-
-    def __call__(self, status: StationStatus) -> None:
-        if self._quiet:
-            return
-        session = status.session
-        if self._task is None:
-            self._bar.start()
-            self._task = self._bar.add_task("", total=len(session.poses))
+    def show(status: StationStatus) -> None:
+        nonlocal told
+        session, events = status.session, status.events
         where = f"pose {session.current + 1} " if session.current is not None else ""
-        self._bar.update(
-            self._task,
-            description=f"{where}{status.state.value}",
-            total=len(session.poses),
-            completed=session.captured,
-        )
-        for event in self._new(status):
+        words = f"{where}{status.state.value}"
+        bar.start()
+        bar.update(task, description=words, total=len(session.poses), completed=session.captured)
+        new = events[events.index(told[0]) + 1 :] if told and told[0] in events else events
+        told = events[-1:] or told
+        for event in new:
             number = f"pose {event.pose_index + 1:>2}  " if event.pose_index is not None else ""
             style = {"warning": "yellow", "error": "red"}.get(event.level, "dim")
-            self._bar.console.print(Text(f"{number}{event.text}", style))
+            bar.console.print(Text(f"{number}{event.text}", style))
 
-    def _new(self, status: StationStatus) -> list[Event]:
-        events = list(status.events)
-        if self._last in events:
-            events = events[events.index(self._last) + 1 :]
-        if status.events:
-            self._last = status.events[-1]
-        return events
+    try:
+        yield (lambda status: None) if quiet else show
+    finally:
+        bar.stop()

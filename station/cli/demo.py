@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -21,40 +21,29 @@ from rich.text import Text
 from calibrate.files.calibration import Calibration, Sigma, read_calibration
 from calibrate.files.formatting import arm_sentences
 from calibrate.geometry import difference
-from calibrate.results import HoldoutScore
-from recordings.errors import ErrorReport
 from recordings.files import state_root
 from recordings.reader import open_recording
 from recordings.schema.messages import Matrix4, Mount
 from station.cell.errors import ConfigError, StationError
 from station.cell.session_folder import CALIBRATION_FILE
-from station.cell.status import MotionPreview, StationStatus
-from station.cli.attended import SessionProgress
+from station.cell.status import StationStatus
+from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, err, out, print_json
 from station.cli.daemon import own_daemon
 from station.cli.session import PosesJson
 from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
-from station.operate.motion import carry_out, wait_until_idle
-from station.plan.choose import Aim
-from station.protocol.client import Client
 from station.protocol.verbs import MakePlan, Purpose
 from station.simulation.netns import is_isolated, isolated_command
 from station.simulation.truth import CellTruth
 
-SOLVE_TIMEOUT_S = 300.0
+PLAN_S = 120.0
+_REPORT_FILE = "report.html"
 _GATE_FAILED = 4
 
 
 class ErrorJson(msgspec.Struct, frozen=True):
     translation_mm: float
     rotation_deg: float
-
-
-class DemoArmJson(msgspec.Struct, frozen=True):
-    offered: bool
-    with_table_mm: float | None
-    without_table_mm: float | None
-    sentences: list[str]
 
 
 class DemoJson(msgspec.Struct, frozen=True):
@@ -70,15 +59,13 @@ class DemoJson(msgspec.Struct, frozen=True):
     recording: str
     calibration: str
     report: str
-    holdout: HoldoutScore | None
     gates_passed: bool
     approved_again: int
     """How often the cell approved the rest by itself, after news that came late."""
-    arm: DemoArmJson
 
 
 class DemoError(StationError):
-    """A step of the demonstration failed; text and code are that step's own."""
+    """A step of the demonstration failed."""
 
     code = "demo"
 
@@ -110,27 +97,53 @@ def demo_command(
         command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
         os.execv(command[0], command)
     folder = output or state_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
-    cell = {"seed": seed, "scene": scene, "mount": mount, "noise": noise}
-    arguments = [part for name, value in cell.items() for part in (f"--{name}", str(value))]
+    arguments = ["--seed", str(seed), "--scene", scene, "--mount", mount, "--noise", noise]
     arguments += ["--time-scale", str(time_scale), *(["--gige"] if gige else [])]
     arguments += ["--control", control] if control else []
-    progress, started_s = SessionProgress(err, quiet=headless or as_json), time.monotonic()
-    result = _run(folder, arguments, poses, seed, progress, cell)
+    quiet, started_s = headless or as_json, time.monotonic()
+    if not quiet:
+        err.print(f"a simulated cell: {' '.join(arguments)}", style="dim")
+    # A worn arm is worth poses that tell its table from the rest.
+    plan = MakePlan(poses, seed, aim="arm" if noise == "high" else "camera")
+    with simulated_daemon(folder, arguments) as socket:
+        outcome = asyncio.run(_captured(socket, plan, quiet))
+    solved, made = _solved(outcome), Path(outcome.session.folder)
+    arm = solved.arm_table
+    # The camera's true pose is that on the true arm: the X of the corrected one is to be compared with it.
+    own, sigma = solved.result, solved.sigma
+    if arm is not None and arm.result is not None:
+        own, sigma = arm.result, Sigma.of(arm.covariance)
+    result = DemoJson(
+        seed,
+        scene,
+        mount,
+        noise,
+        truth_error=ErrorJson(*truth_error(Path(outcome.session.recording), own.matrix)),
+        sigma=sigma,
+        poses=PosesJson(len(outcome.session.poses), outcome.session.captured),
+        recording=outcome.session.recording,
+        calibration=str(made / CALIBRATION_FILE),
+        report=str(made / _REPORT_FILE),
+        gates_passed=all(gate.passed for gate in solved.quality.gates),
+        approved_again=outcome.session.approved_again,
+    )
     if as_json:
         print_json(result)
     else:
-        _show_demo(result, time.monotonic() - started_s)
+        _show_demo(result, arm is not None and arm.offered, time.monotonic() - started_s)
+        for sentence in arm_sentences(solved):
+            out.print(sentence)
     if not result.gates_passed:
-        raise typer.Exit(4)
+        raise typer.Exit(_GATE_FAILED)
     if result.poses.captured < result.poses.planned:
         raise typer.Exit(3)
 
 
-def _show_demo(result: DemoJson, duration_s: float) -> None:
+def _show_demo(result: DemoJson, with_table: bool, duration_s: float) -> None:
     table = Table(title=f"SIMULATED cell, seed {result.seed}: {result.mount}, {result.scene} scene")
     for heading in ("", "translation", "rotation"):
         table.add_column(heading, justify="left" if not heading else "right")
-    on_table = ", with the arm's table" if result.arm.offered else ""
+    on_table = ", with the arm's table" if with_table else ""
     for name, value in (
         (f"error against the truth{on_table}", result.truth_error),
         (f"standard uncertainty{on_table}", result.sigma),
@@ -144,64 +157,12 @@ def _show_demo(result: DemoJson, duration_s: float) -> None:
         out.print(f"approved again by itself {again} time{'s' * (again > 1)}: this computer was busy")
     for name in ("recording", "calibration", "report"):
         out.print(f"{name:<12} {getattr(result, name)}")
-    for sentence in result.arm.sentences:
-        out.print(sentence)
 
 
-def _run(
-    folder: Path, arguments: list[str], poses: int, seed: int, progress: SessionProgress, cell: dict[str, Any]
-) -> DemoJson:
-    """Return what `--json` prints. `arguments`: of `station serve`; `cell`: the same. Raises StationError."""
-    progress.say(f"starting a simulated cell: {' '.join(arguments)}")
-    # A worn arm is worth poses that tell its table from the rest.
-    aim: Aim = "arm" if "high" in arguments else "camera"
-    with simulated_daemon(folder, arguments) as socket:
-        outcome = asyncio.run(_captured(socket, MakePlan(poses, seed, aim=aim), progress))
-    if not outcome.session.recording:
-        raise unfinished(outcome)
-    recording, session = Path(outcome.session.recording), Path(outcome.session.folder)
-    calibration, report = session / CALIBRATION_FILE, session / "report.html"
-    progress.say("solving the recording, in a process of its own")
-    solved = _solve(recording, calibration, report)
-    arm = solved.arm_table
-    # The camera's true pose is that on the true arm: the X of the corrected one is to be compared with it.
-    own, sigma = solved.result, solved.sigma
-    if arm is not None and arm.result is not None:
-        own, sigma = arm.result, Sigma.of(arm.covariance)
-    return DemoJson(
-        **cell,
-        truth_error=ErrorJson(*truth_error(recording, own.matrix)),
-        sigma=sigma,
-        poses=PosesJson(len(outcome.session.poses), outcome.session.captured),
-        recording=str(recording),
-        calibration=str(calibration),
-        report=str(report),
-        holdout=solved.quality.holdout,
-        gates_passed=all(gate.passed for gate in solved.quality.gates),
-        approved_again=outcome.session.approved_again,
-        arm=DemoArmJson(
-            offered=arm is not None and arm.offered,
-            with_table_mm=None if arm is None else arm.with_table_mm,
-            without_table_mm=None if arm is None else arm.without_table_mm,
-            sentences=[*arm_sentences(solved)],
-        ),
-    )
-
-
-async def _captured(socket: Path, plan: MakePlan, progress: SessionProgress) -> StationStatus:
-    async with Client(socket, "the demo") as client:
-        await wait_until_idle(client)
-        progress.say(f"planning {plan.poses} poses")
-        await client.call(plan, timeout_s=120.0)
-        with progress:
-            return await carry_out(
-                client, Purpose.RUN, approve_simulated, progress, finish_with_loss=True, headless=True
-            )
-
-
-async def approve_simulated(_: MotionPreview) -> bool:
-    """Approve a motion of a cell that `simulated_daemon` started: nothing real moves."""
-    return True
+async def _captured(socket: Path, plan: MakePlan, quiet: bool) -> StationStatus:
+    async with attended(socket, headless=True, quiet=quiet) as shell:
+        await shell.client.call(plan, timeout_s=PLAN_S)
+        return await shell.carry_out(Purpose.RUN)
 
 
 def simulated_daemon(root: Path, arguments: Sequence[str]) -> AbstractContextManager[Path]:
@@ -210,31 +171,22 @@ def simulated_daemon(root: Path, arguments: Sequence[str]) -> AbstractContextMan
     return own_daemon(["--simulate", "--root", str(root), *arguments], root / "daemon.log")
 
 
-def unfinished(outcome: StationStatus) -> DemoError:
-    """Why there is no recording, and where the poses are that were saved."""
+def _solved(outcome: StationStatus) -> Calibration:
+    """What `calibrate solve` finds in a process of its own, as on an operator's laptop."""
     session, why = outcome.session, outcome.reason or outcome.state.value
-    saved = f", saved in {session.folder}" if session.captured else ""
-    return DemoError(
-        "demo-unfinished", captured=session.captured, poses=len(session.poses), saved=saved, why=str(why)
-    )
-
-
-def _solve(recording: Path, calibration: Path, report: Path) -> Calibration:
-    """`calibrate solve` in a process of its own, as an operator's laptop would run it."""
-    command = [sys.executable, "-m", "calibrate.cli", "solve", str(recording), "--json"]
-    command += ["--output", str(calibration), "--report", str(report)]
-    try:
-        done = subprocess.run(command, capture_output=True, timeout=SOLVE_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        raise DemoError("demo-solve-hangs", limit_s=SOLVE_TIMEOUT_S) from None
+    if not session.recording:
+        saved = f", saved in {session.folder}" if session.captured else ""
+        raise DemoError(
+            "demo-unfinished", captured=session.captured, poses=len(session.poses), saved=saved, why=why
+        )
+    folder = Path(session.folder)
+    calibration, report = str(folder / CALIBRATION_FILE), str(folder / _REPORT_FILE)
+    command = [sys.executable, "-m", "calibrate.cli", "solve", session.recording]
+    command += ["--output", calibration, "--report", report]
+    done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode not in (0, _GATE_FAILED):
-        try:
-            problem = msgspec.json.decode(done.stdout, type=ErrorReport).error
-        except msgspec.DecodeError:
-            said = done.stderr.decode(errors="replace").strip()
-            raise DemoError("demo-solve-failed", exit_code=done.returncode, said=said) from None
-        raise DemoError.from_data(problem)
-    return read_calibration(calibration)
+        raise DemoError("demo-solve-failed", exit_code=done.returncode, said=done.stderr.strip())
+    return read_calibration(Path(calibration))
 
 
 def truth_error(recording: Path, found: Matrix4) -> tuple[float, float]:

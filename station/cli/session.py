@@ -6,8 +6,6 @@ import asyncio
 import shlex
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +20,6 @@ from station.cli.console import AsJson, Headless, Socket, err, out, print_json
 from station.operate.drift_check import POSES, check_arguments, judged, start_drift_check
 from station.operate.ending import after_capture
 from station.plan.files import load_plan
-from station.protocol.client import Client
 from station.protocol.verbs import LoadPlan, Purpose
 
 Approve = Annotated[str, typer.Option("--approve", help="Hash of the approved plan, 12 digits or more")]
@@ -43,9 +40,8 @@ def capture_command(
 
     Exit codes: 0 all poses captured, 1 failed or stopped, 2 usage, 3 poses missing.
     """
-    before = partial(load_into, plan=load_plan(plan))
-    outcome = asyncio.run(session(socket, Purpose.RUN, headless, approve, as_json, before))
-    _finish(outcome, as_json)
+    poses = load_plan(plan)
+    _finish(asyncio.run(session(socket, Purpose.RUN, headless, approve, as_json, poses)), as_json)
 
 
 def resume_command(
@@ -78,13 +74,12 @@ def drift_check_command(
     """
 
     async def captured() -> tuple[StationStatus, str]:
-        async with attended(socket, headless, approve) as shell:
+        async with attended(socket, headless, approve, quiet=headless) as shell:
             standing = await shell.status()
-            shell.progress.skip(standing)
             started = await start_drift_check(
                 shell.client, standing, shell.approves, poses, headless=not shell.interactive
             )
-            return await shell.watch(started), shell.client.camera
+            return await shell.watch(started, standing), shell.client.camera
 
     outcome, camera = asyncio.run(captured())
     if not outcome.session.recording:
@@ -96,22 +91,18 @@ def drift_check_command(
     raise typer.Exit(done.returncode)
 
 
-async def load_into(client: Client, plan: Plan) -> None:
-    await client.call(LoadPlan(plan))
-
-
 async def session(
     socket: Path | None,
     purpose: Purpose,
     headless: bool,
-    approved: str = "",
-    quiet: bool = False,
-    before: Callable[[Client], Awaitable[None]] | None = None,
+    approved: str,
+    quiet: bool,
+    plan: Plan | None = None,
 ) -> StationStatus:
     """One session, approved by a person here or by the hash of what was approved."""
-    async with attended(socket, headless, approved, quiet) as shell:
-        if before is not None:
-            await before(shell.client)
+    async with attended(socket, headless, approved, headless or quiet) as shell:
+        if plan is not None:
+            await shell.client.call(LoadPlan(plan))
         return await shell.carry_out(purpose)
 
 
@@ -139,9 +130,5 @@ def _finish(outcome: StationStatus, as_json: bool) -> None:
         if not session.check:
             out.print(f"Next: calibrate solve {shlex.quote(session.recording)}", soft_wrap=True)
     else:
-        _say_state(outcome, outcome.reason)
+        err.print(Text.assemble((outcome.state.value, "bold"), f": {outcome.reason}"))
     raise typer.Exit(1 if not session.recording else 3 if session.captured < len(session.poses) else 0)
-
-
-def _say_state(status: StationStatus, why: str) -> None:
-    err.print(Text.assemble((status.state.value, "bold"), f": {why}"))

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from recordings.reader import open_recording
 from recordings.schema.frame_ids import frames_between
-from station.cli.demo import approve_simulated, simulated_daemon
-from station.operate.motion import carry_out, wait_until_idle
-from station.protocol.client import Client
-from station.protocol.verbs import Purpose
+from station.cli.attended import attended
+from station.cli.demo import simulated_daemon
+from station.protocol.verbs import LoadPlan, Purpose
 from station.simulation.cells import cell_config, make_cell
 from tests.station.quick_plan import quick_plan
 
@@ -25,10 +23,9 @@ async def test_every_pose_has_the_picture_of_its_own_pulse(lonely_network: None,
     truth = make_cell()
     plan = quick_plan(cell_config(truth), truth, seed=0, count=POSES)
     with simulated_daemon(tmp_path, ["--gige", "--hardware-trigger"]) as socket:
-        async with Client(socket) as client:
-            await wait_until_idle(client)
-            await client.request("load_plan", plan=msgspec.to_builtins(plan))
-            ended = await carry_out(client, Purpose.RUN, approve_simulated, lambda status: None)
+        async with attended(socket, headless=True, quiet=True) as shell:
+            await shell.client.call(LoadPlan(plan))
+            ended = await shell.carry_out(Purpose.RUN)
     assert ended.session.captured == POSES, ended.reason
     box = ended.trigger
     assert box.identity == "calibration-trigger SIM1" and box.pulses == box.frames > POSES, "glimpses too"

@@ -13,7 +13,8 @@ import pytest
 
 from calibrate.files.calibration import read_calibration
 from station.cell.status import PoseStatus, SessionStatus, StationState, StationStatus
-from station.cli.demo import DemoError, DemoJson, _solve, unfinished
+from station.cli.demo import DemoJson, _solved
+from tests.codes import raises
 from tests.recordings.small_recording import shown
 
 
@@ -40,13 +41,15 @@ def test_the_demo_finds_the_truth(tmp_path: Path) -> None:
     assert shown(last, "/tf_static/board")
 
 
-def test_a_solve_that_failed_says_why_under_one_name(tmp_path: Path) -> None:
-    with pytest.raises(DemoError) as failed:
-        _solve(tmp_path / "none.mcap", tmp_path / "calibration.yaml", tmp_path / "report.html")
+def test_a_solve_that_failed_says_why(tmp_path: Path) -> None:
+    session = SessionStatus(folder=str(tmp_path), recording=str(tmp_path / "none.mcap"))
+    with raises("demo-solve-failed") as failed:
+        _solved(StationStatus(session=session))
     assert str(tmp_path / "none.mcap") in str(failed.value)
 
 
 def test_a_demo_that_stops_on_the_way_says_where_its_poses_are() -> None:
     session = SessionStatus(name="s-1", folder="/root/s-1", captured=9, poses=(PoseStatus(0, "p01"),) * 25)
-    error = unfinished(StationStatus(StationState.FAULT, "no news from the robot", session=session))
-    assert "9 of 25" in str(error) and "/root/s-1" in str(error) and error.remedy
+    with raises("demo-unfinished", captured=9, poses=25) as failed:
+        _solved(StationStatus(StationState.FAULT, "no news from the robot", session=session))
+    assert "/root/s-1" in str(failed.value) and failed.value.remedy

@@ -24,10 +24,9 @@ def test_a_line_of_the_table_opens_its_commands_help(name: str) -> None:
     assert 0 < len(line) <= 72
 
 
-@pytest.mark.parametrize(("old", "new"), [("check", "drift-check"), ("verify", "touch-test")])
-def test_a_command_answers_to_its_former_name_too(old: str, new: str) -> None:
-    assert resolve(old)[0] == new
-    assert old not in STATION.commands
+def test_a_command_answers_to_its_former_name_too() -> None:
+    assert resolve("check")[0] == "drift-check"
+    assert "check" not in STATION.commands
 
 
 @pytest.mark.parametrize("command", ["capture", "resume", "drift-check"])

@@ -15,7 +15,7 @@ from station.cell.status import Event, MotionPreview, PoseStatus, SessionStatus,
 from station.cli import control as cli_control
 from station.cli import main
 from station.cli import session as cli_session
-from station.cli.attended import SessionProgress, ask_person
+from station.cli.attended import ask_person, session_progress
 from station.plan.files import save_plan
 from station.protocol.verbs import Check
 from station.simulation.cells import cell_config, make_cell
@@ -92,10 +92,11 @@ def test_how_a_session_ended(recording: str, capsys: pytest.CaptureFixture[str])
 
 def test_events_of_a_session() -> None:
     words = io.StringIO()
-    with SessionProgress(Console(file=words, width=200), quiet=False) as progress:
-        progress.say(f"say {ALL}")
-        progress(StationStatus(events=(Event(1, "warning", f"event {ALL}"),)))
-    assert f"say {ALL}" in words.getvalue()
+    earlier, later = Event(1, "info", "sealed"), Event(2, "warning", f"event {ALL}")
+    before = StationStatus(events=(earlier,))
+    with session_progress(Console(file=words, width=200), False, before) as show:
+        show(StationStatus(events=(earlier, later)))
+    assert "sealed" not in words.getvalue(), "it was told before the session"
     assert f"event {ALL}" in words.getvalue()
 
 

@@ -81,7 +81,7 @@ def board_sheet(spec: BoardSpec, paper: str | None = None) -> Sheet:
     Raises BoardError for an impossible board and for a sheet that is too small.
     """
     check_board(spec)
-    squares, circles, width, height = _DRAWN[spec.kind](spec)
+    squares, circles, width, height = draw_pattern(spec)
     need_w, need_h = width + 2 * _MARGIN_MM, height + 2 * _MARGIN_MM + _FOOT_MM
     sheet_w, sheet_h = (need_w, need_h) if paper is None else _paper(paper, need_w, need_h, spec)
     x, y = (sheet_w - width) / 2, (sheet_h - _FOOT_MM - height) / 2
@@ -107,12 +107,17 @@ def _origin(
     """
     if spec.kind in SINGLE_TAGS:
         return np.zeros((0, 4)), ()
-    right = down = spec.square_m * 1000
-    if spec.kind is BoardKind.APRIL_GRID:
-        right = (spec.marker_m or 0.0) * 1000
-        down = height - right
+    right, down = origin_mm(spec, height)
     ticks = np.array([[x + right - 0.15, y - 4.5, 0.3, 3.0], [x - 4.5, y + down - 0.15, 3.0, 0.3]])
     return ticks, ((x + right + 1.0, y - 2.0, "x → from the origin"), (x - 5.0, y + down + 3.5, "y ↓"))
+
+
+def origin_mm(spec: BoardSpec, height: float) -> tuple[float, float]:
+    """Return x and y of the board's origin in its pattern, which is `height` mm tall."""
+    side, gap = spec.square_m * 1000, (spec.marker_m or 0.0) * 1000
+    if spec.kind in SINGLE_TAGS:
+        return (height - side) / 2, (height - side) / 2
+    return (gap, height - gap) if spec.kind is BoardKind.APRIL_GRID else (side, side)
 
 
 def _paper(paper: str, need_w: float, need_h: float, spec: BoardSpec) -> tuple[float, float]:
@@ -137,8 +142,13 @@ def _paper(paper: str, need_w: float, need_h: float, spec: BoardSpec) -> tuple[f
 
 
 _Drawn = tuple[Array, Array, float, float]
-"""Rectangles (n, 4), circles (m, 3), width and height of the pattern, mm."""
+"""Black rectangles (n, 4), circles (m, 3), width and height of the pattern, mm."""
 _NO_CIRCLES = np.zeros((0, 3))
+
+
+def draw_pattern(spec: BoardSpec) -> _Drawn:
+    """Draw what is black, from the top left of the pattern on; no margins."""
+    return _DRAWN[spec.kind](spec)
 
 
 def _chessboard(spec: BoardSpec) -> _Drawn:

@@ -1,4 +1,4 @@
-"""Simulated cells: those of the paper and the blog, and random ones by seed.
+"""Simulated cells: that of the paper, and random ones by seed.
 
 Seed 0 is the cell as published. Other seeds draw the camera's orientation (anywhere on SO(3)), the board's
 pose, lens and noise, such that 25 different poses can see the board.
@@ -11,11 +11,10 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from calibrate.geometry import Array, pose, project_to_rotation, random_rotation, rotation_exp
+from calibrate.geometry import pose, project_to_rotation, random_rotation, rotation_exp
 from calibrate.kinematics import MODELS, forward
-from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
-from station.cell.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig, matrix4, vector6
-from station.cell.errors import ConfigError
+from recordings.schema.messages import CameraModel, Matrix4, Mount, Vector6
+from station.cell.config import PAPER_BOARD, PoseGuess, StationConfig, matrix4, vector6
 from station.cell.layout import guess_from
 from station.simulation.placement import (
     Placement,
@@ -27,23 +26,26 @@ from station.simulation.placement import (
 from station.simulation.renderer import scaled
 from station.simulation.truth import CellTruth, NoiseLevel, SceneName
 
-PAPER_X = (
-    (1.0000, -0.0032, -0.0026, -0.0013),
-    (0.0032, 1.0000, -0.0068, -0.0603),
-    (0.0026, 0.0068, 1.0000, 0.0870),
+_PRINTED_X = np.array(
+    [
+        (1.0000, -0.0032, -0.0026, -0.0013),
+        (0.0032, 1.0000, -0.0068, -0.0603),
+        (0.0026, 0.0068, 1.0000, 0.0870),
+    ]
 )
-"""flange_from_camera of eq. 23 of the paper; it is rounded, so its rotation is orthonormalised here."""
+PAPER_X = pose(project_to_rotation(_PRINTED_X[:, :3]), _PRINTED_X[:, 3])
+"""flange_from_camera of eq. 23 of the paper, where it is rounded"""
+_FOCAL_PX = 8.0 / 0.0048
+PAPER_LENS = CameraModel(
+    width=1280,
+    height=1024,
+    matrix=((_FOCAL_PX + 3.1, 0.0, 646.2), (0.0, _FOCAL_PX + 2.7, 505.8), (0.0, 0.0, 1.0)),
+    distortion=(-0.092, 0.118, 0.0004, -0.0003, 0.0),
+)
 _START_DEG = (0.0, -94.0, -90.0, -86.0, 90.0, 0.0)
 """Start joints: the flange points straight down, half a metre above the table."""
 _GUESS_M, _GUESS_RAD = 0.004, 0.02
 """1σ per axis of the errors of the configured initial poses"""
-
-
-class _PublishedCell(NamedTuple):
-    board: BoardSpec
-    camera: CameraModel
-    mount: Array
-    """Published flange_from_camera"""
 
 
 class _CellNoise(NamedTuple):
@@ -68,21 +70,17 @@ _FAR_M = 0.6
 def make_cell(
     scene: SceneName = "paper", seed: int = 0, noise: NoiseLevel = "low", mount: Mount = "eye-in-hand"
 ) -> CellTruth:
-    """Make the truth of a cell; equal arguments give the same cell. ConfigError for an unknown name."""
-    published_cells = {"paper": _paper, "blog": _blog, "paper-binned": _paper_binned}
-    if scene not in published_cells or noise not in _NOISE or mount not in ("eye-in-hand", "eye-to-hand"):
-        known = {"scenes": ", ".join(published_cells), "levels": ", ".join(_NOISE)}
-        raise ConfigError("unknown-cell", scene=scene, noise=noise, mount=mount, **known)
+    """Make the truth of a cell; equal arguments give the same cell."""
     rng = np.random.default_rng([2026, seed])
-    published = published_cells[scene]()
-    camera = published.camera if seed == 0 else _other_lens(published.camera, rng)
-    placed = _place(published, camera, seed, mount, rng)
+    published = PAPER_LENS if scene == "paper" else scaled(PAPER_LENS, 0.5)
+    camera = published if seed == 0 else _other_lens(published, rng)
+    placed = _place(camera, seed, mount, rng)
     truth = CellTruth(
         scene=scene,
         seed=seed,
         mount=mount,
         robot_model="UR10",
-        board=published.board,
+        board=PAPER_BOARD,
         camera=camera,
         camera_mount=matrix4(placed.camera_mount),
         board_place=matrix4(placed.board_place),
@@ -91,54 +89,17 @@ def make_cell(
     return _with_noise(truth, _NOISE[noise], rng)
 
 
-def _paper() -> _PublishedCell:
-    focal_px = 8.0 / 0.0048
-    camera = CameraModel(
-        width=1280,
-        height=1024,
-        matrix=((focal_px + 3.1, 0.0, 646.2), (0.0, focal_px + 2.7, 505.8), (0.0, 0.0, 1.0)),
-        distortion=(-0.092, 0.118, 0.0004, -0.0003, 0.0),
-    )
-    rows = np.array(PAPER_X)
-    return _PublishedCell(PAPER_BOARD, camera, pose(project_to_rotation(rows[:, :3]), rows[:, 3]))
-
-
-def _paper_binned() -> _PublishedCell:
-    """Make the paper's cell with 2 × 2 binning, for small recordings."""
-    paper = _paper()
-    return paper._replace(camera=scaled(paper.camera, 0.5))
-
-
-def _blog() -> _PublishedCell:
-    """Make the blog's cell: X is its `Hand-Eye` frame, RPY(0, −15, 0)° at (0.1, 0, 0) m on the flange.
-
-    RobWork's camera looks along −z of `Hand-Eye-Sim`, which is `Hand-Eye` rolled by 180°. The blog's own
-    answer is `Hand-Eye` itself, so that its z is the optical axis; `camera` is taken as that frame.
-    """
-    focal_px = 360.0 / np.tan(np.deg2rad(31.0482) / 2)
-    camera = CameraModel(
-        width=960,
-        height=720,
-        matrix=((float(focal_px), 0.0, 480.0), (0.0, float(focal_px), 360.0), (0.0, 0.0, 1.0)),
-    )
-    return _PublishedCell(
-        BLOG_BOARD, camera, pose(rotation_exp([0.0, np.deg2rad(-15.0), 0.0]), [0.1, 0.0, 0.0])
-    )
-
-
-def _place(
-    published: _PublishedCell, camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator
-) -> Placement:
+def _place(camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator) -> Placement:
     if mount == "eye-to-hand":
-        return place_fixed_camera(published.board, camera, rng)
+        return place_fixed_camera(PAPER_BOARD, camera, rng)
     if seed != 0:
-        return place_moving_camera(published.board, camera, random_rotation(rng), rng)
+        return place_moving_camera(PAPER_BOARD, camera, random_rotation(rng), rng)
     start = np.deg2rad(_START_DEG)
-    base_from_camera = forward(MODELS["UR10"], start) @ published.mount
+    base_from_camera = forward(MODELS["UR10"], start) @ PAPER_X
     axis = base_from_camera[:3, 2]
     middle = base_from_camera[:3, 3] - axis * base_from_camera[2, 3] / axis[2]
     level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    return Placement(published.mount, pose(level, middle - level @ board_centre(published.board)), start)
+    return Placement(PAPER_X, pose(level, middle - level @ board_centre(PAPER_BOARD)), start)
 
 
 def _other_lens(camera: CameraModel, rng: np.random.Generator) -> CameraModel:

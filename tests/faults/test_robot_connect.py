@@ -51,7 +51,7 @@ async def test_nobody_is_there(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fault", "code"),
     [
-        ({"cmd": "stall_dash"}, "dashboard"),
+        ({"cmd": "mute", "ports": ["dashboard"]}, "dashboard"),
         ({"cmd": "mute", "ports": ["rtde"]}, "rtde"),
         ({"cmd": "stall"}, "rtde"),
         ({"cmd": "black_hole"}, "dashboard"),

@@ -114,7 +114,7 @@ async def test_another_clients_program_in_the_place_of_ours_is_named(
     await c.robot.start_control()
 
     def replace() -> None:
-        c.admin.ask("stall_dash")  # whose stop would end that program before it begins
+        c.admin.ask("mute", ports=["dashboard"])  # whose stop would end that program before it begins
         c.admin.ask("foreign", name="palletising.urp")
 
     outcome = await c.strike(replace)

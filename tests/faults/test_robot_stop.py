@@ -67,7 +67,7 @@ async def test_with_a_hung_child_the_dashboard_stops_the_arm(
 
 async def test_with_a_silent_dashboard_the_child_stops_the_arm(cell: Make) -> None:
     c = await cell()
-    c.admin.ask("stall_dash")
+    c.admin.ask("mute", ports=["dashboard"])
     move = await c.cruising()
     await c.robot.stop("operator")
     await c.stops()

@@ -92,8 +92,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--program", dest="programs", action="append", metavar="NAME", help=text)
     text = "answer with another version, for example 5.25.1"
     add("--software", type=version_of, metavar="VERSION", help=text)
-    add("--joints", dest="start_joints_rad", type=float, nargs=6, metavar="RAD", help="start joints")
-    add("--serial", help="answer to `get serial number`")
     add("--local", dest="remote", action="store_const", const=False, help="start in local control (e-Series)")
     add("--time-scale", type=float, metavar="F", help="the arm moves F times faster; for tests")
     add("--die-with-parent", action="store_true", help="end when standard input closes or the parent is gone")

@@ -62,16 +62,6 @@ def restart(
     machine.reboot(down_s, running)
 
 
-def late(machine: Machine, ms: Annotated[float, Meta(ge=0, le=60_000)]) -> None:
-    """No cycle runs for this long; then all that were due run at once (a hiccup of the simulation)."""
-    machine.clock.hold_until_ns = time.monotonic_ns() + int(ms * 1e6)
-
-
-def lose(machine: Machine, packets: Count) -> None:
-    """The next cycles' data packets are never sent."""
-    machine.lose_packets = packets
-
-
 def in_use(machine: Machine, inputs: list[str], on: bool = True) -> None:
     """Another RTDE client owns these input variables (e.g. "input_int_register_0")."""
     for name in inputs:
@@ -210,10 +200,6 @@ _SHORT: dict[str, tuple[str, Command]] = {
     "freeze": (
         "RTDE sends the same packet for ever: the timestamp stands still on a live link.",
         lambda m, on=True: setattr(m.rtde, "frozen", on),
-    ),
-    "stall_dash": (
-        "The dashboard accepts connections and never says a word.",
-        lambda m, on=True: setattr(m.dashboard, "silent", on),
     ),
     "unlock": (
         "A person clears the protective stop (refused within 5 s of it). Not in the dashboard's log.",

@@ -63,7 +63,7 @@ class DashboardConnection(Connection):
     def _answer(self, text: str) -> str:
         robot = self._robot
         words = text.split(" ")
-        starts = [" ".join(words[:n]) for n in range(len(words), 0, -1)]  # "load installation" before "load"
+        starts = [" ".join(words[:n]) for n in range(len(words), 0, -1)]
         verb = next((s for s in starts if s in self._known and (s == text or VERBS[s]["argument"])), "")
         if not verb:
             robot.journal.note("dashboard", text[:200], refused=True)
@@ -105,12 +105,6 @@ class DashboardConnection(Connection):
                 return f"Loaded program: {robot.loaded}" if robot.loaded else "No program loaded"
             case "get robot model":
                 return robot.settings.model.rstrip("e")
-            case "isProgramSaved":
-                return f"true {robot.loaded or '<unnamed>'}"
-            case "setUserRole":
-                robot.user_role = argument
-            case "set operational mode" | "clear operational mode":
-                robot.operational_mode = argument.upper() or "NONE"
             case "power on":
                 robot.power_on()
             case "power off" | "shutdown":
@@ -119,8 +113,6 @@ class DashboardConnection(Connection):
                 robot.run()
             case "unlock protective stop":
                 return "Protective stop releasing" if robot.unlock() else UNLOCK_TOO_EARLY
-            case "generate flight report" if not argument:
-                return "Flight Report generated with id: system"
             case "is in remote control":
                 return str(robot.remote).lower()
         return None

@@ -36,8 +36,6 @@ class Clock:
         self.start_ns = 0
         """Host time of the controller's time 0."""
         self.count = 0
-        self.hold_until_ns = 0
-        """No cycle runs before this time; then all that were due run late."""
         self.worst_lateness_ns = 0
         self.late_cycles = 0
 
@@ -55,8 +53,8 @@ class Clock:
 
     def _arm(self) -> None:
         self.stop()
-        at_ns = max(self.due_ns(self.count + 1), self.hold_until_ns)
-        self._timer = asyncio.get_running_loop().call_at(at_ns / 1e9, self._wake)
+        at_s = self.due_ns(self.count + 1) / 1e9
+        self._timer = asyncio.get_running_loop().call_at(at_s, self._wake)
 
     def _wake(self) -> None:
         try:
@@ -65,8 +63,6 @@ class Clock:
             self._arm()
 
     def _catch_up(self, now_ns: int) -> None:
-        if now_ns < self.hold_until_ns:
-            return
         behind = int((now_ns - self.start_ns) / self._cycle_ns) - self.count
         late = behind > LATE_CYCLES
         for left in reversed(range(min(behind, CHUNK))):
@@ -84,9 +80,8 @@ class Machine:
         self.robot = SimulatedRobot(settings, Journal())
         self.clock = Clock(self.robot.dt_s / (1 + settings.controller_clock_drift_ppm * 1e-6), self._tick)
         self.rtde = RtdeServer(host, self.robot)
-        self.dashboard = dashboard_service(host, self.robot)
-        self.services = [self.rtde.service, *script_services(host, self.robot), self.dashboard]
-        self.lose_packets = 0
+        dashboard = dashboard_service(host, self.robot)
+        self.services = [self.rtde.service, *script_services(host, self.robot), dashboard]
         self._rebooting: asyncio.Task[None] | None = None
 
     def open(self) -> None:
@@ -102,11 +97,7 @@ class Machine:
 
     def _tick(self, due_ns: int, late: bool) -> None:
         self.robot.tick(due_ns, late)
-        if self.lose_packets > 0:
-            self.lose_packets -= 1
-            self.rtde.skipped += 1
-        else:
-            self.rtde.send_states()
+        self.rtde.send_states()
 
     def chosen(self, ports: list[str] | None) -> list[Service]:
         """Services whose name begins with one of these words; all for None. ValueError for none, and while

@@ -234,7 +234,6 @@ class ControllerState(ABC):
         self.freedrive = False
         self.loaded = ""
         """The program that the dashboard loaded."""
-        self.user_role, self.operational_mode = "PROGRAMMER", "NONE"
         self.watchdog_s = 0.0
         """Longest silence of `watched`, an input variable, that is allowed; 0 = none."""
         self.watched = ""

@@ -10,7 +10,7 @@ import pytest
 from calibrate.boards.model import board_points
 from calibrate.geometry import inverse, is_rigid, rotation_angle, transform_points
 from calibrate.kinematics import MODELS, forward
-from station.cell.config import BLOG_BOARD, PAPER_BOARD
+from station.cell.config import PAPER_BOARD
 from station.plan.planner import make_plan
 from station.simulation.cells import cell_config, make_cell
 from station.simulation.placement import board_centre
@@ -37,15 +37,6 @@ def test_the_papers_scene_is_the_default() -> None:
     assert place[2, 3] == pytest.approx(0.0, abs=1e-9) and place[2, 2] == pytest.approx(-1.0)
 
 
-def test_the_blogs_scene_has_its_lens_board_and_answer() -> None:
-    cell = make_cell("blog")
-    assert cell.board == BLOG_BOARD and (cell.camera.width, cell.camera.height) == (960, 720)
-    assert cell.camera.matrix is not None
-    assert 2 * np.degrees(np.arctan(360 / cell.camera.matrix[1][1])) == pytest.approx(31.0482)
-    printed = np.array([[0.965926, 0, -0.258819, 0.1], [0, 1, 0, 0], [0.258819, 0, 0.965926, 0]])
-    assert np.abs(np.array(cell.camera_mount)[:3] - printed).max() < 1e-6
-
-
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_the_camera_sees_the_board_from_the_start(mount: str, seed: int) -> None:
@@ -62,7 +53,7 @@ def test_the_camera_sees_the_board_from_the_start(mount: str, seed: int) -> None
 
 @pytest.mark.parametrize(
     ("scene", "seed", "mount"),
-    [("paper", 7, "eye-in-hand"), ("blog", 3, "eye-to-hand")],
+    [("paper", 7, "eye-in-hand"), ("paper-binned", 3, "eye-to-hand")],
 )
 def test_a_plan_of_25_poses_exists_from_what_an_operator_would_guess(
     scene: str, seed: int, mount: str
@@ -106,11 +97,6 @@ def test_the_guess_is_off_but_within_its_own_sigmas() -> None:
         off = np.linalg.norm(t - np.array(cell.camera_mount)[:3, 3])
         assert 0 < off < 2 * np.sqrt(3) * guess.sigma_m
     assert cell_config(cell).camera.model_is_rough
-
-
-def test_unknown_names_are_refused() -> None:
-    with raises("unknown-cell"):
-        make_cell("moon")  # type: ignore[arg-type]
 
 
 def test_a_missing_or_broken_truth_is_named(tmp_path: Path) -> None:

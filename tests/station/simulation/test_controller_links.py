@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 import time
 from itertools import pairwise
@@ -109,24 +111,14 @@ def test_a_reboot_resets_links_closes_ports_and_starts_at_time_zero(controller, 
     assert state["timestamp_s"] == pytest.approx(since_zero_ns / 1e9, abs=1e-6)
 
 
-def test_lost_packets(controller, rtde, admin) -> None:
-    running = controller("UR10")
-    ask = admin(running)
-    client = rtde(running)
-    client.start("timestamp")
-    stamps = [client.sample()["timestamp"]]
-    ask.ask("lose", packets=5)
-    stamps += [client.sample()["timestamp"] for _ in range(20)]
-    steps = [b - a for a, b in pairwise(stamps)]
-    assert sorted(round(s / 0.008) for s in steps)[-1] == 6
-
-
 def test_late_cycles_come_all_and_in_order(controller, rtde, admin) -> None:
     running = controller("UR10e")
     ask = admin(running)
     client = rtde(running)
     client.start("timestamp")
-    ask.ask("late", ms=200)
+    os.kill(running.process.pid, signal.SIGSTOP)
+    time.sleep(0.2)
+    os.kill(running.process.pid, signal.SIGCONT)
     stamps = [client.sample()["timestamp"] for _ in range(300)]
     assert [b - a for a, b in pairwise(stamps)] == pytest.approx([0.002] * 299, abs=1e-9)
     stats = ask.ask("stats")

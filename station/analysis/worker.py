@@ -24,7 +24,7 @@ from calibrate.geometry import Array
 from recordings.images import Pixels, eight_bits, viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Vector6
 from station.cell.config import StationConfig
-from station.cell.layout import geometry_from
+from station.cell.layout import cell_geometry
 from station.cell.limits import PlanCheck, check_plan
 from station.cell.pose_plan import ExpectedView, Plan
 from station.cell.process import die_with_parent
@@ -139,7 +139,7 @@ def _distance_and_tilt(
 
 def check_run(config: StationConfig, plan: Plan, start_joints_rad: Vector6) -> PlanCheck:
     """Check the whole path of a plan from the arm's present joints (6,), rad."""
-    return check_plan(plan, start_joints_rad, geometry_from(config, start_joints_rad))
+    return check_plan(plan, start_joints_rad, cell_geometry(config))
 
 
 @dataclass(frozen=True, eq=False)

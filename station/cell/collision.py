@@ -80,14 +80,6 @@ def body_segments(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, Arr
     return np.stack(starts, axis=1), np.stack(ends, axis=1), np.array(radii)
 
 
-def gap_to_arm(geometry: CellGeometry, joints_rad: Array, starts: Array, ends: Array) -> Array:
-    """Compute distances (n,) of the arm at joints (6,) to segments, (n, 3) each, on its flange in `base`."""
-    first, last, radii = body_segments(geometry, joints_rad[None])
-    bodies = list(_SELF_BODIES_FOR_TOOL)
-    gap = segment_distance(first[:, bodies], last[:, bodies], starts[:, None], ends[:, None])
-    return np.asarray((gap - radii[bodies]).min(axis=1))
-
-
 def surface_speeds(geometry: CellGeometry, joints_rad: Array, joint_speeds_rad_s: Array) -> Array:
     """Compute speeds (n, k), m/s, of the fastest surface point at both ends of every body.
 

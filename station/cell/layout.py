@@ -12,7 +12,6 @@ from calibrate.boards.model import board_points
 from calibrate.geometry import (
     Array,
     inverse,
-    perturb,
     pose_from_quaternion,
     pose_from_rotvec,
     quaternion_from_matrix,
@@ -23,7 +22,7 @@ from calibrate.kinematics import MODELS, RobotModel, forward
 from calibrate.projection import camera_matrix
 from calibrate.views import board_in_camera, implied_flange
 from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
-from station.cell.collision import SPACING_M, CellGeometry, gap_to_arm, plate
+from station.cell.collision import CellGeometry, plate
 from station.cell.config import (
     Capsule,
     PoseGuess,
@@ -42,7 +41,6 @@ _DOUBT = 3.0
 """Sigmas of its pose by which a body with a rough pose is thickened for collision checks."""
 _MOST_DOUBT_M = 0.03
 """Largest thickening; a thicker camera would collide with the wrist in every posture."""
-_DRAWS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,18 +138,6 @@ def guess_from(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
     return PoseGuess(vector3(matrix[:3, 3]), (x, y, z, w), sigma_m, sigma_rad)
 
 
-def cell_geometry(config: StationConfig) -> CellGeometry:
-    """Make the geometry for checks before motion, with initial poses and their sigmas where given."""
-    camera, board = config.camera_guess, config.board_guess
-    return geometry_of(
-        config,
-        None if camera is None else guess_matrix(camera),
-        None if board is None else guess_matrix(board),
-        0.0 if camera is None else camera.sigma_m,
-        0.0 if board is None else board.sigma_m,
-    )
-
-
 def arm_model(robot: RobotConfig) -> RobotModel:
     """Return the configured arm, with its factory calibration if given. ConfigError: unknown model."""
     if (model := MODELS.get(robot.model)) is None:
@@ -161,44 +147,42 @@ def arm_model(robot: RobotConfig) -> RobotModel:
     return model
 
 
-def geometry_of(
-    config: StationConfig,
-    X: Array | None,
-    Y: Array | None,
-    camera_doubt_m: float = 0.0,
-    board_doubt_m: float = 0.0,
-) -> CellGeometry:
-    """Make solids and obstacles of a cell, for camera and board poses with these 1σ (metres).
+def cell_geometry(config: StationConfig) -> CellGeometry:
+    """Make the geometry for checks before motion: solids and obstacles by the initial poses where given.
 
     A camera or board on the flange gets thicker by three sigmas, at most 30 mm; the clearance of one that is
     fixed in the cell grows by two. Configured solids on the flange are taken as exact.
     """
-    low, high = board_extent(config.board)
-    limits = config.limits
-    solids = limits.solids
+    camera, board, limits = config.camera_guess, config.board_guess, config.limits
+    in_hand = config.mount == "eye-in-hand"
+    solids, clearance = limits.solids, limits.clearance_m
     obstacles: tuple[Capsule, ...] = ()
     watched: tuple[Vector3, ...] = ()
-    clearance = limits.clearance_m
-    if config.mount == "eye-in-hand":
-        if X is not None:
+    if camera is not None:
+        X = guess_matrix(camera)
+        if in_hand:
             watched = (vector3(X[:3, 3]),)
-            solids = solids or (camera_body("camera", X, camera_radius_m(camera_doubt_m)),)
-        if Y is not None:
-            obstacles = plate("board", Y, low, high)
-            clearance = limits.board_clearance_m + 2 * board_doubt_m
-    else:
-        if Y is not None:
-            thicker_m = _thicker_m(board_doubt_m)
-            solids += tuple(
-                msgspec.structs.replace(rod, radius_m=rod.radius_m + thicker_m)
-                for rod in plate("board", Y, low, high)
-            )
+            radius_m = _CAMERA_RADIUS_M + _thicker_m(camera.sigma_m)
+            solids = solids or (camera_body(X, radius_m),)
+        else:
+            obstacles = (camera_body(X, _CAMERA_RADIUS_M),)
+            clearance += 2 * camera.sigma_m
+    if board is not None:
+        Y = guess_matrix(board)
+        rods = plate("board", Y, *board_extent(config.board))
+        if in_hand:
+            obstacles, clearance = rods, limits.board_clearance_m + 2 * board.sigma_m
+        else:
+            thicker_m = _thicker_m(board.sigma_m)
+            solids += tuple(msgspec.structs.replace(rod, radius_m=rod.radius_m + thicker_m) for rod in rods)
             watched = tuple(vector3(p) for p in transform_points(Y, printed_corners(config.board)))
-        if X is not None:
-            obstacles = (camera_body("camera", X),)
-            clearance = limits.clearance_m + 2 * camera_doubt_m
-    model = arm_model(config.robot)
-    return CellGeometry(model, limits, solids, obstacles, clearance, watched, config.mount)
+    return CellGeometry(arm_model(config.robot), limits, solids, obstacles, clearance, watched, config.mount)
+
+
+def camera_body(parent_from_camera: Array, radius_m: float) -> Capsule:
+    """Make the capsule of a camera, behind its optical centre."""
+    ends = transform_points(parent_from_camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -_CAMERA_BODY_M]]))
+    return Capsule("camera", vector3(ends[0]), vector3(ends[1]), radius_m)
 
 
 def _thicker_m(sigma_m: float) -> float:
@@ -213,52 +197,6 @@ def require_kept_clear(config: StationConfig) -> None:
     if guess is None or drawn or guess.sigma_m <= _MOST_DOUBT_M:
         return
     raise LimitError("guess-too-rough", guess=name, sigma_m=guess.sigma_m, limit_m=_MOST_DOUBT_M)
-
-
-def covers_its_doubt(guess: PoseGuess) -> bool:
-    """Tell whether the thickening covers three sigmas of a pose, without being cut at its largest value."""
-    return _DOUBT * guess.sigma_m <= _MOST_DOUBT_M
-
-
-def camera_radius_m(sigma_m: float) -> float:
-    """Return the radius of the capsule of a camera on the flange whose position has this 1σ."""
-    return _CAMERA_RADIUS_M + _thicker_m(sigma_m)
-
-
-def camera_ends(parent_from_camera: Array) -> Array:
-    """Compute the ends (..., 2, 3) of cameras' bodies behind their optical centres; poses (..., 4, 4)."""
-    return transform_points(parent_from_camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -_CAMERA_BODY_M]]))
-
-
-def camera_body(name: str, parent_from_camera: Array, radius_m: float = _CAMERA_RADIUS_M) -> Capsule:
-    """Make the capsule of a camera, behind its optical centre."""
-    ends = camera_ends(parent_from_camera)
-    return Capsule(name, vector3(ends[0]), vector3(ends[1]), radius_m)
-
-
-def geometry_from(config: StationConfig, standing_rad: ArrayLike) -> CellGeometry:
-    """Make the geometry for checks of a motion that begins at the arm's joints (6,).
-
-    A rough camera pose can put the camera into a part of the arm, which is impossible as the arm stands
-    there. Then the most likely pose without collision is used instead, with the same thickness. A pose that
-    is certain enough (`covers_its_doubt`) is used as it is.
-    """
-    guess, board = config.camera_guess, config.board_guess
-    cell = cell_geometry(config)
-    if guess is None or config.mount != "eye-in-hand" or config.limits.solids or covers_its_doubt(guess):
-        return cell
-    draws = np.random.default_rng(0).normal(size=(_DRAWS, 6))
-    draws[0] = 0.0
-    nearest = draws[np.argsort((draws**2).sum(axis=1))] * np.repeat([guess.sigma_m, guess.sigma_rad], 3)
-    mounts = perturb(guess_matrix(guess), nearest)
-    standing = np.asarray(standing_rad, dtype=float)
-    ends = camera_ends(forward(cell.model, standing) @ mounts)
-    room_m = gap_to_arm(cell, standing, ends[:, 0], ends[:, 1]) - camera_radius_m(guess.sigma_m)
-    roomy = np.flatnonzero(room_m >= SPACING_M)
-    if room_m[0] >= SPACING_M / 2 or len(roomy) == 0:  # the margin that the check of a path needs
-        return cell
-    Y, board_m = (None, 0.0) if board is None else (guess_matrix(board), board.sigma_m)
-    return geometry_of(config, mounts[roomy[0]], Y, guess.sigma_m, board_m)
 
 
 def pose_vector(matrix: Array) -> Vector6:

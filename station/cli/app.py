@@ -36,6 +36,7 @@ STATION = LazyGroup(
             gone={
                 "--foxglove": _PLAN_DRAWN,
                 "--picture": _PLAN_DRAWN,
+                "--start": "`station serve` tells where the arm stands.",
                 "--scene": "Give the cell's --config; without it the paper's simulated cell is planned for.",
                 "--taught": "Write the joints into a plan (robot, mount, poses) and `--check` it.",
                 "--d-optimal": "Leave it out: the poses are chosen for the smallest error.",

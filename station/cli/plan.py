@@ -18,7 +18,7 @@ from recordings.schema.messages import Mount
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, LimitError, StationError
-from station.cell.layout import cell_geometry, geometry_from
+from station.cell.layout import cell_geometry
 from station.cell.limits import PlanCheck, Problem, check_plan
 from station.cell.pose_plan import Plan, plan_sha256
 from station.cell.socket_folder import default_socket
@@ -38,10 +38,6 @@ def plan_command(
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Where plan.yaml goes")] = None,
     check: Annotated[Path | None, typer.Option(help="Check this plan instead of making one")] = None,
-    start: Annotated[
-        str | None,
-        typer.Option(help="Joints where the arm stands, degrees: 0,-90,90,…; without it the daemon is asked"),
-    ] = None,
     poses: Annotated[int, typer.Option(min=3, max=200, help="Poses to plan")] = 25,
     seed: Annotated[int, typer.Option(help="The same seed gives the same plan")] = 0,
     socket: Socket = None,
@@ -55,9 +51,7 @@ def plan_command(
 
     Exit codes: 0 it may be run, 1 the check lists what is wrong, 2 usage or configuration.
     """
-    cell, standing = _cell(config, None if start is None else _joints(start))
-    if config is not None and standing is None:
-        standing = _asked_standing(cell, socket or default_socket())
+    cell, standing = _simulated() if config is None else _configured(config, socket or default_socket())
     if check is not None:
         plan = load_plan(check)
     else:
@@ -77,8 +71,7 @@ def plan_command(
             )
         if output is not None:
             save_plan(plan, output)
-    geometry = cell_geometry(cell) if standing is None else geometry_from(cell, standing)
-    outcome = check_plan(plan, standing, geometry)
+    outcome = check_plan(plan, standing, cell_geometry(cell))
     if as_json:
         print_json(_summary(plan, outcome))
     else:
@@ -99,44 +92,29 @@ def _require_replaceable(output: Path) -> None:
             raise ConfigError("target-exists", path=output) from None
 
 
-def _cell(config: Path | None, standing: list[float] | None) -> tuple[StationConfig, list[float] | None]:
-    """The cell to plan for, and where its arm stands."""
-    if config is not None:
-        return load_config(config)[0], standing
+def _simulated() -> tuple[StationConfig, list[float]]:
+    """The paper's cell, and where its arm stands."""
     # Simulation is loaded only where it is wanted.
     from station.simulation.cells import cell_config, make_cell
 
     truth = make_cell("paper", 0, "low", "eye-in-hand")
-    return cell_config(truth), standing or list(truth.start_joints_rad)
+    return cell_config(truth), list(truth.start_joints_rad)
 
 
-def _asked_standing(cell: StationConfig, socket: Path) -> list[float] | None:
-    """Joints where the arm stands, by the daemon that serves this cell; None, and a line, without one."""
+def _configured(config: Path, socket: Path) -> tuple[StationConfig, list[float] | None]:
+    """The cell of a file, and where its arm stands by the daemon that serves it; None: no daemon tells."""
+    cell, _ = load_config(config)
     with contextlib.suppress(StationError, OSError, TimeoutError):
         status = asyncio.run(asyncio.wait_for(status_now(socket), _ASK_S))
         ours = (status.cell, status.mount) == (cell.name, cell.mount)
         if ours and status.robot.model == cell.robot.model and status.robot.joints_rad is not None:
-            return list(status.robot.joints_rad)
+            return cell, list(status.robot.joints_rad)
     err.print(
         "No daemon tells where the arm stands: the plan begins at its first pose. The way there is checked "
         "before it moves.",
         style="yellow",
     )
-    return None
-
-
-def _joints(text: str) -> list[float]:
-    try:
-        degrees = [float(part) for part in text.replace(";", ",").split(",")]
-    except ValueError:
-        degrees = []
-    if len(degrees) != 6 or not np.isfinite(degrees).all():
-        raise ConfigError(
-            "usage",
-            problem=f"--start {text!r} is no posture",
-            advice="Give six joint angles in degrees, e.g. 0,-90,90,-90,-90,0.",
-        )
-    return [float(np.deg2rad(angle)) for angle in degrees]
+    return cell, None
 
 
 class PlanJson(msgspec.Struct, frozen=True):

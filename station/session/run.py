@@ -19,7 +19,7 @@ from station.cell.errors import (
     StationError,
     TriggerError,
 )
-from station.cell.layout import geometry_from
+from station.cell.layout import cell_geometry
 from station.cell.limits import check_path, with_plan_speeds
 from station.cell.status import Event, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError
@@ -59,8 +59,7 @@ class Run:
         self._tried_again = False
 
     def _cell_geometry(self) -> CellGeometry:
-        geometry = geometry_from(self._context.cell.config, self._go.start_joints_rad)
-        return with_plan_speeds(geometry, self._queue.plan)
+        return with_plan_speeds(cell_geometry(self._context.cell.config), self._queue.plan)
 
     async def drive(self) -> None:
         """Carry out the approval, ending in paused, stopped, fault or idle; raises only when cancelled."""

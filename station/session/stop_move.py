@@ -17,7 +17,7 @@ from recordings.schema.messages import Vector6
 from station.cell.arm_acceptance import STOP_GIVEN, STOP_TESTED, StopTestMove, StopWay
 from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError, RobotError, SafetyStopError, StaleStateError
-from station.cell.layout import geometry_from, pose_at
+from station.cell.layout import cell_geometry, pose_at
 from station.cell.limits import MoveCheck, check_path, check_plan, slower
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState
@@ -68,7 +68,7 @@ async def stop_motion(context: SessionContext, test: StopTest) -> Motion:
 def _free_move(context: SessionContext, test: StopTest, start: Vector6) -> Plan:
     """Plan the first turn with a free path; longer turns, and the wanted direction, are tried first."""
     config = context.cell.config
-    geometry = slower(geometry_from(config, start), test.speed_m_s)
+    geometry = slower(cell_geometry(config), test.speed_m_s)
     joint, refused = JOINT_NAMES[test.joint], ""
 
     def turned(turn_rad: float) -> tuple[Vector6, MoveCheck]:

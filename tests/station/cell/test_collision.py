@@ -13,7 +13,6 @@ from station.cell.collision import (
     ARM_BODIES,
     CellGeometry,
     body_segments,
-    gap_to_arm,
     margins,
     moving_points,
     plate,
@@ -120,9 +119,6 @@ def test_margins_are_distances_less_radii_and_clearance():
     column = frames[0, :3, 3] + share * (frames[1, :3, 3] - frames[0, :3, 3])
     apart_m = np.linalg.norm(along_camera[:, None] - column[None], axis=2).min()
     assert margin["base column", "camera", "self"] == pytest.approx(apart_m - 0.09 - 0.04, abs=1e-3)
-    assert gap_to_arm(
-        CellGeometry(MODELS["UR10"], LimitsConfig()), UPRIGHT, along_camera[:1], along_camera[-1:]
-    )[0] == pytest.approx(min(margin[body, "camera", "self"] for body in ARM_BODIES[:5]) + 0.04)
 
 
 def test_the_workspace_box_holds_for_flange_and_camera():

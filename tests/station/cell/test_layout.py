@@ -10,9 +10,9 @@ import pytest
 
 from calibrate.geometry import pose, rotation_exp, transform_points
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
-from station.cell.collision import segment_distance
+from station.cell.collision import CellGeometry, segment_distance
 from station.cell.config import Capsule, PoseGuess
-from station.cell.layout import cell_geometry, geometry_of, require_kept_clear
+from station.cell.layout import cell_geometry, guess_from, require_kept_clear
 from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
 
@@ -27,6 +27,14 @@ def config_of(mount: Mount, **changes: Any) -> Any:
     config = msgspec.structs.replace(cell_config(make_cell(mount=mount)), board=BOARD, mount=mount)
     limits = msgspec.structs.replace(config.limits, clearance_m=0.03, board_clearance_m=0.1, solids=())
     return msgspec.structs.replace(config, **({"limits": limits} | changes))
+
+
+def geometry_of(
+    config: Any, X: Any, Y: Any, camera_doubt_m: float = 0.0, board_doubt_m: float = 0.0
+) -> CellGeometry:
+    board = None if Y is None else guess_from(Y, board_doubt_m, 0.0)
+    camera = guess_from(X, camera_doubt_m, 0.0)
+    return cell_geometry(msgspec.structs.replace(config, camera_guess=camera, board_guess=board))
 
 
 def covers(rods: tuple[Capsule, ...], place: Any) -> bool:

@@ -143,7 +143,6 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
         (("capture", "--plan", "absent.yaml"), 2, "unreadable-plan"),
         (("tui",), 1, "no-terminal"),
         (("demo", "--out", __file__), 2, "not-a-folder"),
-        (("plan", "--start", "1,2,3"), 2, "usage"),
         (("plan", "--taught", "b"), 2, "gone"),
         (("plan", "--from-list", "b"), 2, "gone"),
         (("bootstrap", "--config", "absent.yaml"), 2, "gone"),

@@ -137,7 +137,7 @@ async def test_a_run_that_cannot_be_made_leaves_the_station_at_rest(
     def broken(*_: object) -> None:
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(run, "geometry_from", broken)
+    monkeypatch.setattr(run, "cell_geometry", broken)
     with pytest.raises(ZeroDivisionError):
         await rig.session.go(1, summary.token)
     assert rig.state is S.IDLE and rig.session.store.status.go is None

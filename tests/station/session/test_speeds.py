@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from station.cell.config import SPEED_CAP_M_S
-from station.cell.layout import geometry_from
+from station.cell.layout import cell_geometry
 from station.cell.limits import check_path, point_speed_m_s, sample_path, with_plan_speeds
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
-from tests.station.session_rig import POSES, TRUTH, Rig
+from tests.station.session_rig import POSES, Rig
 
 
 @pytest.mark.parametrize("joint_speed_rad_s", [10.0, 0.2])
@@ -34,7 +34,7 @@ async def test_no_modelled_point_is_driven_faster_than_the_cap_nor_a_joint_than_
     await rig.until(S.IDLE)
     assert len(moves) == POSES
     config = rig.session.context.cell.config
-    geometry = with_plan_speeds(geometry_from(config, TRUTH.start_joints_rad), plan)
+    geometry = with_plan_speeds(cell_geometry(config), plan)
     for start, target, speed_rad_s, acceleration_rad_s2 in moves:
         checked = check_path(geometry, start, target)
         asked = (speed_rad_s, acceleration_rad_s2)

@@ -10,9 +10,7 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.detect import Detection, detect
-from calibrate.boards.printing import board_sheet
 from calibrate.geometry import Array
-from recordings.files import ASKED_FOR, write_atomically
 from recordings.schema.messages import BoardSpec, Image, Mount, RobotState
 from station.cell.errors import RobotError, StationError
 from station.cell.layout import flange_pose
@@ -31,7 +29,7 @@ from station.operate.guided_views import (
 GREY_WANTED = 110.0
 """Mean grey of a well exposed image of paper and table, of 255."""
 EXPOSURE_US = (50.0, 200_000.0)
-_LOOKED_FOR = (CellStep.BOARD, CellStep.VIEWS, CellStep.LIMITS)
+_LOOKED_FOR = (CellStep.BOARD, CellStep.VIEWS)
 
 
 class CellSetup:
@@ -89,10 +87,7 @@ class CellSetup:
             await self.arm.close()
         self.arm = arm
         same = self.draft.robot is not None and self.draft.robot.serial == arm.identity.serial
-        changed = {"host": host, "robot": arm.identity}
-        self.keep(
-            msgspec.structs.replace(self.draft, **changed) if same else self.draft.without_views(**changed)
-        )
+        self._found(same, host=host, robot=arm.identity)
 
     async def look_for_cameras(self) -> bool:
         """Search for cameras; True when the list changed. A single one is opened at once."""
@@ -113,17 +108,14 @@ class CellSetup:
             await self.camera.close()
         self.camera = camera
         height, width = image.pixels.shape[:2]
-        values = {"camera": chosen, "width": width, "height": height, "exposure_us": camera.exposure_us}
-        same = self.draft.camera == chosen
+        same, exposure_us = self.draft.camera == chosen, camera.exposure_us
+        self._found(same, camera=chosen, width=width, height=height, exposure_us=exposure_us)
+
+    def _found(self, same: bool, **values: object) -> None:
+        """Keep what a device tells; views of another device count no more."""
         self.keep(
             msgspec.structs.replace(self.draft, **values) if same else self.draft.without_views(**values)
         )
-
-    async def expose(self, factor: float) -> None:
-        """Change the exposure by a factor. Raises CameraError."""
-        if self.camera is not None:
-            await self.camera.expose(float(np.clip(factor * self.camera.exposure_us, *EXPOSURE_US)))
-            self.change(exposure_us=self.camera.exposure_us)
 
     def read_arm(self) -> None:
         """Take the newest state; none while the arm does not answer."""
@@ -160,28 +152,19 @@ class CellSetup:
             raise StationError("no-view", reason=problem)
         assert self.state is not None and self.arm is not None and self.seen is not None
         view = guided_view(self.state, self.arm.identity.tcp_offset, self.seen[1])
-        self.change(views=(*self.draft.views, view), limits_seen=False)
+        self.change(views=(*self.draft.views, view))
 
     def drop_view(self) -> None:
-        self.change(views=self.draft.views[:-1], limits_seen=False, written="")
+        self.change(views=self.draft.views[:-1], written="")
 
     def set_mount(self) -> None:
         """Save the selected mounting."""
         if self.draft.mount != self.mount:
-            self.change(mount=self.mount, limits_seen=False, written="")
+            self.change(mount=self.mount, written="")
 
     def set_board(self, board: BoardSpec) -> None:
         self.seen = None
         self.keep(self.draft.without_views(board=board))
-
-    def print_board(self) -> Path:
-        """Write the board as a PDF beside the draft. Raises StationError, BoardError, OSError."""
-        board = self.draft.board
-        if board is None:
-            raise StationError("board-missing")
-        name = f"board-{board.kind.value}-{board.columns}x{board.rows}-{1000 * board.square_m:g}mm.pdf"
-        write_atomically(self.root / name, board_sheet(board).encode("pdf"), ASKED_FOR)
-        return self.root / name
 
     async def stop(self) -> None:
         if self.arm is not None:

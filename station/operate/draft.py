@@ -24,7 +24,6 @@ class CellStep(StrEnum):
     MOUNTING = "mounting"
     BOARD = "board"
     VIEWS = "views"
-    LIMITS = "limits"
     SAVE = "save"
 
 
@@ -114,13 +113,12 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
     views: tuple[GuidedView, ...] = ()
     table_m: float | None = None
     """Height of the table in `base`; None: derived from the board."""
-    limits_seen: bool = False
     written: str = ""
     """Path of the written configuration; empty: not written yet."""
 
     def without_views(self, **changes: object) -> Draft:
         """Return the draft with changes, and without the views, which they invalidate."""
-        return msgspec.structs.replace(self, views=(), limits_seen=False, written="", **changes)
+        return msgspec.structs.replace(self, views=(), written="", **changes)
 
 
 def load_draft(root: Path) -> Draft:

@@ -69,9 +69,7 @@ def next_step(draft: Draft) -> CellStep:
         return CellStep.MOUNTING
     if draft.board is None:
         return CellStep.BOARD
-    if not enough(draft):
-        return CellStep.VIEWS
-    return CellStep.SAVE if draft.limits_seen else CellStep.LIMITS
+    return CellStep.SAVE if enough(draft) else CellStep.VIEWS
 
 
 def summary(draft: Draft, step: CellStep) -> str:
@@ -87,8 +85,6 @@ def summary(draft: Draft, step: CellStep) -> str:
             return board_words(draft.board)
         case CellStep.VIEWS if draft.views:
             return f"{len(draft.views)} of {max(FEWEST_GUIDED, len(draft.views))}"
-        case CellStep.LIMITS if draft.limits_seen:
-            return "set"
         case CellStep.SAVE if draft.written:
             return Path(draft.written).name
     return ""

@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 from rich.text import Text
-from textual import events, work
+from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical, VerticalScroll
@@ -20,9 +20,7 @@ from textual.reactive import reactive
 from textual.widgets import Footer, Input, OptionList, Static
 from textual.widgets.option_list import Option
 
-from calibrate.boards.detect import Detection
 from recordings.errors import CodedError
-from recordings.schema.messages import Image
 from station.analysis.worker import preview_image
 from station.cell.errors import StationError
 from station.operate import new_cell as flow
@@ -30,7 +28,7 @@ from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
 from station.operate.guided_views import enough
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
-from station.tui.new_cell_steps import DRAWINGS, STEP_ACTIONS, SavePage, StepPage, pages
+from station.tui.new_cell_steps import DRAWINGS, PAGES, about, accept, file_text, live_lines, next_of, typed
 from station.tui.task import Step
 from station.tui.themes import ThemedApp
 from station.tui.widgets.preview import PreviewPane
@@ -41,6 +39,14 @@ Ending = Literal["", "serve", "rehearse"]
 ARM_PERIOD_S, CAMERA_PERIOD_S, LOOK_S = 0.1, 0.15, 1.0
 SHOWN_WIDTH_PX = 640
 NO_CAMERA = "No camera answers. Check its power, cable and network; this list refreshes every few seconds."
+ONLY_IN = {
+    "other_mount": CellStep.MOUNTING,
+    "take": CellStep.VIEWS,
+    "drop": CellStep.VIEWS,
+    "table_here": CellStep.SAVE,
+    "rehearse": CellStep.SAVE,
+}
+"""Actions that have a key in one step only."""
 
 
 class NewCell(ThemedApp[Ending]):
@@ -57,9 +63,6 @@ class NewCell(ThemedApp[Ending]):
         Binding("left,right", "other_mount", "Other drawing"),
         Binding("f2", "take", "Take view", tooltip="Take this view now"),
         Binding("f3", "drop", "Drop view", tooltip="Take the last view away"),
-        Binding("f4", "print_board", "Print board", tooltip="Write the board as a PDF"),
-        Binding("f5", "expose(0.7)", "Darker"),
-        Binding("f6", "expose(1.4)", "Brighter"),
         Binding("f7", "table_here", "Table here", tooltip="The table is as high as the tool now"),
         Binding("f9", "rehearse", "Rehearse", tooltip="Run the whole job with this cell in simulation"),
         Binding("escape", "leave", "Leave", tooltip="Leave; what was found is kept"),
@@ -69,7 +72,6 @@ class NewCell(ThemedApp[Ending]):
     def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
         super().__init__()
         self.setup = CellSetup(hardware, root, output)
-        self._pages = pages(self.setup)
         self._pictures = 0
 
     def compose(self) -> ComposeResult:
@@ -93,15 +95,11 @@ class NewCell(ThemedApp[Ending]):
                 yield Static(id="written", markup=False)
         yield Footer()
 
-    async def on_mount(self) -> None:
+    def on_mount(self) -> None:
         self.watch_step()
-        self.watch_arm()
-        self.watch_camera()
+        self.set_interval(ARM_PERIOD_S, self.look_at_arm)
+        self.look_at_camera()
         self.resume()
-
-    @property
-    def page(self) -> StepPage:
-        return self._pages[self.step]
 
     @work(group="accept", exit_on_error=False)
     async def resume(self) -> None:
@@ -109,7 +107,7 @@ class NewCell(ThemedApp[Ending]):
         draft = self.setup.draft
         with self._problems():
             if draft.host:
-                self._say_live(f"Asking {draft.host} …")
+                self._say("#live-lines", f"Asking {draft.host} …")
                 await self.setup.connect(draft.host)
             if draft.camera is not None:
                 await self.setup.open(draft.camera)
@@ -117,16 +115,13 @@ class NewCell(ThemedApp[Ending]):
 
     # --- what the devices show ---
 
-    @work(group="arm", exit_on_error=False)
-    async def watch_arm(self) -> None:
-        while True:
-            await asyncio.sleep(ARM_PERIOD_S)
-            if self.setup.arm is not None:
-                self.setup.read_arm()
-                self._show()
+    def look_at_arm(self) -> None:
+        if self.setup.arm is not None:
+            self.setup.read_arm()
+            self._show()
 
     @work(group="camera", exit_on_error=False)
-    async def watch_camera(self) -> None:
+    async def look_at_camera(self) -> None:
         while True:
             await asyncio.sleep(CAMERA_PERIOD_S)
             try:
@@ -135,16 +130,15 @@ class NewCell(ThemedApp[Ending]):
                 elif self.step is CellStep.CAMERA:
                     await self._look_for_cameras()
             except StationError as problem:
-                self._say_problem(str(problem))
+                self._say("#problem", str(problem))
                 await asyncio.sleep(LOOK_S)
 
     async def _look_for_cameras(self) -> None:
         changed = await self.setup.look_for_cameras()
-        self._say_problem("" if self.setup.cameras else NO_CAMERA)
+        self._say("#problem", "" if self.setup.cameras else NO_CAMERA)
         if changed:
             choice = self.query_one("#choice", OptionList)
-            choice.clear_options()
-            choice.add_options([Option(camera.name) for camera in self.setup.cameras])
+            choice.set_options([Option(camera.name) for camera in self.setup.cameras])
             choice.highlighted = 0 if self.setup.cameras else None
             if self.step is CellStep.CAMERA:
                 choice.focus()
@@ -157,19 +151,14 @@ class NewCell(ThemedApp[Ending]):
         if image is None:
             return
         found = await asyncio.to_thread(self.setup.look, begun_s, image, step)
-        await self._show_picture(image, found)
+        pane = self.query_one(PreviewPane)
+        if pane.display:
+            self._pictures += 1
+            corners = np.zeros((0, 2)) if found is None else found.pixels
+            pane.show(preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures))
         if step is self.step is CellStep.VIEWS and self.setup.new_view():
             self._add_view()
         self._show()
-
-    async def _show_picture(self, image: Image, found: Detection | None) -> None:
-        pane = self.query_one(PreviewPane)
-        if not pane.display:
-            return
-        self._pictures += 1
-        corners = np.zeros((0, 2)) if found is None else found.pixels
-        preview = preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures)
-        pane.show(preview)
 
     def _add_view(self) -> None:
         self.setup.take_view()
@@ -180,12 +169,12 @@ class NewCell(ThemedApp[Ending]):
 
     def _tell_found(self) -> None:
         found = self.setup.found
-        self._say_problem("" if found is None else found.warning)
+        self._say("#problem", "" if found is None else found.warning)
 
     # --- keys ---
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        return action in self.page.actions or action not in STEP_ACTIONS
+        return ONLY_IN.get(action, self.step) is self.step
 
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
@@ -200,8 +189,7 @@ class NewCell(ThemedApp[Ending]):
 
     def action_go(self, by: int) -> None:
         at = STEPS.index(self.step) + by
-        reached = STEPS.index(flow.next_step(self.setup.draft))
-        if 0 <= at <= min(reached, len(STEPS) - 1):
+        if 0 <= at <= STEPS.index(flow.next_step(self.setup.draft)):
             self.step = STEPS[at]
 
     def action_other_mount(self) -> None:
@@ -216,18 +204,18 @@ class NewCell(ThemedApp[Ending]):
 
     @work(group="accept", exclusive=True, exit_on_error=False)
     async def action_accept(self, chosen: CameraChoice | None = None) -> None:
-        page = self.page
-        if page.working:
-            self._say_live(page.working)
+        step = self.step
+        if step is CellStep.ROBOT:
+            self._say("#live-lines", "Asking the controller …")
         with self._problems():
             if chosen is not None:
                 await self.setup.open(chosen)
-            if not await page.accept(self.query_one("#typed", Input).value.strip()):
+            if not await accept(self.setup, step, self.query_one("#typed", Input).value.strip()):
                 self.watch_step()
-            elif page.step is CellStep.SAVE:
+            elif step is CellStep.SAVE:
                 self.exit("serve")
             else:
-                self.step = STEPS[STEPS.index(page.step) + 1]
+                self.step = STEPS[STEPS.index(step) + 1]
 
     def action_rehearse(self) -> None:
         if self.setup.draft.written:
@@ -245,46 +233,34 @@ class NewCell(ThemedApp[Ending]):
         self.setup.drop_view()
         self._tell_found()
 
-    @work(group="print", exclusive=True, exit_on_error=False)
-    async def action_print_board(self) -> None:
-        with self._problems():
-            path = await asyncio.to_thread(self.setup.print_board)
-            how = "Print it at 100 %, glue it to something flat, and measure one square."
-            self.notify(f"Written: {path}. {how}", timeout=20)
-
-    @work(group="expose", exclusive=True, exit_on_error=False)
-    async def action_expose(self, factor: float) -> None:
-        with self._problems():
-            await self.setup.expose(factor)
-
     def action_table_here(self) -> None:
         if self.setup.state is not None:
-            self.setup.change(table_m=float(self.setup.state.tcp_pose[2]))
+            self.setup.change(table_m=float(self.setup.state.tcp_pose[2]), written="")
             self.watch_step()
 
     # --- what is shown ---
 
-    def on_resize(self, event: events.Resize) -> None:
+    def on_resize(self) -> None:
         self.call_after_refresh(self._show)
 
     def watch_step(self) -> None:
-        page = self.page
-        self.query_one("#title", Static).update(page.title)
-        self.query_one("#about", Static).update(page.about)
+        setup, page = self.setup, PAGES[self.step]
+        self._say("#title", page.title)
+        self._say("#about", about(setup, self.step))
         for part in ("#typed", "#choice", "#drawings", "#picture", "#text"):
             self.query_one(part).display = part in page.parts
         for mount in DRAWINGS:
-            self.query_one(f"#{mount}").set_class(mount == self.setup.mount, "chosen")
-        typed = self.query_one("#typed", Input)
-        typed.value, typed.placeholder = page.typed, page.placeholder
-        if typed.display:
-            typed.focus()
-        elif self.step is CellStep.CAMERA and self.setup.cameras:
+            self.query_one(f"#{mount}").set_class(mount == setup.mount, "chosen")
+        line = self.query_one("#typed", Input)
+        line.value, line.placeholder = typed(setup, self.step), page.placeholder
+        if line.display:
+            line.focus()
+        elif self.step is CellStep.CAMERA and setup.cameras:
             self.query_one("#choice").focus()
         else:
             self.set_focus(None)
-        if isinstance(page, SavePage):
-            self.query_one("#written", Static).update(Text(page.text()))
+        if self.step is CellStep.SAVE:
+            self.query_one("#written", Static).update(Text(file_text(setup)))
         self._tell_found()
         self._show()
         self.refresh_bindings()
@@ -302,25 +278,28 @@ class NewCell(ThemedApp[Ending]):
             bar.append(Content.styled(f"  {who.model} {who.serial}", "bold $strong"))
             bar.append(dim(f"  {setup.arm.trouble() or 'ready'}"))
         bar.append(dim("  Your hand moves the arm, never this wizard."))
-        self.query_one("#bar", Static).update(fitting(bar, width))
-        self.query_one("#rail", Static).update(rail_line(self._rail(), self.step, width))
-        self.query_one("#next", Static).update(next_line(self.page.next, width))
-        self._say_live("\n".join(self.page.live()))
+        self._say("#bar", fitting(bar, width))
+        self._say("#rail", rail_line(self._rail(), self.step, width))
+        self._say("#next", next_line(next_of(setup, self.step), width))
+        self._say("#live-lines", "\n".join(live_lines(setup, self.step)))
 
     def _rail(self) -> tuple[Step, ...]:
         draft = self.setup.draft
-        reached = STEPS.index(flow.next_step(draft))
-        done = [
-            number < reached or (step is CellStep.SAVE and bool(draft.written))
-            for number, step in enumerate(STEPS)
-        ]
+        reached = STEPS.index(flow.next_step(draft)) + bool(draft.written)
         return tuple(
-            Step(step, "now" if step is self.step else "done" if was else "todo", flow.summary(draft, step))
-            for step, was in zip(STEPS, done, strict=True)
+            Step(
+                step,
+                "now" if step is self.step else "done" if number < reached else "todo",
+                flow.summary(draft, step),
+            )
+            for number, step in enumerate(STEPS)
         )
 
-    def _say_live(self, text: str) -> None:
-        self.query_one("#live-lines", Static).update(text)
+    def _say(self, selector: str, text: str | Content) -> None:
+        part = self.query_one(selector, Static)
+        part.update(text)
+        if selector == "#problem":
+            part.display = bool(text)
 
     @contextmanager
     def _problems(self) -> Iterator[None]:
@@ -328,12 +307,7 @@ class NewCell(ThemedApp[Ending]):
         try:
             yield
         except (CodedError, OSError) as problem:
-            self._say_problem(str(problem))
-
-    def _say_problem(self, text: str) -> None:
-        problem = self.query_one("#problem", Static)
-        problem.display = bool(text)
-        problem.update(text)
+            self._say("#problem", str(problem))
 
     async def on_unmount(self) -> None:
         await self.setup.close()

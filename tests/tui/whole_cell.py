@@ -75,9 +75,7 @@ def main(folder: Path) -> None:
             for count, joints in enumerate(guided_joints(truth)[1:4], start=2):
                 with controller.admin() as admin:
                     admin.ask("hand_move", path=[joints.tolist()], speed_rad_s=0.5)
-                person.sees("✓" * count + "○" if count < 4 else "Where may the arm move")
-            person.press("enter")
-            person.sees("Write the file")
+                person.sees("✓" * count + "○" if count < 4 else "Write the file")
             person.press("enter")
             person.sees("Open this cell")
             person.press("enter")

@@ -96,7 +96,7 @@ def test_it_is_taken_up_where_it_was_left(done: tuple[Draft, object], tmp_path: 
     assert flow.next_step(drafts.load_draft(tmp_path)) is CellStep.ROBOT
     drafts.save_draft(tmp_path, draft)
     again = drafts.load_draft(tmp_path)
-    assert again == draft and flow.next_step(again) is CellStep.LIMITS
+    assert again == draft and flow.next_step(again) is CellStep.SAVE
     assert flow.next_step(draft.without_views(board=draft.board)) is CellStep.VIEWS
     (tmp_path / drafts.DRAFT_FILE).write_text("{")
     assert drafts.load_draft(tmp_path) == Draft()

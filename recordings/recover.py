@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+from mcap.records import Channel, Schema
 from mcap.writer import Writer
 
 from recordings.errors import (
@@ -27,12 +29,19 @@ from recordings.files import (
     sync_folder,
 )
 from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
+from recordings.mcap.contents import Contents
 from recordings.mcap.output import OutputFile
 from recordings.mcap.records import with_crc
 from recordings.mcap.salvage import Salvage, salvage
-from recordings.schema.definitions import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
+from recordings.schema.definitions import (
+    CHANNEL_RECORDS,
+    RECOVERY_RECORD,
+    SESSION_RECORDS,
+    SchemaError,
+    decode,
+)
 from recordings.schema.messages import SessionInfo, View
-from recordings.schema.topics import Topic, identify
+from recordings.schema.topics import Topic, schema_bytes, schema_name
 from recordings.segment import RecordingSegment
 
 DAMAGED_SUFFIX = ".damaged"
@@ -213,8 +222,9 @@ def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment
 
     Raises _NothingToSaveError, RecordingError, or OSError when the disk fails.
     """
-    found = salvage(descriptor, identify)
+    found = salvage(descriptor)
     metadata = found.contents.metadata
+    _declare_by_records(found.contents)
     session = next((metadata[name] for name in SESSION_RECORDS if name in metadata), None)
     if session is None:
         size = os.fstat(descriptor).st_size
@@ -232,36 +242,55 @@ def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment
         raise RecordingError("unrecoverable", path=source, reason=error.text) from error
 
 
+def _declare_by_records(contents: Contents) -> None:
+    """Declare the channels of this station whose declaration is lost with its chunk."""
+    for name, record in contents.metadata.items():
+        number = name.removeprefix(CHANNEL_RECORDS)
+        if number != name and number.isdecimal() and int(number) not in contents.channels:
+            topic = Topic(record["topic"])
+            schema = Schema(-int(number), schema_bytes(topic), "protobuf", schema_name(topic))
+            contents.schemas[schema.id] = schema
+            contents.channels[int(number)] = Channel(int(number), topic.value, "protobuf", {}, schema.id)
+
+
 def _orphans(found: Salvage) -> set[int]:
-    """Numbers of the messages that lost their partner, an image its facts or a view its image.
+    """Numbers of the messages that lost their partner: a channel, an image its facts, a view its image.
 
     They are told as losses. Messages are counted as `found.messages` yields them.
     """
-    topics = {number: channel.topic for number, channel in found.contents.channels.items()}
     facts: dict[int, int] = {}
     images: dict[int, int] = {}
-    views: list[tuple[int, bytes]] = []
+    views: dict[int, bytes] = {}
+    dropped: set[int] = set()
+    nameless: Counter[int] = Counter()
     for number, message in enumerate(found.messages()):
-        match topics.get(message.channel_id):
+        channel = found.contents.channels.get(message.channel_id)
+        match channel and channel.topic:
+            case None:
+                dropped.add(number)
+                nameless[message.channel_id] += len(message.data)
             case Topic.PICTURE_FACTS:
                 facts[message.sequence] = number
             case Topic.RAW_IMAGE | Topic.COMPRESSED_IMAGE:
                 images[message.sequence] = number
             case Topic.VIEW:
-                views.append((number, message.data))
-    halves = facts.keys() ^ images.keys()
-    dropped = {table[sequence] for table in (facts, images) for sequence in halves & table.keys()}
-    found.losses += [f"image {sequence} is incomplete" for sequence in sorted(halves)]
-    for number, data in views:
+                views[number] = message.data
+    for channel_id, size_bytes in nameless.items():
+        found.lose(size_bytes, f"nothing says what the messages of channel {channel_id} are")
+    for sequence in sorted(facts.keys() ^ images.keys()):
+        dropped.add({**facts, **images}[sequence])
+        found.losses.append(f"image {sequence} is incomplete")
+    for number, data in views.items():
         try:
             view = decode(View, data)
         except SchemaError:
-            dropped.add(number)
-            found.losses.append(f"message {number}, a view, cannot be read")
-            continue
-        if view.picture_sequence not in facts.keys() & images.keys():
-            dropped.add(number)
-            found.losses.append(f"pose {view.index + 1} (attempt {view.attempt}) lost its image")
+            said = f"message {number}, a view, cannot be read"
+        else:
+            if view.picture_sequence in facts.keys() & images.keys():
+                continue
+            said = f"pose {view.index + 1} (attempt {view.attempt}) lost its image"
+        dropped.add(number)
+        found.losses.append(said)
     return dropped
 
 
@@ -279,9 +308,9 @@ def _write(writer: Writer, found: Salvage, session: dict[str, str], dropped: set
         writer.add_attachment(kept.create_time, kept.log_time, kept.name, kept.media_type, kept.data)
     numbers: dict[int, int] = {}
     for number, message in enumerate(found.messages()):
-        channel = contents.channels.get(message.channel_id)
-        if channel is None or number in dropped:
+        if number in dropped:
             continue
+        channel = contents.channels[message.channel_id]
         if channel.id not in numbers:
             schema = contents.schema_of(channel)
             declared = writer.register_schema(schema.name, schema.encoding, schema.data)

@@ -16,7 +16,7 @@ from recordings.errors import BadImageError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name, open_file
 from recordings.images import ImageError, Pixels, decode_image, raw_array
 from recordings.manifest import PARTS_LIMIT
-from recordings.mcap.contents import MessageIndex, joined
+from recordings.mcap.contents import MessageIndex
 from recordings.mcap.records import BadRecordError, require_crc
 from recordings.mcap.scan import scan_file
 from recordings.mcap.source import ShortFileError
@@ -56,9 +56,7 @@ class RecordingSegment:
             self.size_bytes = os.fstat(self._descriptor).st_size
             self._contents, self._source, self.sha256 = scan_file(self._descriptor, path)
             self.info = self._session_info()
-            self.foreign: dict[str, MessageIndex] = {}
-            """By topic: what other programs added."""
-            self._topics = self._check_channels()
+            self._check_channels()
             self.lost_bytes = self._recovery_loss()
             self.attachments = self._checked_attachments()
             self._facts = self._index_images(Topic.PICTURE_FACTS)
@@ -80,7 +78,12 @@ class RecordingSegment:
 
     def messages(self, topic: Topic) -> MessageIndex:
         """List the places of a topic's messages, with their times; empty when there are none."""
-        return self._topics.get(topic, MessageIndex())
+        return self._contents.messages.get(topic, MessageIndex())
+
+    @property
+    def foreign(self) -> dict[str, MessageIndex]:
+        """By topic: what other programs added."""
+        return {name: index for name, index in self._contents.messages.items() if name not in set(Topic)}
 
     def robot_states(self) -> Iterator[RobotState]:
         return self._decoded(Topic.ROBOT_STATE, RobotState)
@@ -175,17 +178,12 @@ class RecordingSegment:
     def _unusable(self, reason: str) -> CorruptRecordingError:
         return CorruptRecordingError("contradiction", path=self.path, reason=reason)
 
-    def _check_channels(self) -> dict[Topic, MessageIndex]:
-        """Known topics with exactly the meaning this version knows; the others are `foreign`."""
-        names = {topic.value: topic for topic in Topic}
-        found: dict[Topic, list[MessageIndex]] = {}
-        for number, channel in self._contents.channels.items():
-            index = self._contents.messages[number]
-            topic = names.get(channel.topic)
-            if topic is None:
-                self.foreign[channel.topic] = index
+    def _check_channels(self) -> None:
+        """Known topics have exactly the meaning that this version knows."""
+        for channel in self._contents.channels.values():
+            if channel.topic not in set(Topic):
                 continue
-            schema = self._contents.schema_of(channel)
+            topic, schema = Topic(channel.topic), self._contents.schema_of(channel)
             meaning = (channel.message_encoding, schema.encoding, schema.name)
             if meaning != ("protobuf", "protobuf", schema_name(topic)):
                 difference = f"it holds {schema.name[:60]}, not {schema_name(topic)}"
@@ -198,8 +196,6 @@ class RecordingSegment:
                 raise CorruptRecordingError(
                     "other-schema", path=self.path, topic=topic.value, difference=difference
                 )
-            found.setdefault(topic, []).append(index)
-        return {topic: joined(indexes) for topic, indexes in found.items()}
 
     def _session_info(self) -> SessionInfo:
         record = self._contents.metadata.get(SESSION_RECORDS[0], {})

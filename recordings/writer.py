@@ -26,7 +26,7 @@ from recordings.mcap.output import OutputFile
 from recordings.mcap.records import with_crc
 from recordings.scene import Entity, scene_update
 from recordings.schema import viewing
-from recordings.schema.definitions import FORMATS, SESSION_RECORDS, PictureFacts, encode
+from recordings.schema.definitions import CHANNEL_RECORDS, FORMATS, SESSION_RECORDS, PictureFacts, encode
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
@@ -153,10 +153,12 @@ class RecordingWriter:
             self._copy_session()
 
     def _copy_session(self) -> None:
-        """Behind the first view: a lost page at the file's beginning does not reach it."""
+        """Behind the first view, with the channels so far: a lost page at the beginning does not reach it."""
         if self._session:
             self._mcap.add_metadata(SESSION_RECORDS[1], self._session)
             self._session = {}
+            for topic in self._channels:
+                self._name_channel(topic)
 
     def marks(self, sequence: int, marks: Sequence[viewing.Marks], text: str = "") -> None:
         """Write marks that viewers draw over an image: corners, residuals. Nothing for an unknown image."""
@@ -276,7 +278,13 @@ class RecordingWriter:
         schema = self._mcap.register_schema(schema_name(topic), "protobuf", schema_bytes(topic))
         number = self._mcap.register_channel(topic.value, "protobuf", schema)
         self._channels[topic] = _Channel(number)
+        if not self._session:
+            self._name_channel(topic)
         return self._channels[topic]
+
+    def _name_channel(self, topic: Topic) -> None:
+        name = f"{CHANNEL_RECORDS}{self._channels[topic].number}"
+        self._mcap.add_metadata(name, with_crc({"topic": topic.value}))
 
     @contextmanager
     def _disk(self) -> Iterator[None]:

@@ -133,12 +133,14 @@ class _McapBag:
                 done += source.size_bytes
                 if SESSION_RECORDS[0] in contents.metadata:
                     raise ImportSourceError("a-recording", path=path)
-                for number, channel in contents.channels.items():
+                declared: dict[str, tuple[str, str]] = {}
+                for channel in contents.channels.values():
                     schema, encoding = contents.schema_of(channel).name, channel.message_encoding
                     if encoding == CDR and "/msg/" not in schema:  # as some bridges write it
                         schema = "/msg/".join(schema.split("/", 1))
-                    count = len(contents.messages[number])
-                    self.declared.append((channel.topic, encoding, schema, count))
+                    declared[channel.topic] = encoding, schema
+                for topic, (encoding, schema) in declared.items():
+                    self.declared.append((topic, encoding, schema, len(contents.messages[topic])))
         except BaseException:
             self.close()
             raise
@@ -159,10 +161,8 @@ class _McapBag:
 
     def _addresses(self, topic: str) -> Iterator[tuple[Source, int]]:
         for contents, source in self._files:
-            for number, channel in contents.channels.items():
-                if channel.topic == topic:
-                    for address in contents.messages[number].addresses:
-                        yield source, address
+            for address in contents.messages[topic].addresses if topic in contents.messages else ():
+                yield source, address
 
 
 class _RosBag:

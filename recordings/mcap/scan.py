@@ -14,12 +14,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mcap.opcode import Opcode
-from mcap.records import DataEnd, Footer, Header, Statistics
+from mcap.records import DataEnd, Footer, Header
 
 from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError, recover_line
 from recordings.mcap.contents import Contents
 from recordings.mcap.records import (
-    FOOTER_BYTES,
     MAGIC,
     RECORD_HEAD,
     RECORD_LIMIT_BYTES,
@@ -27,14 +26,19 @@ from recordings.mcap.records import (
     TooLargeError,
     parse,
     parse_chunk,
-    split,
 )
 from recordings.mcap.source import ShortFileError, Source
 
-SUMMARY_LIMIT_BYTES = 32 * 1024 * 1024
 _TOLD_BYTES = 256 * 1024
 """Between two reports of progress."""
-_TAIL_BYTES = FOOTER_BYTES + len(MAGIC)
+_IN_DATA = {
+    *(Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX),
+    *(Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END),
+}
+_IN_SUMMARY = {
+    *(Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX),
+    *(Opcode.STATISTICS, Opcode.SUMMARY_OFFSET, Opcode.FOOTER),
+}
 
 
 def scan_file(
@@ -78,46 +82,42 @@ class _Scan:
         self._file = io.BufferedReader(io.FileIO(source.descriptor, closefd=False), 256 * 1024)
         self._sha256 = hashlib.sha256()
         self._crc = 0
+        """Checksum of the data section, then of the summary section."""
+        self._summary_start = 0
 
     def run(self) -> str:
         """Returns the SHA-256."""
-        footer = self._tail()
-        start, end = footer.summary_start, self.source.size_bytes - _TAIL_BYTES
+        self._check_ends()
         self._file.seek(0)
         self._read(len(MAGIC))
-        self._data(start or end)
-        if start and self.position != start:
-            raise BadRecordError("the data does not end where the footer says")
-        summary = self._read(end - self.position)
-        tail = self._read(_TAIL_BYTES)
-        if start and footer.summary_crc:
-            covered = tail[: FOOTER_BYTES - 4]
-            if zlib.crc32(covered, zlib.crc32(summary)) != footer.summary_crc:
-                raise BadRecordError("the checksum of the summary does not fit its content")
-        self._summary(summary)
+        opcode = 0
+        while opcode != Opcode.FOOTER:
+            self.position = self._file.tell()
+            room = self.source.size_bytes - len(MAGIC) - self.position - RECORD_HEAD.size
+            if room < 0:
+                raise BadRecordError("a record head is cut")
+            crc = self._crc
+            opcode, length = RECORD_HEAD.unpack(self._read(RECORD_HEAD.size))
+            if length > room or (opcode == Opcode.FOOTER and length != room):
+                raise BadRecordError(f"a record says it has {length} bytes, {room} are left")
+            if length > RECORD_LIMIT_BYTES:
+                raise BadRecordError(f"a record of {length} bytes is larger than any recording needs")
+            if (opcode == Opcode.HEADER) != (self.position == len(MAGIC)):
+                raise BadRecordError("the header is missing, or not at the beginning")
+            self._record(opcode, self._read(length), crc)
+            if self.position // _TOLD_BYTES != (self.position + length) // _TOLD_BYTES:
+                self._progress(self.position)
+        self._progress(self.position)
+        self._read(len(MAGIC))
         return self._sha256.hexdigest()
 
-    def _tail(self) -> Footer:
-        """Checks the magic at both ends."""
+    def _check_ends(self) -> None:
         size = self.source.size_bytes
         beginning = self.source.read(0, min(len(MAGIC), size))
         if not beginning or not MAGIC.startswith(beginning):
             raise BadRecordError("it does not begin like an MCAP file, perhaps another one was meant")
-        if size < len(MAGIC) + _TAIL_BYTES:
-            raise _CutError(f"only {size} bytes")
-        tail = self.source.read(size - _TAIL_BYTES, _TAIL_BYTES)
-        if not tail.endswith(MAGIC):
+        if size < 2 * len(MAGIC) or self.source.read(size - len(MAGIC), len(MAGIC)) != MAGIC:
             raise _CutError("the end mark is missing")
-        if RECORD_HEAD.unpack_from(tail) != (Opcode.FOOTER, FOOTER_BYTES - RECORD_HEAD.size):
-            raise _CutError("the footer is missing")
-        footer = parse(Footer, tail[RECORD_HEAD.size : FOOTER_BYTES])
-        self.position = size - _TAIL_BYTES
-        if footer.summary_start and not len(MAGIC) < footer.summary_start <= self.position:
-            raise BadRecordError(f"the footer points to byte {footer.summary_start}")
-        if footer.summary_start and self.position - footer.summary_start > SUMMARY_LIMIT_BYTES:
-            raise BadRecordError("the summary is larger than any recording needs")
-        self.position = 0
-        return footer
 
     def _read(self, length: int) -> bytes:
         """The next bytes of the file, counted into the hash and the checksum."""
@@ -128,31 +128,11 @@ class _Scan:
         self._crc = zlib.crc32(data, self._crc)
         return data
 
-    def _data(self, limit: int) -> None:
-        """Takes in the records before the summary; no one reaches over the byte `limit`."""
-        self.position = len(MAGIC)
-        opcode = 0
-        while opcode != Opcode.DATA_END:
-            crc = self._crc
-            room = limit - self.position - RECORD_HEAD.size
-            if room < 0:
-                raise BadRecordError("a record head is cut")
-            opcode, length = RECORD_HEAD.unpack(self._read(RECORD_HEAD.size))
-            if length > room:
-                raise BadRecordError(f"a record says it has {length} bytes, {room} are left")
-            if length > RECORD_LIMIT_BYTES:
-                raise BadRecordError(f"a record of {length} bytes is larger than any recording needs")
-            if (opcode == Opcode.HEADER) != (self.position == len(MAGIC)):
-                raise BadRecordError("the header is missing, or not at the beginning")
-            content = self._read(length)
-            self._record(opcode, content, crc)
-            if self.position // _TOLD_BYTES != (self.position + length) // _TOLD_BYTES:
-                self._progress(self.position)
-            self.position += RECORD_HEAD.size + length
-        self._progress(self.position)
-
     def _record(self, opcode: int, content: bytes, crc: int) -> None:
-        """`crc`: of everything before the record."""
+        """`crc`: of the section before the record."""
+        known = opcode <= Opcode.DATA_END
+        if known and opcode not in (_IN_SUMMARY if self._summary_start else _IN_DATA):
+            raise BadRecordError(f"a record of kind 0x{opcode:02x} does not belong here")
         match opcode:
             case Opcode.MESSAGE:
                 self.contents.add_message(self.position, content, 0, len(content))
@@ -175,16 +155,11 @@ class _Scan:
             case Opcode.DATA_END:
                 if parse(DataEnd, content).data_section_crc not in (0, crc):
                     raise BadRecordError("the checksum of the data section does not fit its content")
-            case _ if opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE_INDEX:
-                raise BadRecordError(f"a record of kind 0x{opcode:02x} does not belong here")
-
-    def _summary(self, summary: bytes) -> None:
-        for _, opcode, start, end in split(summary):
-            content = summary[start:end]
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.contents.declare(opcode, content)
-            elif opcode == Opcode.STATISTICS:
-                if difference := self.contents.differs(parse(Statistics, content)):
-                    raise BadRecordError(difference)
-            elif opcode in (Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.DATA_END):
-                raise BadRecordError(f"a record of kind 0x{opcode:02x} does not belong here")
+                self._summary_start, self._crc = self._file.tell(), 0
+            case Opcode.FOOTER:
+                footer = parse(Footer, content)
+                if footer.summary_start not in (0, self._summary_start):
+                    raise BadRecordError("the data does not end where the footer says")
+                covered = RECORD_HEAD.pack(opcode, len(content)) + content[:-4]
+                if footer.summary_start and footer.summary_crc not in (0, zlib.crc32(covered, crc)):
+                    raise BadRecordError("the checksum of the summary does not fit its content")

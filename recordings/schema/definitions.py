@@ -31,6 +31,8 @@ FORMATS = ("station-recording/1", "station-recording/2")
 """Formats that are read, oldest first; the newest is written."""
 SESSION_RECORDS = ("session", "session-copy")
 """Metadata records with the SessionInfo: twice, because nothing can be saved from a file without it."""
+CHANNEL_RECORDS = "channel-"
+"""Metadata record of each channel, behind it its number: the chunk that declares it may be lost."""
 RECOVERY_RECORD = "recovery"
 """Metadata record of a rebuilt file: what was lost."""
 PACKAGE = "station"

@@ -14,7 +14,6 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from google.protobuf.message import DecodeError
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from recordings.schema.definitions import PictureFacts, message_class
@@ -73,28 +72,3 @@ def schema_bytes(topic: Topic) -> bytes:
     """The FileDescriptorSet that goes into the file."""
     descriptors: FileDescriptorSet = build_file_descriptor_set(_MESSAGES[topic])
     return bytes(descriptors.SerializeToString())
-
-
-def identify(samples: list[bytes]) -> tuple[str, str, str, bytes] | None:
-    """Messages of one channel → its topic, schema name, encoding and schema; None unless exactly one fits.
-
-    For files whose declarations are lost: a message fits a topic when every byte of it is a field that the
-    topic's message has, and it says again the same number of bytes.
-    """
-    fitting = [topic for topic in Topic if all(_fits(topic, data) for data in samples)]
-    for twin in (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM):  # of /tf
-        if len(fitting) > 1 and twin in fitting:
-            fitting.remove(twin)
-    if len(fitting) != 1 or not samples:
-        return None
-    return fitting[0].value, schema_name(fitting[0]), "protobuf", schema_bytes(fitting[0])
-
-
-def _fits(topic: Topic, data: bytes) -> bool:
-    try:
-        message = parse(topic, data)
-    except (DecodeError, UnicodeDecodeError):
-        return False
-    size = message.ByteSize()
-    message.DiscardUnknownFields()
-    return bool(data) and size == message.ByteSize() == len(data)

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from calibrate.files.calibration import read_calibration as read_calibration
     from calibrate.files.calibration import write_calibration as write_calibration
     from calibrate.files.exports import export as export
-    from calibrate.files.gate import Gate as Gate
     from calibrate.files.install import install as install
     from calibrate.files.install import rollback as rollback
     from calibrate.files.install import set_validity as set_validity
@@ -41,10 +40,11 @@ if TYPE_CHECKING:
     from calibrate.job import SolvedRecording as SolvedRecording
     from calibrate.pipeline import solve_recording as solve_recording
     from calibrate.quality.gates import GateLimits as GateLimits
+    from calibrate.results import Gate as Gate
 
 _MODULES = {
     "errors": "CalibrationError",
-    "files.calibration": "Calibration Gate read_calibration write_calibration",
+    "files.calibration": "Calibration read_calibration write_calibration",
     "files.exports": "export",
     "files.install": "install rollback set_validity",
     "files.loader": "InstallationChange InstalledCalibration load_installed watch",
@@ -53,6 +53,7 @@ _MODULES = {
     "job": "JobOptions SolvedRecording",
     "pipeline": "solve_recording",
     "quality.gates": "GateLimits",
+    "results": "Gate",
 }
 """Module → names that it gives."""
 _HOME = {name: module for module, names in _MODULES.items() for name in names.split()}

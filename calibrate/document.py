@@ -30,7 +30,6 @@ from calibrate.files.calibration import (
     Views,
     ViewWeight,
 )
-from calibrate.files.gate import Gate
 from calibrate.geometry import Transform
 from calibrate.handeye.solution import Solution, TableResult, Verification
 from calibrate.lens.intrinsics import Intrinsics
@@ -38,7 +37,7 @@ from calibrate.lens.pnp import view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty
 from calibrate.load import LoadedViews
 from calibrate.projection import intrinsics_names
-from calibrate.results import Remark
+from calibrate.results import Gate, Remark
 from calibrate.views import ViewSet
 from recordings.reader import Recording
 

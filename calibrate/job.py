@@ -9,12 +9,12 @@ import msgspec
 
 from calibrate.errors import require_choice
 from calibrate.files.calibration import Calibration
-from calibrate.files.gate import Gate
 from calibrate.handeye.solution import Profile, Solution, Verification
 from calibrate.lens.intrinsics import Intrinsics, LensModel
 from calibrate.lens.uncertainty import LensUncertainty
 from calibrate.load import LoadedViews
 from calibrate.quality.gates import GateLimits
+from calibrate.results import Gate
 from calibrate.views import ViewSet
 from recordings.reader import Recording
 from recordings.schema.messages import BoardSpec, CameraModel

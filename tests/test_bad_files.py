@@ -117,10 +117,6 @@ PLACES: dict[str, Place] = {
     "board": ("board.yaml", _command(calibrate, "solve", SAMPLE, "--board", "FILE", "-o", "NEW")),
     "camera": ("camera.yaml", _command(calibrate, "solve", SAMPLE, "--camera", "FILE", "-o", "NEW")),
     "limits": ("gates.yaml", _command(calibrate, "solve", SAMPLE, "--gates", "FILE", "-o", "NEW")),
-    "scheduler": (
-        "scheduler.json",
-        _command(calibrate, "batch", SAMPLE, "-o", "NEW", "--scheduler-file", "FILE"),
-    ),
     "bag": ("bag.mcap", _command(recordings, "import", "FILE", "-o", "NEW.mcap")),
     "bag of ROS 2": ("bag.db3", _command(recordings, "import", "FILE", "-o", "NEW.mcap")),
     "metadata of a bag": ("metadata.yaml", lambda path: _bag(path.parent)),

@@ -15,9 +15,8 @@ from calibrate.files.calibration import (
     Sigma,
     Views,
 )
-from calibrate.files.gate import Gate
 from calibrate.files.validity import Validity
-from calibrate.results import BoardShape, Certificate, CrossValidation, HoldoutScore, PeerResult, Remark
+from calibrate.results import BoardShape, Certificate, CrossValidation, Gate, HoldoutScore, PeerResult, Remark
 from recordings.schema.messages import Mount
 
 

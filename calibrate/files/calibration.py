@@ -16,12 +16,19 @@ import yaml
 from numpy.typing import ArrayLike
 
 from calibrate.errors import CalibrationFileError
-from calibrate.files.gate import Gate
-from calibrate.files.proof import check_result, content_sha256, proven_plain, read_bounded, refused_table
+from calibrate.files.proof import check_result, content_sha256, proven_plain, read_bounded
 from calibrate.files.touch import Touch
 from calibrate.geometry import Transform
 from calibrate.kinematics import RobotModel, base_from_flange
-from calibrate.results import BoardShape, Certificate, CrossValidation, HoldoutScore, RejectedView, Remark
+from calibrate.results import (
+    BoardShape,
+    Certificate,
+    CrossValidation,
+    Gate,
+    HoldoutScore,
+    RejectedView,
+    Remark,
+)
 from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
 from recordings.schema.messages import (
     BoardSpec,
@@ -192,6 +199,12 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     result: FramePose | None = None
     """corrected_flange_from_camera (eye-in-hand) or corrected_base_from_camera."""
 
+    def __post_init__(self) -> None:
+        frames = ("", "") if self.result is None else (self.result.parent_frame, self.result.child_frame)
+        known = frames in (("corrected_flange", "camera"), ("corrected_base", "camera"))
+        if not (self.offered == known == (self.corrected is not None) == (self.result is not None)):
+            raise ValueError("the arm's table and its X do not belong together")
+
     def base_from_flange(self, joints_rad: ArrayLike) -> Transform:
         """Compute corrected_base_from_corrected_flange of joints (6,). Raises as `installable`."""
         table, _ = self.installable()
@@ -201,7 +214,7 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     def installable(self) -> tuple[DhTable, Transform]:
         """Return the table and the X that belongs to it. CalibrationFileError if not offered."""
         if not self.offered or self.corrected is None or self.result is None:
-            raise refused_table(self.refused)
+            raise CalibrationFileError("table-not-offered", reason=self.refused)
         return self.corrected, self.result.transform
 
 

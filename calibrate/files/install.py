@@ -21,7 +21,6 @@ from calibrate.files.folders import (
     read_validity,
     readable_folder,
 )
-from calibrate.files.gate import Gate
 from calibrate.files.lines import append_line
 from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import FILE as VALIDITY_FILE
@@ -45,6 +44,7 @@ from calibrate.files.versions import (
     who,
 )
 from calibrate.geometry import difference
+from calibrate.results import Gate
 from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import Source
 

@@ -5,40 +5,29 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calibrate.errors import CalibrationError, CalibrationFileError, InstallError
 from calibrate.files.folders import calibrations_folder, current_version, readable_folder, validity_of
-from calibrate.files.proof import check_result, proven_plain, read_bounded, refused_table
+from calibrate.files.proof import check_result, proven_plain, read_bounded
 from calibrate.files.validity import (
-    FILE,
     Validity,
     ValidityReason,
     ValidityState,
-    parse_time,
     require_usable,
     time_text,
 )
 from calibrate.geometry import Array, Transform
-from calibrate.kinematics import base_from_flange
 from recordings.files import MAIN_CAMERA
 
 if TYPE_CHECKING:
     from recordings.schema.messages import CameraModel, Mount, Source
 
 _NOT_REAL = ("simulated", "playback")
-
-
-@dataclass(frozen=True)
-class InstalledDevice:
-    model: str
-    serial: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,20 +58,6 @@ class InstalledLens:
 
 
 @dataclass(frozen=True, eq=False)
-class InstalledArm:
-    """The arm's corrected table with the X that belongs to it; use neither without the other."""
-
-    transform: Transform
-    """corrected_flange_from_camera (eye-in-hand) or corrected_base_from_camera (eye-to-hand), metres."""
-    table: dict[str, list[float]]
-    """a_m, d_m, alpha_rad, theta_rad, beta_rad: see `calibrate.kinematics`."""
-
-    def base_from_flange(self, joints_rad: ArrayLike) -> Transform:
-        """Compute corrected_base_from_corrected_flange, metres, of joints (6,), radians."""
-        return Transform("corrected_base", "corrected_flange", base_from_flange(self.table, joints_rad))
-
-
-@dataclass(frozen=True, eq=False)
 class InstalledCalibration:
     """Installed calibration for programs. The whole file: `read_calibration(self.path)`."""
 
@@ -99,18 +74,6 @@ class InstalledCalibration:
         """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), metres; the arm as it is."""
         result = self.plain["result"]
         return Transform(result["parent_frame"], result["child_frame"], np.array(result["matrix"], float))
-
-    @cached_property
-    def corrected_arm(self) -> InstalledArm:
-        """Return the arm's corrected table with its X. CalibrationFileError if none is offered."""
-        found = self.plain.get("arm_table") or {"refused": "the arm's model is not known"}
-        if not found.get("offered"):
-            raise refused_table(str(found.get("refused", "")))
-        result = found["result"]
-        return InstalledArm(
-            Transform(result["parent_frame"], result["child_frame"], np.array(result["matrix"], float)),
-            found["corrected"],
-        )
 
     @cached_property
     def covariance(self) -> Array:
@@ -133,29 +96,6 @@ class InstalledCalibration:
     def source(self) -> Source:
         source: Source = self.plain["source"]
         return source
-
-    @property
-    def created(self) -> str:
-        """Time of the solve, UTC."""
-        return str(self.plain["created"])
-
-    @property
-    def robot(self) -> InstalledDevice:
-        return self._device("robot")
-
-    @property
-    def camera(self) -> InstalledDevice:
-        return self._device("camera")
-
-    def _device(self, name: str) -> InstalledDevice:
-        found = self.plain[name]
-        return InstalledDevice(str(found.get("model", "")), str(found.get("serial", "")))
-
-    @property
-    def age_s(self) -> float:
-        """Seconds since the last proof: the views it was solved from, or a check that passed."""
-        proven = parse_time(self.validity.verified) or parse_time(self.created)
-        return float("nan") if proven is None else (datetime.now(UTC) - proven).total_seconds()
 
 
 def load_installed(
@@ -180,19 +120,13 @@ def load_installed(
     found = _read(root, camera)
     if found.source in _NOT_REAL and not allow_simulated:
         raise InstallError("not-real", path=found.path, source=found.source)
-    for name, serial, device in (
-        ("robot", robot_serial, found.robot),
-        ("camera", camera_serial, found.camera),
-    ):
-        if serial and device.serial != serial:
-            text = f"It is of {name} {device.serial or 'unknown'}, there is {serial}. Calibrate the new one."
-            reason = ValidityReason(f"{name}-changed", text, {"calibrated": device.serial, "found": serial})
-            doubt = ValidityState.IN_DOUBT
-            if found.validity.state is not ValidityState.WITHDRAWN:
-                found = replace(
-                    found,
-                    validity=replace(found.validity, state=doubt, since=time_text(), reason=reason),
-                )
+    for name, serial in (("robot", robot_serial), ("camera", camera_serial)):
+        own = str(found.plain[name].get("serial", ""))
+        if serial and own != serial and found.validity.state is not ValidityState.WITHDRAWN:
+            text = f"It is of {name} {own or 'unknown'}, there is {serial}. Calibrate the new one."
+            reason = ValidityReason(f"{name}-changed", text, {"calibrated": own, "found": serial})
+            doubted = replace(found.validity, state=ValidityState.IN_DOUBT, since=time_text(), reason=reason)
+            found = replace(found, validity=doubted)
     if require_valid is not False:
         anyway = "require_valid=False loads it all the same"
         proven = require_valid is True
@@ -237,54 +171,43 @@ def watch(
 
     `first`: begin with what is installed now, so that nothing is missed between loading and watching.
 
-    Polls the times of two files every `poll_s` seconds, which works on any file system. Also yields when
+    Reads two small files every `poll_s` seconds, which works on any file system. Also yields when
     the last proof grows too old by the cell's rule. `stop_s`: seconds after which it ends; None: never.
     Nothing is refused, simulated ones neither: check `.installed.source` and `.installed.validity`.
     """
     folder = calibrations_folder(root, camera)
     ends_s = None if stop_s is None else time.monotonic() + stop_s
-    marks = _marks(folder)  # before reading, so that a change in between is seen at the next poll
-    before = _look(root, camera, None)
+    seen, version = _state(folder), 0
     if first:
-        yield before
+        change, version = _look(root, camera, 0)
+        yield change
+    else:
+        version = seen[0] if isinstance(seen[0], int) else 0
     while ends_s is None or time.monotonic() < ends_s:
         time.sleep(poll_s)
-        seen = _marks(folder)
-        held = None if before.installed is None else before.installed.validity
-        ages = held is not None and held.at(datetime.now(UTC)).state is not held.state
-        if seen == marks and not ages:
-            continue
-        marks, now = seen, _look(root, camera, before)
-        if _key(now) != _key(before):
-            yield now
-        before = now
+        if (now := _state(folder)) != seen:
+            seen = now
+            change, version = _look(root, camera, version)
+            yield change
 
 
-def _marks(folder: Path) -> list[int]:
-    """Read the modification times of `current` and of the validity file; 0 where there is none."""
-    marks = []
-    for name in ("current", FILE):
-        try:
-            marks.append((folder / name).lstat().st_mtime_ns)
-        except OSError:
-            marks.append(0)
-    return marks
+def _state(folder: Path) -> tuple[object, ...]:
+    """Version, validity state, since when and why; or the code of the error."""
+    try:
+        number, _ = current_version(folder)
+        held = validity_of(folder, number)
+        return number, held.state, held.since, held.reason.code
+    except CalibrationError as problem:
+        return (problem.code,)
 
 
-def _look(root: Path | str | None, camera: str, before: InstallationChange | None) -> InstallationChange:
+def _look(root: Path | str | None, camera: str, before: int) -> tuple[InstallationChange, int]:
+    """The change after version `before` (0: none), and the version now."""
     try:
         now = _read(root, camera)
     except CalibrationError as problem:
-        return InstallationChange("unreadable", None, problem)
-    was = None if before is None else before.installed
-    if was is None or now.version != was.version:
-        older = was is not None and now.version < was.version
-        return InstallationChange("rolled-back" if older else "installed", now)
-    return InstallationChange(now.validity.state.value, now)
-
-
-def _key(change: InstallationChange) -> tuple[object, ...]:
-    if change.installed is None:
-        return (None if change.problem is None else change.problem.code,)
-    validity = change.installed.validity
-    return change.installed.version, validity.state, validity.since, validity.reason.code
+        return InstallationChange("unreadable", None, problem), 0
+    event = now.validity.state.value
+    if now.version != before:
+        event = "rolled-back" if now.version < before else "installed"
+    return InstallationChange(event, now), now.version

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import re
 import shlex
-from json.encoder import encode_basestring
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,6 @@ import numpy as np
 
 from calibrate.errors import CalibrationFileError
 from calibrate.geometry import Array, is_rigid, skew
-from calibrate.kinematics import TABLE_COLUMNS
 from recordings import strict_yaml
 from recordings.files import read_beginning
 
@@ -29,49 +30,32 @@ def read_bounded(path: Path) -> bytes:
         raise CalibrationFileError(path=path, why=problem.strerror or str(problem)) from None
 
 
-_GIVE = "Give one that `calibrate solve` wrote."
-
-
 def proven_plain(content: bytes, where: str) -> dict[str, Any]:
-    """Parse a calibration file to plain data without `sha256`, after verifying hash and result.
+    """Parse a calibration file to plain data without `sha256`, after verifying its hash.
 
     CalibrationFileError says what is wrong.
     """
     if content.startswith(_MCAP):
-        raise CalibrationFileError(
-            "not-a-calibration",
-            path=where,
-            why="it is a recording",
-            advice=f"First run: calibrate solve {shlex.quote(where)}",
-        )
+        solve = f"First run: calibrate solve {shlex.quote(where)}"
+        raise CalibrationFileError("not-a-calibration", path=where, why="it is a recording", advice=solve)
     if len(content) > _LIMIT_BYTES:
-        raise CalibrationFileError(
-            "not-a-calibration",
-            path=where,
-            why="it is larger than any",
-            advice=_GIVE,
-            size_bytes=len(content),
-            limit_bytes=_LIMIT_BYTES,
-        )
+        raise _other(where, f"it is larger than {_LIMIT_BYTES} bytes")
     try:
         plain = strict_yaml.load_plain(content)
-    except strict_yaml.StrictYamlError as problem:
-        raise CalibrationFileError("damaged-calibration", path=where, why=str(problem)) from None
-    if not isinstance(plain, dict) or plain.get("format") != FORMAT_NAME:
         found = plain.get("format") if isinstance(plain, dict) else None
-        raise CalibrationFileError(
-            "not-a-calibration",
-            path=where,
-            why=f"format is {found!r}, expected {FORMAT_NAME!r}",
-            advice=_GIVE,
-        )
-    try:
-        hash_now = content_sha256(plain)
-    except (TypeError, ValueError) as problem:
-        raise CalibrationFileError("damaged-calibration", path=where, why=str(problem)) from None
-    if plain.pop("sha256", None) != hash_now:
-        raise CalibrationFileError("damaged-calibration", path=where, why="the content does not fit its hash")
-    return plain
+        if not isinstance(plain, dict) or found != FORMAT_NAME:
+            raise _other(where, f"format is {found!r}, expected {FORMAT_NAME!r}")
+        if plain.pop("sha256", None) == content_sha256(plain):
+            return plain
+        why = "the content does not fit its hash"
+    except (strict_yaml.StrictYamlError, TypeError, ValueError) as problem:
+        why = str(problem)
+    raise CalibrationFileError("damaged-calibration", path=where, why=why)
+
+
+def _other(where: str, why: str) -> CalibrationFileError:
+    give = "Give one that `calibrate solve` wrote."
+    return CalibrationFileError("not-a-calibration", path=where, why=why, advice=give)
 
 
 def content_sha256(plain: dict[str, Any]) -> str:
@@ -83,34 +67,21 @@ def content_sha256(plain: dict[str, Any]) -> str:
 def canonical_json(value: object) -> str:
     """Encode as JSON with sorted keys and no spaces, as `msgspec.json.encode(order="deterministic")` does.
 
-    TypeError for types that JSON does not have, ValueError for keys that are not text.
+    TypeError for types that JSON does not have.
     """
-    if isinstance(value, str):
-        return str(encode_basestring(value))
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, float):
-        return _number(value)
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(canonical_json, value))}]"
-    if isinstance(value, dict):
-        if not all(isinstance(key, str) for key in value):
-            raise ValueError("a key is no text")
-        return f"{{{','.join(f'{canonical_json(k)}:{canonical_json(value[k])}' for k in sorted(value))}}}"
-    raise TypeError(f"{type(value).__name__} is no JSON")
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    return _STRING_OR_POWER.sub(_as_msgspec_writes, text)
 
 
-def _number(value: float) -> str:
-    """Format with the shortest digits that read back as `value`; 1e-5 as 0.00001, 1e16 without a +."""
-    mantissa, _, exponent = repr(value).partition("e")
-    if not exponent:
-        return mantissa if np.isfinite(value) else "null"
-    if int(exponent) == -5:
-        sign = "-" if mantissa.startswith("-") else ""
-        return f"{sign}0.0000{mantissa.lstrip('-').replace('.', '')}"
-    return f"{mantissa}e{int(exponent)}"
+_STRING_OR_POWER = re.compile(r'"(?:[^"\\]|\\.)*"|-?[\d.]+e[+-]\d+')
+
+
+def _as_msgspec_writes(found: re.Match[str]) -> str:
+    """Strings as they are; 1e-05 as 0.00001, 1e+16 as 1e16."""
+    mantissa, _, exponent = found[0].partition("e")
+    if found[0].startswith('"'):
+        return found[0]
+    return f"{Decimal(found[0]):f}" if int(exponent) == -5 else f"{mantissa}e{int(exponent)}"
 
 
 def check_result(plain: dict[str, Any], where: str) -> None:
@@ -143,33 +114,11 @@ def check_result(plain: dict[str, Any], where: str) -> None:
         asymmetry = np.abs(covariance - covariance.T).max()
         if asymmetry > rounding or np.linalg.eigvalsh(covariance).min() < -rounding:
             wrong = "the covariance is not symmetric and positive"
-    wrong = wrong or _wrong_table(plain.get("arm_table"), parent)
     if wrong:
         raise CalibrationFileError("contradiction", path=where, why=wrong)
-
-
-def _wrong_table(arm: dict[str, Any] | None, parent: str) -> str:
-    """Say what is wrong with an offered table of the arm; empty when nothing is."""
-    if arm is None or not (arm["offered"] or arm.get("result") or arm.get("corrected")):
-        return ""
-    result = arm.get("result") or {}
-    frames = (result.get("parent_frame"), result.get("child_frame"))
-    if not arm["offered"] or not arm.get("corrected") or frames != (f"corrected_{parent}", "camera"):
-        return "the arm's table and its X do not belong together"
-    numbers = [np.array(arm["corrected"][key], float) for key in TABLE_COLUMNS]
-    if not is_rigid(np.array(result["matrix"], float)) or not all(
-        column.shape == (6,) and np.isfinite(column).all() for column in numbers
-    ):
-        return "the arm's table or its X holds impossible numbers"
-    return ""
 
 
 def _rotation(quaternion_xyzw: Array) -> Array:
     """Convert a unit quaternion (4,): R = (w² - v·v) I + 2 v vᵀ + 2 w [v]× (Kuipers 1999, eq. 5.11)."""
     v, w = quaternion_xyzw[:3], quaternion_xyzw[3]
     return np.asarray((w * w - v @ v) * np.eye(3) + 2 * np.outer(v, v) + 2 * w * skew(v))
-
-
-def refused_table(reason: str) -> CalibrationFileError:
-    """Make the error for a calibration that offers no table of the arm."""
-    return CalibrationFileError("table-not-offered", reason=reason)

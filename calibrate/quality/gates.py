@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 
 from calibrate.errors import UsageError
-from calibrate.files.gate import Gate, Sense
 from calibrate.handeye.solution import Reading, Solution
+from calibrate.results import Gate, Sense
 from recordings import strict_yaml
 from recordings.files import read_file
 
@@ -48,12 +48,6 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     is at most 0.04 mm at one metre."""
     robot_error_m: float | None = 0.002
     robot_error_deg: float | None = 0.3
-    certificate: bool | None = None
-    """No effect; accepted in files for earlier versions. The certificate is information only."""
-    agreement_sigma: float | None = None
-    """No effect; accepted in files for earlier versions."""
-    board_scale: float | None = None
-    """No effect; accepted in files for earlier versions; see `board_pull`."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +79,6 @@ def judge(solution: Solution, inputs: GateInputs, limits: GateLimits | None = No
         if value is None or limit is None:
             continue
         rule = _RULES[name]
-        if name == "holdout_share":
-            limit *= solution.working_distance_m
         text = f"{rule.title} {title}".rstrip()
         found.append(Gate.measured(name, text, value, rule.sense, limit, rule.unit, remedy or rule.remedy))
     return tuple(found)
@@ -106,7 +98,7 @@ _RULES = {
     "rotation_deg": _Rule("Rotation range", "≥", "deg", "Add poses with more tilt and roll."),
     "axis_spread": _Rule("Rotation diversity", "≥", ""),
     "view_rms_px": _Rule("Worst reprojection error", "≤", "px"),
-    "holdout_share": _Rule("Held-out error", "≤", "m", "Check robot accuracy and corner detection."),
+    "holdout_share": _Rule("Held-out error", "≤", "share", "Check robot accuracy and corner detection."),
     "cross_validation": _Rule(
         "Cross-validated error over the largest that was claimed",
         "≤",
@@ -147,7 +139,8 @@ def _measured(solution: Solution, inputs: GateInputs) -> Iterator[tuple[str, flo
         remedy = f"Retake pose {worst + 1}, or check the intrinsics."
         yield "view_rms_px", solution.residual_px[worst], f"(pose {worst + 1})", remedy
     if solution.holdout is not None and distance_m:
-        yield "holdout_share", solution.holdout.e_t_m, "", ""
+        missed_m = solution.holdout.e_t_m
+        yield "holdout_share", missed_m / distance_m, f"({1e3 * missed_m:.2g} mm)", ""
     if folds is not None:
         figures = f"({folds.rms_mm:.2f} mm, claimed {folds.claimed_mm:.2f} mm)"
         yield "cross_validation", folds.rms_mm / folds.claimed_mm / folds.limit, figures, ""

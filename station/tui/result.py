@@ -17,12 +17,12 @@ from textual.widgets import DataTable, Static
 
 from calibrate.files.calibration import Calibration
 from calibrate.files.formatting import arm_sentences, error_text, figures, noise_text
-from calibrate.files.gate import Gate
 from calibrate.files.install import change_text
 from calibrate.files.touch import LIMIT_SIGMAS, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import ValidityState, validity_text
 from calibrate.files.versions import same_solve
 from calibrate.quality.drift_history import find_trend
+from calibrate.results import Gate
 from station.operate.ending import Way, after_drift_check, after_solve
 from station.tui.installed import Result, local
 from station.tui.jobs import install_result, undo_install

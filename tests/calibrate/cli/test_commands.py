@@ -24,7 +24,7 @@ from recordings.schema.messages import CameraIdentity, RobotIdentity
 from tests.calibrate.calling import raises_code, refused, run
 from tests.calibrate.sessions import Scene, write_session
 
-GATE_KEYS = {"name", "passed", "value", "limit", "unit", "text", "remedy"}
+GATE_KEYS = {"name", "passed", "value", "limit", "unit", "text", "remedy", "sense"}
 
 
 def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) -> None:

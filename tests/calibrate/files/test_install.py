@@ -20,7 +20,6 @@ import recordings
 from calibrate.cli import main
 from calibrate.errors import CalibrationFileError, GateFailedError, InstallError, UsageError
 from calibrate.files.calibration import read_calibration
-from calibrate.files.gate import Gate
 from calibrate.files.install import (
     install,
     install_line,
@@ -33,6 +32,7 @@ from calibrate.files.loader import load_installed
 from calibrate.files.touch import Touch
 from calibrate.files.versions import installed_versions, read_log
 from calibrate.job import SolvedRecording
+from calibrate.results import Gate
 from tests.calibrate.calling import raises_code
 from tests.command_line import call
 

@@ -129,7 +129,7 @@ def test_a_root_from_before_validity_was_recorded_is_unverified(root: Path) -> N
 
 @pytest.mark.parametrize("kind", ["robot", "camera"])
 def test_another_device_than_the_calibrated_one_is_a_doubt(root: Path, kind: str) -> None:
-    serial = getattr(load_installed(root), kind).serial
+    serial = load_installed(root).plain[kind]["serial"]
     assert load_installed(root, **{f"{kind}_serial": serial}).validity.state is V
     with raises_code(InstallError, "calibration-in-doubt", reason=f"{kind}-changed"):
         load_installed(root, **{f"{kind}_serial": "another"})
@@ -160,7 +160,7 @@ def test_a_check_judges_the_version_that_it_was_made_on(root: Path, make_file: M
 def test_a_state_may_be_given_by_its_name_and_no_other_one(root: Path) -> None:
     set_validity(root, D, MOVED)
     assert set_validity(root, "valid", MOVED).state is V  # type: ignore[arg-type]
-    assert load_installed(root).validity.verified != load_installed(root).created
+    assert load_installed(root).validity.verified != installed_calibration(root).created
     with raises_code(UsageError, "choice", given="validd"):
         set_validity(root, "validd", MOVED)  # type: ignore[arg-type]
 

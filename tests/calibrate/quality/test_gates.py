@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from calibrate.errors import UsageError
-from calibrate.files.gate import Gate
 from calibrate.handeye.solution import (
     Explanation,
     Finding,
@@ -21,7 +20,7 @@ from calibrate.handeye.solution import (
 )
 from calibrate.job import SolvedRecording
 from calibrate.quality.gates import GateInputs, GateLimits, judge, read_limits
-from calibrate.results import CrossValidation, HoldoutScore, Remark
+from calibrate.results import CrossValidation, Gate, HoldoutScore, Remark
 from tests.calibrate.calling import raises_code
 
 GOOD = GateInputs(0.6, 0.001)
@@ -105,7 +104,7 @@ def test_each_gate_closes_alone_and_says_why(solution: Solution, name: str) -> N
 def test_values_and_limits_are_in_the_units_of_the_file_of_limits(solution: Solution) -> None:
     gates = {gate.name: (gate.value, gate.limit) for gate in judge(solution, GOOD)}
     assert gates["rotation_deg"] == pytest.approx((np.degrees(1.2), 30))
-    assert gates["holdout_share"] == pytest.approx((0.0005, 0.01 * 0.5))
+    assert gates["holdout_share"] == pytest.approx((0.0005 / 0.5, 0.01))
     assert gates["cross_validation"] == pytest.approx((0.0005 / 0.0004 / 1.5, 1.0))
     assert gates["robot_error_deg"] == pytest.approx((np.degrees(0.0002), 0.3))
     assert gates["lens_pull"] == gates["board_pull"] == (0.0, 1.0)
@@ -137,8 +136,7 @@ def test_a_move_closes_the_session_gate(solution: Solution) -> None:
 
 def test_the_certificate_informs_and_closes_nothing(solution: Solution) -> None:
     bad = replace(solution.certificate, certified=False, distance_sigma=40.0)
-    old_file = GateLimits(certificate=True, agreement_sigma=6.0, board_scale=0.01)
-    assert failed(judge(replace(solution, certificate=bad), GOOD, old_file)) == []
+    assert failed(judge(replace(solution, certificate=bad), GOOD)) == []
 
 
 def test_what_cannot_be_judged_is_left_out(solution: Solution) -> None:

@@ -6,9 +6,9 @@ import msgspec
 import pytest
 
 from calibrate.files.calibration import Calibration, RejectedView
-from calibrate.files.gate import Gate
 from calibrate.files.touch import Touch
 from calibrate.quality.drift_history import CheckEntry
+from calibrate.results import Gate
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.status import PoseStatus, SessionStatus
 from station.operate.ending import Way, after_capture, after_drift_check, after_solve, after_touches

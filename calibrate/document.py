@@ -34,7 +34,6 @@ from calibrate.geometry import Transform
 from calibrate.handeye.solution import Solution, TableResult, Verification
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
-from calibrate.lens.uncertainty import LensUncertainty
 from calibrate.load import LoadedViews
 from calibrate.projection import intrinsics_names
 from calibrate.results import Gate, Remark
@@ -53,7 +52,6 @@ def make_calibration(
     solution: Solution,
     gates: tuple[Gate, ...],
     options: dict[str, Any],
-    lens_known: LensUncertainty | None = None,
     verified: Verification | None = None,
 ) -> Calibration:
     """`options`: the choices that differ from the defaults."""
@@ -84,7 +82,7 @@ def make_calibration(
             turned=list(solution.turned),
             weights=[ViewWeight(i, round(w, 4)) for i, w in solution.weights.items()],
         ),
-        quality=_quality(solution, gates, loaded, intrinsics, lens_known),
+        quality=_quality(solution, gates, loaded, intrinsics),
         provenance=Provenance(
             recording=recording.path.name,
             recording_sha256=recording.sha256,
@@ -164,7 +162,6 @@ def _quality(
     gates: tuple[Gate, ...],
     loaded: LoadedViews,
     intrinsics: Intrinsics | None,
-    lens_known: LensUncertainty | None,
 ) -> Quality:
     noise, arm = solution.noise, solution.arm
     remarks = _remarks(solution, loaded, intrinsics)
@@ -179,7 +176,6 @@ def _quality(
         board_spread_deg=_scaled(solution.board_spread_rad, _DEG),
         predicted_error_mm=_scaled(solution.predicted_error_m, 1e3),
         working_distance_m=solution.working_distance_m,
-        projection_sigma_px={} if lens_known is None else lens_known.figures,
         noise={}
         if noise is None
         else {

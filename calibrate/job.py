@@ -11,7 +11,6 @@ from calibrate.errors import require_choice
 from calibrate.files.calibration import Calibration
 from calibrate.handeye.solution import Profile, Solution, Verification
 from calibrate.lens.intrinsics import Intrinsics, LensModel
-from calibrate.lens.uncertainty import LensUncertainty
 from calibrate.load import LoadedViews
 from calibrate.quality.gates import GateLimits
 from calibrate.results import Gate
@@ -75,8 +74,6 @@ class PreparedViews:
 class SolvedRecording(PreparedViews):
     solution: Solution
     coverage: float
-    lens_known: LensUncertainty | None
-    """None without corners, or with the paper's profile."""
     gates: tuple[Gate, ...]
     calibration: Calibration
     verified: Verification | None = None

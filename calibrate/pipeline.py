@@ -23,7 +23,6 @@ from calibrate.handeye.solve import solve_views
 from calibrate.job import JobOptions, PreparedViews, SolvedRecording
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
-from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.load import Progress, load_views, without_views
 from calibrate.projection import intrinsics_names
 from calibrate.quality.gates import GateInputs, judge
@@ -131,13 +130,12 @@ def solve_recording(
         watch.lap("verify")
     used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
     coverage = picture_coverage(used)
-    known = _lens_known(used, solution)
     inputs = GateInputs(
         coverage if prepared.intrinsics is not None else None, _clock_bound_s(recording, solution)
     )
     gates = judge(solution, inputs, options.limits)
     calibration = make_calibration(
-        recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen, known, verified
+        recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen, verified
     )
     watch.lap("judge")
     made = vars(prepared) | {"stage_ms": prepared.stage_ms | watch.stage_ms}
@@ -145,7 +143,6 @@ def solve_recording(
         **made,
         solution=solution,
         coverage=coverage,
-        lens_known=known,
         gates=gates,
         calibration=calibration,
         verified=verified,
@@ -158,13 +155,6 @@ def _judged_by(verified: Verification, solution: Solution) -> Solution:
     if verified.better or arm is None or arm.result is None or not arm.result.offered:
         return solution
     return replace(solution, arm=replace(arm, result=replace(arm.result, refused="not-better")))
-
-
-def _lens_known(used: ViewSet, solution: Solution) -> LensUncertainty | None:
-    if solution.lens_covariance is None or not all(len(view.pixels) for view in used):
-        return None
-    seen = np.concatenate([view.pixels for view in used])
-    return lens_uncertainty(solution.camera, solution.lens_covariance, seen)
 
 
 def _lens_sigma(options: JobOptions, camera: CameraModel) -> tuple[float, ...] | None:

@@ -31,13 +31,14 @@ COMMANDS = {
     "export": LazyCommand(
         f"{_FILES}:export",
         (
-            "calibrate export --to ros-launch-follow -o camera.launch.py  # follows what is installed",
+            "calibrate export --to ros-launch -o camera.launch.py  # of what is installed",
             "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
         ),
         gone={
             **dict.fromkeys(("json", "arm-json"), "Use `calibrate show --json`."),
             "arm-urdf": "Give ur-kinematics to ur_description, which makes the URDF.",
             **dict.fromkeys(("ros-static-transform", "easy-handeye2"), "Use ros-launch, which sends it."),
+            "ros-launch-follow": "Use ros-launch. `calibrate follow` prints every change.",
             **dict.fromkeys(("xacro", "mjcf"), "Use urdf."),
             **dict.fromkeys(
                 ("kalibr", "nerfstudio", "matlab"), "Use opencv: it holds transform and intrinsics."

@@ -17,7 +17,7 @@ from calibrate.errors import UsageError
 from calibrate.files import exports
 from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, read_calibration, write_output
-from calibrate.files.exports import FORMATS, FrameNames, follow_command
+from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.folders import cameras, current_validity, readable_folder
 from calibrate.files.formatting import override_text, pose_text, summary, verdict_text
 from calibrate.files.lines import read_lines
@@ -82,8 +82,7 @@ def export(
     """
     calibration, validity = named_or_installed(file, root, camera)
     names = FrameNames.of_camera(camera if file is None else calibration.camera_name)
-    follow = () if file is not None else follow_command(root, camera)
-    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity, follow, with_table)
+    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity, with_table)
     content = exports.export(calibration, str(to.value), frames)
     if validity is not None and validity.state is not ValidityState.VALID:
         err.print(f"Warning: the calibration is {validity_text(validity)}", style="yellow")
@@ -135,7 +134,7 @@ def install(
         camera_serial=facts.camera_serial,
         max_age_days=facts.max_age_days if max_age_days is None else max_age_days,
     )
-    _switched(made, root, as_json)
+    _switched(made, as_json)
     if not as_json:
         camera = camera or facts.camera or read_calibration(made.path).camera_name
         out.print(f"To undo: {installing.undo_line(root, camera)}", soft_wrap=True)
@@ -152,7 +151,7 @@ def rollback(
 
     The one before, or a version of `calibrate list`. It is unverified then, until a drift check passes.
     """
-    _switched(installing.rollback(root, to, reason, camera=camera), root, as_json)
+    _switched(installing.rollback(root, to, reason, camera=camera), as_json)
 
 
 def withdraw(
@@ -173,7 +172,7 @@ def withdraw(
         out.print(f"Camera {camera}, version {validity.version}: {validity_text(validity)}")
 
 
-def _switched(version: InstalledVersion, root: Path | None, as_json: bool) -> None:
+def _switched(version: InstalledVersion, as_json: bool) -> None:
     folder = version.path.parents[1]
     stable = folder / "current"
     if as_json:
@@ -186,11 +185,6 @@ def _switched(version: InstalledVersion, root: Path | None, as_json: bool) -> No
         out.print(f"Change: {log[-1].change}")
     if version.validity is not None:
         out.print(f"Validity: {validity_text(version.validity)}")
-    hooks = state_root(root) / "hooks"
-    if hooks.is_dir():
-        err.print(
-            f"Programs in {hooks} are no longer run. Use: calibrate follow", style="yellow", soft_wrap=True
-        )
 
 
 def list_installed(

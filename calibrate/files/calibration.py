@@ -228,8 +228,6 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     board_spread_deg: float | None = None
     predicted_error_mm: float | None = None
     working_distance_m: float | None = None
-    projection_sigma_px: dict[str, float] = {}
-    """centre, corner, worst: 1σ of the projection of a fixed direction by the estimated lens; else empty."""
     noise: dict[str, float] = {}
     """corner_px, robot_mm, robot_deg"""
     error_shares: dict[str, float] = {}

@@ -1,5 +1,5 @@
-"""Intrinsics from a session's own views, board poses from corners, and the uncertainty over the image.
+"""Intrinsics from a session's own views, and board poses from corners.
 
-The ways in are `intrinsics.calibrate_intrinsics`, `pnp.solve_pnp` and `uncertainty.lens_uncertainty`;
+The ways in are `intrinsics.calibrate_intrinsics` and `pnp.solve_pnp`;
 everything else is private. The lens models themselves are in `calibrate.projection`.
 """

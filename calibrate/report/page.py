@@ -115,9 +115,7 @@ def _gates(job: SolvedRecording) -> Iterator[str]:
 def _error(job: SolvedRecording) -> Iterator[str]:
     quality = job.calibration.quality
     if quality.error_shares:
-        shares = {name: share for name, share in quality.error_shares.items() if share > 0.001}
-        listed = shares_text(job.calibration)
-        yield html.figure(plots.error_shares(shares), f"Shares of the variance of X by source: {listed}.")
+        yield html.paragraph(f"Shares of the variance of X: {shares_text(job.calibration)}.")
     yield html.paragraph(noise_text(job.calibration))
     yield html.paragraph(f"Least known: {quality.weakest}." if quality.weakest else "")
     for sentence in cell_sentences(job.calibration):
@@ -168,27 +166,7 @@ def _residuals(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
 
 
 def _arm(job: SolvedRecording) -> Iterator[str]:
-    sentences = list(arm_sentences(job.calibration))
-    if not sentences:
-        return
-    for sentence in sentences:
-        yield html.paragraph(sentence)
-    arm = job.solution.arm
-    if arm is None or arm.result is None:
-        return
-    if job.verified is not None:
-        yield html.figure(
-            plots.held_out_over_workspace(job.verified.flange_m, *job.verified.missed_m),
-            f"Verification by {job.verified.recording}: distance of the board's middle from its mean place, "
-            "where the flange stood.",
-        )
-    if arm.result.held_out_m is not None:
-        without_m, with_table_m = arm.result.held_out_m
-        yield html.figure(
-            plots.held_out_over_workspace(job.views.base_from_flange[:, :3, 3], without_m, with_table_m),
-            "Each view predicted from views taken elsewhere: by how much the board's middle is missed, where "
-            "the flange stood.",
-        )
+    yield from map(html.paragraph, arm_sentences(job.calibration))
 
 
 def _lens(job: SolvedRecording) -> Iterator[str]:
@@ -207,18 +185,7 @@ def _lens(job: SolvedRecording) -> Iterator[str]:
         for name, value in values.items()
     ]
     yield html.table(("", "value", "1σ"), rows, (1, 2))
-    yield html.figure(
-        plots.coverage_map(job.views),
-        f"Left: image coverage by corners ({job.coverage:.0%}). Right: distortion.",
-    )
-    if job.lens_known is not None:
-        px = job.lens_known.figures
-        yield html.figure(
-            plots.uncertainty_map(job.lens_known, job.views),
-            f"Standard uncertainty of a direction (1σ): {px['centre']:.3f} px at the centre, "
-            f"{px['corner']:.3f} px in the worst corner, {px['worst']:.3f} px at worst. Blue: the corners "
-            "that fixed it. Where it is large, show the board there too.",
-        )
+    yield html.paragraph(f"Image coverage by corners: {job.coverage:.0%}.")
 
 
 def _distortion_names(model: str) -> tuple[str, ...]:

@@ -35,7 +35,7 @@ LENSES = {
 }
 MOUNTS = {"in-hand": ("eye-in-hand", "flange"), "to-hand": ("eye-to-hand", "base")}
 CASES = [f"{mount}-{lens}" for mount in MOUNTS for lens in LENSES]
-BY_OTHERS = {"ros-launch-follow", "ur-kinematics"}
+BY_OTHERS = {"ur-kinematics"}
 
 
 def seen_points() -> np.ndarray[Any, Any]:

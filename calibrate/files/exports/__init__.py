@@ -11,7 +11,6 @@ from calibrate.files.calibration import Calibration, FramePose
 from calibrate.files.exports import models, ros, vision
 from calibrate.files.exports.frames import ExportError as ExportError
 from calibrate.files.exports.frames import FrameNames as FrameNames
-from calibrate.files.exports.frames import follow_command as follow_command
 from calibrate.files.validity import require_usable
 
 
@@ -26,9 +25,6 @@ class Format(NamedTuple):
 FORMATS: dict[str, Format] = {
     "ros-camera-info": Format(".yaml", "ROS camera_info YAML: the intrinsics", ros.ros_camera_info),
     "ros-launch": Format(".launch.py", "ROS 2 launch file with the static transform", ros.ros_launch, True),
-    "ros-launch-follow": Format(
-        ".launch.py", "ROS 2 launch file that follows what is installed", ros.ros_launch_follow
-    ),
     "urdf": Format(".urdf", "URDF: camera body and optical frame", models.urdf, True),
     "opencv": Format(".yml", "OpenCV FileStorage: transform and intrinsics", vision.opencv),
     "halcon": Format(".dat", "HALCON pose: tool_in_cam_pose or base_in_cam_pose", vision.halcon),

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,7 @@ from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, source_stamp
 from calibrate.files.validity import Validity, validity_text
 from calibrate.geometry import Array, pose
-from recordings.files import MAIN_CAMERA, state_root
+from recordings.files import MAIN_CAMERA
 
 BODY_FROM_OPTICAL: Array = pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """REP-103: a body frame looks along x with z up, an optical frame along z with y down."""
@@ -42,8 +40,6 @@ class FrameNames:
     body: str = "camera_link"
     validity: Validity | None = None
     """Validity of the installed calibration, for the comment; None: the export is of a file."""
-    follow: tuple[str, ...] = ()
-    """Command that prints every change of the installed calibration; empty: the export is of a file."""
     with_table: bool = False
     """True: export the camera pose that belongs to the arm's corrected table."""
 
@@ -60,12 +56,6 @@ class FrameNames:
         """Name of the camera's ROS node: letters, digits and underscores."""
         name = re.sub(r"\W", "_", self.body.removesuffix("_link"), flags=re.ASCII)
         return name if name[:1].isalpha() else f"camera{name}"
-
-
-def follow_command(root: Path | None, camera: str) -> tuple[str, ...]:
-    """Make the command that prints every change of the installed calibration, from any working directory."""
-    place = ("--root", str(state_root(root).resolve()), "--camera", camera)
-    return (sys.executable, "-I", "-m", "calibrate.cli", "follow", *place)  # without the caller's PYTHONPATH
 
 
 def comment(calibration: Calibration, frames: FrameNames) -> str:

@@ -1,11 +1,11 @@
-"""Exports for ROS: camera_info, static transforms, a launch file that follows."""
+"""Exports for ROS: camera_info, and a launch file with the static transform."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from calibrate.files.calibration import Calibration
-from calibrate.files.exports.frames import ExportError, FrameNames, comment, commented_yaml
+from calibrate.files.exports.frames import FrameNames, comment, commented_yaml
 from calibrate.geometry import Array
 from calibrate.projection import camera_matrix, distortion
 
@@ -59,75 +59,3 @@ def generate_launch_description():
         ),
     ])
 '''
-
-
-def ros_launch_follow(calibration: Calibration, frames: FrameNames) -> str:
-    """Make a launch file that runs itself as a node, which publishes what `calibrate follow` prints."""
-    if not frames.follow:
-        raise ExportError("not-installed")
-    return _FOLLOWING.format(
-        comment=comment(calibration, frames),
-        command=list(frames.follow),
-        frames={"base": frames.base, "flange": frames.flange, "camera": frames.camera},
-        node=f"{frames.node}_publisher",
-    )
-
-
-_FOLLOWING = """\
-# {comment}
-# This file holds no values: it publishes the installed calibration, and again whenever that changes. One in
-# doubt or withdrawn is not published, but /tf_static keeps what was published before.
-import json
-import subprocess
-import sys
-
-FOLLOW = {command!r}
-FRAMES = {frames!r}
-
-
-def generate_launch_description():
-    from launch import LaunchDescription
-    from launch.actions import ExecuteProcess
-
-    return LaunchDescription([ExecuteProcess(cmd=[sys.executable, __file__], output="screen")])
-
-
-def transform(result, stamp):
-    from geometry_msgs.msg import TransformStamped
-
-    message = TransformStamped()
-    message.header.stamp = stamp
-    message.header.frame_id = FRAMES[result["parent_frame"]]
-    message.child_frame_id = FRAMES[result["child_frame"]]
-    for place, numbers in (("translation", "translation_m"), ("rotation", "rotation_xyzw")):
-        for axis, value in zip("xyzw", result[numbers]):
-            setattr(getattr(message.transform, place), axis, value)
-    return message
-
-
-def main():
-    import rclpy
-    from tf2_ros.static_transform_broadcaster import StaticTransformBroadcaster
-
-    rclpy.init()
-    node = rclpy.create_node({node!r})
-    broadcaster = StaticTransformBroadcaster(node)
-    follower = subprocess.Popen(FOLLOW, stdout=subprocess.PIPE, text=True)
-    try:
-        for line in follower.stdout:
-            change = json.loads(line)
-            state = change["validity"]["state"] if change["validity"] else "unreadable"
-            say = node.get_logger().info if state == "valid" else node.get_logger().error
-            say("calibration version {{}}: {{}}".format(change["version"], change["text"]))
-            if state in ("valid", "unverified"):
-                broadcaster.sendTransform(transform(change["result"], node.get_clock().now().to_msg()))
-        sys.exit(f"{{FOLLOW}} ended with code {{follower.wait()}}")
-    except KeyboardInterrupt:
-        pass
-    finally:
-        follower.terminate()
-
-
-if __name__ == "__main__":
-    main()
-"""

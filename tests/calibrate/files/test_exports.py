@@ -7,7 +7,6 @@ import re
 import sys
 import types
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +36,8 @@ from calibrate.kinematics import MODELS, forward, with_near_axes
 from calibrate.load import arm_of_ros
 from tests.calibrate.calling import raises_code
 
-FOLLOWED = FrameNames(follow=("calibrate", "follow"))
 
-
-def export(calibration: Calibration, name: str, frames: FrameNames = FOLLOWED) -> str:
+def export(calibration: Calibration, name: str, frames: FrameNames | None = None) -> str:
     """The content as text."""
     return exports.export(calibration, name, frames).decode()
 
@@ -140,7 +137,7 @@ def test_a_ros_transform_is_of_the_arm_as_it_is_unless_asked_for_the_table(calib
         own, other = (export(calibration, name, FrameNames(with_table=yes)) for yes in (True, False))
         assert own.splitlines()[0] != other.splitlines()[0], "the first line says which"
     with pytest.raises(ExportError) as refused:
-        export(calibration, "ros-launch-follow", FrameNames(with_table=True))
+        export(calibration, "halcon", FrameNames(with_table=True))
     assert refused.value.code == "not-of-table"
 
 
@@ -304,25 +301,19 @@ def test_camera_info_of_other_lenses(
     assert found["data"] == [*lens.distortion, *[0.0] * (count - given)]
 
 
-def test_only_what_is_installed_can_be_followed(calibration: Calibration) -> None:
-    with pytest.raises(ExportError) as caught:
-        exports.export(calibration, "ros-launch-follow")
-    assert caught.value.code == "not-installed"
-
-
 @pytest.mark.parametrize("name", FORMATS)
 def test_equal_calibrations_give_equal_bytes(calibration: Calibration, name: str) -> None:
-    assert exports.export(calibration, name, FOLLOWED) == exports.export(calibration, name, FOLLOWED)
+    assert exports.export(calibration, name) == exports.export(calibration, name)
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_says_whether_the_installed_one_holds(calibration: Calibration, name: str) -> None:
-    names = replace(FOLLOWED, validity=unrecorded(3, "2026-01-01T00:00:00+00:00"))
+    names = FrameNames(validity=unrecorded(3, "2026-01-01T00:00:00+00:00"))
     assert "unverified" in export(calibration, name, names)
     for state in (ValidityState.IN_DOUBT, ValidityState.WITHDRAWN):
         held = Validity(3, state, "2026-01-01T00:00:00+00:00", ValidityReason("watch"))
         with raises_code(InstallError, f"calibration-{state}", version=3, reason="watch"):
-            export(calibration, name, replace(FOLLOWED, validity=held))
+            export(calibration, name, FrameNames(validity=held))
 
 
 def test_camera_info_is_named_by_the_body_frame(calibration: Calibration) -> None:

@@ -47,11 +47,13 @@ Box = tuple[float, float, float, float]
 
 TARGET_WHITE = 0.75
 """Wanted level of the board's white, with room for uneven light before saturation."""
-_KEEP = (0.8, 1.25)
-"""Range of factors on the light for which no change is advised"""
 _SATURATED, _SATURATED_SHARE = 0.98, 0.005
-_DARK_WHITE, _BRIGHT_WHITE = 0.35, 0.95
-_LOW_CONTRAST = 0.25
+_DARK, _BRIGHT = 0.35, 0.95
+"""Levels of the board's white"""
+_LIT = 0.15
+"""Level of the brightest part below which an image without a board is too dark."""
+_LEAST_CONTRAST = 0.25
+"""Contrast below which the blur cannot be measured."""
 _BLUR_PX = 2.0
 LONGEST_EXPOSURE_US = 40_000.0
 """Longest exposure that is advised; beyond it gain is raised instead, to keep captures short."""
@@ -105,7 +107,7 @@ def sight(
         distance_m, tilt_rad = _distance_and_tilt(pixels, board_points(board)[found.indices], camera)
     advice = ""
     if exposure is not None:
-        advice = "; ".join(assess(image, found.pixels if found.found else None, *exposure).warnings.values())
+        advice = assess(image, found.pixels if found.found else None, *exposure).text
     status = DetectionStatus(
         found=found.found,
         reason=found.reason,
@@ -158,49 +160,45 @@ class CapturedView:
 
 @dataclass(frozen=True)
 class ExposureAdvice:
+    cause: str
+    """over-exposed, under-exposed or blurred; empty: nothing is wrong."""
+    text: str
+    """The cause as a sentence for people, with what to set."""
     exposure_us: float
     gain_db: float
     """Advised exposure and gain; the present ones where these are good."""
-    white: float
-    black: float
-    saturated: float
-    """Share of saturated pixels"""
-    blur_px: float | None
-    """Sigma of the sharpest edges; None where the contrast is too low to measure it."""
-    warnings: dict[str, str]
-    """Sentences for people by their cause (over-exposed, under-exposed, low-contrast, blurred)."""
 
 
-def assess(
-    image: Pixels,
-    corners: Array | None,
-    exposure_us: float,
-    gain_db: float,
-) -> ExposureAdvice:
+def assess(image: Pixels, corners: Array | None, exposure_us: float, gain_db: float) -> ExposureAdvice:
     """Advise on exposure and gain from an image (h, w[, 3]) and the settings it was taken with.
 
     `corners`: the board's detected points (k, 2); None when it was not found: the whole image is used.
     """
     grey = _levels(image)
     # Half of a board is white; without a board take the few brightest pixels, which may saturate.
-    region, share = (grey, 97.0) if corners is None else (_inside(grey, corners), 85.0)
+    region, share, dark = (grey, 97.0, _LIT) if corners is None else (_inside(grey, corners), 85.0, _DARK)
     black, white = (float(v) for v in np.percentile(region, (8.0, share)))
     saturated = float((region >= _SATURATED).mean())
-    factor = _factor(black, white, saturated)
-    wanted_us, wanted_db = _settings(exposure_us, gain_db, factor)
-    blur_px = _blur(grey, white - black)
-    advice = f"set {wanted_us:.0f} µs and {wanted_db:.1f} dB"
-    warnings: dict[str, str] = {}
-    if saturated > _SATURATED_SHARE or white > _BRIGHT_WHITE:
-        warnings["over-exposed"] = f"too bright: {saturated:.1%} of the pixels are saturated; {advice}"
-    elif white < _DARK_WHITE:
-        warnings["under-exposed"] = f"too dark: the board's white is at {white:.0%} of full scale; {advice}"
-    elif white - black < _LOW_CONTRAST:
-        text = f"low contrast: white {white:.0%}, black {black:.0%}; look for reflections and stray light"
-        warnings["low-contrast"] = text
-    if blur_px is not None and blur_px > _BLUR_PX:
-        warnings["blurred"] = f"blurred: edges are {blur_px:.1f} px wide; focus the lens, or the arm moves"
-    return ExposureAdvice(wanted_us, wanted_db, white, black, saturated, blur_px, warnings)
+    if saturated > _SATURATED_SHARE or white > _BRIGHT:
+        # Clipped levels do not tell how much is too much: the more of them, the larger the step.
+        factor = 0.5 if saturated < 0.2 else 0.25
+        cause, text = "over-exposed", f"too bright: {saturated:.1%} of the pixels are saturated"
+    elif white < dark:
+        factor = min(TARGET_WHITE / max(white, 0.01), 16.0)
+        cause, text = "under-exposed", f"too dark: the board's white is at {white:.0%} of full scale"
+    else:
+        blur_px = _blur(grey, white - black)
+        if blur_px is None or blur_px <= _BLUR_PX:
+            return ExposureAdvice("", "", exposure_us, gain_db)
+        text = f"blurred: edges are {blur_px:.1f} px wide; focus the lens, or the arm moves"
+        return ExposureAdvice("blurred", text, exposure_us, gain_db)
+    # Exposure is raised before gain, and gain is lowered before exposure.
+    total_us = exposure_us * 10 ** (gain_db / 20) * factor
+    wanted_us = float(np.clip(total_us, SHORTEST_EXPOSURE_US, LONGEST_EXPOSURE_US))
+    wanted_db = float(np.clip(20 * np.log10(total_us / wanted_us), 0.0, HIGHEST_GAIN_DB))
+    return ExposureAdvice(
+        cause, f"{text}; set {wanted_us:.0f} µs and {wanted_db:.1f} dB", wanted_us, wanted_db
+    )
 
 
 def _levels(image: Pixels) -> NDArray[np.float32]:
@@ -218,28 +216,9 @@ def _inside(grey: NDArray[np.float32], corners: Array) -> NDArray[np.float32]:
     return grey[mask.astype(bool)] if mask.any() else grey.ravel()
 
 
-def _factor(black: float, white: float, saturated: float) -> float:
-    """Compute the factor on the light by which white reaches its target."""
-    if saturated > _SATURATED_SHARE:
-        # Clipped levels do not tell how much is too much: the more of them, the larger the step.
-        return 0.5 if saturated < 0.2 else 0.25
-    factor = TARGET_WHITE / max(white, 0.01)
-    return 1.0 if _KEEP[0] <= factor <= _KEEP[1] else min(factor, 16.0)
-
-
-def _settings(exposure_us: float, gain_db: float, factor: float) -> tuple[float, float]:
-    """Split a change of light: exposure is raised before gain, and gain is lowered before exposure."""
-    if factor == 1.0:
-        return exposure_us, gain_db
-    total_us = exposure_us * 10 ** (gain_db / 20) * factor
-    wanted_us = float(np.clip(total_us, SHORTEST_EXPOSURE_US, LONGEST_EXPOSURE_US))
-    wanted_db = float(np.clip(20 * np.log10(total_us / wanted_us), 0.0, HIGHEST_GAIN_DB))
-    return wanted_us, wanted_db
-
-
 def _blur(grey: NDArray[np.float32], contrast: float) -> float | None:
     """Measure the Gaussian sigma of the sharpest edges: their slope is contrast / (sigma √(2π))."""
-    if contrast < _LOW_CONTRAST:
+    if contrast < _LEAST_CONTRAST:
         return None
     dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8)
     dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=1 / 8)

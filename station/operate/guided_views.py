@@ -43,23 +43,16 @@ _WRONG_SCALE = 0.03
 """Relative deviation of the squares from their stated size above which a warning is given."""
 _SCALE_SIGMA, _TRAVEL_M = 0.5, 0.001
 """Prior 1σ of the scale; 1σ of the arm's travel against the camera's."""
-_LIT = 0.15
-"""Level of the brightest part, of full scale, below which an image without a board is too dark."""
 _OTHER_MOUNT = 3.0
 """Ratio of the fits from which the other mounting is taken to be the right one."""
 
 
 def image_trouble(image: Image, found: Detection) -> tuple[str, str]:
     """Say what is wrong with an image: code and sentence; both empty: nothing."""
-    advice = assess(image.pixels, found.pixels if found.found else None, image.exposure_us, image.gain_db)
     if found.cause and found.cause != "not-found":
         return found.cause, found.reason
-    told = dict(advice.warnings)
-    if not found.found and advice.white > _LIT:
-        told.pop("under-exposed", None)  # meaningless without the board's white paper in the image
-        told.pop("low-contrast", None)
-    cause = next(iter(told), "")
-    return (cause, told[cause]) if cause else (found.cause, found.reason)
+    advice = assess(image.pixels, found.pixels if found.found else None, image.exposure_us, image.gain_db)
+    return (advice.cause, advice.text) if advice.cause else (found.cause, found.reason)
 
 
 def guided_view(state: RobotState, tcp_offset: Vector6, found: Detection) -> GuidedView:

@@ -37,16 +37,8 @@ def test_following_the_advice_ends_at_a_well_exposed_board(
 ) -> None:
     for _ in range(6):
         advice = look(exposure_us, gain_db, light)
-        if (advice.exposure_us, advice.gain_db) == (exposure_us, gain_db):
-            break
         exposure_us, gain_db = advice.exposure_us, advice.gain_db
-    final = look(exposure_us, gain_db, light)
-    assert final.warnings == {} and 0.55 < final.white < 0.95 and final.saturated < 0.005
-
-
-def test_a_good_picture_is_left_alone() -> None:
-    advice = look(10_000, 0.0)
-    assert advice.warnings == {} and (advice.exposure_us, advice.gain_db) == (10_000, 0.0)
+    assert look(exposure_us, gain_db, light).cause == ""
 
 
 def test_gain_is_raised_only_where_exposure_is_used_up() -> None:
@@ -57,32 +49,23 @@ def test_gain_is_raised_only_where_exposure_is_used_up() -> None:
 
 
 @pytest.mark.parametrize(
-    ("picture", "word"),
+    ("picture", "cause"),
     [
-        ({"light": 4.0}, "too bright"),
-        ({"light": 0.1}, "too dark"),
+        ({}, ""),
+        ({"light": 4.0}, "over-exposed"),
+        ({"light": 0.1}, "under-exposed"),
         ({"blur_px": 3.0}, "blurred"),
     ],
 )
-def test_what_is_wrong_is_named(picture: dict[str, float], word: str) -> None:
-    assert any(word in warning for warning in look(10_000, 0.0, **picture).warnings.values())
-
-
-def test_a_veil_of_stray_light_is_low_contrast() -> None:
-    picture = render(CAMERA, PAPER_BOARD, VIEW, Light(exposure_us=2000, pixel_noise=1.0))
-    advice = assess(picture + np.uint8(90), corners(), 2000, 0.0)
-    assert any("low contrast" in warning for warning in advice.warnings.values())
-
-
-@pytest.mark.parametrize("blur_px", [0.7, 1.5, 3.0])
-def test_the_blur_is_measured(blur_px: float) -> None:
-    advice = look(10_000, 0.0, blur_px=blur_px, pixel_noise=1.0)
-    assert advice.blur_px is not None and advice.blur_px == pytest.approx(blur_px, rel=0.5)
+def test_what_is_wrong_is_named_and_only_the_light_is_changed(picture: dict[str, float], cause: str) -> None:
+    advice = look(10_000, 0.0, **picture)
+    kept = (advice.exposure_us, advice.gain_db) == (10_000, 0.0)
+    assert advice.cause == cause and kept == (cause in ("", "blurred")) and bool(advice.text) == bool(cause)
 
 
 def test_deep_and_colour_pictures_count_the_same() -> None:
-    picture = render(CAMERA, PAPER_BOARD, VIEW, Light(pixel_noise=0.0))
+    picture = render(CAMERA, PAPER_BOARD, VIEW, Light(pixel_noise=0.0, illumination=4.0))
     plain = assess(picture, None, 10_000, 0.0)
-    deep = assess(picture.astype(np.uint16) << 4, None, 10_000, 0.0)
-    colour = assess(np.repeat(picture[:, :, None], 3, axis=2), None, 10_000, 0.0)
-    assert deep.white == pytest.approx(plain.white, abs=0.01) and colour.white == plain.white
+    assert plain.cause == "over-exposed"
+    assert assess(picture.astype(np.uint16) << 4, None, 10_000, 0.0).exposure_us == plain.exposure_us
+    assert assess(np.repeat(picture[:, :, None], 3, axis=2), None, 10_000, 0.0) == plain

@@ -52,8 +52,6 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     note: str = ""
     criterion: Criterion | None = None
     """Criterion by which the planner chose the poses; None: a person taught, listed or changed some."""
-    motion: Literal["stops", "sweep"] = "stops"
-    """sweep: of an earlier release; such a plan can be read, but not driven."""
 
 
 def plan_sha256(plan: Plan) -> str:

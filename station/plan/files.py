@@ -60,8 +60,6 @@ def load_plan(path: Path) -> Plan:
 def _value_problems(plan: Plan) -> list[str]:
     """Find wrong values and contradictions that types cannot express."""
     problems = []
-    if plan.motion != "stops":
-        problems.append("motion: sweeps are gone. Make a plan of poses: `station plan`")
     if plan.robot not in MODELS:
         problems.append(f"robot '{plan.robot}' is unknown; known are {', '.join(MODELS)}")
     if not 1 <= len(plan.poses) <= _POSE_LIMIT:

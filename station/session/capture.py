@@ -7,7 +7,6 @@ import contextlib
 import logging
 import math
 import time
-from collections import deque
 
 import numpy as np
 
@@ -24,10 +23,8 @@ from station.session.context import SessionContext
 from station.session.recording import to_the_end
 
 SATURATED_LIMIT = 0.05
-GAPS_S = (0.0, 0.03)
-"""Pauses between the images for motion; unequal, so that no vibration has a period that fits both."""
-IMAGES = 3
-GLIMPSE_TRIES = 2
+GAPS_S = (0.0, 0.0, 0.03)
+"""Pauses before the images for motion; unequal between them, so that no vibration's period fits both."""
 WORKER_TIMEOUT_S = 5.0
 
 log = logging.getLogger(__name__)
@@ -177,13 +174,10 @@ class ImageWatch:
 
     def __init__(self, context: SessionContext, index: int) -> None:
         self._context, self._index = context, index
-        self._images: deque[tuple[int, Pixels]] = deque(maxlen=IMAGES)
         self._found: tuple[int, float] | None = None
         """Time before which none of the three exposures began (host monotonic ns), and the motion, px."""
-        self._blind = False
+        self._blind = self._ended = False
         self._again = asyncio.Event()
-        self._glimpsing: asyncio.Task[Image | None] | None = None
-        self._task: asyncio.Task[None] | None = None
         model = context.cell.config.camera.model
         self._width = model.width if model is not None else 0
         view = context.require_queue().pose(index).view
@@ -206,47 +200,37 @@ class ImageWatch:
 
     async def __aexit__(self, *_: object) -> None:
         """End the measurement; a request to the camera that is under way is completed first."""
-        assert self._task is not None
-        self._task.cancel()
-        ending = {self._task, *([self._glimpsing] if self._glimpsing else [])}
-        await asyncio.wait(ending)
-        # Ignore errors of the last look: if they persist, the next image reports them.
-        await asyncio.gather(*ending, return_exceptions=True)
+        self._ended = True
+        self._again.set()
+        await asyncio.wait({self._task})
 
     async def _run(self) -> None:
         try:
-            while await self._one_more():
-                if len(self._images) == IMAGES:
-                    await self._measure()
-                    self._again.clear()
+            while not self._ended and (motion := await self._measure()) is not None:
+                self._found = motion
+                self._again.clear()
+                if not self._ended:
                     await self._again.wait()
-                else:
-                    await asyncio.sleep(GAPS_S[len(self._images) - 1])
         except Exception as error:  # even a defect must not block the pose
             if not isinstance(error, StationError):
                 log.exception("the image motion could not be measured")
-            self._context.store.problem(error, "warning", self._index, "image motion not measured: {}")
+            if not self._ended:  # if it persists, the next image reports it
+                self._context.store.problem(error, "warning", self._index, "image motion not measured: {}")
         self._blind = True
 
-    async def _one_more(self) -> bool:
-        """Take one more image; False when the camera cannot."""
-        for left in reversed(range(GLIMPSE_TRIES)):
-            asked_ns = time.monotonic_ns()
-            self._glimpsing = asyncio.create_task(self._context.cell.camera.glimpse())
+    async def _measure(self) -> tuple[int, float] | None:
+        """Return the time before three images, and the motion in them; None when the camera cannot."""
+        begun_ns, images = time.monotonic_ns(), list[Pixels]()
+        for gap_s in GAPS_S:
+            await asyncio.sleep(gap_s)
             try:
-                image = await asyncio.shield(self._glimpsing)
-            except CameraError:
-                if not left:
-                    raise
-                continue
-            if image is not None:
-                self._images.append((asked_ns, viewable(image.pixels, image.pixel_format)))
-            return image is not None
-        return False
-
-    async def _measure(self) -> None:
-        images = [image for _, image in self._images]
+                image = await self._context.cell.camera.glimpse()
+            except CameraError:  # one lost frame is no reason to look no more
+                image = None if self._ended else await self._context.cell.camera.glimpse()
+            if image is None or self._ended:
+                return None
+            images.append(viewable(image.pixels, image.pixel_format))
         motion_px = await self._context.workers.call(
             image_motion, images, self._width, self._box, timeout_s=WORKER_TIMEOUT_S
         )
-        self._found = self._images[0][0], math.nan if motion_px is None else motion_px
+        return begun_ns, math.nan if motion_px is None else motion_px

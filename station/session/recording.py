@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import platform
 import threading
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Coroutine
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,7 +23,6 @@ from recordings.recorder import Recorder
 from recordings.schema.messages import (
     ARM_KINEMATICS_NAME,
     CameraModel,
-    CaptureEvent,
     Image,
     Matrix4,
     SessionInfo,
@@ -42,7 +40,6 @@ from station.cell.session_folder import (
     segment_path,
     write_state,
 )
-from station.cell.status import Level
 from station.devices.cell import Cell
 from station.session.queue import PoseQueue
 from station.session.threads import DISK
@@ -51,10 +48,6 @@ _PACKAGES = (
     "calibration-station", "numpy", "scipy", "opencv-python-headless", "mcap", "ur-rtde",
 )  # fmt: skip
 SYNC_TIMEOUT_S = 30.0
-_LEVELS: tuple[tuple[int, Level], ...] = (
-    (logging.ERROR, "error"), (logging.WARNING, "warning"), (logging.INFO, "info"),
-)  # fmt: skip
-_LOG_TEXT_LIMIT = 2000
 
 R = TypeVar("R")
 
@@ -301,21 +294,3 @@ class SessionRecording:
         if self.recorder is None:
             raise RecordingError("not-open", folder=self.folder)
         return self.recorder
-
-
-class Logbook(logging.Handler):
-    """Log handler that writes the log of `station` to the recording; events are recorded elsewhere."""
-
-    def __init__(self, recorder: Callable[[], Recorder | None]) -> None:
-        super().__init__(logging.INFO)
-        self._recorder = recorder
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Record a log line; callable from any thread, never raises."""
-        recorder = self._recorder()
-        if recorder is None or record.name == "station.events":
-            return
-        level: Level = next((word for number, word in _LEVELS if record.levelno >= number), "debug")
-        text = f"{record.name}: {record.getMessage()}"[:_LOG_TEXT_LIMIT]
-        with contextlib.suppress(RecordingError):
-            recorder.event(CaptureEvent(stamps_now(), "log", detail=text, level=level))

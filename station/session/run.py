@@ -28,8 +28,7 @@ from station.devices.news import Delay
 from station.protocol.verbs import Purpose
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import RunRequests, SessionContext
-from station.session.lease import MotionApproval, require_start
-from station.session.motion import Motion, previewed
+from station.session.motion import Motion, MotionApproval, previewed, require_start
 from station.session.queue import BUSY
 from station.session.recording import to_the_end
 from station.session.stop_move import stop_half_way
@@ -341,13 +340,13 @@ async def _seal(context: SessionContext) -> None:
         context.store.enter(StationState.IDLE)
 
 
-def disk_failed(context: SessionContext, error: RecordingError) -> None:
+def disk_failed(context: SessionContext, error: RecordingError | StationError) -> None:
     """Report a disk error; the `.part` file stays for recovery, and a STOP meanwhile stays latched."""
     if context.recording is not None:
         context.recording.abandon()
     text = f"Recording: {str(error).rstrip('.')}. What was saved before is safe."
     reason = StationError.from_data(ErrorData(error.code, text))
-    if context.requests.halt:
+    if context.store.state is StationState.STOPPED:
         context.store.update(reason=f"{context.store.status.reason} — {reason}")
     else:
         context.store.enter(StationState.FAULT, reason)
@@ -368,11 +367,7 @@ def unmark_busy(context: SessionContext) -> None:
 
 async def close_or_seal(context: SessionContext) -> None:
     """Finish the recording; on a disk error enter fault and leave the `.part` file."""
-    recording = context.require_recording()
     try:
         await seal(context)
     except (RecordingError, StationError) as error:
-        recording.abandon()
-        context.store.problem(error, "error", said="not finished: {}")
-        if context.store.state is not StationState.STOPPED:
-            context.store.enter(StationState.FAULT, f"Recording: {error}", error.code)
+        disk_failed(context, error)

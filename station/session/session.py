@@ -34,11 +34,10 @@ from station.session.context import RunRequests, SessionContext, StatusStore
 from station.session.device_connector import DeviceConnector
 from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
-from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
-from station.session.motion import previewed, session_motion
+from station.session.motion import ApprovalManager, MotionApproval, previewed, session_motion
 from station.session.previews import Previewer
 from station.session.queue import PoseQueue
-from station.session.recording import Logbook, SessionRecording
+from station.session.recording import SessionRecording
 from station.session.run import Run, close_or_seal, unmark_busy
 from station.session.stop_move import stop_motion
 from station.session.supervisor import SessionSupervisor
@@ -67,7 +66,6 @@ class Session:
         self.context = SessionContext(
             cell, geometry, self.store, Workers(start_worker, warm_up), monitor, root
         )
-        self.leases = LeaseManager()
         self.approvals = ApprovalManager(time.monotonic)
         self.supervisor = SessionSupervisor(self.context, self._jogged, self._void)
         self.devices = DeviceConnector(self.context)
@@ -81,12 +79,10 @@ class Session:
         cell.robot.subscribe(self.context.record_state)
         self.store.recorded = self.context.record_event
         self.store.watch(self._estimator.poke)
-        self._logbook = Logbook(lambda: self.context.recorder)
 
     async def start(self) -> None:
         """Connect devices (read-only, with retries) and restore a session that a crash interrupted."""
         self.context.root.mkdir(parents=True, exist_ok=True)
-        logging.getLogger("station").addHandler(self._logbook)
         found = await DISK.run(interrupted_session, self.context.root)
         if found is not None:
             show_interrupted(self.context, *found)
@@ -107,7 +103,6 @@ class Session:
             with contextlib.suppress(RecordingError):
                 path = await context.recording.seal(context.require_queue())
                 self.store.event("finished", f"finished before the end: {path}", path=str(path))
-        logging.getLogger("station").removeHandler(self._logbook)
         for task in self._tasks:
             task.cancel()
         context.workers.close()
@@ -129,13 +124,13 @@ class Session:
 
     async def lease_lost(self, client_id: int, how: str = "The connection of {} was lost.") -> None:
         """Stop the arm as the client in control is gone; going on needs a new approval."""
-        holder = self.leases.lease.holder
-        if not self.leases.release(client_id):
+        lease = self.store.status.lease
+        if lease.client_id != client_id:
             return
         self._void()
-        self.store.update(lease=self.leases.lease)
+        self.store.update(lease=LeaseStatus())
         if self.store.state in RUNNING:
-            reason = how.format(holder) + " Approve again to continue."
+            reason = how.format(lease.holder) + " Approve again to continue."
             await self._halt(self.context.resting, reason, "control-lost")
 
     async def _halt(self, state: StationState, reason: str, cause: str) -> None:
@@ -209,7 +204,7 @@ class Session:
         plan_sha256 = context.queue.sha256 if context.queue else ""
         try:
             go = self.approvals.redeem(token, client_id, plan_sha256, joints, again)
-            go = replace(go, approval=approval or f"motion approved by {self.leases.lease.holder}")
+            go = replace(go, approval=approval or f"motion approved by {self.store.status.lease.holder}")
         finally:
             self.store.update(go=None)
         self._notes = ()
@@ -260,10 +255,18 @@ class Session:
 
     # -- control, plan, freedrive ------------------------------------------------------------------------
 
-    def take_lease(self, client_id: int, who: str) -> LeaseStatus:
-        lease = self.leases.take(client_id, who, time.time_ns())
-        self.store.update(lease=lease)
-        return lease
+    def take_lease(self, client_id: int, who: str) -> None:
+        """Give control to a client, which may already have it. RefusedError names another that has it."""
+        if self.store.status.lease.client_id is None:
+            self.store.update(lease=LeaseStatus(who, client_id, time.time_ns()))
+        self._require_control(client_id)
+
+    def _require_control(self, client_id: int) -> None:
+        lease = self.store.status.lease
+        if lease.client_id is None:
+            raise RefusedError("no-control")
+        if lease.client_id != client_id:
+            raise RefusedError("control-held", holder=lease.holder)
 
     async def release(self, client_id: int, silent: bool = False) -> None:
         """Release control, as asked or as the terminal is `silent`; a moving arm decelerates."""
@@ -346,7 +349,7 @@ class Session:
 
         Not by an approval: it holds only under the control under which the motion was offered.
         """
-        if verb.control and verb is not verbs.Go and self.leases.lease.client_id is None:
+        if verb.control and verb is not verbs.Go and self.store.status.lease.client_id is None:
             self._require_state(verb)
             self.take_lease(client_id, who)
         self.permit(verb, client_id)
@@ -354,7 +357,7 @@ class Session:
     def permit(self, verb: type[Verb[object]], client_id: int) -> None:
         """Raise RefusedError unless a verb is allowed to this client in the present state."""
         if verb.control:
-            self.leases.require(client_id)
+            self._require_control(client_id)
         self._require_state(verb)
 
     def _require_state(self, verb: type[Verb[object]]) -> None:

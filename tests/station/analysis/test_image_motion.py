@@ -18,7 +18,7 @@ from station.cell.errors import CameraError
 from station.cell.pose_plan import ExpectedView
 from station.cell.status import StationState as S
 from station.cell.stillness import StillnessMonitor
-from station.session.capture import GLIMPSE_TRIES, ImageWatch
+from station.session.capture import ImageWatch
 from station.session.queue import PoseQueue
 from station.simulation.camera import RenderedCamera
 from station.simulation.launch import SimulatedController
@@ -109,7 +109,7 @@ async def test_it_is_captured_as_soon_as_the_picture_rests(rig: Rig) -> None:
 async def test_what_cannot_be_looked_at_is_recorded_as_not_measured(rig: Rig, why: str) -> None:
     rig.camera.blind = why == "played"
     if why == "failing":
-        rig.camera.glimpse_fails = ["no frame"] * GLIMPSE_TRIES * POSES
+        rig.camera.glimpse_fails = ["no frame"] * 2 * POSES
     assert await recorded(rig) == [None] * POSES
     told = rig.told("camera")
     assert len(told) == (POSES if why == "failing" else 0)

@@ -1,4 +1,4 @@
-"""The lease and the go: one commander, one use, and void at the first doubt."""
+"""The approval: one use, and void at the first doubt."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan
 from station.cell.status import MotionPreview
 from station.protocol.verbs import Purpose
-from station.session.lease import (
+from station.session.motion import (
     APPROVAL_LIFETIME_S,
     START_TOLERANCE_RAD,
     ApprovalManager,
-    LeaseManager,
+    Motion,
     MotionApproval,
 )
-from station.session.motion import Motion
 from station.session.queue import PoseQueue
 from tests.codes import raises
 
@@ -89,18 +88,3 @@ def test_a_newer_go_replaces_the_older_and_void_ends_both() -> None:
     for go in (old, new):
         with pytest.raises(RefusedError):
             desk.redeem(go.preview.token, 1, PLAN, HERE)
-
-
-def test_one_commander_the_second_hears_who_it_is() -> None:
-    desk = LeaseManager()
-    desk.take(1, "anna on tty1", 0)
-    desk.take(1, "anna on tty1", 0)
-    with raises("control-held"):
-        desk.take(2, "bert", 0)
-    with raises("control-held"):
-        desk.require(2)
-    assert not desk.release(2)
-    assert desk.release(1)
-    with raises("no-control"):
-        desk.require(1)
-    desk.take(2, "bert", 0)

@@ -69,14 +69,14 @@ async def test_whoever_does_not_hold_the_lease_commands_nothing(
 
 
 async def test_control_that_nobody_has_goes_to_the_first_that_needs_it(rig: Rig, small_plan: Plan) -> None:
-    dispatcher, lease = SessionDispatcher(rig.session), rig.session.leases
+    dispatcher, store = SessionDispatcher(rig.session), rig.session.store
     await rig.session.release(1)
     for verb, code in (("go", "no-control"), ("record", "wrong-state"), ("retake", "wrong-arguments")):
         with raises(code):  # an approval of another's motion, nothing that could be done, no request
             await dispatcher.handle(BERT, verb, NONE if verb == "retake" else arguments(verb, small_plan))
     await dispatcher.handle(BERT, "configuration", NONE)
-    assert lease.lease.client_id is None
+    assert store.status.lease.client_id is None
     await dispatcher.handle(BERT, "skip", arguments("skip", small_plan))
-    assert lease.lease.client_id == BERT.client_id == rig.session.store.status.lease.client_id
+    assert store.status.lease.client_id == BERT.client_id
     with raises("control-held"):
         await dispatcher.handle(ANNA, "skip", arguments("skip", small_plan))

@@ -21,12 +21,8 @@ from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import Rig
 
 
-async def robot_check(rig: Rig) -> Check:
-    return (await checklist(rig.session.context, {}))[0]
-
-
-async def test_a_robot_that_is_there_is_ok(rig: Rig) -> None:
-    assert (await robot_check(rig)).state == "ok"
+async def check(rig: Rig, name: str) -> Check:
+    return next(check for check in await checklist(rig.session.context, {}) if check.name == name)
 
 
 @pytest.mark.parametrize(
@@ -46,28 +42,15 @@ async def test_what_drives_the_arm_is_said(
     monkeypatch.setattr("station.devices.ur.library_installed", lambda: installed)
     rig.arm.control_path = path
     object.__setattr__(rig.session.context.cell, "source", source)
-    found = next(c for c in await checklist(rig.session.context, {}) if c.name == "control")
+    found = await check(rig, "control")
     assert found.state == state and bool(found.remedy) == (state in ("failed", "warning"))
 
 
 async def test_without_news_the_driver_says_what_is_missing(rig: Rig) -> None:
+    assert (await check(rig, "robot")).state == (await check(rig, "camera")).state == "ok"
     rig.arm.lost = True
-    found = await robot_check(rig)
+    found = await check(rig, "robot")
     assert (found.state, found.remedy) == ("failed", "switch it on")
-
-
-async def test_the_size_of_the_camera_is_that_of_its_pictures_not_of_the_preview(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def settings() -> dict[str, object]:
-        return {"region": [0, 0, 1280, 1024]}
-
-    monkeypatch.setattr(rig.camera, "preview", rig.camera.glimpse)
-    said = {check.name: check.text for check in await checklist(rig.session.context, {})}
-    assert said["camera"].endswith("80×64")  # a camera that tells no more
-    monkeypatch.setattr(rig.camera, "settings", settings)
-    said = {check.name: check.text for check in await checklist(rig.session.context, {})}
-    assert said["camera"].endswith("1280×1024")
 
 
 @pytest.mark.parametrize(
@@ -91,49 +74,37 @@ async def test_clocks_are_ok_only_where_frames_have_a_time(
     fit = ClockFit(0.0, 0.0, 0.0, 0.0, 0.0001, 0.0, 60.0)
     rig.arm.clock = lambda: fit  # type: ignore[method-assign]
     rig.camera.timing = FrameTiming(source, bound_s, fit if clock else None, impossible)
-    found = next(c for c in await checklist(rig.session.context, {}) if c.name == "clocks")
+    found = await check(rig, "clocks")
     assert found.state == state and bool(found.remedy) == (state != "ok")
 
 
-@pytest.mark.parametrize(
-    ("camera", "state"),
-    [
-        (None, "skipped"),
-        (FoundCamera("V", "M", "S", "1", "10.0.0.5/24", "10.0.0.1/24"), "ok"),
-        (FoundCamera("V", "M", "S", "1", "10.0.0.5/24", "192.168.1.9/24"), "warning"),
-        (FoundCamera("V", "M", "S", "1", "10.0.0.5/32", "10.0.0.1/24"), "warning"),  # its mask is wrong
-        (FoundCamera("V", "M", "S", "1", "10.0.0.5/24", "10.0.0.1/24", True, "10.0.0.9"), "warning"),
-    ],
-)
-async def test_a_wrong_mask_and_a_camera_in_use_are_named(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch, camera: FoundCamera | None, state: str
-) -> None:
-    cell = rig.session.context.cell
-    wired = msgspec.structs.replace(cell.config.camera, driver="aravis", device="S")
-    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, camera=wired))
-    monkeypatch.setattr("station.session.checklist.discover", lambda: [] if camera is None else [camera])
-    found = next(c for c in await checklist(rig.session.context, {}) if c.name == "network cameras")
-    assert found.state == state and bool(found.remedy) == (state == "warning")
+FOUND = FoundCamera("V", "M", "S", "1", "10.0.0.5/24", "10.0.0.1/24")
+PLUGGED = UsbCamera("V", "M", "S", "1", "2-1", 5000.0, True)
 
 
 @pytest.mark.parametrize(
     ("camera", "state"),
     [
         (None, "skipped"),
-        (UsbCamera("V", "M", "S", "1", "2-1", 5000.0, True), "ok"),
-        (UsbCamera("V", "M", "S", "1", "2-1", 480.0, True), "warning"),  # a USB 2 cable or port
-        (UsbCamera("V", "M", "S", "1", "2-1", 5000.0, False), "warning"),
+        (FOUND, "ok"),
+        (msgspec.structs.replace(FOUND, seen_from="192.168.1.9/24"), "warning"),
+        (msgspec.structs.replace(FOUND, address="10.0.0.5/32"), "warning"),  # its mask is wrong
+        (msgspec.structs.replace(FOUND, controlled=True, controlled_from="10.0.0.9"), "warning"),
+        (PLUGGED, "ok"),
+        (msgspec.structs.replace(PLUGGED, speed_mbit_s=480.0), "warning"),  # a USB 2 cable or port
+        (msgspec.structs.replace(PLUGGED, permitted=False), "warning"),
     ],
 )
-async def test_usb_cameras_are_listed_with_what_keeps_one_from_being_used(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch, camera: UsbCamera | None, state: str
+async def test_a_camera_that_is_there_is_listed_with_what_keeps_it_from_being_used(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, camera: FoundCamera | UsbCamera | None, state: str
 ) -> None:
     cell = rig.session.context.cell
     wired = msgspec.structs.replace(cell.config.camera, driver="aravis", device="S")
     object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, camera=wired))
-    monkeypatch.setattr("station.session.checklist.discover", list)
-    monkeypatch.setattr("station.session.checklist.discover_usb", lambda: [] if camera is None else [camera])
-    found = next(c for c in await checklist(rig.session.context, {}) if c.name == "usb cameras")
+    for name, kind in (("discover", FoundCamera), ("discover_usb", UsbCamera)):
+        there = [camera] if isinstance(camera, kind) else []
+        monkeypatch.setattr(f"station.session.checklist.{name}", lambda there=there: there)
+    found = await check(rig, "usb cameras" if isinstance(camera, UsbCamera) else "network cameras")
     assert found.state == state and bool(found.remedy) == (state == "warning")
 
 
@@ -144,11 +115,8 @@ async def test_usb_cameras_are_listed_with_what_keeps_one_from_being_used(
 async def test_what_is_installed_is_of_this_robot_and_camera_and_holds(
     rig: Rig, tmp_path: Path, change: str, state: str
 ) -> None:
-    async def check() -> Check:
-        return next(c for c in await checklist(rig.session.context, {}) if c.name == "calibration")
-
     root, cell = rig.session.context.root, rig.session.context.cell
-    assert (await check()).state == "skipped"
+    assert (await check(rig, "calibration")).state == "skipped"
     robot, camera = (
         msgspec.structs.replace(
             device.identity, serial="another" if change == name else device.identity.serial
@@ -161,5 +129,5 @@ async def test_what_is_installed_is_of_this_robot_and_camera_and_holds(
         set_validity(root, ValidityState.IN_DOUBT, ValidityReason("drift-check"))
     if change == "damage":
         (root / "calibrations/current").resolve().write_text("format: handeye-calibration/1")
-    found = await check()
+    found = await check(rig, "calibration")
     assert found.state == state and bool(found.remedy) == (state != "ok")

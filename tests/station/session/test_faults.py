@@ -122,15 +122,6 @@ async def test_a_jogged_arm_is_named_and_its_go_is_void(rig: Rig) -> None:
     assert any("was moved" in warning for warning in again.warnings)
 
 
-async def test_a_robot_that_is_lost_at_rest_comes_back(rig: Rig) -> None:
-    rig.arm.lost = True
-    await rig.until(S.DISCONNECTED)
-    with raises("wrong-state"):
-        await rig.session.prepare(1, Purpose.RUN)
-    rig.arm.lost = False
-    await rig.until(S.IDLE)
-
-
 async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_part(
     new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

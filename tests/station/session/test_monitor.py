@@ -71,13 +71,3 @@ async def test_the_question_says_that_a_playback_moves_nothing(new_rig: NewRig) 
     summary = await rig.session.prepare(1, Purpose.RUN)
     assert summary.warnings == ("PLAYBACK of a recording: no arm moves",)
     assert rig.session.store.status.robot.condition.held == ""
-
-
-async def test_a_drift_check_is_told_as_one_until_the_next_run(rig: Rig) -> None:
-    await rig.give_go(Purpose.DRIFT_CHECK)
-    await until(lambda: bool(rig.session.store.status.session.recording))
-    assert rig.session.store.status.session.check
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
-    assert not rig.session.store.status.session.check

@@ -8,11 +8,10 @@ import pytest
 
 from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, forward
-from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import Image, RobotIdentity, RobotState, Stamps, Vector6
 from station.cell.errors import RobotError
 from station.cell.status import StationState as S
-from tests.station.session_rig import BOUND_S, POSES, Rig, sealed
+from tests.station.session_rig import POSES, Rig, sealed
 
 TOOL: Vector6 = (0.01, -0.02, 0.15, 0.0, 0.3, 0.5)
 
@@ -65,18 +64,6 @@ async def test_it_is_the_pose_of_mid_exposure(rig: Rig, monkeypatch: pytest.Monk
         assert view.stamps.host_monotonic_ns == middle_ns
         assert view.stamps.device_ns == stamps.device_ns + round(500 * picture.exposure_us) > stamps.device_ns
         assert view.joints_rad[0] == pytest.approx(turned[middle_ns], abs=1e-12)
-
-
-async def test_the_time_bound_is_the_cameras_and_the_robots(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot_clock = ClockFit(0.0, 0.0, 0.0, 0.0, 0.003, 0.001, 60.0)
-    assert robot_clock.bound_s > 0.002
-    monkeypatch.setattr(rig.arm, "clock", lambda: robot_clock)
-    await rig.give_go()
-    await rig.until(S.IDLE)
-    expected_s = BOUND_S + robot_clock.bound_s
-    assert [view.time_bound_s for view in sealed(rig).views()] == [pytest.approx(expected_s)] * POSES
 
 
 async def test_an_arm_that_is_moved_between_rest_and_exposure_gives_no_view(

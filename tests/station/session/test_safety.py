@@ -17,6 +17,7 @@ from station.analysis.pool import WorkerError, Workers
 from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import StationError
 from station.cell.pose_plan import Plan
+from station.cell.status import LeaseStatus
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Skip
 from station.server.control import ControlServer
@@ -87,6 +88,8 @@ async def test_a_robot_that_was_lost_voids_the_go(rig: Rig) -> None:
     summary = await rig.session.prepare(1, Purpose.RUN)
     rig.arm.lost = True
     await rig.until(S.DISCONNECTED)
+    with raises("wrong-state"):
+        await rig.session.prepare(1, Purpose.RUN)
     rig.arm.lost = False
     await rig.until(S.IDLE)
     assert rig.session.store.status.go is None
@@ -166,7 +169,7 @@ async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_p
         client.setblocking(False)
         await asyncio.get_running_loop().sock_connect(client, str(tmp_path / "s"))
         if verb == "release":
-            rig.session.leases.lease = msgspec.structs.replace(rig.session.leases.lease, client_id=1)
+            rig.session.store.update(lease=LeaseStatus("anna", 1))
         client.send(msgspec.json.encode({"id": 1, "verb": verb}) + b"\n")
         await until(lambda: "stop" in rig.arm.log)
     await asyncio.sleep(0.15)

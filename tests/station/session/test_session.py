@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import threading
 from pathlib import Path
@@ -16,31 +15,18 @@ import pytest
 from calibrate.load import load_views
 from recordings.manifest import enter_part
 from recordings.reader import open_recording
+from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import ArmKinematics
 from station.cell.errors import LimitError, RobotError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
 from tests.codes import raises
+from tests.durability import disk_order
 from tests.patience import PATIENCE_S, until
-from tests.station.session_rig import POSES, HeldDisk, Rig, sealed
+from tests.station.session_rig import BOUND_S, POSES, HeldDisk, NewRig, Rig, sealed
 
 WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
-
-
-async def test_the_recording_keeps_the_arm_s_own_table(rig: Rig, small_plan: Plan) -> None:
-    table = ArmKinematics("UR10", "controller", (0.1,) * 6, (0.2,) * 6, (0.3,) * 6, (0.4,) * 6)
-    rig.arm.kinematics = table
-    await rig.give_go()
-    await rig.until(S.IDLE)
-    arm = load_views(sealed(rig), fewest=0).views.arm
-    assert arm is not None and arm.name == "UR10"
-    assert (arm.a_m, arm.d_m, arm.alpha_rad, arm.theta_rad) == (
-        (0.1,) * 6,
-        (0.2,) * 6,
-        (0.3,) * 6,
-        (0.4,) * 6,
-    )
 
 
 async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> None:
@@ -48,6 +34,10 @@ async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> No
     await rig.until(S.IDLE)
     assert rig.states == [S.IDLE, S.CHECKING, *WHOLE_POSE * POSES, S.SEALING, S.IDLE]
     assert rig.pose_states == ["done"] * POSES
+    assert rig.arm.log[: POSES + 2] == ["start control", *["move"] * POSES, "end control"]
+    assert not rig.arm.control
+    with raises("no-session"):
+        await rig.session.prepare(1, Purpose.RESUME)
     recording = sealed(rig)
     views = recording.views()
     assert [view.index for view in views] == list(range(POSES))
@@ -57,19 +47,40 @@ async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> No
         assert view.stillness is not None
     assert set(recording.attachments()) == {"plan.yaml", "config.yaml", "camera.json", "truth.json"}
     assert recording.info.source == "simulated"
-    assert any("saved" in event.detail for event in recording.events())
+    told = [event.detail for event in recording.events()]
+    assert rig.told("recording")[0].text in told and any("saved" in text for text in told)
+    assert "anna" in rig.told("approved")[0].text
+    assert rig.told("finished")[0].values == {"captured": POSES, "poses": POSES, "path": str(recording.path)}
+    assert recording.info.camera_identity.name == ""
     assert sum(1 for _ in recording.robot_states()) > POSES * 50
 
 
-async def test_control_lives_only_for_a_go(rig: Rig) -> None:
-    assert "start control" not in rig.arm.log
-    await rig.session.prepare(1, Purpose.RUN)
-    assert "start control" not in rig.arm.log
-    await rig.give_go()
-    await rig.until(S.IDLE)
-    await until(lambda: rig.arm.log[-1] == "end control")
-    assert rig.arm.log.count("start control") == 1
-    assert not rig.arm.control
+async def test_a_recording_tells_of_arm_clocks_and_camera(
+    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = await new_rig(source="real")
+    table = ArmKinematics("UR10", "controller", (0.1,) * 6, (0.2,) * 6, (0.3,) * 6, (0.4,) * 6)
+    clock = ClockFit(0.0, 0.0, 0.0, 0.0, 0.003, 0.001, 60.0)
+    rig.arm.kinematics = table
+    monkeypatch.setattr(rig.arm, "clock", lambda: clock)
+    cell = rig.session.context.cell
+    camera = msgspec.structs.replace(cell.config.camera, name="overhead")
+    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, camera=camera))
+    with disk_order(monkeypatch) as order:
+        await rig.give_go()
+        await until(lambda: rig.pose_states[0] == "done")
+        until_then = list(order)
+        await rig.until(S.IDLE)
+    # Data that no name leads to after a power loss would be lost with it.
+    assert {"sync sessions", f"sync {rig.session.context.root.name}"} <= set(until_then)
+    recording = sealed(rig)
+    arm = load_views(recording, fewest=0).views.arm
+    assert arm is not None and arm.name == "UR10"
+    assert (arm.a_m, arm.d_m, arm.alpha_rad) == (table.a_m, table.d_m, table.alpha_rad)
+    assert recording.info.camera_identity.name == "overhead", "under it the calibration is installed"
+    assert "not accepted" in recording.info.software["robot stops"]
+    bounds_s = [view.time_bound_s for view in recording.views()]
+    assert bounds_s == [pytest.approx(BOUND_S + clock.bound_s)] * POSES
 
 
 async def test_the_heart_beats_only_while_a_go_is_carried_out(rig: Rig) -> None:
@@ -232,16 +243,6 @@ async def test_the_end_of_the_daemon_seals_a_recording_that_is_just_being_opened
     assert list(tmp_path.rglob("*.mcap")) and not list(tmp_path.rglob("*.part"))
 
 
-async def test_the_log_is_in_the_recording_too(rig: Rig) -> None:
-    await rig.go_until_it_moves()
-    logging.getLogger("station.devices.ur").warning("a path of the stop failed")
-    rig.arm.slow = False
-    rig.arm.arrive.set()
-    await rig.until(S.IDLE)
-    logged = [event.detail for event in sealed(rig).events() if event.kind == "log"]
-    assert "station.devices.ur: a path of the stop failed" in logged
-
-
 async def test_a_notice_of_the_arm_is_shown_while_it_moves(rig: Rig) -> None:
     rig.arm.slow = True
     rig.arm.notice = "speed slider at 5 %"
@@ -251,14 +252,6 @@ async def test_a_notice_of_the_arm_is_shown_while_it_moves(rig: Rig) -> None:
     rig.arm.arrive.set()
     await rig.until(S.IDLE)
     assert rig.session.store.status.reason == ""
-
-
-async def test_a_sealed_session_is_not_added_to(rig: Rig) -> None:
-    await rig.give_go()
-    await until(lambda: bool(rig.session.store.status.session.recording))
-    await rig.until(S.IDLE)
-    with raises("no-session"):
-        await rig.session.prepare(1, Purpose.RESUME)
 
 
 async def test_a_plan_from_another_posture_is_told_from_one_that_is_not_free(

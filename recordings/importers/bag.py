@@ -7,7 +7,6 @@ time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -26,12 +25,12 @@ from recordings.images import (
     pixel_format_of,
     read_header,
 )
-from recordings.importers.bags import Bag, open_bag
+from recordings.importers.bags import open_bag
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
-from recordings.importers.messages import ImageMessage, JointMessage, Progress
-from recordings.importers.selection import JointSample, Selection, Wanted, select
+from recordings.importers.messages import ImageMessage, Progress
+from recordings.importers.selection import Selection, Wanted, select
 from recordings.importers.stops import Standstill, StandstillLimits, find_stops
-from recordings.schema.messages import CameraModel, Image, Joints, Matrix4, RobotState, Stamps, View
+from recordings.schema.messages import CameraModel, Image, Joints, Matrix4, RobotState, Stamps, Vector6, View
 from recordings.writer import RecordingWriter, derived_recording
 
 PAIR_WITHIN_S = 0.05
@@ -84,7 +83,9 @@ def import_bag(
         chosen = select(bag, wanted)
         images_ns = np.fromiter((image.stamp_ns for image in bag.images(chosen.image.name)), np.int64)
         joints = chosen.joints
-        speeds = (joints.stamps_ns, joints.fastest_rad_s) if joints and joints.has_speeds else None
+        speeds = None
+        if joints is not None and joints.speeds_rad_s is not None:
+            speeds = joints.stamps_ns, np.abs(joints.speeds_rad_s).max(axis=1)
         stops, passed = find_stops(chosen.track, images_ns, speeds, limits, pair_within_s)
         plan = BagPlan(
             image_topic=chosen.image.name,
@@ -110,7 +111,7 @@ def import_bag(
                 limit=STOPS_LEAST,
             )
         assert described is not None
-        images = bag.images(chosen.image.name, sorted(stop.place for stop in stops))
+        images = bag.images(chosen.image.name, {stop.place for stop in stops})
         first = next(images)
         camera = _camera(described, chosen.camera, *_size(first))
         note = f"imported from {source.name}: {plan.image_topic}, {plan.poses_from}"
@@ -118,7 +119,13 @@ def import_bag(
         with derived_recording(output, info) as writer:
             writer.attach(DATASET_FILE, "application/yaml", description_bytes)
             writer.attach("import.json", "application/json", msgspec.json.encode(asdict(plan)))
-            _write(writer, bag, chosen, stops, chain([first], images), pair_within_s, progress)
+            _write_states(writer, chosen)
+            in_file_order = sorted(enumerate(stops), key=lambda numbered: numbered[1].place)
+            pairs = zip(in_file_order, chain([first], images), strict=True)
+            for done, ((index, stop), image) in enumerate(pairs, 1):
+                at_stop = joints.at(stop.stamp_ns, pair_within_s) if joints else None
+                _write_view(writer, index, stop, image, at_stop)
+                progress(done, len(stops), "importing")
             return replace(plan, bytes_written=writer.finish().stat().st_size)
     finally:
         bag.close()
@@ -141,32 +148,6 @@ def _camera_text(described: Dataset | None, chosen: Selection) -> str:
     return "intrinsics of the bag" if known else "size of the images, intrinsics to be estimated"
 
 
-def _write(
-    writer: RecordingWriter,
-    bag: Bag,
-    chosen: Selection,
-    stops: list[Standstill],
-    images: Iterator[ImageMessage],
-    pair_within_s: float,
-    progress: Progress,
-) -> None:
-    """`images`: of the stops, in the order of the file."""
-    index = {stop.place: number for number, stop in enumerate(stops)}
-    samples = _joint_samples(bag, chosen)
-    last, waiting = None, next(samples, None)
-    in_file_order = sorted(stops, key=lambda stop: stop.place)
-    for done, (stop, image) in enumerate(zip(in_file_order, images, strict=True), 1):
-        while waiting is not None and waiting.stamp_ns <= stop.stamp_ns:
-            _write_state(writer, chosen, waiting)
-            last, waiting = waiting, next(samples, None)
-        joints_rad = _joints_at(stop.stamp_ns, last, waiting, pair_within_s)
-        _write_view(writer, index[stop.place], stop, image, joints_rad)
-        progress(done, len(stops), "importing")
-    while waiting is not None:
-        _write_state(writer, chosen, waiting)
-        waiting = next(samples, None)
-
-
 def _camera(described: Dataset, found: CameraModel | None, width: int, height: int) -> CameraModel:
     """The description's, else the bag's, else the size alone. ImportSourceError for another size."""
     camera = described.camera or found or CameraModel(width, height)
@@ -175,52 +156,31 @@ def _camera(described: Dataset, found: CameraModel | None, width: int, height: i
     return camera
 
 
-def _joint_samples(bag: Bag, chosen: Selection) -> Iterator[JointSample]:
-    """The arm's joints in the order of its axes, from every message about them."""
-    if chosen.joints is None:
+def _write_states(writer: RecordingWriter, chosen: Selection) -> None:
+    """Robot states of an arm of six joints; the tool's pose is the flange's, for nobody told of a tool."""
+    joints = chosen.joints
+    if joints is None or joints.positions_rad.shape[1] != 6:
         return
-    for value in bag.values(chosen.joints.topic):
-        assert isinstance(value, JointMessage)
-        if (sample := chosen.joints.sample(value)) is not None:
-            yield sample
-
-
-def _write_state(writer: RecordingWriter, chosen: Selection, sample: JointSample) -> None:
-    """A robot state, of an arm of six joints; the tool's pose is the flange's, for nobody told of a tool."""
-    if len(sample.positions_rad) != 6:
-        return
-    base_from_flange = chosen.track.at(np.array([sample.stamp_ns]))[0]
-    x, y, z = base_from_flange[:3, 3].tolist()
-    rx, ry, rz = cv2.Rodrigues(base_from_flange[:3, :3])[0].ravel().tolist()
-    j1, j2, j3, j4, j5, j6 = sample.positions_rad
-    v1, v2, v3, v4, v5, v6 = sample.speeds_rad_s
-    state = RobotState(
-        stamps=Stamps(host_wall_ns=sample.stamp_ns, controller_s=sample.stamp_ns / 1e9),
-        joints_rad=(j1, j2, j3, j4, j5, j6),
-        joint_speeds_rad_s=(v1, v2, v3, v4, v5, v6),
-        target_joints_rad=(j1, j2, j3, j4, j5, j6),
-        tcp_pose=(x, y, z, rx, ry, rz),
-        robot_mode=0,
-        safety_mode=0,
-        safety_status_bits=0,
-        runtime_state=0,
-        robot_status_bits=0,
-        speed_scaling=1.0,
-        target_speed_fraction=1.0,
-    )
-    writer.robot_state(state)
-
-
-def _joints_at(
-    stamp_ns: int, before: JointSample | None, after: JointSample | None, within_s: float
-) -> Joints | None:
-    """Interpolated between the reports around the stamp; None when they are farther from it than allowed."""
-    near = [sample for sample in (before, after) if sample is not None]
-    if not near or any(abs(s.stamp_ns - stamp_ns) > within_s * 1e9 for s in near):
-        return None
-    times = [sample.stamp_ns - stamp_ns for sample in near]
-    joints = zip(*[sample.positions_rad for sample in near], strict=True)
-    return tuple(float(np.interp(0, times, joint)) for joint in joints)
+    speeds = np.zeros_like(joints.positions_rad) if joints.speeds_rad_s is None else joints.speeds_rad_s
+    for stamp_ns, *told in zip(joints.stamps_ns.tolist(), joints.positions_rad, speeds, strict=True):
+        T = chosen.track.at(np.array([stamp_ns]))[0]
+        pose = [*T[:3, 3].tolist(), *cv2.Rodrigues(T[:3, :3])[0].ravel().tolist()]
+        at, moving, tcp_pose = (msgspec.convert(list(map(float, six)), Vector6) for six in (*told, pose))
+        state = RobotState(
+            stamps=Stamps(host_wall_ns=stamp_ns, controller_s=stamp_ns / 1e9),
+            joints_rad=at,
+            joint_speeds_rad_s=moving,
+            target_joints_rad=at,
+            tcp_pose=tcp_pose,
+            robot_mode=0,
+            safety_mode=0,
+            safety_status_bits=0,
+            runtime_state=0,
+            robot_status_bits=0,
+            speed_scaling=1.0,
+            target_speed_fraction=1.0,
+        )
+        writer.robot_state(state)
 
 
 def _write_view(

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from recordings.errors import ImportSourceError
 from recordings.files import open_file
-from recordings.importers.messages import (
-    CDR,
-    ImageMessage,
-    Kind,
-    Progress,
-    Value,
-    decoded,
-    kind_of,
-    ros_types,
-)
-from recordings.mcap.contents import Contents
+from recordings.importers.messages import ImageMessage, Kind, Progress, Value, decoded, kind_of, ros_types
+from recordings.mcap.contents import Contents, MessageIndex
 from recordings.mcap.scan import scan_file
 from recordings.mcap.source import Source
 from recordings.schema.definitions import SESSION_RECORDS
@@ -41,60 +34,48 @@ class BagTopic:
     messages: int
 
 
-_Messages = Iterator[tuple[int, bytes]]
-"""(time in ns, data)"""
-
-
-class _Storage(Protocol):
-    declared: list[tuple[str, str, str, int]]
-    """Topic, encoding, schema and messages of each channel."""
-
-    def read(self, topic: str, places: list[int] | None) -> _Messages:
-        """A topic's messages, or those at the ascending places, in file order."""
-        ...
-
-    def deserialize(self, data: bytes, schema: str) -> Any:
-        """A ROS message."""
-        ...
-
-    def close(self) -> None: ...
-
-
-class Bag:
+class Bag(ABC):
     """A source that is read topic by topic, as often as needed, one message in memory at a time."""
 
-    def __init__(self, storage: _Storage, progress: Progress) -> None:
-        self._storage, self._progress = storage, progress
-        topics: dict[str, BagTopic] = {}
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self.topics: dict[str, BagTopic] = {}
+        """By name."""
         self.others: list[str] = []
         """Topics of kinds that are not used here."""
-        for name, encoding, schema, messages in storage.declared:
-            if (kind := kind_of(encoding, schema)) is None:
-                self.others.append(f"{name} ({schema or 'no schema'}, {encoding})")
-            else:
-                before = topics[name].messages if name in topics else 0
-                topics[name] = BagTopic(name, kind, encoding, schema, before + messages)
-        self.topics = list(topics.values())
-        self._by_name = topics
-        self._total = sum(topic.messages for topic in self.topics)
         self._done = 0
 
-    def close(self) -> None:
-        self._storage.close()
+    def _declare(self, name: str, encoding: str, schema: str, messages: int) -> None:
+        if (kind := kind_of(encoding, schema)) is None:
+            self.others.append(f"{name} ({schema or 'no schema'}, {encoding})")
+        else:
+            before = self.topics[name].messages if name in self.topics else 0
+            self.topics[name] = BagTopic(name, kind, encoding, schema, before + messages)
 
-    def values(self, topic: str, places: list[int] | None = None) -> Iterator[Value]:
-        """Yield the values, or those at the ascending places, in the order of the file.
+    @abstractmethod
+    def close(self) -> None: ...
+
+    @abstractmethod
+    def _read(self, topic: str, places: Collection[int] | None) -> Iterator[tuple[int, bytes]]:
+        """(time in ns, data) of a topic's messages, or of those at these places, in file order."""
+
+    @abstractmethod
+    def _deserialize(self, data: bytes, schema: str) -> Any:
+        """A ROS message."""
+
+    def values(self, topic: str, places: Collection[int] | None = None) -> Iterator[Value]:
+        """Yield the values, or those at these places, in the order of the file.
 
         The first pass over a topic tells how far it is. Raises ImportSourceError.
         """
-        told = self._by_name[topic]
-        for time_ns, data in self._storage.read(topic, places):
-            yield decoded(told.encoding, told.schema, data, time_ns, self._storage.deserialize)
+        told, total = self.topics[topic], sum(known.messages for known in self.topics.values())
+        for time_ns, data in self._read(topic, places):
+            yield decoded(told.encoding, told.schema, data, time_ns, self._deserialize)
             self._done += 1
-            if self._done <= self._total and self._done % _SHOWN_EVERY == 0:
-                self._progress(self._done, self._total, "reading the bag")
+            if self._done <= total and self._done % _SHOWN_EVERY == 0:
+                self._progress(self._done, total, "reading the bag")
 
-    def images(self, topic: str, places: list[int] | None = None) -> Iterator[ImageMessage]:
+    def images(self, topic: str, places: Collection[int] | None = None) -> Iterator[ImageMessage]:
         return (image for image in self.values(topic, places) if isinstance(image, ImageMessage))
 
 
@@ -110,65 +91,60 @@ def open_bag(path: Path, progress: Progress = lambda done, total, text: None) ->
         mcap, ros = ([], [path]) if path.suffix in (".bag", ".db3") else ([path], [])
     if not mcap and not ros:
         raise ImportSourceError("no-bag", path=path)
-    return Bag(_McapBag(mcap, progress) if mcap else _RosBag(ros), progress)
+    return _McapBag(mcap, progress) if mcap else _RosBag(ros, progress)
 
 
-class _McapBag:
+class _McapBag(Bag):
     """One or several MCAP files, with ROS 2 messages, foxglove's, or both."""
 
     def __init__(self, paths: list[Path], progress: Progress) -> None:
-        self._descriptors: list[int] = []
-        self._files: list[tuple[Contents, Source]] = []
-        self.declared: list[tuple[str, str, str, int]] = []
+        super().__init__(progress)
+        self._files: list[tuple[int, Contents, Source]] = []
         done, total = 0, sum(path.stat().st_size for path in paths)
-        try:
-            for path in paths:
-                self._descriptors.append(open_file(path))
-
-                def scanned(bytes_done: int, before: int = done) -> None:
-                    progress(before + bytes_done, total, "checking the bag")
-
-                contents, source, _ = scan_file(self._descriptors[-1], path, _RESCUE, scanned)
-                self._files.append((contents, source))
-                done += source.size_bytes
+        for path in paths:
+            descriptor = open_file(path)
+            try:
+                told = partial(self._checked, done, total)
+                contents, source, _ = scan_file(descriptor, path, _RESCUE, told)
                 if SESSION_RECORDS[0] in contents.metadata:
                     raise ImportSourceError("a-recording", path=path)
-                declared: dict[str, tuple[str, str]] = {}
-                for channel in contents.channels.values():
-                    schema, encoding = contents.schema_of(channel).name, channel.message_encoding
-                    if encoding == CDR and "/msg/" not in schema:  # as some bridges write it
-                        schema = "/msg/".join(schema.split("/", 1))
-                    declared[channel.topic] = encoding, schema
-                for topic, (encoding, schema) in declared.items():
-                    self.declared.append((topic, encoding, schema, len(contents.messages[topic])))
-        except BaseException:
-            self.close()
-            raise
+            except BaseException:
+                os.close(descriptor)
+                self.close()
+                raise
+            self._files.append((descriptor, contents, source))
+            done += source.size_bytes
+            for channel in {channel.topic: channel for channel in contents.channels.values()}.values():
+                schema, encoding = contents.schema_of(channel).name, channel.message_encoding
+                if encoding == "cdr" and "/msg/" not in schema:  # as some bridges write it
+                    schema = "/msg/".join(schema.split("/", 1))
+                self._declare(channel.topic, encoding, schema, len(contents.messages[channel.topic]))
+
+    def _checked(self, before: int, total: int, done: int) -> None:
+        self._progress(before + done, total, "checking the bag")
 
     def close(self) -> None:
-        while self._descriptors:
-            os.close(self._descriptors.pop())
+        while self._files:
+            os.close(self._files.pop()[0])
 
-    def deserialize(self, data: bytes, schema: str) -> Any:
+    def _read(self, topic: str, places: Collection[int] | None) -> Iterator[tuple[int, bytes]]:
+        place = -1
+        for _, contents, source in self._files:
+            for address in contents.messages.get(topic, MessageIndex()).addresses:
+                place += 1
+                if places is None or place in places:
+                    found = source.message(address)
+                    yield found.log_time, found.data
+
+    def _deserialize(self, data: bytes, schema: str) -> Any:
         return ros_types().deserialize_cdr(data, schema)
 
-    def read(self, topic: str, places: list[int] | None) -> _Messages:
-        wanted = None if places is None else set(places)
-        for place, (source, address) in enumerate(self._addresses(topic)):
-            if wanted is None or place in wanted:
-                found = source.message(address)
-                yield found.log_time, found.data
 
-    def _addresses(self, topic: str) -> Iterator[tuple[Source, int]]:
-        for contents, source in self._files:
-            for address in contents.messages[topic].addresses if topic in contents.messages else ():
-                yield source, address
-
-
-class _RosBag:
+class _RosBag(Bag):
     """A ROS 2 bag in sqlite3, whole or a single file, or ROS 1 bags."""
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    def __init__(self, paths: list[Path], progress: Progress) -> None:
+        super().__init__(progress)
         types = ros_types()
         from rosbags.highlevel import AnyReader
 
@@ -182,7 +158,8 @@ class _RosBag:
             self._reader.open()
         except Exception as error:  # sqlite's, yaml's and the library's own
             raise self._unreadable(error) from error
-        self.declared = [(c.topic, CDR, c.msgtype, c.msgcount) for c in self._reader.connections]
+        for c in self._reader.connections:
+            self._declare(c.topic, "cdr", c.msgtype, c.msgcount)
 
     def _unreadable(self, error: Exception) -> ImportSourceError:
         return ImportSourceError("unreadable-bag", path=self._path, reason=str(error))
@@ -190,19 +167,14 @@ class _RosBag:
     def close(self) -> None:
         self._reader.close()
 
-    def deserialize(self, data: bytes, schema: str) -> Any:
-        return self._reader.deserialize(data, schema)
-
-    def read(self, topic: str, places: list[int] | None) -> _Messages:
+    def _read(self, topic: str, places: Collection[int] | None) -> Iterator[tuple[int, bytes]]:
         chosen = [c for c in self._reader.connections if c.topic == topic]
-        wanted = None if places is None else set(places)
-        messages = enumerate(self._reader.messages(connections=chosen))
-        while True:
-            try:
-                place, (_, time_ns, data) = next(messages)
-            except StopIteration:
-                return
-            except Exception as error:
-                raise self._unreadable(error) from error
-            if wanted is None or place in wanted:
-                yield time_ns, bytes(data)
+        try:
+            for place, (_, time_ns, data) in enumerate(self._reader.messages(connections=chosen)):
+                if places is None or place in places:
+                    yield time_ns, data
+        except Exception as error:
+            raise self._unreadable(error) from error
+
+    def _deserialize(self, data: bytes, schema: str) -> Any:
+        return self._reader.deserialize(data, schema)

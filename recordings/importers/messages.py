@@ -10,23 +10,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.json_format import ParseDict
 from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError
 from recordings.schema.messages import CameraModel
-from recordings.schema.viewing import camera_model_of, intrinsics
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -78,17 +71,14 @@ class FrameMessage:
 Value = ImageMessage | CameraModel | JointMessage | list[FrameMessage]
 
 
-CDR, PROTOBUF, JSON = "cdr", "protobuf", "json"
-_FOXGLOVE: dict[str, tuple[Any, Kind]] = {
-    "foxglove.RawImage": (RawImage, Kind.IMAGE),
-    "foxglove.CompressedImage": (CompressedImage, Kind.IMAGE),
-    "foxglove.CameraCalibration": (CameraCalibration, Kind.CAMERA),
-    "foxglove.JointStates": (JointStates, Kind.JOINTS),
-    "foxglove.FrameTransform": (FrameTransform, Kind.TRANSFORMS),
-    "foxglove.FrameTransforms": (FrameTransforms, Kind.TRANSFORMS),
-    "foxglove.PoseInFrame": (PoseInFrame, Kind.POSE),
-}
-_ROS = {
+_KINDS = {
+    "foxglove.RawImage": Kind.IMAGE,
+    "foxglove.CompressedImage": Kind.IMAGE,
+    "foxglove.CameraCalibration": Kind.CAMERA,
+    "foxglove.JointStates": Kind.JOINTS,
+    "foxglove.FrameTransform": Kind.TRANSFORMS,
+    "foxglove.FrameTransforms": Kind.TRANSFORMS,
+    "foxglove.PoseInFrame": Kind.POSE,
     "sensor_msgs/msg/Image": Kind.IMAGE,
     "sensor_msgs/msg/CompressedImage": Kind.IMAGE,
     "sensor_msgs/msg/CameraInfo": Kind.CAMERA,
@@ -98,13 +88,19 @@ _ROS = {
     "geometry_msgs/msg/PoseStamped": Kind.POSE,
 }
 _NS = 1_000_000_000
+_LENS_MODELS: dict[str, Any] = {
+    "kannala_brandt": "equidistant",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "rational_polynomial": "rational_polynomial",
+}
+"""Names of ROS and foxglove → ours; others are plumb_bob."""
 
 
 def kind_of(encoding: str, schema: str) -> Kind | None:
     """Return the content of such messages; None for kinds that are not used here."""
-    if encoding in (PROTOBUF, JSON):
-        return _FOXGLOVE[schema][1] if schema in _FOXGLOVE else None
-    return _ROS.get(schema) if encoding == CDR else None
+    readable = ("protobuf", "json") if schema.startswith("foxglove.") else ("cdr",)
+    return _KINDS.get(schema) if encoding in readable else None
 
 
 def decoded(
@@ -115,18 +111,25 @@ def decoded(
     `deserialize`: makes a message of ROS's bytes.
     """
     try:
-        if encoding == PROTOBUF:
-            return _from_foxglove(schema, _FOXGLOVE[schema][0].FromString(data), time_ns)
-        if encoding == JSON:
+        if encoding == "protobuf":
+            message = _foxglove(schema).FromString(data)
+        elif encoding == "json":
             fields = json.loads(data, object_hook=_protobufs_time)
-            message = ParseDict(fields, _FOXGLOVE[schema][0](), ignore_unknown_fields=True)
-            return _from_foxglove(schema, message, time_ns)
-        message = deserialize(data, schema)
+            message = ParseDict(fields, _foxglove(schema)(), ignore_unknown_fields=True)
+        else:
+            message = deserialize(data, schema)
     except ImportSourceError:
         raise
     except Exception as error:  # whatever rosbags makes of bytes that are no message
         raise ImportSourceError("undecodable-message", schema=schema, reason=repr(error)) from error
-    return _from_ros(schema, message, time_ns)
+    return _value(_KINDS[schema], message, time_ns)
+
+
+@cache
+def _foxglove(schema: str) -> Any:
+    """The protobuf class of a published schema."""
+    name = schema.removeprefix("foxglove.")
+    return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
 
 
 def _protobufs_time(found: dict[str, Any]) -> object:
@@ -146,71 +149,60 @@ def ros_types() -> Any:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
+def _value(kind: Kind, message: Any, time_ns: int) -> Value:
+    """`message`: of ROS, which has a header, or of foxglove; most of their fields have the same names."""
+    if kind is Kind.TRANSFORMS:
+        return [_transform(moved, time_ns) for moved in getattr(message, "transforms", [message])]
+    stamp_ns = _stamp_ns(message, time_ns)
+    if kind is Kind.POSE:
+        frame = message.header.frame_id if hasattr(message, "header") else message.frame_id
+        return [_frame(stamp_ns, frame, "", message.pose.position, message.pose.orientation)]
+    if kind is Kind.CAMERA:
+        K, D = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)  # ROS 2
+        return _lens(message.width, message.height, K, D, message.distortion_model)
+    if kind is Kind.JOINTS and hasattr(message, "joints"):
+        joints = message.joints
+        speeds = tuple(j.velocity for j in joints) if all(j.HasField("velocity") for j in joints) else ()
+        names, positions = tuple(j.name for j in joints), tuple(j.position for j in joints)
+        return JointMessage(stamp_ns, names, positions, speeds)
+    if kind is Kind.JOINTS:
+        positions, speeds = (tuple(map(float, told)) for told in (message.position, message.velocity))
+        return JointMessage(stamp_ns, tuple(message.name), positions, speeds)
+    if not hasattr(message, "step"):
+        encoding = message.format.partition(";")[
+            0
+        ]  # "bayer_rggb8; png compressed", as image_transport writes
+        return ImageMessage(stamp_ns, 0, 0, encoding, 0, bytes(message.data))
+    if getattr(message, "is_bigendian", False) and "16" in message.encoding:
+        raise ImportSourceError("big-endian")
+    size = (message.width, message.height)
+    return ImageMessage(stamp_ns, *size, message.encoding, message.step, bytes(message.data))
+
+
+def _stamp_ns(message: Any, time_ns: int) -> int:
+    if hasattr(message, "header"):
+        stamp = message.header.stamp
+        return int(stamp.sec * _NS + stamp.nanosec) or time_ns
+    return int(message.timestamp.seconds * _NS + message.timestamp.nanos) or time_ns
+
+
+def _transform(message: Any, time_ns: int) -> FrameMessage:
+    of_ros = hasattr(message, "header")
+    parent = message.header.frame_id if of_ros else message.parent_frame_id
+    moved, stamp_ns = message.transform if of_ros else message, _stamp_ns(message, time_ns)
+    return _frame(stamp_ns, parent, message.child_frame_id, moved.translation, moved.rotation)
+
+
 def _frame(stamp_ns: int, parent: str, child: str, at: Any, turn: Any) -> FrameMessage:
     return FrameMessage(stamp_ns, parent, child, (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w))
 
 
-def _from_foxglove(schema: str, message: Any, time_ns: int) -> Value:
-    if schema == "foxglove.FrameTransforms":
-        return [_foxglove_frame(transform, time_ns) for transform in message.transforms]
-    if schema == "foxglove.FrameTransform":
-        return [_foxglove_frame(message, time_ns)]
-    stamp_ns, frame = _foxglove_stamp(message, time_ns), getattr(message, "frame_id", "")
-    if schema == "foxglove.RawImage":
-        size = (message.width, message.height)
-        return ImageMessage(stamp_ns, *size, message.encoding, message.step, message.data)
-    if schema == "foxglove.CompressedImage":
-        return ImageMessage(stamp_ns, 0, 0, "", 0, message.data)
-    if schema == "foxglove.CameraCalibration":
-        return camera_model_of(message)
-    if schema == "foxglove.JointStates":
-        joints = message.joints
-        speeds = tuple(j.velocity for j in joints) if all(j.HasField("velocity") for j in joints) else ()
-        return JointMessage(
-            stamp_ns, tuple(j.name for j in joints), tuple(j.position for j in joints), speeds
-        )
-    return [_frame(stamp_ns, frame, "", message.pose.position, message.pose.orientation)]
-
-
-def _foxglove_stamp(message: Any, time_ns: int) -> int:
-    return int(message.timestamp.seconds * _NS + message.timestamp.nanos) or time_ns
-
-
-def _foxglove_frame(message: Any, time_ns: int) -> FrameMessage:
-    names = (message.parent_frame_id, message.child_frame_id)
-    return _frame(_foxglove_stamp(message, time_ns), *names, message.translation, message.rotation)
-
-
-def _from_ros(schema: str, message: Any, time_ns: int) -> Value:
-    if schema == "tf2_msgs/msg/TFMessage":
-        return [_ros_frame(transform, time_ns) for transform in message.transforms]
-    if schema == "geometry_msgs/msg/TransformStamped":
-        return [_ros_frame(message, time_ns)]
-    stamp_ns, frame = _ros_stamp(message.header, time_ns), str(message.header.frame_id)
-    if schema == "sensor_msgs/msg/Image":
-        if message.is_bigendian and "16" in message.encoding:
-            raise ImportSourceError("big-endian")
-        size = (message.width, message.height)
-        return ImageMessage(stamp_ns, *size, message.encoding, message.step, message.data.tobytes())
-    if schema == "sensor_msgs/msg/CompressedImage":
-        encoding = message.format.partition(";")[
-            0
-        ]  # "bayer_rggb8; png compressed", as image_transport writes
-        return ImageMessage(stamp_ns, 0, 0, encoding, 0, message.data.tobytes())
-    if schema == "sensor_msgs/msg/CameraInfo":
-        size = (message.width, message.height)
-        k, d = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)  # ROS 1, ROS 2
-        return intrinsics(*size, k, d, message.distortion_model)
-    if schema == "sensor_msgs/msg/JointState":
-        speeds = tuple(map(float, message.velocity))
-        return JointMessage(stamp_ns, tuple(message.name), tuple(map(float, message.position)), speeds)
-    return [_frame(stamp_ns, frame, "", message.pose.position, message.pose.orientation)]
-
-
-def _ros_stamp(header: Any, time_ns: int) -> int:
-    return int(header.stamp.sec * _NS + header.stamp.nanosec) or time_ns
-
-
-def _ros_frame(message: Any, time_ns: int) -> FrameMessage:
-    names, moved = (message.header.frame_id, message.child_frame_id), message.transform
-    return _frame(_ros_stamp(message.header, time_ns), *names, moved.translation, moved.rotation)
+def _lens(width: int, height: int, K: Any, D: Any, distortion_model: str) -> CameraModel:
+    """Intrinsics; a K of zeros means that nobody knows them."""
+    k = np.array(K, float).ravel()
+    if len(k) != 9 or not k[0] > 0:
+        return CameraModel(width, height)
+    model = _LENS_MODELS.get(distortion_model, "plumb_bob")
+    return CameraModel(
+        width, height, tuple(map(tuple, k.reshape(3, 3).tolist())), tuple(map(float, D)), model
+    )

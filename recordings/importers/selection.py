@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,40 +38,28 @@ class Selection:
     track: Track
     poses_from: str
     """In words: which frames or topic."""
-    joints: JointSource | None
+    joints: JointTrack | None
 
 
 @dataclass(frozen=True, eq=False)
-class JointSource:
+class JointTrack:
+    """The arm's joints over time, base first."""
+
     topic: str
-    order: tuple[int, ...]
-    """Places of the arm's joints, base first, in its messages with these names."""
-    names: tuple[str, ...]
     stamps_ns: NDArray[np.int64]
-    fastest_rad_s: Array
-    has_speeds: bool
+    positions_rad: Array
+    """(n, joints)"""
+    speeds_rad_s: Array | None
+    """(n, joints); None where some message tells none."""
 
-    def sample(self, joints: JointMessage) -> JointSample | None:
-        """Its joints in the arm's order; None for a message about other joints."""
-        if joints.names != self.names:
+    def at(self, time_ns: int, within_s: float) -> Joints | None:
+        """Interpolated between the reports around; None when one is farther away than allowed."""
+        after = int(np.searchsorted(self.stamps_ns, time_ns, "right"))
+        near = slice(max(0, after - 1), after + 1)
+        away_ns = self.stamps_ns[near] - time_ns
+        if not len(away_ns) or np.abs(away_ns).max() > within_s * 1e9:
             return None
-        speeds = (
-            joints.speeds_rad_s if len(joints.speeds_rad_s) == len(self.names) else (0.0,) * len(self.names)
-        )
-        return JointSample(
-            joints.stamp_ns,
-            tuple(joints.positions_rad[place] for place in self.order),
-            tuple(speeds[place] for place in self.order),
-        )
-
-
-@dataclass(frozen=True)
-class JointSample:
-    """Joints of the arm at one time, base first."""
-
-    stamp_ns: int
-    positions_rad: Joints
-    speeds_rad_s: Joints
+        return tuple(float(np.interp(0, away_ns, joint)) for joint in self.positions_rad[near].T)
 
 
 def select(bag: Bag, wanted: Wanted) -> Selection:
@@ -95,7 +84,7 @@ def select(bag: Bag, wanted: Wanted) -> Selection:
 
 
 def _of(bag: Bag, kind: Kind) -> list[BagTopic]:
-    return [topic for topic in bag.topics if topic.kind is kind and topic.messages]
+    return [topic for topic in bag.topics.values() if topic.kind is kind and topic.messages]
 
 
 def _one(bag: Bag, kind: Kind, name: str | None, option: str) -> BagTopic:
@@ -146,29 +135,27 @@ def _camera(bag: Bag, image: BagTopic) -> CameraModel | None:
     return last
 
 
-def _joints(bag: Bag) -> JointSource | None:
+def _joints(bag: Bag) -> JointTrack | None:
     """The first topic that tells of an arm's joints."""
     for topic in _of(bag, Kind.JOINTS):
+        names: tuple[str, ...] | None = None
         order: tuple[int, ...] | None = None
-        names: tuple[str, ...] = ()
-        stamps_ns: list[int] = []
-        fastest: list[float] = []
-        has_speeds = True
+        stamps_ns, positions, speeds = array("q"), array("d"), array("d")
         for value in bag.values(topic.name):
             assert isinstance(value, JointMessage)
             if order is None:
                 order, names = arm_joints(value.names), value.names
             if order is None or value.names != names:
                 continue
+            stamps_ns.append(value.stamp_ns)
+            positions.extend(value.positions_rad[place] for place in order)
             if len(value.speeds_rad_s) == len(names):
-                fastest.append(max(abs(value.speeds_rad_s[place]) for place in order))
-                stamps_ns.append(value.stamp_ns)
-            else:
-                has_speeds = False
+                speeds.extend(value.speeds_rad_s[place] for place in order)
         if order is not None:
             by_time = np.argsort(stamps_ns, kind="stable")
-            stamps, speeds = np.array(stamps_ns, np.int64)[by_time], np.array(fastest)[by_time]
-            return JointSource(topic.name, order, names, stamps, speeds, has_speeds)
+            told, moved = (np.array(values).reshape(-1, len(order)) for values in (positions, speeds))
+            track = np.array(stamps_ns)[by_time], told[by_time]
+            return JointTrack(topic.name, *track, moved[by_time] if len(moved) == len(told) else None)
     return None
 
 

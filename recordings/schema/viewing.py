@@ -40,12 +40,6 @@ _NS = 1_000_000_000
 _LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _FISHEYE = {"equidistant": "kannala_brandt"}
 """Foxglove's name for OpenCV's fisheye model."""
-_OURS: dict[str, Any] = {
-    "kannala_brandt": "equidistant",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-    "rational_polynomial": "rational_polynomial",
-}
 
 
 def _stamp(message: Any, time_ns: int) -> None:
@@ -90,25 +84,6 @@ def camera_calibration(model: CameraModel, time_ns: int) -> Any:
     message.P.extend(np.column_stack([K, np.zeros(3)]).ravel())
     _stamp(message, time_ns)
     return message
-
-
-def camera_model_of(message: Any) -> CameraModel:
-    """The intrinsics of a `foxglove.CameraCalibration`."""
-    return intrinsics(message.width, message.height, message.K, message.D, message.distortion_model)
-
-
-def intrinsics(width: int, height: int, K: Any, D: Any, distortion_model: str) -> CameraModel:
-    """Return intrinsics as Foxglove and ROS write them; a K of zeros means that nobody knows them."""
-    k = [float(number) for number in K]
-    if len(k) != 9 or not k[0] > 0:
-        return CameraModel(width, height)
-    return CameraModel(
-        width,
-        height,
-        ((k[0], k[1], k[2]), (k[3], k[4], k[5]), (k[6], k[7], k[8])),
-        tuple(float(number) for number in D),
-        _OURS.get(distortion_model, "plumb_bob"),
-    )
 
 
 def frame_transform(parent: str, child: str, T: Matrix4, time_ns: int) -> Any:

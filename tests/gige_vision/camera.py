@@ -95,7 +95,7 @@ class EmulatedCamera:
         """Host monotonic start and end of every exposure"""
         self._tick_hz, self._chunk_payload = tick_hz, chunk_payload
         self._memory = bytearray(at.XML_AT)
-        self._xml = at.zipped(at.genicam_xml(serial))
+        self._xml = at.zipped()
         self._chunks = {name: name == "Image" for name in at.CHUNKS}
         self._controller: tuple[str, int] | None = None
         self._heard_s = 0.0

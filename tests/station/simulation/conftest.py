@@ -1,14 +1,9 @@
-"""Controllers as processes, the real wheel in a child of its own, a raw client, robots without sockets."""
+"""Controllers as processes, a raw client, robots without sockets."""
 
 from __future__ import annotations
 
-import json
-import signal
 import socket
 import struct
-import subprocess
-import sys
-import textwrap
 from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -27,39 +22,11 @@ from station.devices.rtde import (
     packet,
     split_names,
 )
-from station.devices.ur import library_installed
 from station.simulation.controller.programs import UploadReader
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from tests.patience import PATIENCE_S
-
-_BEFORE = """
-import json, math, os, sys, threading, time
-import rtde_control, rtde_receive, rtde_io, dashboard_client
-from station.simulation.launch import AdminClient
-from tests.patience import wait_until as until
-host = sys.argv[1]
-admin = AdminClient(host)
-result = {}
-HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
-NEAR = [0.2, -1.5, 1.5, -1.5, -1.5, 0.1]
-FAR = [1.2, -1.5, 1.5, -1.5, -1.5, 0.1]
-def near(q, goal):
-    return max(abs(a - b) for a, b in zip(q, goal)) < 1e-6
-def fastest(speeds):
-    return max(map(abs, speeds))
-def told(receive):
-    # what was done before has reached the wheel
-    done_s = admin.ask("state")["timestamp_s"]
-    until(lambda: receive.getTimestamp() > done_s)
-def finished(control):
-    return control.getAsyncOperationProgress() < 0
-"""
-_AFTER = """
-print("RESULT", json.dumps(result), flush=True)
-os._exit(0)  # never the wheel's destructors
-"""
 
 
 @pytest.fixture
@@ -87,30 +54,6 @@ def admin() -> Iterator[Callable[[SimulatedController], AdminClient]]:
     yield connect
     for client in clients:
         client.close()
-
-
-def run_wheel(running: SimulatedController, code: str, ends: bool = True) -> dict[str, Any]:
-    """Runs code against the unmodified ur_rtde wheel in a process of its own; its `result` comes back.
-    ends=False: the code kills its process instead."""
-    source = _BEFORE + textwrap.dedent(code) + _AFTER
-    child = subprocess.run(
-        [sys.executable, "-c", source, running.host], capture_output=True, text=True, timeout=PATIENCE_S
-    )
-    for line in child.stdout.splitlines():
-        if line.startswith("RESULT "):
-            result: dict[str, Any] = json.loads(line.removeprefix("RESULT "))
-            return result
-    if not ends and child.returncode == -signal.SIGKILL:
-        return {}
-    raise AssertionError(f"the child gave no result (exit {child.returncode}):\n{child.stderr[-3000:]}")
-
-
-@pytest.fixture
-def wheel() -> Callable[..., dict[str, Any]]:
-    """`wheel(controller, code)`: what `code` put into `result`, run against the unmodified ur_rtde wheel."""
-    if not library_installed():
-        pytest.skip("ur_rtde is not installed")
-    return run_wheel
 
 
 class RtdeClient:

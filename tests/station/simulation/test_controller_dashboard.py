@@ -66,6 +66,20 @@ def test_e_series_in_local_control_refuses_changes_and_answers_questions(control
     assert replies[4:6] == [LOCAL_REFUSAL] * 2 and replies[6] == "Robotmode: RUNNING"
 
 
+def test_remote_control_frees_the_next_connection_only(controller, admin) -> None:
+    running = controller("UR10e", options=("--local",))
+    with (
+        socket.create_connection((running.host, 29999), 3) as link,
+        link.makefile("rw", newline="\n") as lines,
+    ):
+        lines.readline()
+        admin(running).ask("remote", on=True)
+        lines.write("stop\n")
+        lines.flush()
+        assert lines.readline().strip() == LOCAL_REFUSAL
+    assert dashboard(running.host, "stop")[1] == "Stopped"
+
+
 def test_a_bare_line_on_a_script_port_replaces_the_program(controller, admin) -> None:
     running = controller("UR10")
     ask = admin(running)

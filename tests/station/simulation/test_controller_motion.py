@@ -97,21 +97,6 @@ def test_a_straight_line_is_straight_and_turns_about_one_axis() -> None:
         assert T[:3] == pytest.approx(first[:3], abs=1e-9)
 
 
-def test_a_turn_on_the_spot_is_timed_by_its_angle() -> None:
-    start = compose(forward(UR10, HOME), TOOL)
-    goal = compose(start, from_pose((0.0, 0.0, 0.0, 0.0, 0.0, 0.5)))
-    assert LinePath(UR10, TOOL, HOME, goal).length == pytest.approx(0.5)
-
-
-def test_impossible_goals_are_refused_before_anything_moves() -> None:
-    arm = make_arm()
-    with pytest.raises(UnreachableError):
-        go(arm, (7.0, *HOME[1:]))
-    with pytest.raises(UnreachableError):
-        arm.start(lambda q: LinePath(UR10, TOOL, q, from_pose((3.0, 0, 0, 0, 0, 0))), 0.1, 0.5)
-    assert not arm.moving
-
-
 def test_a_line_that_leaves_the_reach_freezes_the_arm() -> None:
     """Both ends are in reach; between them the line crosses the cylinder no wrist centre can enter."""
     arm = SimulatedArm(UR10, (0.0, -1.0, 1.9, -2.4, -1.5, 0.0), lambda: (0.0,) * 6)
@@ -202,24 +187,6 @@ def test_a_stop_at_a_low_slider_starts_from_the_low_speed() -> None:
     assert arm.command_speed[0] < 0.25
     run(arm, 0.5, scale=0.25)
     assert arm.command[0] - before == pytest.approx(0.25**2 / (2 * 2.0), rel=0.02)
-
-
-def test_freeze_is_at_once() -> None:
-    arm = make_arm()
-    go(arm, (3.0, *HOME[1:]))
-    run(arm, 0.6)
-    arm.freeze()
-    where = arm.actual
-    run(arm, 0.5)
-    assert arm.actual == where and arm.actual_speed == (0.0,) * 6
-
-
-def test_a_polyline_passes_its_corners() -> None:
-    corners = [HOME, (0.5, *HOME[1:]), (0.5, -1.0, *HOME[2:])]
-    path = JointPath(*corners)
-    assert path.length == pytest.approx(1.0)
-    assert path.at(0.5) == pytest.approx(corners[1]) and path.at(2.0) == corners[2]
-    assert path.at(0.25)[0] == pytest.approx(0.25)
 
 
 def test_every_stop_misses_differently_and_never_jumps() -> None:

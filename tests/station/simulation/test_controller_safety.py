@@ -64,16 +64,24 @@ def test_programs_are_ignored_when_they_must_be(stepped, model, spoil, accepted)
     assert [e["accepted"] for e in made.robot.journal.entries() if "accepted" in e] == [accepted]
 
 
-def test_pause_holds_the_motion_and_play_goes_on(started) -> None:
+@pytest.mark.parametrize(
+    ("hold", "release"),
+    [
+        (lambda robot: robot.pause_program(), lambda robot: None),
+        (lambda robot: robot.safeguard(True), lambda robot: robot.safeguard(False)),
+    ],
+)
+def test_a_pause_or_a_safeguard_holds_the_motion_and_play_goes_on(started, hold, release) -> None:
     made = started(MOVES)
     made.run(0.5)
-    assert made.robot.pause_program()
+    hold(made.robot)
     made.run(0.5)
     where = made.robot.arm.command
     made.run(0.5)
     assert made.robot.arm.command == where and made.robot.arm.moving
     assert made.output("speed_scaling") == pytest.approx(0.0)
-    assert made.robot.play_program()
+    release(made.robot)
+    assert made.robot.arm.command == where and made.robot.play_program()
     made.run_until(lambda: not made.robot.arm.moving)
     assert made.robot.arm.command == GOAL
 

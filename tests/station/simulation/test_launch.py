@@ -28,18 +28,6 @@ def test_it_is_ready_when_the_call_returns_and_gone_after_the_block() -> None:
     running.stop()
 
 
-def test_several_at_once_on_their_own_addresses() -> None:
-    with start_controller("UR10") as first, start_controller("UR3e") as second:
-        assert first.host != second.host
-        with first.admin() as a, second.admin() as b:
-            assert (a.ask("state")["model"], b.ask("state")["model"]) == ("UR10", "UR3e")
-
-
-def test_an_address_in_use_is_an_error_that_says_so() -> None:
-    with start_controller("UR10") as first, raises("simulation-not-started"):
-        start_controller("UR10", host=first.host)
-
-
 def test_a_bad_truth_file_is_an_error_that_names_it(tmp_path: Path) -> None:
     path = tmp_path / "truth.json"
     path.write_text("{}")
@@ -102,17 +90,6 @@ def test_its_standard_error_goes_where_it_is_told(tmp_path: Path) -> None:
     with start_controller("UR10", log=log) as first, raises("simulation-not-started"):
         start_controller("UR10", host=first.host, log=log)
     assert "cannot listen" in log.read_text()
-
-
-def test_help_teaches() -> None:
-    text = subprocess.run(
-        [sys.executable, "-m", "station.simulation.controller", "--help"],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    for word in ("30004", "29990", "truth", '{"cmd": "pstop"}', "docs/contributor/simulator.md"):
-        assert word in text
 
 
 def test_it_starts_without_the_numeric_libraries() -> None:

@@ -11,7 +11,6 @@ from calibrate.boards.model import board_points, looks_same_turns
 from calibrate.geometry import Array, pose, rotation_exp
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from station.cell.config import PAPER_BOARD
-from station.simulation.board_print import board_print
 from station.simulation.placement import seen_from
 from station.simulation.renderer import BLACK_LEVEL, Light, render, scaled
 
@@ -115,14 +114,6 @@ def test_every_board_is_detected_where_it_is(name: str) -> None:
         error = min((seen.pixels - points[seen.indices] for points in orders), key=np.linalg.norm)
         # Centres of circles are seen a little off by perspective; everything else is exact.
         assert np.sqrt((error**2).mean()) < (0.25 if "circles" in name else 0.12)
-
-
-def test_black_squares_begin_with_the_first_one() -> None:
-    ink = board_print(PAPER_BOARD)
-    s = PAPER_BOARD.square_m
-    x = np.array([-0.5 * s, 0.5 * s, 0.5 * s, 6.5 * s, 7.6 * s], dtype=np.float32)
-    y = np.array([-0.5 * s, -0.5 * s, 0.5 * s, -0.5 * s, 0.0], dtype=np.float32)
-    assert np.allclose(ink.albedo(x, y, 0.3), [0.05, 0.85, 0.05, 0.85, 0.3])
 
 
 def test_light_gain_and_exposure_scale_the_picture() -> None:

@@ -118,8 +118,7 @@ def test_a_text_runs_or_is_refused(text: str) -> None:
         pass
 
 
-def test_blocks_and_loops() -> None:
-    text = """
+BLOCKS = """
 def counted():
   n = 0
   while True:
@@ -136,11 +135,7 @@ def counted():
   say("never")
 end
 """
-    assert said(text) == [1, 3, 4, 5]
-
-
-def test_scope() -> None:
-    text = """
+SCOPE = """
 def prog():
   global shared = 1
   around = 10
@@ -161,11 +156,7 @@ def prog():
   say(around)
 end
 """
-    assert said(text) == [11, 20, 100, 3, 15]
-
-
-def test_an_inner_function_reads_what_is_around_it_and_lists_are_copied() -> None:
-    text = """
+COPIES = """
 def prog():
   limit = [1, 2]
   other = limit
@@ -182,18 +173,7 @@ def prog():
   say(other)
 end
 """
-    assert said(text) == [1, [9, 7], [9, 2]]
-
-
-def test_an_item_is_set_in_the_list_that_is_there_when_its_value_is_known() -> None:
-    text = (
-        "def prog():\n a = [1, 2]\n def other():\n a = [3, 4]\n return 9\n end\n a[0] = other()\n say(a)\nend"
-    )
-    assert said(text) == [[9, 4]]
-
-
-def test_threads_share_globals_and_have_one_turn_each_cycle() -> None:
-    text = """
+THREADS = """
 def prog():
   global n = 0
   thread count(step):
@@ -212,7 +192,33 @@ def prog():
   say(n)
 end
 """
-    assert said(text) == [10, 20, 20]
+PYTHON_WORDS = """
+def lambda():
+  def import(from, class=2):
+    return from + class
+  end
+  None = import(1)
+  is = import(from=2, class=None)
+  say(is)
+  say(length('é'))
+end
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (BLOCKS, [1, 3, 4, 5]),
+        (SCOPE, [11, 20, 100, 3, 15]),
+        (COPIES, [1, [9, 7], [9, 2]]),
+        (THREADS, [10, 20, 20]),
+        (PYTHON_WORDS, [5, 1]),
+        ("def p():\n a = [1]\n def f():\n  a = [3]\n  return 9\n end\n a[0] = f()\n say(a)\nend", [[9]]),
+    ],
+    ids=["blocks", "scope", "copies", "threads", "Python's words", "item of the new list"],
+)
+def test_a_program_says(text: str, expected: list[Any]) -> None:
+    assert said(text) == expected
 
 
 def test_kill_ends_what_the_thread_waits_for_and_join_waits_for_it() -> None:
@@ -302,11 +308,6 @@ def test_a_text_that_is_no_program(text: str) -> None:
 def test_what_stops_a_program(text: str) -> None:
     with pytest.raises(ScriptRuntimeError):
         said(text)
-
-
-def test_a_name_may_be_a_word_of_python() -> None:
-    text = "def lambda():\n def import(from, class=2):\n return from + class\n end\n None = import(1)\n"
-    assert said(text + " is = import(from=2, class=None)\n say(is)\n say(length('é'))\nend") == [5, 1]
 
 
 def test_a_loop_that_waits_is_none_that_never_ends() -> None:

@@ -17,18 +17,12 @@ import pytest
 
 from calibrate.cli import main as calibrate
 from calibrate.files.loader import load_installed
-from calibrate.files.versions import installed_versions, read_log
-from calibrate.quality.drift_history import read_checks
 from recordings.cli import main as recordings
 from recordings.errors import CodedError
-from recordings.importers.bags import open_bag
-from station.cell.arm_acceptance import read_acceptance
-from station.cell.session_folder import interrupted_session, list_sessions
+from station.cell.session_folder import list_sessions
 from station.cli import main as station
-from station.operate.draft import Draft, load_draft
 from tests.command_line import call
 
-SAMPLE = Path(__file__).parents[1] / "recordings" / "samples" / "paper-640.mcap"
 MOST_CPU_S, MOST_BYTES, GIVE_UP_S = 2.0, 3 * 2**30, 60
 
 
@@ -63,15 +57,6 @@ def _command(main: Callable[[], None], *arguments: str | Path) -> Callable[[Path
     return run
 
 
-def _nothing(found: object) -> None:
-    assert not found
-
-
-def _bag(folder: Path) -> None:
-    (folder / "bag.db3").touch()
-    open_bag(folder).close()
-
-
 def _of_session(root: Path) -> None:
     """The session is listed, without what its file would tell."""
     (found,) = list_sessions(root)
@@ -79,49 +64,19 @@ def _of_session(root: Path) -> None:
 
 
 PLACES: dict[str, Place] = {
-    "configuration, doctor": ("station.yaml", _command(station, "doctor", "--config", "FILE")),
-    "configuration, serve": ("station.yaml", _command(station, "serve", "--config", "FILE", "--root", "NEW")),
-    "configuration, plan": ("station.yaml", _command(station, "plan", "--config", "FILE", "-o", "NEW")),
-    "calibration, install": ("cell.yaml", _command(calibrate, "install", "FILE", "--root", "NEW")),
+    "configuration": ("station.yaml", _command(station, "doctor", "--config", "FILE")),
     "plan": ("plan.yaml", _command(station, "plan", "--check", "FILE")),
-    "plan to capture": ("plan.yaml", _command(station, "capture", "--plan", "FILE", "--socket", "NEW")),
     "replay": ("session.mcap", _command(station, "serve", "--replay", "FILE", "--root", "NEW")),
     "session.json": ("sessions/one/session.json", lambda path: _of_session(path.parents[2])),
-    "recording of a session": ("sessions/one/session.mcap", lambda path: _of_session(path.parents[2])),
-    "active": ("active", lambda path: _nothing(interrupted_session(path.parent))),
-    "session.json, interrupted": (
-        "sessions/one/session.json",
-        lambda path: (
-            (path.parents[2] / "active").write_text("one"),
-            _nothing(interrupted_session(path.parents[2])),
-        ),
-    ),
-    "acceptance.json": ("acceptance.json", lambda path: _nothing(read_acceptance(path.parent))),
-    "draft of a cell": ("new-cell.json", lambda path: _nothing(load_draft(path.parent) != Draft())),
     "calibration": ("cell.yaml", _command(calibrate, "show", "FILE")),
-    "calibration, export": ("cell.yaml", _command(calibrate, "export", "--to", "ros-camera-info", "FILE")),
-    "calibration, annotate": ("cell.yaml", _command(calibrate, "annotate", SAMPLE, "FILE", "-o", "NEW")),
-    "installed version": (
-        "calibrations/gen/0001-00000000.yaml",
-        lambda path: _nothing([v.calibration for v in installed_versions(path.parents[2]) if v.calibration]),
-    ),
     "current": ("calibrations/current", lambda path: load_installed(path.parents[1])),
-    "log of installs": ("calibrations/log.jsonl", lambda path: read_log(path.parents[1])),
-    "validity": ("calibrations/validity.jsonl", lambda path: installed_versions(path.parents[1])),
-    "log of checks": ("calibrations/checks.jsonl", lambda path: read_checks(path.parents[1])),
     "recording": ("session.mcap", _command(recordings, "info", "FILE")),
     "recording to recover": ("session.mcap.part", _command(recordings, "recover", "FILE")),
-    "recording to solve": ("session.mcap", _command(calibrate, "solve", "FILE", "-o", "NEW")),
-    "recordings to solve": ("session.mcap", _command(calibrate, "batch", "FILE", "-o", "NEW")),
-    "list of segments": ("parts.json", _command(recordings, "info", "ROOT")),
-    "board": ("board.yaml", _command(calibrate, "solve", SAMPLE, "--board", "FILE", "-o", "NEW")),
-    "camera": ("camera.yaml", _command(calibrate, "solve", SAMPLE, "--camera", "FILE", "-o", "NEW")),
-    "limits": ("gates.yaml", _command(calibrate, "solve", SAMPLE, "--gates", "FILE", "-o", "NEW")),
     "bag": ("bag.mcap", _command(recordings, "import", "FILE", "-o", "NEW.mcap")),
     "bag of ROS 2": ("bag.db3", _command(recordings, "import", "FILE", "-o", "NEW.mcap")),
-    "metadata of a bag": ("metadata.yaml", lambda path: _bag(path.parent)),
     "dataset.yaml": ("dataset.yaml", _command(recordings, "import", "ROOT", "-o", "NEW.mcap")),
 }
+"""One of each way to read; that there are no others: tests/test_rooms.py."""
 
 
 CASES = [(place, kind) for place in PLACES for kind in KINDS]
@@ -161,12 +116,6 @@ def test_nothing_in_place_of_a_file_is_waited_for(
             read(path)
         except CodedError as error:
             assert error.code
-        except OSError:
-            assert place in (
-                "log of installs",
-                "log of checks",
-                "validity",
-            )  # the commands name the file, too
 
 
 ENDLESS: dict[str, bytes] = {
@@ -178,7 +127,7 @@ ENDLESS: dict[str, bytes] = {
 }
 
 
-OTHERS = ("configuration, doctor", "calibration", "board")
+OTHERS = ("configuration", "calibration")
 
 
 @pytest.mark.parametrize(

@@ -126,20 +126,8 @@ def _end_in_time() -> None:
     faulthandler.dump_traceback_later(END_S, exit=True)
 
 
-class JournalFormatter(logging.Formatter):
-    """Lines with syslog's priority in front (sd-daemon(3)); the journal has its own clock."""
-
-    _PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
-
-    def format(self, record: logging.LogRecord) -> str:
-        priority = next((p for level, p in self._PRIORITIES if record.levelno >= level), 7)
-        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
-
-
 def log_to_stderr() -> None:
-    handler = logging.StreamHandler()
-    if "JOURNAL_STREAM" in os.environ:
-        handler.setFormatter(JournalFormatter("%(name)s: %(message)s"))
-    else:
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    journal = "JOURNAL_STREAM" in os.environ  # it has a clock of its own
+    logging.basicConfig(
+        level=logging.INFO, format=f"{'' if journal else '%(asctime)s '}%(levelname)s %(name)s: %(message)s"
+    )

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
 import msgspec
@@ -21,15 +19,16 @@ from calibrate.files.install import installed_calibration
 from calibrate.files.versions import installed_versions
 from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec
-from station.cell.status import MotionPreview, StationState
-from station.operate.motion import carry_out, wait_until_idle
+from station.cell.status import StationState
+from station.cli.attended import attended
+from station.cli.daemon import own_daemon
+from station.operate.motion import wait_until_idle
 from station.operate.new_cell import write_config
 from station.protocol.client import Client
 from station.protocol.verbs import Configuration, GetPlan, MakePlan, Purpose
 from station.simulation.cells import make_cell
 from station.simulation.truth import read_truth
 from tests.command_line import call
-from tests.patience import PATIENCE_S
 from tests.station.operate.guided_views import draft_of
 
 pytestmark = pytest.mark.process
@@ -65,22 +64,10 @@ def touched(trap: socket.socket) -> bool:
     return True
 
 
-@contextmanager
-def rehearsing(config: Path, root: Path) -> Iterator[Path]:
+def rehearsing(config: Path, root: Path) -> AbstractContextManager[Path]:
     """Its control socket."""
-    control = root / "s.sock"
-    what = ("serve", "--config", str(config), "--rehearse", "--root", str(root), "--socket", str(control))
-    daemon = subprocess.Popen(
-        [sys.executable, "-m", "station.cli", *what, "--end-with-stdin"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    )
-    try:
-        assert daemon.stdout is not None
-        assert b"ready" in daemon.stdout.readline()
-        yield control
-    finally:
-        daemon.communicate(timeout=PATIENCE_S)
+    what = ["--config", str(config), "--rehearse", "--root", str(root)]
+    return own_daemon(what, config.with_name("daemon.log"))
 
 
 async def test_nothing_of_the_configuration_is_connected_to(
@@ -101,8 +88,10 @@ async def test_nothing_of_the_configuration_is_connected_to(
             assert len((await client.call(GetPlan())).plan.poses) == 4
             assert client.root == tmp_path / "rehearsal"
     assert not any(touched(trap) for trap in traps)
+    socket.create_connection((ROBOT, PORTS[0])).close()
+    assert touched(traps[0])
     assert (tmp_path / "rehearsal" / "simulation" / "truth.json").is_file()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["rehearsal", "station.yaml"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["daemon.log", "rehearsal", "station.yaml"]
 
 
 async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path: Path) -> None:
@@ -113,16 +102,10 @@ async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path
     write_config(draft, tmp_path / "station.yaml")
     root, result, report = tmp_path / "rehearsal", tmp_path / "calibration.yaml", tmp_path / "report.html"
 
-    async def approved(preview: MotionPreview) -> bool:
-        return True
-
     with rehearsing(tmp_path / "station.yaml", tmp_path) as control:
-        async with Client(control) as client:
-            await wait_until_idle(client)
-            await client.call(MakePlan(POSES, 0), timeout_s=120.0)
-            outcome = await carry_out(
-                client, Purpose.RUN, approved, lambda _: None, finish_with_loss=True, headless=True
-            )
+        async with attended(control, headless=True, quiet=True) as shell:
+            await shell.client.call(MakePlan(POSES, 0), timeout_s=120.0)
+            outcome = await shell.carry_out(Purpose.RUN)
             assert outcome.session.captured >= POSES - 2
     solved = call(calibrate, "solve", outcome.session.recording, "-o", result, "--report", report, "--json")
     answer = json.loads(solved.stdout)
@@ -137,8 +120,3 @@ async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path
     real = tmp_path / "real"
     assert call(calibrate, "install", result, "--root", real).returncode == 1
     assert not installed_versions(real)
-
-
-def test_a_trap_sees_a_connection(traps: list[socket.socket]) -> None:
-    socket.create_connection((ROBOT, PORTS[0])).close()
-    assert [touched(trap) for trap in traps] == [True, *[False] * 5]

@@ -10,7 +10,6 @@ import pty
 import shutil
 import signal
 import struct
-import subprocess
 import termios
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -26,13 +25,12 @@ from station.protocol.client import Client
 from station.tui.words import STATE_WORDS
 from tests.patience import until
 from tests.system.conftest import SystemRig, go, status_when
-from tests.system.machine import CHECKOUT, PREFIX, REPOSITORY, VENV, CannotBootError, Machine
+from tests.system.machine import CHECKOUT, VENV, CannotBootError, Machine
 from tests.tui.terminal import KEYS, Glass
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(240)]
 SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 SOCKET = "/run/station/control.sock"
-"""Shorter than the unit's 10 s, so that the test is."""
 
 
 class Console:
@@ -188,48 +186,10 @@ def test_a_finished_session_is_solved_without_network_or_devices(machine: Machin
     shutil.rmtree(folder)
 
 
-async def until_state(machine: Machine, unit: str, *states: str) -> None:
-    await asyncio.to_thread(machine.until, lambda: machine.show(unit, "ActiveState") in states)
-
-
-async def test_a_missing_configuration_is_said_once_and_not_started_again(machine: Machine) -> None:
+def test_a_missing_configuration_is_said_once_and_not_started_again(machine: Machine) -> None:
     machine.drop_in("station.service", f"Environment=PYTHONPATH={CHECKOUT}")
     machine.run("systemctl", "start", "station", check=False)
-    await until_state(machine, "station", "failed")
+    machine.until(lambda: machine.show("station", "ActiveState") == "failed")
     assert machine.show("station", "ExecMainStatus") == "2"
     assert machine.show("station", "NRestarts") == "0"
     machine.run("systemctl", "reset-failed", "station")
-
-
-async def test_warnings_carry_the_journals_priority(station: Machine) -> None:
-    async with await client_of(station) as anna:
-        await anna.request("stop")
-        await status_when(anna, lambda s: s.state is S.STOPPED)
-    said = station.run("journalctl", "--unit=station", "--priority=warning", "--output=cat", "--no-pager")
-    everything = station.run("journalctl", "--unit=station", "--output=cat", "--no-pager")
-    assert 0 < len(said.splitlines()) < len(everything.splitlines())
-    assert not said.startswith("<")
-
-
-async def test_an_upgrade_keeps_what_is_the_owners_and_uninstalling_stops_and_disables(
-    station: Machine, rig: SystemRig
-) -> None:
-    own = station.root / "etc/station/station.env"
-    own.write_text("STATION_CONFIG=/etc/station/mine.yaml\n")
-    make = ("make", "--silent", "-C", str(CHECKOUT), f"PREFIX={PREFIX}")
-    station.run("systemctl", "enable", "station")
-    station.run(*make, "install-files")
-    station.run("systemctl", "daemon-reload")
-    station.run("systemctl", "restart", "station")
-    assert station.show("station", "ActiveState") == "active" and "mine.yaml" in own.read_text()
-    station.run(*make, "uninstall")
-    assert station.show("station", "ActiveState") == "inactive"
-    assert not list((station.root / "etc/systemd/system").rglob("station.service"))
-    assert own.exists() and (station.root / "var/lib/station/sessions").is_dir()
-    subprocess.run(
-        ["make", "-C", str(REPOSITORY), "install-files", f"DESTDIR={station.root}", f"PREFIX={PREFIX}"],
-        check=True,
-        capture_output=True,
-    )
-    station.furnish_programs()
-    station.run("systemctl", "daemon-reload")

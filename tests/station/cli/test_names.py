@@ -7,15 +7,13 @@ from pathlib import Path
 
 import msgspec
 import pytest
-import typer
 from rich.console import Console
 
 from station.cell.pose_plan import Plan, PlannedPose
-from station.cell.status import Event, MotionPreview, PoseStatus, SessionStatus, StationStatus
+from station.cell.status import Event, PoseStatus, SessionStatus, StationStatus
 from station.cli import control as cli_control
 from station.cli import main
-from station.cli import session as cli_session
-from station.cli.attended import ask_person, session_progress
+from station.cli.attended import session_progress
 from station.plan.files import save_plan
 from station.protocol.verbs import Check
 from station.simulation.cells import cell_config, make_cell
@@ -51,15 +49,6 @@ def test_a_plan_and_its_poses(folder: Path) -> None:
     assert f"note: {ALL}" in done.stdout
 
 
-def test_a_plan_that_breaks_a_limit(folder: Path) -> None:
-    """Its problems name the pose."""
-    low = (0.0, -0.17, 0.7, -2.1, -1.57, 0.0)
-    save_plan(Plan("UR10", "eye-in-hand", (PlannedPose("[/]", low),)), folder / "].yaml")
-    done = call(main, "plan", "--check", folder / "].yaml")
-    assert done.returncode == 1
-    assert "✗ pose 1 ([/])" in done.stdout
-
-
 def test_what_the_daemon_tells(monkeypatch: pytest.MonkeyPatch) -> None:
     session = SessionStatus(name=ALL, recording=f"/sessions/{ALL}", poses=(PoseStatus(0, "[/]"),))
     status = StationStatus(reason=ALL, session=session)
@@ -70,24 +59,6 @@ def test_what_the_daemon_tells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cli_control, "ask", lambda socket, verb: checks)
     said = call(main, "doctor").stdout
     assert "MISSING" in said and "[red]x[/]" in said and "→ [/]" in said
-
-
-def test_a_question(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(typer, "confirm", lambda *told, **more: True)
-    told = {"purpose": f"p {ALL}", "first_move": f"f {ALL}", "changes": (f"c {ALL}",), "warnings": (ALL,)}
-    numbers = {"poses": 1, "path_m": 1, "largest_step_rad": 1, "top_speed_m_s": 0.1, "duration_s": 1}
-    go = msgspec.convert({"token": "", "plan_sha256": "", **told, **numbers}, MotionPreview)
-    assert ask_person(go)
-    said = capsys.readouterr().err
-    assert said.count(ALL) == 4
-
-
-@pytest.mark.parametrize("recording", ["", f"/sessions/{ALL}"])
-def test_how_a_session_ended(recording: str, capsys: pytest.CaptureFixture[str]) -> None:
-    status = StationStatus(reason=ALL, session=SessionStatus(recording=recording))
-    with pytest.raises(typer.Exit):
-        cli_session._finish(status, as_json=False)
-    assert ALL in "".join(capsys.readouterr())
 
 
 def test_events_of_a_session() -> None:

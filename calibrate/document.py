@@ -58,9 +58,8 @@ def make_calibration(
     info = recording.info
     arm = None if solution.arm is None else solution.arm.result
     X, covariance = solution.parent_from_child, solution.covariance
-    if solution.arm is not None and solution.arm.uncorrected is not None and solution.arm.detected:
+    if solution.arm is not None and (as_it_is := solution.arm.installed) is not None:
         # Beside uncorrected flanges that X is worse than one that knows nothing of the arm's errors.
-        as_it_is = solution.arm.uncorrected
         X, covariance = Transform(X.parent, X.child, as_it_is.X), as_it_is.covariance
     return Calibration(
         format=FORMAT,

@@ -38,6 +38,9 @@ class JobOptions:
     """Find them from these pictures even where some are recorded."""
     limits: GateLimits = field(default_factory=GateLimits)
     working_distance_m: float | None = None
+    robot_accuracy_m: float | None = None
+    """1σ per axis of an error of the flange that all views share, for an arm that nothing else describes."""
+    robot_accuracy_rad: float | None = None
     without: tuple[int, ...] = ()
     """Numbers, from 1, of the poses that a person leaves out."""
     threads: int | None = None

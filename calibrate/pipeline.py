@@ -100,6 +100,8 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
         lens_sigma=_lens_sigma(options, prepared.views.camera),
         board=BoardTolerance.of(prepared.loaded.board),
         working_distance_m=options.working_distance_m,
+        robot_accuracy_m=options.robot_accuracy_m,
+        robot_accuracy_rad=options.robot_accuracy_rad,
     )
 
 

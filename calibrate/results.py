@@ -42,11 +42,11 @@ class Gate(msgspec.Struct, frozen=True):
     """Value in `unit`; None in a file where it was not a finite number."""
     limit: float | None
     text: str
-    """Name, value, unit, limit, PASS or FAIL, and the remedy of a failed one."""
+    """Name, value, unit, limit, PASS, WARN or FAIL, and the remedy of one that did not simply pass."""
     unit: str = ""
     """m, deg, s, px, share; empty for plain numbers."""
     remedy: str = ""
-    """Next step; empty when passed."""
+    """Next step; empty when passed, unless with a warning."""
     sense: Sense | None = None
     """Side of the limit on which a value passes; None for a gate without a number."""
 
@@ -74,9 +74,9 @@ class Gate(msgspec.Struct, frozen=True):
 
     @property
     def narrow(self) -> bool:
-        """True when passed with less than a tenth of the limit to spare."""
+        """True when passed with a warning, or with less than a tenth of the limit to spare."""
         if not self.passed or self.value is None or not self.limit:
-            return False
+            return self.passed and bool(self.remedy)
         return abs(self.value / self.limit - 1) <= _NARROW
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import wraps
@@ -44,6 +45,14 @@ Threads = Annotated[int | None, typer.Option(min=1, help="Threads of the board d
 Distance = Annotated[
     float | None,
     typer.Option("--working-distance-mm", min=1.0, max=1e5, help="Distance for predicted error, mm"),
+]
+AccuracyMm = Annotated[
+    float | None,
+    typer.Option("--robot-accuracy-mm", min=0.0, help="Arm without joints: its error, 1σ per axis"),
+]
+AccuracyDeg = Annotated[
+    float | None,
+    typer.Option("--robot-accuracy-deg", min=0.0, help="The same of its orientation (1 mrad a mm)"),
 ]
 
 TimeLimit = Annotated[float, typer.Option(min=0.0, max=1e6, help="Time limit, s (0: none)")]
@@ -120,6 +129,8 @@ def job_options(
     profile: ProfileName = "robust",
     gates: GatesFile = None,
     working_distance_mm: Distance = None,
+    robot_accuracy_mm: AccuracyMm = None,
+    robot_accuracy_deg: AccuracyDeg = None,
 ) -> JobOptions:
     """Add how they are solved and judged."""
     return replace(
@@ -127,4 +138,6 @@ def job_options(
         profile=profile,
         limits=GateLimits() if gates is None else read_limits(gates),
         working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
+        robot_accuracy_m=None if robot_accuracy_mm is None else robot_accuracy_mm / 1000,
+        robot_accuracy_rad=None if robot_accuracy_deg is None else math.radians(robot_accuracy_deg),
     )

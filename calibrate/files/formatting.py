@@ -32,9 +32,11 @@ class ShownFigure:
 def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str, ShownFigure]:
     """Collect the figures that a calibration is judged by, most important first, without unknown ones."""
     quality, gates, views = calibration.quality, calibration.quality.gates, calibration.views
-    shown = {"error": ShownFigure("camera position", f"± {calibration.sigma.translation_mm:.3g} mm (1σ)")}
+    without = "without the arm's own" * any(gate.name == "arm" and gate.remedy for gate in gates)
+    position = f"± {calibration.sigma.translation_mm:.3g} mm (1σ)"
+    shown = {"error": ShownFigure("camera position", position, without)}
     if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
-        at = f"at {1000 * quality.working_distance_m:.0f} mm"
+        at = f"at {1000 * quality.working_distance_m:.0f} mm" + f", {without}" * bool(without)
         shown["error"] = ShownFigure("predicted error", f"± {quality.predicted_error_mm:.3g} mm (1σ)", at)
     if (held := quality.holdout) is not None:
         missed = f"{1000 * held.e_t_m:.3g} mm, e_R {held.e_R:.3g}"

@@ -64,7 +64,7 @@ def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: f
     return Finding(sigmas if told.any() else 0.0, float(np.linalg.norm(J @ moved[:6])))
 
 
-def error_shares(fit: CellFit) -> dict[str, float]:
+def error_shares(fit: CellFit, common: Array) -> dict[str, float]:
     """Split X's variance by source into shares that sum to 1, mean over directions.
 
     The share of the lens is the variance that would vanish if it were known exactly, that of the board what
@@ -72,13 +72,14 @@ def error_shares(fit: CellFit) -> dict[str, float]:
     corners, robot translation and robot rotation.
     """
     covariance, at = fit.estimate.covariance, Layout.of(fit.estimate.state)
-    whiten = np.linalg.inv(covariance[:6, :6])
+    whiten = np.linalg.inv(covariance[:6, :6] + common)
     shares = {}
     for name, part in (("intrinsics", at.lens), ("board", at.shape), ("kinematics", at.table)):
         known = covariance[:, part] @ np.linalg.pinv(covariance[part, part], hermitian=True)
         taken = known @ covariance[part]
         shares[name] = float(np.trace(whiten @ taken[:6, :6])) / 6
         covariance = covariance - taken
+    shares["kinematics"] += float(np.trace(whiten @ common)) / 6
     noise = fit.estimate.noise_parts / fit.estimate.noise_parts.sum() * (1.0 - sum(shares.values()))
     return dict(zip(("corners", "robot_translation", "robot_rotation"), noise.tolist(), strict=True)) | shares
 

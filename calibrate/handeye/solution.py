@@ -53,6 +53,10 @@ class SolveOptions:
     holdout: bool = True
     folds: bool = True
     """Cross-validate."""
+    robot_accuracy_m: float | None = None
+    """1σ per axis of an error of the flange that all views share; counts where the arm is not modelled."""
+    robot_accuracy_rad: float | None = None
+    """The same of its orientation; None: 1 mrad for each mm."""
 
     def __post_init__(self) -> None:
         require_choice("profile", self.profile, get_args(Profile))
@@ -172,6 +176,11 @@ class ArmTable:
     def detected(self) -> bool:
         return self.log_bayes > 3.0
 
+    @property
+    def installed(self) -> UncorrectedArm | None:
+        """The X to install beside the controller's flanges; None where the fit's own X serves."""
+        return self.uncorrected if self.detected else None
+
 
 class Reading(Enum):
     """Interpretations of a recording, such as inverted poses; the value is the code in files."""
@@ -249,8 +258,11 @@ class Solution:
     noise: NoiseScales | None = None
     error_shares: dict[str, float] = field(default_factory=dict)
     arm: ArmTable | None = None
+    without_arm: bool = False
+    """The stated error is without the arm's own: it is neither modelled nor stated."""
     predicted_error_m: float | None = None
-    """1σ (root of the mean squared length) of a point at the working distance on the camera's axis."""
+    """1σ (root of the mean squared length) of a point at the working distance on the camera's axis; where
+    errors of the arm are detected, that of `ArmTable.installed`."""
     working_distance_m: float | None = None
     board_spread_m: float | None = None
     """Root mean square distance of the board's origin in base (or flange), view by view, from its mean."""

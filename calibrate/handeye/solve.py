@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
-from calibrate.geometry import Array, Transform
+from calibrate.geometry import Array, Transform, skew
 from calibrate.handeye.arm import FLEX
 from calibrate.handeye.arm_result import arm_results
 from calibrate.handeye.axxb.certificate import TOLERANCE, certify
@@ -126,7 +126,10 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
     H, C = mount_poses(views.base_from_flange, views.mount), found.board_poses
     parent, child = camera_frames(views.mount)
     distance = options.working_distance_m or median_distance_m(C[used])
-    covariance = found.covariance[:6, :6]
+    common = _common_error(views, state.X, options) if fit.arm is None else np.zeros((6, 6))
+    covariance = found.covariance[:6, :6] + common
+    arm = _arm(fit, found.covariance[at.table, at.table], options, distance)
+    installed = None if arm is None else arm.installed
     pairs, certified = fit.pairs, fit.certified
     apart = distance_in_sigmas(certified.X, state.X, pair_covariance(certified.objective, pairs, certified.X))
     spread_m, spread_rad = board_spread(H[used], C[used], state.X)
@@ -162,9 +165,12 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
         board=_board(fit, found.covariance[at.shape, at.shape]) if seen else None,
         board_finding=board_finding,
         noise=NoiseScales(found.scales.tau_px, *(float(s) for s in found.scales.robot)),
-        error_shares=error_shares(fit),
-        arm=_arm(fit, found.covariance[at.table, at.table], options, distance),
-        predicted_error_m=point_error_m(state.X, covariance, distance),
+        error_shares=error_shares(fit, common),
+        arm=arm,
+        without_arm=fit.arm is None and not common.any(),
+        predicted_error_m=point_error_m(state.X, covariance, distance)
+        if installed is None
+        else installed.error_m,
         working_distance_m=distance,
         board_spread_m=spread_m,
         board_spread_rad=spread_rad,
@@ -175,6 +181,19 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
         },
         seed=options.seed,
     )
+
+
+def _common_error(views: ViewSet, X: Array, options: SolveOptions) -> Array:
+    """Compute the covariance (6, 6) of X by the stated error of the robot, which no number of views lowers.
+
+    It turns the flange about itself: eye-to-hand about the mean place of the flange.
+    """
+    metres = options.robot_accuracy_m or 0.0
+    radians = metres if options.robot_accuracy_rad is None else options.robot_accuracy_rad
+    pivot = np.zeros(3) if views.mount == "eye-in-hand" else views.base_from_flange[:, :3, 3].mean(axis=0)
+    J = np.eye(6)
+    J[:3, 3:] = -skew(X[:3, 3] - pivot)
+    return np.asarray(J * np.repeat([metres, radians], 3) ** 2 @ J.T)
 
 
 def _corner_rms(fit: CellFit) -> tuple[float | None, Array]:
@@ -255,11 +274,6 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
             not fit.observed.has_pixels,
             "no-corners",
             "No corners were recorded: board poses count as exact, all error is the robot's.",
-        ),
-        (
-            arm is not None and arm.uncorrected is None,
-            "arm-not-modelled",
-            "Neither a known model nor recorded joints: the arm's own errors are not in the stated error.",
         ),
         (arm is not None and arm.detected, "arm-systematics", systematic),
         (bool(fit.joints_note), "joints", fit.joints_note),

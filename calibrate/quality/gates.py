@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -25,6 +25,8 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Smallest mean weight of the views: below it too many were rejected or down-weighted."""
     session: bool | None = True
     """No other reading of the recording (inverted poses, other square size, …) explains it better."""
+    arm: Literal["warn", "fail"] | None = "warn"
+    """What becomes of a stated error that is without the arm's own: no joints, model or accuracy known."""
     rotation_deg: float | None = 30.0
     """Smallest allowed value of the largest rotation between two views."""
     axis_spread: float | None = 0.1
@@ -74,6 +76,8 @@ def judge(solution: Solution, inputs: GateInputs, limits: GateLimits | None = No
     """Judge every gate that is switched on and can be judged, in order of reading."""
     limits = limits or GateLimits()
     found = [_session_gate(solution)] if limits.session and solution.profile == "robust" else []
+    if limits.arm and solution.profile == "robust":
+        found.append(_arm_gate(solution.without_arm, limits.arm))
     for name, value, title, remedy in _measured(solution, inputs):
         limit = getattr(limits, name)
         if value is None or limit is None:
@@ -155,6 +159,14 @@ def _measured(solution: Solution, inputs: GateInputs) -> Iterator[tuple[str, flo
     if noise is not None:
         yield "robot_error_m", noise.robot_m, "", ""
         yield "robot_error_deg", float(np.degrees(noise.robot_rad)), "", ""
+
+
+def _arm_gate(without: bool, limit: Literal["warn", "fail"]) -> Gate:
+    if not without:
+        return Gate("arm", True, None, None, "Arm's own error: in the stated error PASS")
+    remedy = "Record joints, or state --robot-accuracy-mm."
+    text = f"Arm's own error: not in the stated error {limit.upper()}. {remedy}"
+    return Gate("arm", limit == "warn", None, None, text, remedy=remedy)
 
 
 def _session_gate(solution: Solution) -> Gate:

@@ -69,6 +69,7 @@ def test_the_table_with_its_own_x_is_best_at_new_poses(worn: Worn, solved: Solut
     uncorrected = spread(nominal, as_it_is(solved).X, worn.new_board_poses)
     assert both < 0.6 * uncorrected
     assert table.with_table_m < 0.7 * as_it_is(solved).error_m
+    assert solved.predicted_error_m == as_it_is(solved).error_m, "that of the X which is installed"
 
 
 def test_held_out_poses_elsewhere_say_the_same(solved: Solution) -> None:

@@ -25,7 +25,7 @@ from tests.calibrate.calling import raises_code
 
 GOOD = GateInputs(0.6, 0.001)
 NAMES = [
-    "session", "weight", "views", "rotation_deg", "axis_spread", "view_rms_px", "holdout_share",
+    "session", "arm", "weight", "views", "rotation_deg", "axis_spread", "view_rms_px", "holdout_share",
     "cross_validation", "predicted_error_m", "coverage", "clock_bound_s", "lens_pull", "board_pull",
     "robot_error_m", "robot_error_deg",
 ]  # fmt: skip
@@ -71,6 +71,7 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
     other = Explanation(Reading.SHIFTED, 90.0, 1)
     changed = {
         "views": replace(solution, used=solution.used[:5]),
+        "arm": replace(solution, without_arm=True),
         "rotation_deg": replace(solution, observability=replace(seen, largest_angle_rad=0.2)),
         "axis_spread": replace(solution, observability=replace(seen, axis_spread=0.01)),
         "session": replace(solution, session=other, warnings=(Remark(other.reading.value, "Move them."),)),
@@ -94,7 +95,7 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
 @pytest.mark.parametrize("name", NAMES)
 def test_each_gate_closes_alone_and_says_why(solution: Solution, name: str) -> None:
     bad, evidence = spoiled(solution, name)
-    gates = judge(bad, evidence)
+    gates = judge(bad, evidence, GateLimits(arm="fail"))
     assert failed(gates) == [name]
     gate = next(gate for gate in gates if gate.name == name)
     assert gate.remedy and gate.text.endswith(f"FAIL. {gate.remedy}")
@@ -142,7 +143,7 @@ def test_the_certificate_informs_and_closes_nothing(solution: Solution) -> None:
 def test_what_cannot_be_judged_is_left_out(solution: Solution) -> None:
     bare = replace(solution, noise=None, holdout=None, predicted_error_m=None, cross_validation=None)
     names = [gate.name for gate in judge(bare, GateInputs())]
-    assert names == ["session", "weight", "views", "rotation_deg", "axis_spread", "view_rms_px"]
+    assert names == ["session", "arm", "weight", "views", "rotation_deg", "axis_spread", "view_rms_px"]
 
 
 def test_limits_come_from_a_file_and_null_switches_a_gate_off(solution: Solution, tmp_path: Path) -> None:
@@ -172,7 +173,18 @@ def test_the_documented_defaults_are_those_in_force() -> None:
     for row in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", table, re.MULTILINE):
         documented |= zip(re.findall(r"`(\w+)`", row[0]), row[1].strip().split(", "), strict=True)
     defaults = {k: v for k, v in msgspec.structs.asdict(GateLimits()).items() if v is not None}
-    assert documented == {name: f"{v}".lower() if v is True else f"{v:g}" for name, v in defaults.items()}
+    assert documented == {
+        name: f"{v}".lower() if isinstance(v, bool | str) else f"{v:g}" for name, v in defaults.items()
+    }
+
+
+def test_an_error_without_the_arm_s_own_is_a_warning_unless_the_integrator_says_more(
+    solution: Solution,
+) -> None:
+    gates = judge(replace(solution, without_arm=True), GOOD)
+    assert failed(gates) == []
+    assert [gate.name for gate in gates if gate.remedy] == ["arm"]
+    assert all(gate.narrow for gate in gates if gate.remedy)
 
 
 def test_the_pose_to_retake_is_numbered_as_on_the_screen(solution: Solution) -> None:

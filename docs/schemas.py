@@ -23,7 +23,7 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.validity import Validity
 from recordings.cli.importing import ImportJson
 from recordings.errors import ErrorReport
-from recordings.info import RecordingInfoJson
+from recordings.info import RecordingInfo
 from recordings.recover import Recovery
 from station.cell.config import StationConfig
 from station.cell.pose_plan import Plan
@@ -52,7 +52,7 @@ TYPES: dict[str, tuple[str, Any]] = {
     "demo": ("station demo --json", DemoJson),
     "plan-report": ("station plan --json", PlanJson),
     "capture": ("station capture | resume --json", SessionJson),
-    "info": ("recordings info --json", RecordingInfoJson),
+    "info": ("recordings info --json", RecordingInfo),
     "recover": ("recordings recover --json", list[Recovery]),
     "import": ("recordings import --json", ImportJson),
     "error": ("Every command with --json that fails", ErrorReport),

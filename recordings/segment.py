@@ -81,9 +81,9 @@ class RecordingSegment:
         return self._contents.messages.get(topic, MessageIndex())
 
     @property
-    def foreign(self) -> dict[str, MessageIndex]:
-        """By topic: what other programs added."""
-        return {name: index for name, index in self._contents.messages.items() if name not in set(Topic)}
+    def topics(self) -> dict[str, MessageIndex]:
+        """Every topic, those that other programs added, too."""
+        return self._contents.messages
 
     def robot_states(self) -> Iterator[RobotState]:
         return self._decoded(Topic.ROBOT_STATE, RobotState)

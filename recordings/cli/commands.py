@@ -15,9 +15,10 @@ from recordings.exporters import Target
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.recover import Recovery, recover_recording
+from recordings.schema.messages import SINGLE_TAGS
 
 if TYPE_CHECKING:
-    from recordings.info import PicturesInfoJson, RecordingInfoJson
+    from recordings.info import RecordingInfo
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's folder", show_default=False)]
 _LOSSES_SHOWN = 20
@@ -33,7 +34,7 @@ def info_command(recording: Rec, as_json: AsJson = False) -> None:
         print_json(facts)
     else:
         _print_info(facts)
-    if facts["missing"]:
+    if facts.missing:
         raise typer.Exit(3)
 
 
@@ -81,7 +82,7 @@ def recover_command(
     raise typer.Exit(3 if any(result.rebuilt or result.missing for result in results) else 0)
 
 
-def _print_info(facts: RecordingInfoJson) -> None:
+def _print_info(facts: RecordingInfo) -> None:
     """Prints what `recording_info` found as two small tables."""
     from rich.table import Column, Table
     from rich.text import Text
@@ -92,62 +93,45 @@ def _print_info(facts: RecordingInfoJson) -> None:
         table.add_row(Text(name, _STYLES.get(name, "")), value)
     console.print(table)
     topics = Table("topic", "messages", "rate", "size", box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for topic in facts["topics"]:
-        rate = f"{topic['rate_hz']:.1f} Hz" if topic["rate_hz"] else "-"
-        name = topic["topic"] + (" (of another program, ignored)" if topic["foreign"] else "")
-        topics.add_row(name, str(topic["messages"]), rate, f"{topic['bytes'] / 1e6:.2f} MB")
+    for topic in facts.topics:
+        rate = f"{topic.rate_hz:.1f} Hz" if topic.rate_hz else "-"
+        name = topic.topic + (" (of another program, ignored)" if topic.foreign else "")
+        topics.add_row(name, str(topic.messages), rate, f"{topic.bytes / 1e6:.2f} MB")
     console.print(topics)
 
 
-def _info_rows(facts: RecordingInfoJson) -> Iterator[tuple[str, str]]:
-    created = datetime.fromtimestamp(facts["created_wall_ns"] / 1e9, UTC)
-    camera, robot, views = facts["camera"], facts["robot"], facts["views"]
-    whole = "INCOMPLETE, the segments here are finished" if facts["missing"] else "finished"
-    yield "recording", f"{facts['path']}  {facts['size_bytes'] / 1e6:.1f} MB  {whole}, all checksums good"
-    yield "session", f"{facts['name']}  {facts['source']}  {facts['mount']}  {created:%Y-%m-%d %H:%M} UTC"
-    if facts["parts"] > 1:
-        yield "segments", str(facts["parts"])
-    for missing in facts["missing"]:
+def _info_rows(facts: RecordingInfo) -> Iterator[tuple[str, str]]:
+    session = facts.session
+    board, camera, identity, robot = session.board, session.camera, session.camera_identity, session.robot
+    created = datetime.fromtimestamp(session.created_wall_ns / 1e9, UTC)
+    whole = "INCOMPLETE, the segments here are finished" if facts.missing else "finished"
+    yield "recording", f"{facts.path}  {facts.size_bytes / 1e6:.1f} MB  {whole}, all checksums good"
+    yield "session", f"{session.name}  {session.source}  {session.mount}  {created:%Y-%m-%d %H:%M} UTC"
+    yield "segments", str(facts.segments)
+    for missing in facts.missing:
         yield "MISSING", missing
-    for loss in facts["losses"]:
+    for loss in facts.losses:
         yield "lost", loss
-    yield "board", facts["board"]
-    known = "intrinsics known" if camera["intrinsics"] else "intrinsics to be estimated"
-    yield (
-        "camera",
-        f"{camera['identity']} {camera['serial']} {camera['width']}×{camera['height']}, {known}".strip(),
-    )
-    yield "robot", f"{robot['model']} {robot['serial']}".strip()
-    retakes = views["attempts"] - views["poses"]
-    yield "views", f"{views['poses']} poses" + (f", {retakes} retaken" if retakes else "")
-    if states := facts["robot_states"]:
-        rate = f"{states['rate_hz']:.1f} Hz" if states["rate_hz"] else "a controller time that does not go on"
-        count = states["gaps"]
-        gaps = "no gap"
-        if count:
-            plural = "s" if count > 1 else ""
-            gaps = f"{count} gap{plural}, largest {states['largest_gap_s'] * 1e3:.0f} ms"
-        if back := states["backward"]:
-            gaps += f", controller time goes back {back} time{'s' * (back > 1)}"
-        yield "robot states", f"{states['count']} at {rate}, {gaps}"
-    if images := facts["pictures"]:
-        yield "images", _images_text(images)
-        for source, bound_s in images["time_bounds_s"].items():
-            yield "image time", f"by {source}, within {1000 * bound_s:.2f} ms of mid-exposure"
-    if facts["attachments"]:
-        yield "attached", ", ".join(f"{name} ({size} B)" for name, size in facts["attachments"].items())
-    if facts["note"]:
-        yield "note", facts["note"]
-
-
-def _images_text(images: PicturesInfoJson) -> str:
-    settings = [f"{value:g} µs" for value in images["exposure_us"]]
-    settings += [f"{value:g} dB" for value in images["gain_db"]]
-    jumps = images["frame_id_jumps"]
-    order = "no frame id missing"
-    if jumps:  # between triggered images a camera may go on counting
-        order = f"frame ids jump {jumps} time{'s' * (jumps > 1)}"
-    return ", ".join([str(images["count"]), *images["pixel_formats"], *settings, order])
+    single = board.kind in SINGLE_TAGS
+    counted = str(board.tag_id) if single else f"{board.columns}×{board.rows}"
+    yield "board", f"{board.kind} {counted}, {board.square_m * 1e3:g} mm"
+    known = "to be estimated" if camera.matrix is None else "known"
+    device = " ".join(filter(None, [identity.vendor, identity.model, identity.serial]))
+    yield "camera", f"{device} {camera.width}×{camera.height}, intrinsics {known}"
+    yield "robot", f"{robot.model} {robot.serial}".strip()
+    yield "views", f"{facts.poses} poses, {facts.attempts - facts.poses} retaken"
+    if states := facts.robot_states:
+        rate = f"{states.rate_hz:.1f} Hz" if states.rate_hz else "a controller time that does not go on"
+        gaps = f"gaps: {states.gaps}, largest {states.largest_gap_s * 1e3:.0f} ms"
+        back = f", controller time goes back: {states.backward}" if states.backward else ""
+        yield "robot states", f"{states.count} at {rate}, {gaps}{back}"
+    yield "images", str(facts.images)
+    for source, bound_s in facts.time_bounds_s.items():
+        yield "image time", f"by {source}, within {1000 * bound_s:.2f} ms of mid-exposure"
+    if facts.attachments:
+        yield "attached", ", ".join(f"{name} ({size} B)" for name, size in facts.attachments.items())
+    if session.note:
+        yield "note", session.note
 
 
 def _print_recovery(result: Recovery) -> None:

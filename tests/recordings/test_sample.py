@@ -26,5 +26,6 @@ def test_every_shipped_sample_opens_and_says_that_it_is_simulated() -> None:
             stored = recording.stored_image(view)
             assert stored is not None
             assert stored[0] == "png"
-        assert recording_info(recording)["robot_states"]["count"] > 25
+        states = recording_info(recording).robot_states
+        assert states is not None and states.count > 25
         assert "truth.json" in recording.attachments()

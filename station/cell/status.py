@@ -8,7 +8,6 @@ from typing import Literal
 import msgspec
 
 from recordings.errors import Value
-from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import (
     CameraIdentity,
     Matrix4,
@@ -20,6 +19,7 @@ from recordings.schema.messages import (
     Vector6,
 )
 from station.cell.arm_acceptance import StopTestMove
+from station.cell.clock_fit import ClockFit
 
 
 class StationState(StrEnum):

@@ -9,13 +9,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recordings.schema.clocks import monotonic_from_wall_ns
-from recordings.schema.frame_ids import FrameIds
-from recordings.schema.frame_time import DeviceClock
 from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.cell.status import StreamCounts
+from station.devices.clocks import monotonic_from_wall_ns
+from station.devices.frame_ids import FrameIds
+from station.devices.frame_time import DeviceClock
 from station.devices.genicam_settings import (
     Applied,
     apply_settings,

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol, TypeVar
 
-from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
 from station.cell.arm_acceptance import StopWay
+from station.cell.clock_fit import ClockFit
 from station.cell.errors import StaleStateError
 from station.cell.status import ArmCondition, CameraCounts, FrameTiming
 from station.devices.frames import TriggerPulse

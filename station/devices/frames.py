@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import msgspec
 
-from recordings.schema.frame_ids import LAST_BLOCK_ID, FrameIds, frames_between
-from recordings.schema.frame_time import (
+from recordings.schema.messages import FrameTime, Image, TimeSource
+from station.cell.errors import CameraError
+from station.cell.status import CameraCounts, FrameTiming, StreamCounts
+from station.devices.frame_ids import LAST_BLOCK_ID, FrameIds, frames_between
+from station.devices.frame_time import (
     UNKNOWN_READOUT_S,
     DeviceClock,
     by_arrival,
     by_clock,
     by_trigger,
 )
-from recordings.schema.messages import FrameTime, Image, TimeSource
-from station.cell.errors import CameraError
-from station.cell.status import CameraCounts, FrameTiming, StreamCounts
 
 RETAKE = "Retake this pose."
 

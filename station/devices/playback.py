@@ -19,7 +19,6 @@ from calibrate.geometry import interpolate, pose_from_rotvec
 from recordings import strict_yaml
 from recordings.errors import RecordingError
 from recordings.reader import Recording, open_recording
-from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import (
     CameraIdentity,
     FrameTime,
@@ -31,6 +30,7 @@ from recordings.schema.messages import (
     View,
 )
 from station.cell.arm_acceptance import StopWay
+from station.cell.clock_fit import ClockFit
 from station.cell.config import StationConfig, vector6
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.layout import pose_vector

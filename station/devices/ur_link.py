@@ -12,8 +12,8 @@ import time
 from collections.abc import Callable, Sequence
 
 from calibrate.kinematics import MODELS
-from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState
+from station.cell.clock_fit import ClockFit
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.cell.layout import arm_model

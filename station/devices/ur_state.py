@@ -19,12 +19,12 @@ import msgspec
 
 from calibrate.geometry import interpolate as between_poses
 from calibrate.geometry import pose_from_rotvec
-from recordings.schema.clock_fit import ClockFit
-from recordings.schema.clocks import ClockEstimator, monotonic_from_wall_ns
 from recordings.schema.messages import RobotState, Stamps, Vector6
+from station.cell.clock_fit import ClockFit
 from station.cell.config import vector6
 from station.cell.errors import StaleStateError
 from station.cell.layout import pose_vector
+from station.devices.clocks import ClockEstimator, monotonic_from_wall_ns
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, Recipe, RtdeError, RtdeLink
 from station.devices.ur_dashboard import connect_trouble
 

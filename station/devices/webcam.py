@@ -17,13 +17,13 @@ import cv2
 import msgspec
 import numpy as np
 
-from recordings.schema.frame_time import by_arrival
 from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming
 from station.devices.base import DeviceThread
 from station.devices.discovery import kernel_text
+from station.devices.frame_time import by_arrival
 
 T = TypeVar("T")
 LATENCY_S = 0.2

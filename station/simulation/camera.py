@@ -11,12 +11,12 @@ import time
 import msgspec
 import numpy as np
 
-from recordings.schema.frame_ids import FrameIds
 from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming
 from station.devices.base import Trigger
+from station.devices.frame_ids import FrameIds
 from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
 from station.simulation.launch import Json
 from station.simulation.truth import CellTruth

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from recordings.schema.frame_time import DeviceClock, by_clock
 from recordings.schema.messages import ClockReading
+from station.devices.frame_time import DeviceClock, by_clock
 from station.simulation.camera import RenderedCamera
 
 

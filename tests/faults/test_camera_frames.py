@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.schema.frame_ids import LAST_BLOCK_ID, FrameIds, frames_between
 from station.cell.errors import CameraError
+from station.devices.frame_ids import LAST_BLOCK_ID, FrameIds, frames_between
 from station.devices.frames import FrameCounter
 from station.simulation.camera import RenderedCamera
 from tests.codes import raises

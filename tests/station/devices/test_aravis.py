@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recordings.schema.frame_ids import frames_between
 from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
+from station.devices.frame_ids import frames_between
 from station.devices.frames import TriggerPulse
 from station.devices.pixels import decode, encode
 from station.simulation.gige import PIXEL_FORMATS

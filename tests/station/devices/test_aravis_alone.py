@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recordings.schema.frame_time import DeviceClock
 from recordings.schema.messages import Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import GenicamDevice
+from station.devices.frame_time import DeviceClock
 from station.devices.frames import TriggerPulse
 from station.devices.genicam_settings import CHUNKS, Applied, apply_settings, require_settings
 from tests.codes import raises

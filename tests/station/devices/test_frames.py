@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.schema.clocks import UNFITTED_DRIFT
-from recordings.schema.frame_ids import FrameIds, frames_between
-from recordings.schema.frame_time import DeviceClock, by_arrival, by_clock
 from recordings.schema.messages import ClockReading, FrameTime, Image, Stamps
 from station.cell.status import FrameTiming
+from station.devices.clocks import UNFITTED_DRIFT
+from station.devices.frame_ids import FrameIds, frames_between
+from station.devices.frame_time import DeviceClock, by_arrival, by_clock
 from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
 from tests.codes import raises
 

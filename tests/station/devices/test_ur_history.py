@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import RobotState, Stamps
+from station.cell.clock_fit import ClockFit
 from station.devices.ur_state import state_at
 from tests.codes import raises
 from tests.station.devices.test_ur_moves import STATE

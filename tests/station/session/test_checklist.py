@@ -10,8 +10,8 @@ import pytest
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install, set_validity
 from calibrate.files.validity import ValidityReason, ValidityState
-from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import TimeSource
+from station.cell.clock_fit import ClockFit
 from station.cell.status import FrameTiming
 from station.devices.discovery import FoundCamera, UsbCamera
 from station.protocol.verbs import Check

@@ -15,8 +15,8 @@ import pytest
 from calibrate.load import load_views
 from recordings.manifest import enter_part
 from recordings.reader import open_recording
-from recordings.schema.clock_fit import ClockFit
 from recordings.schema.messages import ArmKinematics
+from station.cell.clock_fit import ClockFit
 from station.cell.errors import LimitError, RobotError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recordings.schema.clock_fit import ClockFit
-from recordings.schema.clocks import ClockEstimator, monotonic_from_wall_ns
+from station.cell.clock_fit import ClockFit
+from station.devices.clocks import ClockEstimator, monotonic_from_wall_ns
 
 OFFSET_NS = 5_000_000_000_000
 
@@ -129,7 +129,7 @@ def test_a_thread_held_up_between_two_clocks_never_stamps_too_early(
         now_ns += held_up_ns
         return now_ns + offset_ns
 
-    monkeypatch.setattr("recordings.schema.clocks.time.monotonic_ns", lambda: read(0))
-    monkeypatch.setattr("recordings.schema.clocks.time.time_ns", lambda: read(OFFSET_NS))
+    monkeypatch.setattr("station.devices.clocks.time.monotonic_ns", lambda: read(0))
+    monkeypatch.setattr("station.devices.clocks.time.time_ns", lambda: read(OFFSET_NS))
     arrived_ns = now_ns - 300_000
     assert arrived_ns <= monotonic_from_wall_ns(arrived_ns + OFFSET_NS) <= arrived_ns + held_up_ns

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from enum import StrEnum
 
 LAST_BLOCK_ID = 65_535
@@ -27,9 +26,3 @@ def frames_between(earlier_id: int, later_id: int, ids: FrameIds = FrameIds.BLOC
     width = next(size for size in (1 << 8, 1 << 16, 1 << 32, 1 << 64) if size > earlier_id)
     steps = (later_id - earlier_id) % width
     return steps if steps < width // 2 else None
-
-
-def guess_ids(numbers: Iterable[int | None]) -> FrameIds:
-    """The numbering of recorded frames: WIDE where an id is not in 1 … 65535."""
-    told = (number for number in numbers if number is not None)
-    return FrameIds.BLOCK if all(1 <= number <= LAST_BLOCK_ID for number in told) else FrameIds.WIDE

@@ -16,7 +16,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.schema.clock_fit import ClockFit
+from station.cell.clock_fit import ClockFit
 
 Array = NDArray[np.float64]
 

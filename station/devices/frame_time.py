@@ -6,9 +6,9 @@ from collections import deque
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from recordings.schema.clock_fit import ClockFit
-from recordings.schema.clocks import DRIFT_LIMIT, DRIFT_SPAN_S, UNFITTED_DRIFT
 from recordings.schema.messages import ClockReading, FrameTime, TimeSource
+from station.cell.clock_fit import ClockFit
+from station.devices.clocks import DRIFT_LIMIT, DRIFT_SPAN_S, UNFITTED_DRIFT
 
 READINGS_KEPT = 200
 UNKNOWN_READOUT_S = 0.05

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ClockFit:
-    """Line that `schema.clocks` fitted; `bound_s` holds for messages inside its window."""
+    """Line that `devices.clocks` fitted; `bound_s` holds for messages inside its window."""
 
     reference_s: float
     """Device time at which `offset_ns` holds."""

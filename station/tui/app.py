@@ -34,7 +34,7 @@ from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
 from station.tui.desk import Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion, Help
-from station.tui.disk_watch import DiskWatch
+from station.tui.installed import Marks, marks, read_result, read_sessions, state_root
 from station.tui.jobs import check_drift, solve_session
 from station.tui.log_screen import LogScreen
 from station.tui.plan_screen import PlanScreen
@@ -45,6 +45,7 @@ from station.tui.task import DIGITS
 from station.tui.widgets.preview import PreviewPane, sharp_widget
 
 GO_TO = Binding.Group("go to", compact=True)
+LOOK_S = 2.0
 PREVIEW_PERIOD_S = 0.25
 SETTLED_S = 2.0
 ACKNOWLEDGE = "Leave STOPPED or FAULT after looking"
@@ -97,14 +98,17 @@ class StationApp(KnowingApp):
     def __init__(self, client: Client) -> None:
         super().__init__()
         self.desk = Desk(self, client)
-        self.attendance, self._disk = Attendance(self.desk), DiskWatch(self)
+        self.attendance = Attendance(self.desk)
+        self._look = asyncio.Event()
+        self._marks: tuple[str, Marks] | None = None
+        """The shown file, and marks of all below the root, when they were read."""
         self._greeted = False
 
     def on_mount(self) -> None:
         self.run_worker(self.desk.follow(), group="follow", exit_on_error=False)
         self.fetch_previews()
         self.set_timer(SETTLED_S, freeze_startup)
-        self.run_worker(self._disk.follow(), group="disk", exit_on_error=False)
+        self.follow_disk()
         self.attendance.begin()
 
     def on_cursor_position(self, event: events.CursorPosition) -> None:
@@ -128,7 +132,7 @@ class StationApp(KnowingApp):
             return
         self.known = replace(self.known, status=status, gone="")
         if before is None or before.session.calibration != status.session.calibration:
-            self.action_look_at_results()
+            self.action_look_at_disk()
         elif before.session.name and not status.session.name:
             self.result_path = ""  # another session begins: what was looked at is no part of it
         if not self._greeted:
@@ -153,15 +157,35 @@ class StationApp(KnowingApp):
         if (checks := await self.desk.ask(verbs.Doctor())) is not None:
             self.known = replace(self.known, checks=tuple(checks))
 
-    @work(exclusive=True, group="sessions", exit_on_error=False)
-    async def action_look_at_sessions(self) -> None:
-        await self._disk.read_sessions()
-
     def watch_result_path(self) -> None:
-        self.action_look_at_results()
+        self.action_look_at_disk()
 
-    def action_look_at_results(self) -> None:
-        self._disk.look()
+    def action_look_at_disk(self) -> None:
+        self._marks = None
+        self._look.set()
+
+    @work(group="disk", exit_on_error=False)
+    async def follow_disk(self) -> None:
+        """Look for what other programs solved or installed; a daemon at work is left in peace."""
+        while True:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._look.wait(), LOOK_S)
+            asked = self._look.is_set()
+            self._look.clear()
+            if self.known.live is not None and (asked or not self.known.works):
+                await self._read_changed(self.known.live.session.calibration)
+
+    async def _read_changed(self, solved: str) -> None:
+        path, client = self.result_path or solved, self.desk.client
+        root = state_root(path) if path else client.root
+        if root is None or (found := (path, await asyncio.to_thread(marks, root))) == self._marks:
+            return
+        result = await asyncio.to_thread(read_result, path) if path else None
+        self.known = replace(self.known, result=result)
+        if (sessions := await self.desk.ask(verbs.Sessions())) is None:
+            return  # a notice said why; the next look asks again
+        kept = await asyncio.to_thread(read_sessions, root, client.camera, sessions)
+        self.known, self._marks = replace(self.known, sessions=kept), found
 
     # --- what the screens ask for by a key ---
 

@@ -1,10 +1,9 @@
-"""Panels of the capture screen: image quality, expected error, coverage of the image, devices."""
+"""Panels of the capture screen: image quality, expected error, coverage of the image."""
 
 from __future__ import annotations
 
 from textual.content import Content
 
-from station.cell.config import CaptureConfig
 from station.cell.status import StationStatus
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
@@ -105,45 +104,3 @@ def coverage_lines(known: Known, width: int, height: int) -> Content:
         said = f"{empty} of {len(views) * columns} parts empty"
         rows.append(mark("look", said) if empty else mark("done", "the board was seen in every part"))
     return lines(*rows[:height])
-
-
-def device_lines(known: Known, width: int, height: int) -> Content:
-    """Name each device with its rate, as many a line as fit."""
-    status = known.shown
-    robot, camera, recorder, timing = status.robot, status.camera, status.recorder, status.camera.timing
-    if status.playback:
-        return dim("robot not live   camera not live")
-    parts = [
-        _device("robot", robot.connected, f"{robot.rate_hz:.0f} Hz"),
-        _device(
-            "camera",
-            camera.connected,
-            f"{camera.fps:.0f} fps" + f", {camera.counts.missing} lost" * bool(camera.counts.missing),
-        ),
-    ]
-    if status.trigger.present:
-        pulses, frames = status.trigger.pulses, status.trigger.frames
-        parts.append(_device("trigger", pulses == frames, f"{pulses} = {frames}"))
-    if recorder.recording or recorder.error:
-        parts.append(_device("record", not recorder.error, f"sync {recorder.sync_ms:.0f} ms"))
-    else:
-        parts.append(mark("todo", "not recording"))
-    known_ms = [1000 * clock.bound_s for clock in (timing, status.clock) if clock is not None]
-    if known_ms:
-        capture = CaptureConfig() if known.configuration is None else known.configuration.capture
-        parts.append(
-            _device(
-                "clocks",
-                sum(known_ms) <= 1000 * capture.time_bound_s,
-                f"± {sum(known_ms):.1f} ms {timing.source if timing else ''}".rstrip(),
-            )
-        )
-    rows = [parts[0]]
-    for part in parts[1:]:
-        longer = Content("   ").join((rows[-1], part))
-        rows[-1:] = [longer] if longer.cell_length <= width else [rows[-1], part]
-    return lines(*rows)
-
-
-def _device(name: str, good: bool, text: str) -> Content:
-    return mark("done" if good else "failed", name) + dim(f" {text}")

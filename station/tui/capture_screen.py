@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from textual.app import ComposeResult
 from textual.containers import Horizontal, Vertical
-from textual.widgets import ProgressBar
 
 from station.protocol.states import LATCHED, RUNNING
-from station.tui.capture_panels import coverage_lines, device_lines, error_lines, quality_line
+from station.tui.capture_panels import coverage_lines, error_lines, quality_line
 from station.tui.frame import Line
 from station.tui.log_screen import newest_events
 from station.tui.progress import LEGEND, progress_lines
@@ -18,7 +17,7 @@ from station.tui.widgets.preview import PreviewPane
 
 
 class CaptureScreen(StationScreen):
-    """The camera's picture as large as it can be; progress, error, coverage and devices beside it."""
+    """The camera's picture as large as it can be; progress, error and coverage beside it."""
 
     MODE, TIP = "capture", "The running capture"
     HELP = (
@@ -35,12 +34,10 @@ class CaptureScreen(StationScreen):
                 yield Panel("What happened", newest_events, id="events", below="6 all")
             with Vertical(id="live-right"):
                 with Box("Poses", id="progress"):
-                    yield ProgressBar(id="bar-of-poses", show_eta=False, show_percentage=False)
                     yield Panel("", progress_lines, id="poses")
                 yield Panel("Expected error of the camera's position (1σ)", error_lines, id="error")
                 title = "Where in the image the board was seen"
                 yield Panel(title, coverage_lines, id="coverage", below="images per part")
-                yield Panel("Devices", device_lines, id="devices")
         yield Stopped(id="stopped")
 
     def show(self, known: Known) -> None:
@@ -60,9 +57,5 @@ class CaptureScreen(StationScreen):
             if status.camera.connected or status.playback
             else "Camera: not connected"
         )
-        bar = self.query_one(ProgressBar)
-        saved, total = float(sum(pose.counts for pose in session.poses)), float(len(session.poses) or 1)
-        if (bar.progress, bar.total) != (saved, total):
-            bar.update(total=total, progress=saved)
         self.query_one("#quality", Line).show(known)
         self.query_one("#live").set_class(status.state in LATCHED, "-dimmed")

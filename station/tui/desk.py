@@ -35,7 +35,6 @@ GONE = "The daemon ended: the controller stops the arm. This screen goes on when
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
 REMEDIES = {
     "nothing-installed": "4 shows the newest result, i installs it.",
-    "no-pointer": "Give its length (Tab in the list of corners), or set the tool on the pendant.",
     "unfinished-recording": "c on 5 recovers it.",
 }
 """By an error's code, where the way out on a screen is another than in a shell."""

@@ -184,7 +184,7 @@ READ = Action("", "Read the result", "It is done; Enter closes this window.", lo
 
 
 class JobScreen(Question[int]):
-    """Runs `python -m MODULE ARGS…` and returns its exit code; Escape or Cancel ends it (-1).
+    """Runs `python -m MODULE ARGS…` and returns its exit code; Escape ends it (-1).
 
     What it said stays until it is read, unless the code is one of `close_on`.
     """
@@ -192,7 +192,8 @@ class JobScreen(Question[int]):
     BOX, NAME = "job", "At work"
     NEXT = Action("", "Wait", "This work runs beside the station; Escape ends it.")
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape", "cancel", "Cancel", tooltip="End this work; no half-written file stays")
+        Binding("escape", "end", "End", tooltip="End this work; no half-written file stays"),
+        Binding("enter", "close", "Close", show=False),
     ]
 
     def __init__(self, title: str, module: str, *args: str, close_on: tuple[int, ...] = (0, 4)) -> None:
@@ -202,15 +203,16 @@ class JobScreen(Question[int]):
         self._title, self._command = title, (sys.executable, "-m", module, *args)
         self._process: asyncio.subprocess.Process | None = None
         self._exit_code: int | None = None
-        self._cancelled = False
+        """Set when all that it said is shown."""
+        self._ended = False
+        """By a person. It may have been done all the same."""
+        self._begun_s = time.monotonic()
 
     def body(self) -> ComposeResult:
         yield Label(self._title, id="job-title")
         yield RichLog(id="job-lines", wrap=True, max_lines=500, min_width=0)
-        yield Button("Cancel", id="job-cancel")
 
     def on_mount(self) -> None:
-        self._begun_s = time.monotonic()
         self.set_interval(1.0, self._say_how_long)
         self.call_after_refresh(self.run_job)  # the width of its lines is known then
 
@@ -236,23 +238,20 @@ class JobScreen(Question[int]):
             self.said.append(line.decode(errors="replace").rstrip())
             lines.write(self.said[-1])
         self._exit_code = await self._process.wait()
-        self.query_one("#job-title", Label).update(self._title)
-        if self._cancelled and self._exit_code != 0:
-            self.dismiss(-1)
-        elif self._cancelled or self._exit_code in self._close_on:  # it may have been done all the same
-            self.dismiss(self._exit_code)
-        else:  # The person reads why before it goes away.
-            close = self.query_one("#job-cancel", Button)
-            close.label = "Close"
-            close.focus()
-            self.query_one(Frame).question = READ
-            self.show(self.known)
-
-    async def action_cancel(self) -> None:
-        if self._process is None or self._exit_code is not None:
-            self.dismiss(-1 if self._exit_code is None else self._exit_code)
+        if self._ended or self._exit_code in self._close_on:
+            self.dismiss(self._exit_code if self._exit_code in self._close_on else -1)
             return
-        self._cancelled = True
+        self.query_one("#job-title", Label).update(self._title)
+        self.query_one(Frame).question = READ  # the person reads why before it goes away
+        self.show(self.known)
+
+    def action_close(self) -> None:
+        if self._exit_code is not None:
+            self.dismiss(self._exit_code)
+
+    async def action_end(self) -> None:
+        self._ended = True
+        self.action_close()
         await self._end()
 
     async def on_unmount(self) -> None:
@@ -269,6 +268,3 @@ class JobScreen(Question[int]):
         except TimeoutError:
             process.kill()
             await process.wait()
-
-    async def on_button_pressed(self) -> None:
-        await self.action_cancel()

@@ -168,10 +168,10 @@ class Kept:
     """The verdict of the drift check that it was recorded for."""
 
 
-def read_sessions(root: Path | None, camera: str, sessions: list[SessionSummary]) -> tuple[Kept, ...]:
+def read_sessions(root: Path, camera: str, sessions: list[SessionSummary]) -> tuple[Kept, ...]:
     """Read what became of each session, newest first; for a thread."""
-    installed = Installed() if root is None else read_installed(root, camera)
-    judged = {} if root is None else {check.recording: check for check in read_checks(root, camera)}
+    installed = read_installed(root, camera)
+    judged = {check.recording: check for check in read_checks(root, camera)}
     return tuple(
         Kept(
             session,

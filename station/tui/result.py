@@ -224,7 +224,7 @@ class ResultScreen(StationScreen):
     """The newest calibration, or the one picked from the sessions."""
 
     MODE, TIP = "result", "The verdict, its checks, install and undo"
-    LOOK = "look_at_results"
+    LOOK = "look_at_disk"
     HELP = (
         "The newest result, or the one picked on 5. Enter on a check shows its details, Tab goes to the "
         "views and the installations. Installing can be undone."

@@ -24,7 +24,7 @@ class SessionsScreen(StationScreen):
     """Past recordings and their calibrations."""
 
     MODE, TIP = "sessions", "Past recordings"
-    LOOK = "look_at_sessions"
+    LOOK = "look_at_disk"
     HELP = (
         "Past recordings. Solving runs in its own process; the daemon and a running capture go on. Home and "
         "End go to the newest and the oldest."

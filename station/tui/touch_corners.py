@@ -9,7 +9,7 @@ from typing import ClassVar
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.widgets import Input, Label, OptionList, Static
+from textual.widgets import Label, OptionList, Static
 from textual.widgets.option_list import Option
 
 from calibrate.boards.model import board_points, outer_corners
@@ -26,7 +26,6 @@ ABOUT = (
     "there and press Enter on that corner. The station moves nothing. The board must stay where it is until "
     "the end."
 )
-POINTER = "pointer's length in mm; empty: as configured, or as on the pendant"
 END = "end"
 
 
@@ -47,9 +46,8 @@ class TouchCorners(Question[list[Touch]]):
         corners = outer_corners(self._board.calibration.board)
         lines = [Option(self._line(corner), str(corner)) for corner in corners]
         yield OptionList(*lines, Option("end, and write what was found", END), id="corners", compact=True)
-        yield Input(id="pointer", type="number", placeholder=POINTER, compact=True)
         yield Label("", id="dialog-problem", markup=False)
-        yield Label("Enter: read that corner. Tab: the pointer's length. Escape: end.", id="dialog-keys")
+        yield Label("Enter: read that corner. Escape: end.", id="dialog-keys")
 
     def _line(self, corner: int) -> Text:
         if (touch := self._found.get(corner)) is not None:
@@ -57,19 +55,14 @@ class TouchCorners(Question[list[Touch]]):
         x_mm, y_mm = 1000 * board_points(self._board.calibration.board)[corner, :2]
         return Text(f"corner {corner}, at {x_mm:.0f}, {y_mm:.0f} mm on the board: not touched yet")
 
-    def on_input_submitted(self) -> None:
-        self.query_one("#corners").focus()
-
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         if event.option_id == END:
             self.action_end()
             return
         corner, problem = int(str(event.option_id)), ""
-        length_mm = self.query_one("#pointer", Input).value.strip()
         now = None if self.known.old else self.known.status
         try:
-            pointer_m = float(length_mm) / 1000 if length_mm else None
-            self._found[corner] = read_touch(self._board, corner, now, pointer_m)
+            self._found[corner] = read_touch(self._board, corner, now)
         except CodedError as refused:
             problem = told(refused)
         else:

@@ -74,7 +74,7 @@ class FakeLink(Client):
 
     def __init__(self) -> None:
         super().__init__(Path("/nowhere/control.sock"))
-        self.own_id = 7
+        self.own_id, self.root = 7, Path("/nowhere")
         self.asked: list[Verb[Any]] = []
         self.refuse: dict[str, Exception] = {}
         self.answers: dict[str, Any] = {

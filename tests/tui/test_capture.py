@@ -7,17 +7,15 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import pose as pose_of
-from station.cell.config import CaptureConfig, matrix4
+from station.cell.config import matrix4
 from station.cell.layout import layout_of
 from station.cell.status import (
-    CameraStatus,
     EstimateStatus,
-    FrameTiming,
     PoseStatus,
     StationState,
     StationStatus,
 )
-from station.tui.capture_panels import coverage_lines, device_lines, error_lines
+from station.tui.capture_panels import coverage_lines, error_lines
 from station.tui.progress import chips, counted_line, pose_line
 from station.tui.stopped import stopped_text
 from station.tui.task import Known
@@ -30,11 +28,6 @@ from tests.tui.conftest import CELL, FakeLink, idle, opened, until
 
 def session(status: StationStatus, **changes: object) -> StationStatus:
     return msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, **changes))
-
-
-def test_a_played_arm_is_said_to_be_none() -> None:
-    said = device_lines(Known(msgspec.structs.replace(idle(), playback=True)), 60, 2).plain
-    assert "robot not live" in said and "Hz" not in said
 
 
 def test_what_comes_next_fits_what_was_recorded() -> None:
@@ -84,13 +77,6 @@ async def test_the_pose_under_way_is_told_by_its_number(link: FakeLink) -> None:
     link.show(moving)
     async with opened(link) as pilot:
         await until(pilot, lambda: pilot.app.screen.query_one("#progress").border_title == "Pose 5 of 7")
-
-
-@pytest.mark.parametrize(("limit_s", "marked"), [(0.02, "✗ clocks"), (0.08, "✓ clocks")])
-def test_clocks_are_judged_by_the_limit_of_this_cell(limit_s: float, marked: str) -> None:
-    status = msgspec.structs.replace(idle(), camera=CameraStatus(timing=FrameTiming("arrival", 0.045)))
-    cell = msgspec.structs.replace(CELL, capture=CaptureConfig(time_bound_s=limit_s))
-    assert marked in device_lines(Known(status, configuration=cell), 80, 4).plain
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install, rollback
 from calibrate.files.versions import note_installed, who
 from station.cell.errors import StationError
-from station.tui import disk_watch
+from station.tui import app as app_module
 from station.tui.app import StationApp
 from station.tui.installed import read_installed
 from tests.tui.conftest import FakeLink, app_on, idle, summary, text_of, until
@@ -30,7 +30,7 @@ def root(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
         write_calibration(
             msgspec.structs.replace(GOOD, created=created, provenance=provenance), folder / "calibration.yaml"
         )
-    monkeypatch.setattr(disk_watch, "LOOK_S", 0.05)
+    monkeypatch.setattr(app_module, "LOOK_S", 0.05)
     link.root = tmp_path
     link.answers["sessions"] = [
         summary(name, tmp_path / "sessions" / name / "calibration.yaml") for name in ("s-2", "s-1")

@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 from textual.pilot import Pilot
-from textual.widgets import Input, OptionList, Static
+from textual.widgets import OptionList, Static
 
 from calibrate.boards.model import board_points, outer_corners
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install, installed_calibration
 from station.tui.touch_corners import TouchCorners
-from tests.station.operate.test_tip_offsets import TIP, Daemon
+from tests.station.operate.test_tip_offsets import Daemon
 from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 
 
@@ -46,12 +46,11 @@ async def touch(
     link: FakeLink,
     daemon: Daemon,
     beside_mm: tuple[float, ...],
-    tip: tuple[float, ...] = TIP,
 ) -> None:
     """The tip so far from the first corner, then Enter on it."""
     corner = outer_corners(daemon.truth.board)[0]
     place = board_points(daemon.truth.board)[corner] + np.array(beside_mm) / 1000
-    status = msgspec.structs.replace(idle(), robot=daemon.touching(place, tip).robot)
+    status = msgspec.structs.replace(idle(), robot=daemon.touching(place).robot)
     link.show(status)
     await until(pilot, lambda: pilot.app.known.status == status)  # type: ignore[attr-defined]
     await pilot.press("enter")
@@ -80,17 +79,6 @@ async def test_what_is_read_goes_into_the_file_and_the_installed_one(
         assert found.offset_mm == pytest.approx((-0.5, -0.25), abs=0.02)
         assert installed_calibration(root) == read_calibration(calibration)
         assert not {"prepare", "go"} & set(link.verbs), "nothing moves"
-
-
-async def test_the_pointers_length_is_asked_for(link: FakeLink, calibration: Path, daemon: Daemon) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await begin(pilot, link, calibration, daemon)
-        await until(pilot, lambda: isinstance(pilot.app.screen, TouchCorners))
-        await pilot.press("tab", *"150", "enter")
-        assert pilot.app.screen.query_one(Input).value == "150"
-        await touch(pilot, link, daemon, (0.0, 0.0, 0.0), (0.0, 0.0, 0.15))
-        await pilot.press("escape")
-        await until(pilot, lambda: read_calibration(calibration).verification != [])
 
 
 async def test_no_board_in_the_image_is_said(link: FakeLink, calibration: Path) -> None:

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import json
+import pickle
+import subprocess
 import sys
 import time
+from typing import Any
 
 import msgspec
-import numpy as np
 
-from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
+from recordings.schema.messages import CameraIdentity, ClockReading, Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming
-from station.devices.base import Trigger
+from station.devices.base import DeviceThread, Trigger
 from station.devices.frame_ids import FrameIds
 from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
-from station.simulation.launch import Json
+from station.simulation.launch import ChildProcess
 from station.simulation.truth import CellTruth
 
 START_TIMEOUT_S = 20.0
 _ANSWER_S = 5.0
 _CLOCK_READINGS = 8
-_PIPE_LIMIT = 4 * 2**20
 
 
 class RenderedCamera:
@@ -44,10 +43,9 @@ class RenderedCamera:
         self._host = controller_host
         self._exposure_us = truth.exposure_us if config is None else config.exposure_us
         self._gain_db = truth.gain_db if config is None else config.gain_db
-        self._process: asyncio.subprocess.Process | None = None
-        self._reader: asyncio.Task[None] | None = None
-        self._frames: asyncio.Queue[Image | CameraError] = asyncio.Queue()
-        self._answers: asyncio.Queue[Image | Json | CameraError] = asyncio.Queue()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._thread = DeviceThread("rendered camera")
+        self._frames: asyncio.Queue[Image | BaseException] = asyncio.Queue()
         self._asking = asyncio.Lock()
         self._clock = FrameClock()
         self.counter = FrameCounter(FrameIds.BLOCK)
@@ -71,29 +69,18 @@ class RenderedCamera:
     def pulse(self) -> None:
         """Deliver an edge on the trigger line; from any thread. Ignored while the camera is not open."""
         if self._loop is not None and self._process is not None:
-            self._loop.call_soon_threadsafe(self._write, {"cmd": "trigger"})
+            self._loop.call_soon_threadsafe(self._expose)
 
     async def open(self) -> CameraIdentity:
         """Start the process and read its clock a few times."""
         self._loop = asyncio.get_running_loop()
-        self._process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "station.simulation.camera_process"),
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            limit=_PIPE_LIMIT,
-        )
-        self._frames, self._answers = asyncio.Queue(), asyncio.Queue()
+        self._frames = asyncio.Queue()
         self.counter.restart()
-        self._reader = asyncio.create_task(self._read(self._process))
-        setup = {
-            "truth": msgspec.to_builtins(self._truth),
-            "controller_host": self._host,
-            "exposure_us": self._exposure_us,
-            "gain_db": self._gain_db,
-        }
         try:
             async with self._asking:  # so that images are taken only after the clock was read
-                await self._ask_locked(setup, START_TIMEOUT_S)
+                await self._thread.run(self._start)
+                setup = (self._truth, self._host, self._exposure_us, self._gain_db)
+                await self._call(*setup, timeout_s=START_TIMEOUT_S)
                 self._clock.restart()  # not before: a clock without readings counts as unreadable
                 for _ in range(_CLOCK_READINGS):
                     await self._read_clock()
@@ -112,20 +99,20 @@ class RenderedCamera:
             pulse: TriggerPulse | None = None
             asked_ns = time.monotonic_ns()
             if self._trigger is None:
-                self._write({"cmd": "trigger"})
+                self._expose()
             else:
                 pulse = await self._trigger.fire()
+            count = None if pulse is None else pulse.count
             try:
                 frame = await asyncio.wait_for(self._frames.get(), timeout_s)
             except TimeoutError:
-                self.counter.lost(None if pulse is None else pulse.count)
+                self.counter.lost(count)
                 raise CameraError("no-image", limit_s=timeout_s) from None
-            if isinstance(frame, CameraError):
+            if isinstance(frame, BaseException):
                 raise frame
-            count = None if pulse is None else pulse.count
             sequence = self.counter.accept(frame.frame_id, count)
             self._check_settings(frame)
-            told = msgspec.structs.replace(frame, sequence=sequence, trigger_count=count)
+            told = msgspec.structs.replace(_dated(frame), sequence=sequence, trigger_count=count)
             return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
 
     async def settings(self) -> dict[str, object]:
@@ -138,9 +125,8 @@ class RenderedCamera:
 
     async def glimpse(self) -> Image | None:
         """Render a new image at half the size."""
-        picture = await self._ask({"cmd": "preview"}, _ANSWER_S)
-        assert isinstance(picture, Image)
-        return picture
+        async with self._asking:
+            return _dated(await self._call("preview"))
 
     async def preview(self) -> Image | None:
         try:
@@ -149,27 +135,15 @@ class RenderedCamera:
             return None
 
     async def inject(self, fault: str, value: object = None) -> None:
-        """Inject a fault of `CameraFaults`; 'unplugged' ends the process."""
-        if fault == "unplugged":
-            self._write({"cmd": "fault", "name": fault})
-            return
-        await self._ask({"cmd": "fault", "name": fault, "value": value}, _ANSWER_S)
+        """Inject a fault of `CameraFaults`."""
+        async with self._asking:
+            await self._call("inject", fault, value)
 
     async def close(self) -> None:
         process, self._process = self._process, None
         if process is not None:
-            assert process.stdin is not None
-            process.stdin.close()
-            try:
-                await asyncio.wait_for(process.wait(), 2.0)
-            except TimeoutError:
-                process.kill()
-                await process.wait()
-        if self._reader is not None:
-            self._reader.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._reader
-            self._reader = None
+            process.kill()  # ends a call that is under way, too
+            await self._thread.close(ChildProcess(process).stop)
 
     def _check_settings(self, frame: Image) -> None:
         found, wanted = (frame.exposure_us, frame.gain_db), (self._exposure_us, self._gain_db)
@@ -179,66 +153,51 @@ class RenderedCamera:
 
     async def _read_clock(self) -> None:
         asked_ns = time.monotonic_ns()
-        answer = await self._ask_locked({"cmd": "clock"}, _ANSWER_S)
-        if isinstance(answer, dict):
-            answered_ns, wall_ns = time.monotonic_ns(), time.time_ns()
-            self._clock.readings.add(ClockReading(asked_ns, answered_ns, answer["device_ns"], wall_ns))
+        device_ns = await self._call("clock")
+        self._clock.readings.add(ClockReading(asked_ns, time.monotonic_ns(), device_ns, time.time_ns()))
 
-    async def _ask(self, request: Json, timeout_s: float) -> Image | Json:
-        async with self._asking:
-            return await self._ask_locked(request, timeout_s)
+    def _expose(self) -> None:
+        """Trigger; the frames, none or several, arrive in `_frames`."""
 
-    async def _ask_locked(self, request: Json, timeout_s: float) -> Image | Json:
-        while not self._answers.empty():
-            self._answers.get_nowait()  # discard answers that came too late
-        self._write(request)
+        def arrived(asked: asyncio.Future[list[Image]]) -> None:
+            error = asked.exception()
+            for frame in [error] if error is not None else asked.result():
+                self._frames.put_nowait(frame)
+
+        self._thread.run(lambda: self._ask("trigger")).add_done_callback(arrived)
+
+    async def _call(self, *request: object, timeout_s: float = _ANSWER_S) -> Any:
         try:
-            answer = await asyncio.wait_for(self._answers.get(), timeout_s)
+            return await asyncio.wait_for(self._thread.run(lambda: self._ask(*request)), timeout_s)
         except TimeoutError:
             raise CameraError("camera-silent", limit_s=timeout_s) from None
-        if isinstance(answer, CameraError):
-            raise answer
+
+    # -- in the camera's thread
+
+    def _start(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "station.simulation.camera_process"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+
+    def _ask(self, *request: object) -> Any:
+        if self._process is None:
+            raise CameraError("not-open")
+        assert self._process.stdin is not None and self._process.stdout is not None
+        try:
+            self._process.stdin.write(pickle.dumps(request))
+            self._process.stdin.flush()
+            done, answer = pickle.load(self._process.stdout)
+        except (EOFError, OSError, pickle.UnpicklingError):
+            raise CameraError("camera-gone", camera=self.identity.serial) from None
+        if not done:
+            raise CameraError("camera-refused", doing=str(request[0]), reason=answer)
         return answer
 
-    def _write(self, request: Json) -> None:
-        if self._process is None or self._process.stdin is None or self._process.returncode is not None:
-            raise CameraError("not-open")
-        self._process.stdin.write(json.dumps(request).encode() + b"\n")
 
-    async def _read(self, process: asyncio.subprocess.Process) -> None:
-        """Distribute the process's messages until it ends; then fail all waiting calls."""
-        assert process.stdout is not None
-        try:
-            while line := await process.stdout.readline():
-                header = json.loads(line)
-                match header["kind"]:
-                    case "frame":
-                        self._frames.put_nowait(await _picture(process.stdout, header))
-                    case "preview":
-                        self._answers.put_nowait(await _picture(process.stdout, header))
-                    case "error":
-                        error = CameraError("camera-refused", doing=header["cmd"], reason=header["text"])
-                        (self._frames if header["cmd"] == "trigger" else self._answers).put_nowait(error)
-                    case _:
-                        self._answers.put_nowait(header)
-        except (asyncio.IncompleteReadError, ConnectionError):
-            pass  # it ended within a frame
-        gone = CameraError("camera-gone", camera=self.identity.serial)
-        self._frames.put_nowait(gone)
-        self._answers.put_nowait(gone)
-
-
-async def _picture(stream: asyncio.StreamReader, header: Json) -> Image:
-    data = await stream.readexactly(header["bytes"])
-    return Image(
-        pixels=np.frombuffer(data, np.uint8).reshape(header["height"], header["width"]),
-        stamps=Stamps(
-            host_monotonic_ns=header["arrival_monotonic_ns"],
-            host_wall_ns=time.time_ns() - (time.monotonic_ns() - header["arrival_monotonic_ns"]),
-            device_ns=header["device_ns"],
-        ),
-        frame_id=header["frame_id"],
-        sequence=0,
-        exposure_us=header["exposure_us"],
-        gain_db=header["gain_db"],
-    )
+def _dated(frame: Image) -> Image:
+    """Add this computer's wall clock at the frame's arrival."""
+    age_ns = time.monotonic_ns() - frame.stamps.host_monotonic_ns
+    stamps = msgspec.structs.replace(frame.stamps, host_wall_ns=time.time_ns() - age_ns)
+    return msgspec.structs.replace(frame, stamps=stamps)

@@ -1,13 +1,13 @@
-"""Process of the rendered camera: triggers on standard input, frames on standard output.
+"""Process of the rendered camera: requests on standard input, answers on standard output, pickled.
 
 It behaves like a device: its own clock, frame ids that wrap, exposure that takes time, and faults on
-demand. Frames are JSON lines with `bytes`, followed by that many bytes of pixels. It ends with its input.
+demand. It ends with its input.
 """
 
 from __future__ import annotations
 
-import json
 import math
+import pickle
 import sys
 import time
 from typing import Any, BinaryIO, get_type_hints
@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array, inverse, pose_from_rotvec
-from recordings.schema.messages import BoardSpec, CameraModel
+from recordings.schema.messages import BoardSpec, CameraModel, Image, Stamps
 from station.cell.errors import RobotError
-from station.simulation.launch import AdminClient, Json
+from station.simulation.launch import AdminClient
 from station.simulation.renderer import Light, render, scaled
 from station.simulation.truth import CellTruth
 
@@ -31,8 +31,6 @@ FIRST_FRAME_ID = 65_520
 """First frame id, so high that every session meets the overflow at 65535."""
 PREVIEW_SCALE = 0.5
 
-
-Message = tuple[Json, NDArray[np.uint8] | None]
 ADDING = ("missed-trigger", "lost-frame", "double-frame", "clock-step")
 """Faults whose value is added to the present one; the default is 1."""
 
@@ -77,7 +75,7 @@ class CameraFaults(msgspec.Struct):
         """Inject a fault. ValueError for an unknown name."""
         field = name.replace("-", "_")
         if field not in self.__struct_fields__:
-            known = ", ".join((*self.__struct_fields__, "unplugged")).replace("_", "-")
+            known = ", ".join(self.__struct_fields__).replace("_", "-")
             raise ValueError(f"no camera fault '{name}'; there are {known}")
         if name in ADDING:
             value = getattr(self, field) + (1 if value is None else value)
@@ -121,47 +119,34 @@ class CameraProcess:
         drift_ns = round(host_monotonic_ns * self.truth.camera_clock_drift_ppm * 1e-6)
         return host_monotonic_ns + drift_ns + self.truth.camera_clock_offset_ns + self.faults.clock_step
 
-    def answer(self, request: Json) -> list[Message]:
-        """Answer a request: messages, each with its pixels or None. RobotError without a controller."""
-        match request["cmd"]:
-            case "trigger":
-                return self._trigger()
-            case "preview":
-                camera = scaled(self.truth.camera, PREVIEW_SCALE)
-                return [self._frame("preview", time.monotonic_ns(), camera, frame_id=0)]
-            case "clock":
-                return [({"kind": "clock", "device_ns": self.device_ns(time.monotonic_ns())}, None)]
-            case "fault":
-                self.faults.inject(request["name"], request.get("value"))
-                return [({"kind": "fault"}, None)]
-        raise ValueError(f"unknown command {request['cmd']!r}")
+    def preview(self) -> Image:
+        return self._frame(time.monotonic_ns(), scaled(self.truth.camera, PREVIEW_SCALE), frame_id=0)
 
-    def _trigger(self) -> list[Message]:
+    def clock(self) -> int:
+        return self.device_ns(time.monotonic_ns())
+
+    def inject(self, fault: str, value: Any) -> None:
+        self.faults.inject(fault, value)
+
+    def trigger(self) -> list[Image]:
+        """Take the frames of one trigger. RobotError without a controller."""
         if self.faults.take("missed_trigger"):
             return []
-        frames: list[Message] = []
+        frames: list[Image] = []
         for _ in range(2 if self.faults.take("double_frame") else 1):
             start_ns = time.monotonic_ns() + TRIGGER_LATENCY_NS
-            frames.append(self._frame("frame", start_ns, self.truth.camera, self._frame_id))
+            frames.append(self._frame(start_ns, self.truth.camera, self._frame_id))
             self._frame_id = self._frame_id % 65_535 + 1
         return [] if self.faults.take("lost_frame") else frames
 
-    def _frame(
-        self, kind: str, start_ns: int, camera: CameraModel, frame_id: int
-    ) -> tuple[Json, NDArray[np.uint8]]:
+    def _frame(self, start_ns: int, camera: CameraModel, frame_id: int) -> Image:
         exposure_us = self.faults.exposure or self.exposure_us
         picture = self.picture(start_ns, camera)
         arrival_ns = start_ns + round(exposure_us * 1000) + READOUT_NS
-        _sleep_until(arrival_ns)
-        header = {
-            "kind": kind,
-            "frame_id": frame_id,
-            "device_ns": self.device_ns(start_ns) + self.faults.stamp_error,
-            "arrival_monotonic_ns": arrival_ns,
-            "exposure_us": exposure_us,
-            "gain_db": self.gain_db,
-        }
-        return header, picture
+        time.sleep(max(0.0, (arrival_ns - time.monotonic_ns()) / 1e9))
+        device_ns = self.device_ns(start_ns) + self.faults.stamp_error
+        stamps = Stamps(host_monotonic_ns=arrival_ns, device_ns=device_ns)
+        return Image(picture, stamps, frame_id, 0, exposure_us, self.gain_db)
 
     def picture(self, start_ns: int, camera: CameraModel) -> NDArray[np.uint8]:
         """Render an image exposed from host time `start_ns`; return after the end of exposure."""
@@ -199,42 +184,24 @@ class CameraProcess:
         return np.array(answer["base_from_flange"])
 
 
-def _sleep_until(host_monotonic_ns: int) -> None:
-    time.sleep(max(0.0, (host_monotonic_ns - time.monotonic_ns()) / 1e9))
-
-
-def serve(lines: BinaryIO, out: BinaryIO) -> None:
-    """Serve requests until the end of input; the first line describes the camera."""
-    setup = json.loads(lines.readline())
-    truth = msgspec.convert(setup["truth"], CellTruth)
-    camera = CameraProcess(truth, setup["controller_host"], setup["exposure_us"], setup["gain_db"])
+def serve(requests: BinaryIO, answers: BinaryIO) -> None:
+    """Serve until the end of input; the first request describes the camera."""
+    camera = CameraProcess(*pickle.load(requests))
     camera.warm_up()
-    _send(out, {"kind": "ready"}, None)
-    for line in lines:
-        request = json.loads(line)
-        if request["cmd"] == "fault" and request["name"] == "unplugged":
-            return
+    answer: tuple[bool, object] = (True, None)
+    while True:
+        pickle.dump(answer, answers, protocol=pickle.HIGHEST_PROTOCOL)
+        answers.flush()
+        name, *arguments = pickle.load(requests)
         try:
-            for header, pixels in camera.answer(request):
-                _send(out, header, pixels)
+            answer = (True, getattr(camera, name)(*arguments))
         except (RobotError, ValueError) as error:
-            _send(out, {"kind": "error", "cmd": request["cmd"], "text": str(error)}, None)
-
-
-def _send(out: BinaryIO, header: Json, pixels: NDArray[np.uint8] | None) -> None:
-    if pixels is None:
-        out.write(json.dumps(header).encode() + b"\n")
-    else:
-        height, width = pixels.shape
-        line = header | {"width": width, "height": height, "bytes": pixels.nbytes}
-        out.write(json.dumps(line).encode() + b"\n")
-        out.write(pixels.data)
-    out.flush()
+            answer = (False, str(error))
 
 
 if __name__ == "__main__":
     cv2.setNumThreads(1)
     try:
         serve(sys.stdin.buffer, sys.stdout.buffer)
-    except (BrokenPipeError, KeyboardInterrupt):
+    except (EOFError, BrokenPipeError, KeyboardInterrupt):
         sys.exit(0)  # the daemon is gone

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -83,7 +84,8 @@ class ChildProcess:
         """End the child, by force if it does not react. Idempotent."""
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
-                pipe.close()  # it ends with its input
+                with suppress(BrokenPipeError):
+                    pipe.close()  # it ends with its input
         try:
             self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:

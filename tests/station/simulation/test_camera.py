@@ -136,14 +136,14 @@ async def test_while_it_starts_nothing_is_said_of_its_clock(
     arm: SimulatedController, cell: CellTruth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Doctor would call a clock missing that is only not read yet."""
-    rendered, ask = RenderedCamera(cell, arm.host), RenderedCamera._ask_locked
+    rendered, call = RenderedCamera(cell, arm.host), RenderedCamera._call
     while_starting = []
 
-    async def asked(camera: RenderedCamera, request: dict[str, object], timeout_s: float) -> object:
+    async def called(camera: RenderedCamera, *request: object, **limit: float) -> object:
         while_starting.append(camera.timing)
-        return await ask(camera, request, timeout_s)
+        return await call(camera, *request, **limit)
 
-    monkeypatch.setattr(RenderedCamera, "_ask_locked", asked)
+    monkeypatch.setattr(RenderedCamera, "_call", called)
     opening = asyncio.create_task(rendered.open())
     while not while_starting:
         await asyncio.sleep(0.001)

@@ -42,22 +42,21 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
         print_json(status)
         return
     _print_state(status)
-    robot, session = status.robot, status.session
-    words = [f"{robot.model} {robot.condition.safety or 'not connected'}"]
-    if robot.state is not None:
-        words.append(f"slider {100 * robot.state.target_speed_fraction:.0f} %")
+    robot, camera, trigger, session = status.robot, status.camera, status.trigger, status.session
+    words = [f"{robot.model} {robot.condition.safety or 'not connected'}", robot.not_accepted, session.name]
     if robot.control_path:
         words.append(f"control by {robot.control_path}")
-    if robot.not_accepted:
-        words.append(robot.not_accepted)
     if session.poses:
         words.append(f"{session.captured} of {len(session.poses)} poses")
-    if session.name:
-        words.append(session.name)
     if status.lease.holder:
         words.append(f"control: {status.lease.holder}")
+    out.print(", ".join(filter(None, words)))
+    words = ["camera not connected"]
+    if camera.connected:
+        words = [f"{camera.model} {camera.fps:.1f} fps", f"{camera.counts.missing} frames dropped"]
+    if trigger.present:
+        words.append(f"trigger {trigger.pulses} pulses, {trigger.frames} frames")
     out.print(", ".join(words))
-    out.print(camera_words(status))
     if session.recording:
         out.print(f"recording {session.recording}")
 
@@ -65,21 +64,6 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
 def _print_state(status: StationStatus) -> None:
     marks = " SIMULATED" if status.simulated else " PLAYBACK" if status.playback else ""
     out.print(Text.assemble((status.state.value, "bold"), f"{marks}  {status.reason}"))
-
-
-def camera_words(status: StationStatus) -> str:
-    """One line on what camera and trigger box did."""
-    camera, trigger = status.camera, status.trigger
-    if not camera.connected:
-        return "camera not connected"
-    counts = camera.counts
-    words = [f"{camera.model} {camera.fps:.1f} fps", f"{counts.missing} frames dropped"]
-    stream = counts.stream
-    if stream.missing_packets or stream.resent_packets:
-        words.append(f"{stream.missing_packets} packets lost, {stream.resent_packets} resent")
-    if trigger.present:
-        words.append(f"trigger {trigger.pulses} pulses, {trigger.frames} frames")
-    return ", ".join(words)
 
 
 def stop_command(socket: Socket = None) -> None:

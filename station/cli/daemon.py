@@ -7,7 +7,6 @@ import select
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,7 +20,6 @@ from station.cli.console import Socket
 from station.protocol.client import DaemonGoneError, ask
 from station.protocol.verbs import GetPlan
 
-ANSWER_S = 30.0
 READY_S = 120.0
 """It took 70 s on a computer at load 14. A daemon that ends says so at once."""
 END_S = 60.0
@@ -54,14 +52,8 @@ def ensure_daemon(socket: Path, config: Path | None = None) -> Path:
     cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
     print(f"No daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
     root.mkdir(parents=True, exist_ok=True)
-    log = root / "daemon.log"
-    child = _started([*what, "--socket", str(socket)], log, subprocess.DEVNULL)
-    give_up_s = time.monotonic() + ANSWER_S
-    while time.monotonic() < give_up_s and child.poll() is None:
-        if answers(socket):
-            return socket
-        time.sleep(0.2)
-    raise _not_started(log)
+    _started([*what, "--socket", str(socket)], root / "daemon.log", subprocess.DEVNULL)
+    return socket
 
 
 @contextmanager
@@ -73,10 +65,8 @@ def own_daemon(arguments: Sequence[str], log: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="station-") as place:
         socket = Path(place) / "control.sock"
         child = _started([*arguments, "--socket", str(socket), "--end-with-stdin"], log, subprocess.PIPE)
-        assert child.stdin is not None and child.stdout is not None
+        assert child.stdin is not None
         try:
-            if not select.select([child.stdout], [], [], READY_S)[0] or not child.stdout.readline():
-                raise _not_started(log)
             yield socket
         finally:
             child.stdin.close()
@@ -85,24 +75,29 @@ def own_daemon(arguments: Sequence[str], log: Path) -> Iterator[Path]:
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()
-            child.stdout.close()
 
 
-def _started(arguments: Sequence[str], log: Path, channel: int) -> subprocess.Popen[bytes]:
-    """A session of its own: Ctrl-C in this terminal is not meant for it."""
+def _started(arguments: Sequence[str], log: Path, stdin: int) -> subprocess.Popen[bytes]:
+    """A daemon that serves, in a session of its own: Ctrl-C in this terminal is not meant for it.
+
+    Raises StationError with the end of its log.
+    """
     with os.fdopen(open_regular(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab") as words:
-        return subprocess.Popen(
+        child = subprocess.Popen(
             [sys.executable, "-m", "station.cli", "serve", *arguments],
-            stdin=channel,
-            stdout=channel,
+            stdin=stdin,
+            stdout=subprocess.PIPE,
             stderr=words,
             start_new_session=True,
         )
-
-
-def _not_started(log: Path) -> StationError:
+    assert child.stdout is not None
+    with child.stdout as told:
+        if select.select([told], [], [], READY_S)[0] and told.readline():
+            return child
+    child.kill()
+    child.wait()
     tail = "\n".join(read_file(log, LOG_LIMIT_BYTES).decode(errors="replace").splitlines()[-3:])
-    return StationError("not-started", log=log, tail=tail)
+    raise StationError("not-started", log=log, tail=tail)
 
 
 def tell_what_goes_on(socket: Path) -> None:

@@ -31,7 +31,7 @@ from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, err, out, print_json
 from station.cli.daemon import own_daemon
 from station.cli.session import PosesJson
-from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
+from station.cli.simulated import GigE, Mounting, Noise, Scene, Seed
 from station.protocol.verbs import MakePlan, Purpose
 from station.simulation.netns import is_isolated, isolated_command
 from station.simulation.truth import CellTruth
@@ -81,7 +81,6 @@ def demo_command(
     headless: Headless = False,
     as_json: AsJson = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
-    control: Control = None,
 ) -> None:
     """Run the whole job on a simulated cell and compare with the truth.
 
@@ -99,7 +98,6 @@ def demo_command(
     folder = output or state_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
     arguments = ["--seed", str(seed), "--scene", scene, "--mount", mount, "--noise", noise]
     arguments += ["--time-scale", str(time_scale), *(["--gige"] if gige else [])]
-    arguments += ["--control", control] if control else []
     quiet, started_s = headless or as_json, time.monotonic()
     if not quiet:
         err.print(f"a simulated cell: {' '.join(arguments)}", style="dim")

@@ -18,7 +18,7 @@ from recordings.files import state_root
 from station.cell.errors import ConfigError
 from station.cell.process import DAEMON_NICENESS, RealTimeThreads, go_before_others
 from station.cell.socket_folder import default_socket
-from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed
+from station.cli.simulated import GigE, Mounting, Noise, Scene, Seed
 from station.devices.cell import Cell
 
 END_S = 4.7
@@ -44,8 +44,6 @@ def serve_command(
     hardware_trigger: Annotated[
         bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera")
     ] = False,
-    control: Control = None,
-    robot: Annotated[str, typer.Option(hidden=True)] = "UR10",
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
 ) -> None:
@@ -87,9 +85,7 @@ def serve_command(
     else:
         from station.simulation.launch_cell import SimulationOptions, simulated_cell
 
-        options = SimulationOptions(
-            scene, seed, noise, mount, time_scale, gige, hardware_trigger, control, robot
-        )
+        options = SimulationOptions(scene, seed, noise, mount, time_scale, gige, hardware_trigger)
         cell = simulated_cell(options, place / "simulation")
     asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin, real_time))
 

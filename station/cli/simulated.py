@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 from recordings.schema.messages import Mount
-from station.cell.config import ControlPath
 from station.simulation.truth import NoiseLevel, SceneName
 
 Seed = Annotated[int, typer.Option(help="Simulated: seed of camera pose, board pose, intrinsics, noise")]
@@ -15,4 +14,3 @@ Scene = Annotated[SceneName, typer.Option(help="Simulated; paper-binned: 640×51
 Noise = Annotated[NoiseLevel, typer.Option(help="Simulated")]
 Mounting = Annotated[Mount, typer.Option("--mount", help="Simulated")]
 GigE = Annotated[bool, typer.Option("--gige", help="Simulated: the camera over GigE Vision packets")]
-Control = Annotated[ControlPath | None, typer.Option("--control", hidden=True)]

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 from recordings.schema.messages import Mount
-from station.cell.config import ControlPath, StationConfig, TriggerConfig
+from station.cell.config import StationConfig, TriggerConfig
 from station.devices.base import Camera, Trigger
 from station.devices.cell import Cell
 from station.simulation.cells import make_cell
@@ -19,6 +19,10 @@ from station.simulation.truth import CellTruth, NoiseLevel, SceneName, write_tru
 
 GIGE_PACKET_BYTES = 8996
 TRUTH = "truth.json"
+
+
+FREE_SPACE_BYTES = 200_000_000
+"""Free disk space below which no pose is captured; small, so that demonstrations run anywhere."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +37,6 @@ class SimulationOptions:
     """Simulate the camera over GigE Vision, in a network namespace with only `lo`."""
     hardware_trigger: bool = False
     """Trigger the camera by a simulated box on a pseudo terminal."""
-    control: ControlPath | None = None
-    """Driver of the arm; None: ur_rtde if installed, else script."""
-    robot: str = "UR10"
-    """Model of the arm; the start posture of each model shows the board for seed 0."""
-    free_space_bytes: int = 200_000_000
-    """Free disk space below which no pose is captured; small, so that demonstrations run anywhere."""
 
 
 def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
@@ -50,7 +48,6 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
     from station.simulation.cells import cell_config
 
     truth = make_cell(options.scene, options.seed, options.noise, options.mount)
-    truth = msgspec.structs.replace(truth, robot_model=options.robot)
     with ExitStack() as ends:
         host, attachments = start_cell(truth, folder, ends, options.time_scale)
         config = cell_config(truth, host)
@@ -69,8 +66,7 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
             changes |= {"driver": "aravis", "device": "127.0.0.1", "packet_size": GIGE_PACKET_BYTES}
         config = msgspec.structs.replace(
             config,
-            capture=msgspec.structs.replace(config.capture, free_space_bytes=options.free_space_bytes),
-            robot=msgspec.structs.replace(config.robot, model=options.robot, control=options.control),
+            capture=msgspec.structs.replace(config.capture, free_space_bytes=FREE_SPACE_BYTES),
             camera=msgspec.structs.replace(config.camera, **changes),
         )
         camera, pulse = _camera(options, config, truth, folder, trigger, ends)

@@ -40,12 +40,10 @@ def test_saving_into_a_missing_folder_says_so(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ("robot: UR10", "robot: UR99", "unknown"),
         ("name: p01", "nam: p01", "did you mean 'name'"),
         ("[0.1,", "[x,", "line"),
         ("distance_m: 0.45", "distance_m: .inf", "finite"),
         ("mount: eye-in-hand", "mount: eye-in-foot", "mount"),
-        ("mount: eye-in-hand", "mount: eye-in-hand\njoint_acceleration_rad_s2: 1.0e-300", "0.01"),
     ],
 )
 def test_a_wrong_value_is_named_with_its_line(tmp_path, old, new, told):
@@ -61,12 +59,12 @@ def test_a_wrong_value_is_named_with_its_line(tmp_path, old, new, told):
 
 def test_all_problems_are_told_at_once(tmp_path):
     poses = (PlannedPose("a", (900.0, 0, 0, 0, 0, 0)), PlannedPose("a", (0.0,) * 6, ((1.0, 0.0),)))
-    wrong = Plan("UR77", "eye-in-hand", poses, joint_speed_rad_s=0.0)
+    wrong = Plan("UR10", "eye-in-hand", poses)
     (tmp_path / "plan.yaml").write_bytes(msgspec.yaml.encode(wrong))
     with pytest.raises(ConfigError) as caught:
         load_plan(tmp_path / "plan.yaml")
     text = str(caught.value)
-    for part in ("UR77", "joint_speed_rad_s", "twice", "not degrees", "4 rows"):
+    for part in ("twice", "not degrees", "4 rows"):
         assert part in text
 
 

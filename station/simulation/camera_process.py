@@ -31,7 +31,7 @@ FIRST_FRAME_ID = 65_520
 """First frame id, so high that every session meets the overflow at 65535."""
 PREVIEW_SCALE = 0.5
 
-ADDING = ("missed-trigger", "lost-frame", "double-frame", "clock-step")
+ADDING = ("missed-trigger", "lost-frame", "double-frame")
 """Faults whose value is added to the present one; the default is 1."""
 
 
@@ -55,8 +55,6 @@ class CameraFaults(msgspec.Struct):
     missed_trigger: int = 0
     lost_frame: int = 0
     double_frame: int = 0
-    clock_step: int = 0
-    """Step of the camera's clock, ns"""
     stamp_error: int = 0
     """Added to the frames' stamps, not to the clock that is read; ns"""
     illumination: float = 1.0
@@ -117,7 +115,7 @@ class CameraProcess:
     def device_ns(self, host_monotonic_ns: int) -> int:
         """Convert a host time to the camera's clock."""
         drift_ns = round(host_monotonic_ns * self.truth.camera_clock_drift_ppm * 1e-6)
-        return host_monotonic_ns + drift_ns + self.truth.camera_clock_offset_ns + self.faults.clock_step
+        return host_monotonic_ns + drift_ns + self.truth.camera_clock_offset_ns
 
     def preview(self) -> Image:
         return self._frame(time.monotonic_ns(), scaled(self.truth.camera, PREVIEW_SCALE), frame_id=0)

@@ -40,10 +40,10 @@ What is verified and what a real controller may do differently: docs/contributor
 def main(arguments: list[str] | None = None) -> int:
     parent = os.getppid()  # now: it surely lives while it waits for the ready line
     options = _parser().parse_args(arguments)
-    if not (options.allow_other_computers or _is_loopback(options.host)):
+    if not _is_loopback(options.host):
         print(
-            f"--host {options.host} lets other computers send programs, which run on this one. Choose "
-            "127.x.y.z, or add --allow-other-computers.",
+            f"--host {options.host} would let other computers send programs, which run on this one. "
+            "Choose 127.x.y.z.",
             file=sys.stderr,
         )
         return 2
@@ -85,8 +85,6 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--model", choices=sorted(TABLES), help="default: UR10 (CB3, 125 Hz)")
     add("--host", default="127.0.0.1", help="loopback address to listen on")
-    text = "listen on an address that is not this computer's own: whoever reaches it can run programs here"
-    add("--allow-other-computers", action="store_true", help=text)
     add("--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors, drift")
     text = "a program that the dashboard can load; it only waits"
     add("--program", dest="programs", action="append", metavar="NAME", help=text)

@@ -153,20 +153,8 @@ def state(machine: Machine) -> Json:
         "remote": robot.remote,
         "watchdog_s": robot.watchdog_s,
         "claims": sorted(machine.rtde.claims),
+        "packets_skipped": machine.rtde.skipped,
         "connections": {s.name: len(s.connections) for s in machine.services},
-    }
-
-
-def stats(machine: Machine) -> Json:
-    """Cycles, packets sent and skipped, lateness of cycles against their grid, CPU time of this process."""
-    clock, rtde = machine.clock, machine.rtde
-    return {
-        "cycles": clock.count,
-        "packets_sent": rtde.sent,
-        "packets_skipped": rtde.skipped,
-        "late_cycles": clock.late_cycles,
-        "worst_lateness_ms": clock.worst_lateness_ns / 1e6,
-        "cpu_s": time.process_time(),
     }
 
 

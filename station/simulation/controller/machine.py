@@ -36,8 +36,6 @@ class Clock:
         self.start_ns = 0
         """Host time of the controller's time 0."""
         self.count = 0
-        self.worst_lateness_ns = 0
-        self.late_cycles = 0
 
     def due_ns(self, cycle: int) -> int:
         return self.start_ns + round(cycle * self._cycle_ns)
@@ -68,8 +66,6 @@ class Clock:
         for left in reversed(range(min(behind, CHUNK))):
             self.count += 1
             due_ns = self.due_ns(self.count)
-            self.worst_lateness_ns = max(self.worst_lateness_ns, now_ns - due_ns)
-            self.late_cycles += late
             self._tick(due_ns, late and left > 0)  # together they last one cycle for whoever counts
 
 

@@ -35,7 +35,6 @@ class RtdeServer:
         """Links live, no data is sent."""
         self.frozen = False
         """The same packet again and again."""
-        self.sent = 0
         self.skipped = 0
 
     def send_states(self) -> None:
@@ -148,4 +147,3 @@ class RtdeConnection(Connection):
             server.skipped += 1
             return
         self.transport.write(self._last)
-        server.sent += 1

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
-from pathlib import Path
+from collections.abc import AsyncIterator, Iterator
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from calibrate.geometry import inverse
 from recordings.schema.messages import Image
 from station.simulation.camera import RenderedCamera
 from station.simulation.cells import make_cell
-from station.simulation.launch import AdminClient, SimulatedController
+from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from station.simulation.truth import CellTruth, write_truth
 from tests.codes import raises
 
@@ -27,17 +26,18 @@ def mid_exposure(picture: Image) -> tuple[int, float]:
     return picture.time.host_monotonic_ns, picture.time.bound_s
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def cell() -> CellTruth:
     return make_cell(seed=3)
 
 
-@pytest.fixture
-def arm(
-    controller: Callable[..., SimulatedController], cell: CellTruth, tmp_path: Path
-) -> SimulatedController:
-    write_truth(cell, tmp_path / "truth.json")
-    return controller(truth=tmp_path / "truth.json")
+@pytest.fixture(scope="module")
+def arm(cell: CellTruth, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedController]:
+    """One for all tests of this module: nothing here moves it."""
+    truth = tmp_path_factory.mktemp("cell") / "truth.json"
+    write_truth(cell, truth)
+    with start_controller(truth=truth) as running:
+        yield running
 
 
 @pytest.fixture

@@ -11,7 +11,6 @@ from calibrate.boards.model import board_points
 from calibrate.geometry import inverse, is_rigid, rotation_angle, transform_points
 from calibrate.kinematics import MODELS, forward
 from station.cell.config import PAPER_BOARD
-from station.plan.planner import make_plan
 from station.simulation.cells import cell_config, make_cell
 from station.simulation.placement import board_centre
 from station.simulation.truth import CellTruth, read_truth, write_truth
@@ -49,21 +48,6 @@ def test_the_camera_sees_the_board_from_the_start(mount: str, seed: int) -> None
     if mount == "eye-in-hand":
         corners = transform_points(np.array(cell.board_place), board_points(cell.board))
         assert corners[:, 2].min() >= -1e-9, "on or over the table"
-
-
-@pytest.mark.parametrize(
-    ("scene", "seed", "mount"),
-    [("paper", 7, "eye-in-hand"), ("paper-binned", 3, "eye-to-hand")],
-)
-def test_a_plan_of_25_poses_exists_from_what_an_operator_would_guess(
-    scene: str, seed: int, mount: str
-) -> None:
-    cell = make_cell(scene, seed, mount=mount)  # type: ignore[arg-type]
-    plan = make_plan(cell_config(cell), start_joints_rad=cell.start_joints_rad)
-    assert len(plan.poses) == 25
-    for planned in plan.poses:
-        centre = transform_points(camera_from_board(cell, planned.joints_rad), board_centre(cell.board))
-        assert centre[2] > 0.25
 
 
 def test_mounts_of_other_seeds_are_spread_over_all_rotations() -> None:

@@ -19,7 +19,6 @@ from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan
-from station.cell.session_folder import SessionSummary
 from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
 from station.protocol.states import LATCHED, RESTING, RUNNING
@@ -324,12 +323,6 @@ class Doctor(Verb[list[Check]], frozen=True):
 
 class Configuration(Verb[StationConfig], frozen=True):
     """Return the cell as it is configured."""
-
-    control = False
-
-
-class Sessions(Verb[list[SessionSummary]], frozen=True):
-    """List the sessions on the disk, newest first."""
 
     control = False
 

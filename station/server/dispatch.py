@@ -9,7 +9,6 @@ from collections.abc import Awaitable, Callable, Coroutine
 import msgspec
 
 from station.cell.errors import RefusedError
-from station.cell.session_folder import list_sessions
 from station.cell.socket_folder import user_name
 from station.protocol import verbs
 from station.protocol.verbs import VERBS, Verb
@@ -17,7 +16,7 @@ from station.server.approval import ApprovalRule, Peer, Process, process
 from station.session.checklist import checklist
 from station.session.recording import software
 from station.session.session import Session
-from station.session.threads import ASKED, NAMES
+from station.session.threads import NAMES
 
 _WHO_LIMIT = 60
 
@@ -130,9 +129,6 @@ class SessionDispatcher:
                 return await checklist(context, session.devices.troubles)
             case verbs.Configuration():
                 return context.cell.config
-            case verbs.Sessions():
-                # In a thread: reading hundreds of files must not delay the arm's heartbeat.
-                return await ASKED.run(list_sessions, context.root)
         return None
 
     async def _welcome(self, caller: Peer, who: str) -> verbs.Welcome:

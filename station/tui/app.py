@@ -23,6 +23,7 @@ from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
 from station.cell.errors import StationError
+from station.cell.session_folder import list_sessions
 from station.cell.status import MotionPreview, SessionStatus, StationState
 from station.operate.motion import prepared_motion
 from station.protocol import verbs
@@ -147,9 +148,9 @@ class StationApp(KnowingApp):
             self.known = replace(self.known, configuration=await self.desk.client.call(verbs.Configuration()))
         if status.playback:
             return
-        missing = status.state is StationState.DISCONNECTED
-        unused = not status.session.poses and await self.desk.ask(verbs.Sessions()) == []
-        if (missing or unused) and self.current_mode == self.DEFAULT_MODE:
+        missing, root = status.state is StationState.DISCONNECTED, self.desk.client.root
+        first = root is not None and not await asyncio.to_thread(list_sessions, root)
+        if (missing or (first and not status.session.poses)) and self.current_mode == self.DEFAULT_MODE:
             await self.switch_mode("connect")
 
     @work(exclusive=True, group="checks", exit_on_error=False)
@@ -182,9 +183,7 @@ class StationApp(KnowingApp):
             return
         result = await asyncio.to_thread(read_result, path) if path else None
         self.known = replace(self.known, result=result)
-        if (sessions := await self.desk.ask(verbs.Sessions())) is None:
-            return  # a notice said why; the next look asks again
-        kept = await asyncio.to_thread(read_sessions, root, client.camera, sessions)
+        kept = await asyncio.to_thread(read_sessions, client.root or root, client.camera)
         self.known, self._marks = replace(self.known, sessions=kept), found
 
     # --- what the screens ask for by a key ---

@@ -18,7 +18,7 @@ from calibrate.files.validity import Validity, ValidityState
 from calibrate.files.versions import LogEntry, read_log, same_solve
 from calibrate.quality.drift_history import CheckEntry, read_checks
 from recordings.files import MAIN_CAMERA
-from station.cell.session_folder import SessionSummary
+from station.cell.session_folder import SessionSummary, list_sessions
 
 Marks = frozenset[tuple[str, int]]
 
@@ -168,7 +168,7 @@ class Kept:
     """The verdict of the drift check that it was recorded for."""
 
 
-def read_sessions(root: Path, camera: str, sessions: list[SessionSummary]) -> tuple[Kept, ...]:
+def read_sessions(root: Path, camera: str) -> tuple[Kept, ...]:
     """Read what became of each session, newest first; for a thread."""
     installed = read_installed(root, camera)
     judged = {check.recording: check for check in read_checks(root, camera)}
@@ -179,5 +179,5 @@ def read_sessions(root: Path, camera: str, sessions: list[SessionSummary]) -> tu
             installed.word(session.name),
             judged.get(session.name),
         )
-        for session in sessions
+        for session in list_sessions(root)
     )

@@ -92,7 +92,6 @@ async def test_the_loop_of_the_heartbeat_touches_no_file(
                 async for status in anna.statuses():
                     if status.session.recording:
                         break
-            await anna.request("sessions")
     finally:
         _LOOPS.clear()
     daemon.end()

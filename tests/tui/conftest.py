@@ -20,7 +20,6 @@ from textual.widgets import Static
 
 from recordings.schema.messages import CameraIdentity, CameraModel, RobotIdentity
 from station.cell.config import PAPER_BOARD, PoseGuess
-from station.cell.session_folder import SessionSummary
 from station.cell.status import (
     ArmCondition,
     CameraStatus,
@@ -32,7 +31,7 @@ from station.cell.status import (
     StationStatus,
 )
 from station.protocol.client import Client
-from station.protocol.verbs import VERBS, Configuration, Done, Preview, PreviewImage, Sessions, Verb, Watch
+from station.protocol.verbs import VERBS, Configuration, Done, Preview, PreviewImage, Verb, Watch
 from station.simulation.placement import cell_description
 from station.tui.app import StationApp
 from tests.patience import PATIENCE_S
@@ -80,7 +79,6 @@ class FakeLink(Client):
         self.answers: dict[str, Any] = {
             "prepare": SUMMARY,
             "preview": _image(),
-            "sessions": [summary("s-0")],
             "configuration": CELL,
         }
         self.silent = asyncio.Event()
@@ -105,11 +103,7 @@ class FakeLink(Client):
 
     @property
     def verbs(self) -> list[str]:
-        return [
-            verb.verb()
-            for verb in self.asked
-            if not isinstance(verb, (Configuration, Preview, Sessions, Watch))
-        ]
+        return [verb.verb() for verb in self.asked if not isinstance(verb, (Configuration, Preview, Watch))]
 
     async def request(self, verb: str, *, timeout_s: float = 0.0, **args: object) -> object:
         self.asked.append(msgspec.convert(args, VERBS[verb]))
@@ -125,10 +119,6 @@ class FakeLink(Client):
 
     async def close(self) -> None:
         self._serves = False
-
-
-def summary(name: str, calibration: Path | str = "") -> SessionSummary:
-    return SessionSummary(name, "", "", "simulated", 0, 0, True, str(calibration))
 
 
 def _image() -> PreviewImage:

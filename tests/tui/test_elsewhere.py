@@ -12,11 +12,10 @@ from textual.widgets import DataTable
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install, rollback
 from calibrate.files.versions import note_installed, who
-from station.cell.errors import StationError
 from station.tui import app as app_module
 from station.tui.app import StationApp
 from station.tui.installed import read_installed
-from tests.tui.conftest import FakeLink, app_on, idle, summary, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 from tests.tui.test_install import GOOD, OFF
 
 
@@ -26,15 +25,13 @@ def root(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     for name, created in (("s-1", "2026-01-01"), ("s-2", "2026-01-02")):
         folder = tmp_path / "sessions" / name
         folder.mkdir(parents=True)
+        (folder / "session.mcap").touch()
         provenance = msgspec.structs.replace(GOOD.provenance, session=name)
         write_calibration(
             msgspec.structs.replace(GOOD, created=created, provenance=provenance), folder / "calibration.yaml"
         )
     monkeypatch.setattr(app_module, "LOOK_S", 0.05)
     link.root = tmp_path
-    link.answers["sessions"] = [
-        summary(name, tmp_path / "sessions" / name / "calibration.yaml") for name in ("s-2", "s-1")
-    ]
     return tmp_path
 
 
@@ -66,9 +63,10 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
         await until(pilot, lambda: states() == ["● INSTALLED", "installed before"])
         rollback(root)
         await until(pilot, lambda: states() == ["installed before", "● INSTALLED, unverified"])
-        link.answers["sessions"] = [summary("s-3"), *link.answers["sessions"]]
         (root / "sessions" / "s-3").mkdir()
-        await until(pilot, lambda: states() == ["", "installed before", "● INSTALLED, unverified"])
+        await until(
+            pilot, lambda: states() == ["c recovers it", "installed before", "● INSTALLED, unverified"]
+        )
         assert table.cursor_row == 2
 
 
@@ -123,22 +121,6 @@ async def test_the_result_of_the_session_just_captured_needs_no_picking(link: Fa
         await until(pilot, lambda: app.known.status is not None and app.known.status.session.calibration)
         await pilot.press("4")
         await until(pilot, lambda: "session s-1" in text_of(app, "#verdict"))
-
-
-async def test_a_list_that_did_not_come_is_asked_for_again_and_the_old_one_stays(
-    link: FakeLink, root: Path
-) -> None:
-    app = app_on(link)
-    async with app.run_test(size=(80, 24)) as pilot:
-        table = await list_of_sessions(app, pilot)
-        await until(pilot, lambda: table.row_count == 2)
-        link.refuse["sessions"] = gone = StationError()
-        (root / "sessions" / "s-3").mkdir()
-        await until(pilot, lambda: any(str(gone) in notice.message for notice in app._notifications))
-        assert table.row_count == 2
-        link.answers["sessions"] = [summary("s-3"), *link.answers["sessions"]]
-        del link.refuse["sessions"]
-        await until(pilot, lambda: table.row_count == 3)
 
 
 async def test_enter_on_a_session_shows_what_it_gave(link: FakeLink, root: Path) -> None:

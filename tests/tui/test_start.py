@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 import pytest
 from textual.widgets import DataTable
@@ -61,7 +63,7 @@ async def test_later_the_live_screen_comes_first(link: FakeLink) -> None:
         assert isinstance(pilot.app.screen, CaptureScreen)
 
 
-async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
+async def test_a_key_that_can_do_nothing_says_why(link: FakeLink, tmp_path: Path) -> None:
     reasons = [
         ("3", "f7", "no session is running"),
         ("3", "f9", "Nothing is finished yet"),
@@ -71,7 +73,8 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
     ]
     fresh = idle()
     link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
-    link.answers |= {"doctor": THERE, "sessions": []}
+    link.answers |= {"doctor": THERE}
+    link.root = tmp_path
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await until(pilot, lambda: isinstance(pilot.app.screen, ConnectScreen))  # before the first session
         await until(pilot, lambda: "Nothing&#160;is&#160;missing" in pilot.app.export_screenshot())
@@ -84,13 +87,17 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
         assert not {"go", "prepare", "finish"} & set(link.verbs)
 
 
-async def test_an_empty_list_says_how_to_begin_but_not_before_it_is_known(link: FakeLink) -> None:
+async def test_an_empty_list_says_how_to_begin_but_not_before_it_is_known(
+    link: FakeLink, tmp_path: Path
+) -> None:
+    link.root, session = tmp_path, tmp_path / "sessions" / "s-0"
+    session.mkdir(parents=True)
     async with opened(link) as pilot:
         await pilot.press("5")
         await until(pilot, lambda: pilot.app.screen.query_one(DataTable).row_count == 1)
         hint = pilot.app.screen.query_one("#sessions-none")
         assert not hint.display
-        link.answers["sessions"] = []
+        session.rmdir()
         await pilot.press("3", "5")
         await until(pilot, lambda: hint.display)
 

@@ -153,7 +153,7 @@ WINDOWS = [
 async def test_stop_stands_whole_on_every_screen_and_question(
     link: FakeLink, size: tuple[int, int], theme: str
 ) -> None:
-    link.answers["sessions"], link.answers["doctor"] = [], []
+    link.answers["doctor"] = []
     async with opened(link, size) as pilot:
         pilot.app.theme = theme
 

@@ -276,7 +276,7 @@ def measure(
     delta = difference(corrected(q), truth.flange(q))
     S = (T := CHAIN.by_links(q)) @ result.covariance[6:, 6:] @ np.swapaxes(T, 1, 2)
     square = np.einsum("ni,nij,nj->n", delta, np.linalg.inv(S), delta)
-    found["inside flange"] = float((square <= result.flange_threshold).mean())
+    found["inside flange"] = float((square <= with_table.confidence_threshold).mean())
     gates = judge(with_table, GateInputs(None, None), GateLimits())
     found["refused"] = float(not all(gate.passed for gate in gates))
     found["offered"] = float(result.offered)

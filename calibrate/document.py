@@ -116,7 +116,6 @@ def _arm_table(solution: Solution, arm: TableResult, verified: Verification | No
         covariance=tuple(tuple(row) for row in arm.covariance.tolist()),
         with_table_mm=1e3 * arm.with_table_m,
         without_table_mm=1e3 * solution.arm.uncorrected.error_m,
-        if_measured_mm={name: 1e3 * value for name, value in arm.if_measured_m.items()},
         held_out=held_out,
         verified=later,
         refused=arm.refused or "",

@@ -130,7 +130,6 @@ class Certificate:
     lower_bound: float = 0.0
     floor: float = 0.0
     """Absolute floor of the denominator, 1e-8 times the trace of the form."""
-    restarts: int = 0
 
 
 @dataclass(frozen=True)

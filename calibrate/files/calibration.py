@@ -188,8 +188,6 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     """1σ of a point at the working distance, averaged over the arm's workspace."""
     without_table_mm: float
     """The same for the uncorrected arm with `result` of the file."""
-    if_measured_mm: dict[str, float] = {}
-    """`with_table_mm` if this (board, intrinsics) were known to 0.02 %."""
     held_out: HeldOutViews | None = None
     verified: HeldOutViews | None = None
     """Verification by another recording: distance of the board's middle from its mean position."""

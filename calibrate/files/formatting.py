@@ -14,8 +14,6 @@ from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override, source_stamp
 from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
-from calibrate.handeye.priors import BoardTolerance
-from calibrate.handeye.solution import MEASURED
 from calibrate.results import BoardShape
 
 
@@ -192,8 +190,6 @@ _REFUSED = {
     "30001 of the controller, which states the factory calibration",
     "not-better": "it does not help on poses elsewhere",
 }
-WORTH_SAYING = 0.85
-"""Share of the error left without a cause below which that cause is named as the limit of the table."""
 
 
 def arm_sentences(calibration: Calibration) -> Iterator[str]:
@@ -220,24 +216,11 @@ def arm_sentences(calibration: Calibration) -> Iterator[str]:
     if arm.offered:
         yield (
             "Where points far from the board count, give the robot program the corrected table (calibrate "
-            "export --to ur-kinematics). The installed camera pose is the best for the arm as it is."
+            "export --to ur-kinematics). The installed camera pose is the best for the arm as it is. "
+            "More poses would lower the error further: station plan --for arm."
         )
     else:
         yield f"The arm's table is not offered: {_REFUSED.get(arm.refused, arm.refused)}."
-    limits = sorted(arm.if_measured_mm.items(), key=lambda item: item[1])
-    if limits and limits[0][1] < WORTH_SAYING * arm.with_table_mm:
-        what, left_mm = limits[0]
-        stated = calibration.board.square_tolerance or BoardTolerance().square
-        known = f"The board's length is known to {stated:.2%}" if what == "board" else "The lens is the limit"
-        yield (
-            f"{known}: {_MEASURE[what]} to {MEASURED:.2%} and the workspace error falls from "
-            f"{arm.with_table_mm:.2f} to {left_mm:.2f} mm."
-        )
-    elif arm.offered:
-        yield "More poses would lower it further: station plan --for arm."
-
-
-_MEASURE = {"board": "measure it (board: square_tolerance)", "intrinsics": "calibrate its focal length"}
 
 
 def _board(board: BoardShape, square_mm: float) -> Iterator[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb
@@ -14,7 +13,6 @@ from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.estimate import CellFit
 from calibrate.handeye.solution import (
-    MEASURED,
     Solution,
     TableRefusal,
     TableResult,
@@ -23,7 +21,6 @@ from calibrate.handeye.solution import (
 )
 from calibrate.handeye.workspace import SPREAD, Workspace, sample_range, sample_workspace
 from calibrate.kinematics import forward
-from calibrate.projection import intrinsics_vector
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, ViewSet, observe_views
 
@@ -65,9 +62,7 @@ def arm_results(
         factory=fit.views.arm is not None,
         corrected=corrected_model(table, errors),
         covariance=covariance,
-        flange_threshold=found.table_threshold,
         with_table_m=corrected_m,
-        if_measured_m=_if_measured(fit, room, places),
         held_out_m=missed,
         refused=_refusal(fit, arm, detected, missed),
     )
@@ -127,19 +122,3 @@ def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | Non
     if missed is not None and not np.nanmean(missed[1] ** 2) < np.nanmean(missed[0] ** 2):
         return "not-better"
     return None
-
-
-def _if_measured(fit: CellFit, room: Workspace, places: NDArray[np.intp]) -> dict[str, float]:
-    """Compute `TableResult.if_measured_m`: the error if board or intrinsics were measured to `MEASURED`."""
-    at, found = Layout.of(fit.estimate.state), fit.estimate
-    focal = intrinsics_vector(found.state.camera)[:2]
-    known = {
-        "board": (np.arange(at.shape.start, at.shape.start + 2), np.full(2, MEASURED)),
-        "intrinsics": (np.arange(at.lens.start, at.lens.start + 2), MEASURED * focal),
-    }
-    errors = {}
-    for name, (which, sigma) in known.items():
-        C = found.covariance
-        gain = C[:, which] @ np.linalg.inv(C[np.ix_(which, which)] + np.diag(sigma**2))
-        errors[name] = room.rms_m((C - gain @ C[which])[np.ix_(places, places)])
-    return errors

@@ -45,8 +45,6 @@ class MeanParts:
     """(s,) weights of the components, sum 1."""
     camera_ratio: Array = field(default_factory=lambda: np.ones(1))
     """(s,) variance of X in each component over that of the mixture."""
-    table_ratio: Array = field(default_factory=lambda: np.ones(1))
-    """(s,) the same for the errors of the arm's table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,16 +83,8 @@ class Estimate:
     @property
     def threshold(self) -> float:
         """Limit of δᵀ C⁻¹ δ that holds the true X with 95 %: 6·F(6, ν), ν = 3n - 6 of n views that count."""
-        return self._region(self.mean_of.camera_ratio)
-
-    @property
-    def table_threshold(self) -> float:
-        """The same limit for the error (6,) of a flange that is computed with the arm's table."""
-        return self._region(self.mean_of.table_ratio)
-
-    def _region(self, ratio: Array) -> float:
         freedom = max(3.0 * float(self.chances[:, 0].sum()) - 6.0 + ROBOT_PRIOR_COUNT, 1.0)
-        chances = self.mean_of.chances
+        chances, ratio = self.mean_of.chances, self.mean_of.camera_ratio
         one = float(6 * special.fdtri(6, freedom, 0.95))
         if len(chances) == 1:
             return one

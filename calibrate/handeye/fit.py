@@ -12,7 +12,7 @@ from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_poi
 from calibrate.handeye.arm import arm_postures, flex_motion
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
-from calibrate.handeye.cell_state import CellState, Layout
+from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import (
     CellFit,
     Estimate,
@@ -45,7 +45,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = all_pairs(H, C)
     require_motion(pairs)
-    certified = solve_global(pairs, seed)
+    certified = solve_global(pairs)
     start = agreed_start(H, BoardPoses.known(C), seed, certified.X)
     views, turned = set_boards_right(views, start.X, start.Y)
     observed, C = observe_views(views), views.camera_from_board
@@ -69,7 +69,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
             observed = replace(observed, table=motion)
         except np.linalg.LinAlgError as problem:
             failure = str(problem)
-    pairs, certified = _certify(views, found, np.flatnonzero(found.used), seed)
+    pairs, certified = _certify(views, found, np.flatnonzero(found.used))
     arm = None if log_bayes is None else arm
     return CellFit(
         views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified, failure, joints_note
@@ -150,8 +150,7 @@ def allow_for_table(
         if steps == 0:
             log_bayes = float(log_all - log_evidence[0])
         converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
-    best, at = solutions[int(chances.argmax())], Layout.of(state)
-    by_table = slice(at.table.start, at.table.start + errors_of_table)
+    best = solutions[int(chances.argmax())]
     with_table = replace(
         plain,
         state=state,
@@ -167,19 +166,14 @@ def allow_for_table(
         log_evidence=float(log_all),
         steps=steps,
         converged=converged,
-        mean_of=MeanParts(
-            chances, _against(spread, covariance, at.X), _against(spread, covariance, by_table)
-        ),
+        mean_of=MeanParts(chances, _against(spread[:, :6, :6], covariance[:6, :6])),
     )
     return with_table, log_bayes
 
 
-def _against(spread: Array, mean: Array, part: slice) -> Array:
-    """Compute the ratios (s,) of covariances (s, q, q) to their mean (q, q), within `part`."""
-    if part.start == part.stop:
-        return np.ones(len(spread))
-    inverse_mean = np.linalg.inv(mean[part, part])
-    return np.asarray(np.einsum("ij,sji->s", inverse_mean, spread[:, part, part]) / (part.stop - part.start))
+def _against(spread: Array, mean: Array) -> Array:
+    """Compute the ratios (s,) of covariances (s, q, q) to their mean (q, q)."""
+    return np.asarray(np.einsum("ij,sji->s", np.linalg.inv(mean), spread) / len(mean))
 
 
 def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Estimate:
@@ -192,11 +186,11 @@ def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Esti
     return narrow if narrow.log_evidence > found.log_evidence + _CLEARLY else found
 
 
-def _certify(views: ViewSet, found: Estimate, places: Places, seed: int) -> tuple[Pairs, GlobalResult]:
+def _certify(views: ViewSet, found: Estimate, places: Places) -> tuple[Pairs, GlobalResult]:
     H = mount_poses(views.base_from_flange, views.mount)[places]
     pairs = all_pairs(H, found.board_poses[places])
     problem = f"the quadratic objective over the pairs of the {len(places)} used views"
-    return pairs, solve_global(pairs, seed, problem)
+    return pairs, solve_global(pairs, problem)
 
 
 def require_plausible_noise(found: Estimate) -> None:

@@ -102,12 +102,8 @@ class TableResult:
     corrected: RobotModel
     covariance: Array
     """(36, 36) of X, as in `Solution.parent_from_child`, and of the links' errors, as in `Chain.by_links`."""
-    flange_threshold: float
-    """As `Solution.confidence_threshold`, for the error (6,) of a flange computed with the table."""
     with_table_m: float
     """1σ of a point over the workspace."""
-    if_measured_m: dict[str, float]
-    """`with_table_m` if this (board, intrinsics) were known to `MEASURED`."""
     held_out_m: Array | None
     """(2, n) error of views predicted from those taken elsewhere: without, with the table."""
     refused: TableRefusal | None
@@ -141,8 +137,6 @@ class Verification:
 TableRefusal = Literal["no-evidence", "no-joints", "not-nominal", "not-better"]
 """No clear evidence; joints by inverse kinematics; recorded flanges do not follow the nominal table; the
 table does not help on poses elsewhere."""
-MEASURED = 2e-4
-"""Relative 1σ of a careful measurement."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,23 +29,14 @@ class EvolutionSettings:
     generations: int = 100
 
 
-@dataclass(frozen=True, eq=False)
-class Evolved:
-    best: Array
-    """(d,)"""
-    value: float
-    population: Array
-    """(M, d) of the last generation."""
-
-
 def evolve(
     evaluate: Evaluate,
     lower: Array,
     upper: Array,
     rng: np.random.Generator,
     settings: EvolutionSettings,
-) -> Evolved:
-    """Minimise within the box; mutants outside are rounded to it, ties are accepted (eq. 20)."""
+) -> Array:
+    """Minimise within the box → (d,); mutants outside are rounded to it, ties are accepted (eq. 20)."""
     s, d = settings, len(lower)
     x = lower + (upper - lower) * rng.random((s.population, d))
     partners = _partners(rng, s.generations, s.population)
@@ -64,8 +55,7 @@ def evolve(
         better = trial_values <= values
         np.copyto(x, trial, where=better[:, None])
         np.copyto(values, trial_values, where=better)
-    best = int(np.argmin(values))
-    return Evolved(x[best].copy(), float(values[best]), x)
+    return np.asarray(x[np.argmin(values)])
 
 
 def _partners(rng: np.random.Generator, generations: int, population: int) -> NDArray[np.intp]:

@@ -35,8 +35,7 @@ class PaperResult:
 def solve_paper(pairs: Pairs, seed: int) -> PaperResult:
     """Run the evolution once, seeded, on all of `pairs`; the caller has taken out those held out."""
     objective = build_objective(pairs, "log", LAMBDA)
-    evolved = evolve(paper_evaluate(objective), -BOX, BOX, np.random.default_rng(seed), SETTINGS)
-    x = evolved.best
+    x = evolve(paper_evaluate(objective), -BOX, BOX, np.random.default_rng(seed), SETTINGS)
     X = pose(rotation_exp(x[:3]), x[3:])
     return PaperResult(X, x, objective, on_box(x))
 

@@ -79,12 +79,12 @@ def test_the_region_of_an_average_holds_95_percent_of_it():
     found = fit_cell(views, Priors(LensPrior.given(views.camera)), 0)
     assert found.estimate.scales.table[0] > 0.2 > found.estimate.scales.table[-1], "the bracket is rigid"
     chances, widths = np.array([0.5, 0.3, 0.2]), np.array([0.2, 0.8, 3.3])
-    average = replace(found.estimate, mean_of=MeanParts(chances, widths, np.ones(3)))
+    average = replace(found.estimate, mean_of=MeanParts(chances, widths))
     rng, n = np.random.default_rng(0), 200_000
     freedom = 3 * average.chances[:, 0].sum() - 5
     drawn = rng.choice(widths, n, p=chances) * 6 * rng.f(6, freedom, n)
     assert np.mean(drawn <= average.threshold) == pytest.approx(0.95, abs=0.002)
-    assert average.threshold > 1.5 * average.table_threshold
+    assert average.threshold > 1.5 * replace(average, mean_of=MeanParts()).threshold
 
 
 def test_noise_and_steps_are_those_of_the_fit_that_is_reported(monkeypatch):

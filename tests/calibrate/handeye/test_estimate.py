@@ -151,7 +151,7 @@ def test_it_beats_the_certified_pair_solution_clearly():
     for seed in range(6):
         cell = make_cell(np.random.default_rng(seed), 25, LOW)
         ours.append(error_mm_deg(solve_views(cell.views, QUICK).matrix, cell.X)[0])
-        start = solve_global(all_pairs(cell.views.base_from_flange, cell.views.camera_from_board), 0)
+        start = solve_global(all_pairs(cell.views.base_from_flange, cell.views.camera_from_board))
         pairs.append(error_mm_deg(start.X, cell.X)[0])
     assert np.mean(ours) < 0.7 * np.mean(pairs)
 

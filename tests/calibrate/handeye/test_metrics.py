@@ -116,7 +116,7 @@ def test_pair_covariance_is_the_scatter_of_the_pair_solution():
     for seed in range(40):
         cell = make_cell(np.random.default_rng(seed), 25, LOW)
         pairs = all_pairs(cell.views.base_from_flange, cell.views.camera_from_board)
-        result = solve_global(pairs, 0)
+        result = solve_global(pairs)
         covariance = pair_covariance(result.objective, pairs, result.X)
         squares.append(distance_in_sigmas(result.X, cell.X, covariance) ** 2)
     assert 4 < np.median(squares) < 9  # χ²(6) has its median at 5.35

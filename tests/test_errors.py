@@ -41,18 +41,9 @@ def test_an_error_begins_with_the_name_of_its_command(
     assert not done.stderr.strip().endswith(".")
 
 
-@pytest.mark.parametrize(
-    ("main", "asked"),
-    [
-        (calibrate.cli.main, ("-h",)),
-        (calibrate.cli.main, ("solve", "-h")),
-        (recordings.cli.main, ("info", "-h")),
-        (station.cli.main, ("-h",)),
-        (station.cli.main, ("stop", "-h")),
-    ],
-)
-def test_help_may_be_asked_for_shortly(main: Callable[[], None], asked: tuple[str, ...]) -> None:
-    done = call(main, *asked)
+@pytest.mark.parametrize("main", [calibrate.cli.main, recordings.cli.main, station.cli.main])
+def test_help_may_be_asked_for_shortly(main: Callable[[], None]) -> None:
+    done = call(main, "-h")
     assert done.returncode == 0 and done.stdout and not done.stderr
 
 

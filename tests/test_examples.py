@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from pathlib import Path
 
 import pytest
 import typer
@@ -18,16 +17,11 @@ PROGRAMS = {
     "recordings": RECORDINGS,
     "station": STATION,
 }
-HANDED_ON = ("station", "board")
-"""Its help is that of `calibrate board`."""
 COMMANDS = [
     (program, name)
     for program, group in PROGRAMS.items()
     for name in group.commands  # type: ignore[attr-defined]
-    if (program, name) != HANDED_ON
 ]
-DOCUMENTS = ("README.md", "docs/**/*.md")
-_ROOT = Path(__file__).parent.parent
 
 
 def examples_in(epilog: str | None) -> list[str]:
@@ -76,18 +70,3 @@ def commands_in(text: str) -> list[str]:
         for line in lines
         if re.match(rf"({'|'.join(PROGRAMS)})( |$)", line) and not re.search(r"[…\[|]|\.\.\.", line)
     ]
-
-
-def test_the_commands_in_the_documents_parse() -> None:
-    found = [
-        (path.name, line)
-        for pattern in DOCUMENTS
-        for path in _ROOT.glob(pattern)
-        for line in commands_in(path.read_text())
-    ]
-    assert len(found) > 15
-    for name, line in found:
-        try:
-            parse(line)
-        except Exception as problem:
-            pytest.fail(f"{name}: {line}: {problem}")

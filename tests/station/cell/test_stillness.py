@@ -97,20 +97,19 @@ def test_a_flange_that_only_turns_on_the_spot_is_no_rest() -> None:
     assert m.unrest(found) == "the flange turns by 0.0170° (limit 0.0029)"
 
 
-def test_a_shift_of_the_flange_is_told_in_millimetres() -> None:
+@pytest.mark.parametrize(
+    ("measured", "said"),
+    [
+        ({"position_scatter_m": 0.00025}, "the flange scatters by 0.250 mm (limit 0.050)"),
+        ({"image_motion_px": 1.5}, "the image moves by 1.50 px (limit 0.30)"),
+    ],
+)
+def test_flange_and_picture_have_a_say(measured: dict[str, float], said: str) -> None:
     m = monitor()
     shake(m, 0.5, 0.0)
     found = m.measure()
     assert found is not None
-    shifted = msgspec.structs.replace(found, position_scatter_m=0.00025)
-    assert m.unrest(shifted) == "the flange scatters by 0.250 mm (limit 0.050)"
-
-
-def test_the_picture_has_a_say() -> None:
-    m = monitor()
-    shake(m, 0.5, 0.0)
-    found = m.measure(image_motion_px=1.5)
-    assert found is not None and m.unrest(found) == "the image moves by 1.50 px (limit 0.30)"
+    assert m.unrest(msgspec.structs.replace(found, **measured)) == said
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1, 0.25])
@@ -151,14 +150,22 @@ async def test_settling_returns_as_soon_as_the_arm_rests() -> None:
     assert 3 <= polls <= 7
 
 
-async def test_an_arm_that_never_rests_is_given_up_with_the_reason() -> None:
+@pytest.mark.parametrize(
+    ("shaken_rad", "alive", "looked", "code"),
+    [(0.01, True, math.nan, "not-settled"), (0.0, None, math.nan, "no-news"), (0.0, True, None, "no-images")],
+)
+async def test_an_arm_that_never_rests_is_given_up_with_the_reason(
+    shaken_rad: float, alive: bool | None, looked: float | None, code: str
+) -> None:
+    """A camera that shows nothing is not called a shake."""
     m = monitor(timeout_s=5.0)
-    shake(m, 0.5, 0.01)
+    shake(m, 0.5, shaken_rad)
     clock = iter([0.0, 1.0, 5.1])
-    with raises("not-settled", NotStillError) as told:
-        await m.settle(lambda: True, now_s=lambda: next(clock))
-    assert told.value.values["limit_s"] == 5.0 and "shoulder" in told.value.text
-    assert float(told.value.values["max_joint_speed_rad_s"]) > 0.1  # type: ignore[arg-type]
+    with raises(code, NotStillError, limit_s=5.0) as told:
+        await m.settle(lambda: alive, lambda since_ns: looked, now_s=lambda: next(clock))
+    if shaken_rad:
+        assert "shoulder" in told.value.text
+        assert float(told.value.values["max_joint_speed_rad_s"]) > 0.1  # type: ignore[arg-type]
 
 
 async def test_waiting_for_rest_leaves_the_loop_to_heartbeat_and_stop() -> None:
@@ -183,22 +190,6 @@ async def test_old_news_of_an_arm_at_rest_are_no_rest() -> None:
 
     await m.settle(alive)
     assert asked == [None, None, True]
-
-
-async def test_news_that_stay_away_are_the_reason() -> None:
-    m = monitor(timeout_s=5.0)
-    shake(m, 0.5, 0.0)
-    clock = iter([0.0, 1.0, 5.1])
-    with raises("no-news", NotStillError):
-        await m.settle(lambda: None, now_s=lambda: next(clock))
-
-
-async def test_a_camera_that_shows_nothing_is_not_called_a_shake() -> None:
-    m = monitor(timeout_s=5.0)
-    shake(m, 0.5, 0.0)
-    clock = iter([0.0, 1.0, 5.1])
-    with raises("no-images", NotStillError):
-        await m.settle(lambda: True, lambda since_ns: None, now_s=lambda: next(clock))
 
 
 async def test_a_lost_robot_ends_the_waiting() -> None:

@@ -20,7 +20,7 @@ from calibrate.geometry import (
     rotation_exp,
 )
 from calibrate.handeye.information import sigma_of
-from calibrate.kinematics import MODELS, forward
+from calibrate.kinematics import MODELS, forward, inverse_many
 from station.cell.config import SPEED_CAP_M_S
 from station.cell.layout import cell_geometry, layout_of
 from station.cell.limits import check_plan
@@ -97,18 +97,11 @@ def test_poses_are_varied_and_say_why_they_are_there():
     assert sigmas[-1] < 0.0005
 
 
-def branch_of(joints):
-    """Shoulder side, elbow, wrist flip: does the wrist's centre lie before or behind the shoulder's axis?"""
-    model = MODELS["UR10"]
-    a2, a3, d5 = model.a_m[1], model.a_m[2], model.d_m[4]
-    q = np.asarray(joints)
-    reach = a2 * np.cos(q[:, 1]) + a3 * np.cos(q[:, 1] + q[:, 2]) + d5 * np.sin(q[:, 1:4].sum(axis=1))
-    return list(zip(reach > 0, np.sin(q[:, 2]) > 0, np.sin(q[:, 4]) > 0, strict=True))
-
-
 def test_all_poses_stand_in_one_arm_branch():
-    joints = np.array([pose.joints_rad for pose in planned().poses])
-    assert len(set(branch_of(joints))) == 1
+    q = np.array([pose.joints_rad for pose in planned().poses])
+    rows, joints, branches = inverse_many(MODELS["UR10"], forward(MODELS["UR10"], q))
+    same = np.abs(np.exp(1j * joints) - np.exp(1j * q[rows])).max(axis=1) < 1e-6
+    assert sorted(rows[same]) == list(range(len(q))) and len(set(branches[same])) == 1
 
 
 def test_the_same_seed_gives_the_same_plan_and_another_seed_another():

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from recordings.errors import MissingSegmentError as MissingSegmentError
     from recordings.errors import RecordingError as RecordingError
     from recordings.errors import UnfinishedRecordingError as UnfinishedRecordingError
-    from recordings.exporters.excerpt import write_excerpt as write_excerpt
     from recordings.exporters.folder import export_recording as export_recording
     from recordings.images import viewable as viewable
     from recordings.importers.bag import import_bag as import_bag
@@ -45,13 +44,11 @@ if TYPE_CHECKING:
     from recordings.schema.messages import SessionInfo as SessionInfo
     from recordings.schema.messages import Stamps as Stamps
     from recordings.schema.messages import View as View
-    from recordings.segment import RecordingSegment as RecordingSegment
     from recordings.writer import RecordingWriter as RecordingWriter
 
 _MODULES = {
     "errors": "BadImageError CodedError CorruptRecordingError MissingSegmentError RecordingError "
     "UnfinishedRecordingError",
-    "exporters.excerpt": "write_excerpt",
     "exporters.folder": "export_recording",
     "images": "viewable",
     "importers.bag": "import_bag",
@@ -61,7 +58,6 @@ _MODULES = {
     "recorder": "Recorder",
     "recover": "recover_recording",
     "schema.messages": "BoardKind BoardSpec CameraModel Image RobotState SessionInfo Stamps View",
-    "segment": "RecordingSegment",
     "writer": "RecordingWriter",
 }
 """Module → names that it gives."""

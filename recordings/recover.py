@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -40,7 +41,7 @@ from recordings.schema.definitions import (
     SchemaError,
     decode,
 )
-from recordings.schema.messages import SessionInfo, View
+from recordings.schema.messages import View
 from recordings.schema.topics import Topic, schema_bytes, schema_name
 from recordings.segment import RecordingSegment
 
@@ -52,12 +53,15 @@ class Recovery:
     """Result of a recovery: what was saved, and what was lost."""
 
     path: Path
-    kept_original: Path | None
+    kept_original: Path | None = None
     """Where the damaged file is now; None when there was nothing to repair."""
-    poses: int
-    pictures: int
-    robot_states: int
-    lost_bytes: int
+    session: str = ""
+    """Empty where nothing could be saved."""
+    segment: int = 0
+    poses: int = 0
+    pictures: int = 0
+    robot_states: int = 0
+    lost_bytes: int = 0
     losses: Sequence[str] = ()
 
     @property
@@ -89,11 +93,11 @@ def recover_recording(source: Path, output: Path | None = None) -> list[Recovery
     `.damaged`. Segments of the session that are not in its folder are given up: reported here, and named by
     every later reader. Raises RecordingError when another process still writes it or nothing can be saved.
     """
-    if source.is_dir():
-        if output is not None:
-            raise RecordingError("no-output")
-        return _recover_session(source)
-    return [_recover_file(source, output)[0]]
+    if not source.is_dir():
+        return [_recover_file(source, output)]
+    if output is not None:
+        raise RecordingError("no-output")
+    return _recover_session(source)
 
 
 def _recover_session(folder: Path) -> list[Recovery]:
@@ -104,37 +108,35 @@ def _recover_session(folder: Path) -> list[Recovery]:
     if not files:
         raise RecordingError("no-recording", folder=folder)
     manifest = read_manifest(folder)
-    done = [_recover_part(path) for path in files]
-    present = {info.part: result.path.name for result, info in done if info is not None}
-    sessions = {info.name for _, info in done if info is not None}
-    results = [result for result, _ in done]
+    results = [_recover_segment(path) for path in files]
+    present = {result.segment: result.path.name for result in results if result.session}
+    sessions = {result.session for result in results if result.session}
     if len(sessions) != 1:  # nothing is left, or files of several sessions: nobody knows whose segments lack
         return results
-    session = sessions.pop()
     again = manifest and msgspec.structs.replace(manifest, given_up=[])  # said every time, not only the first
     missing = missing_parts(folder, again, set(present))
     if missing:
-        give_up_parts(folder, session, present, missing)
+        give_up_parts(folder, sessions.pop(), present, missing)
     for part, name in missing.items():
         reason = (
             f"segment {part} of the session is not in the folder; noted as lost in {MANIFEST_FILE}. "
             "Should it turn up, put it back here and it is read again"
         )
-        results.append(Recovery(folder / name, None, 0, 0, 0, 0, (reason,)))
+        results.append(Recovery(folder / name, losses=(reason,)))
     return results
 
 
-def _recover_part(source: Path) -> tuple[Recovery, SessionInfo | None]:
+def _recover_segment(source: Path) -> Recovery:
     """A segment that was begun but holds nothing is set aside, the session goes on without it."""
     try:
         return _recover_file(source, None)
     except _NothingToSaveError as error:
         aside = _free_name(source.with_name(source.name + EMPTY_SUFFIX))
         rename_new(source, aside)
-        return Recovery(source, aside, 0, 0, 0, aside.stat().st_size, (str(error),)), None
+        return Recovery(source, aside, lost_bytes=aside.stat().st_size, losses=(str(error),))
 
 
-def _recover_file(source: Path, output: Path | None) -> tuple[Recovery, SessionInfo]:
+def _recover_file(source: Path, output: Path | None) -> Recovery:
     descriptor = open_file(source)
     try:
         lock(descriptor, source)
@@ -145,33 +147,28 @@ def _recover_file(source: Path, output: Path | None) -> tuple[Recovery, SessionI
             raise exists_error(final)
         try:
             segment = RecordingSegment(source)
-            if source.name.endswith(PART_SUFFIX):  # only its last rename was missing
-                rename_new(source, final)
-            else:
-                final = source
-            return _report(final, segment, None, 0, ())
         except (UnfinishedRecordingError, CorruptRecordingError):
             return _rebuild(descriptor, source, final, in_place=output is None)
+        if source.name.endswith(PART_SUFFIX):  # only its last rename was missing
+            rename_new(source, final)
+            source = final
+        return _told(source, segment)
     finally:
         os.close(descriptor)
 
 
-def _report(
-    path: Path, segment: RecordingSegment, original: Path | None, lost_bytes: int, losses: Sequence[str]
-) -> tuple[Recovery, SessionInfo]:
-    done = Recovery(
+def _told(path: Path, segment: RecordingSegment) -> Recovery:
+    return Recovery(
         path=path,
-        kept_original=original,
+        session=segment.info.name,
+        segment=segment.info.part,
         poses=len({view.index for view in segment.views}),
         pictures=len(segment.image_sequences()),
         robot_states=len(segment.messages(Topic.ROBOT_STATE)),
-        lost_bytes=lost_bytes,
-        losses=losses,
     )
-    return done, segment.info
 
 
-def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> tuple[Recovery, SessionInfo]:
+def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> Recovery:
     temporary = final.with_name(final.name + ".recovering")
     discard_leftover(temporary)
     try:
@@ -181,7 +178,7 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> tupl
             original = _put_in_place(source, temporary, final)
         else:
             rename_new(temporary, final)
-        return _report(final, segment, original, lost_bytes, losses)
+        return replace(_told(final, segment), kept_original=original, lost_bytes=lost_bytes, losses=losses)
     except OSError as error:
         raise disk_error("write", temporary, error, f"{source} is unchanged.") from error
     finally:
@@ -204,11 +201,8 @@ def _put_in_place(source: Path, temporary: Path, final: Path) -> Path:
 
 def _free_name(path: Path) -> Path:
     """The path, or with -2, -3 … where an earlier recovery left one."""
-    count, free = 1, path
-    while os.path.lexists(free):
-        count += 1
-        free = path.with_name(f"{path.name}-{count}")
-    return free
+    names = (path.with_name(f"{path.name}-{count}") for count in itertools.count(2))
+    return next(name for name in itertools.chain([path], names) if not os.path.lexists(name))
 
 
 class _NothingToSaveError(RecordingError):

@@ -110,8 +110,8 @@ CALIBRATE = LazyGroup(
     "images become a recording by: recordings import FOLDER -o REC.",
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 done with loss, 4 a gate or a "
     "drift check failed.",
-    aliases={"check": "drift-check"},
     gone={
+        "check": "Use drift-check.",
         "diff": "`calibrate show` shows each; `calibrate install` tells how far it is from the one before.",
         "fleet": "Run `calibrate metrics` on each cell.",
         "report": "Use `calibrate solve REC --report FILE`.",

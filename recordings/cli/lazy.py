@@ -45,8 +45,6 @@ class LazyCommand(NamedTuple):
     """`module:function`; the function is declared as typer declares it."""
     examples: tuple[str, ...] = ()
     """Command lines as a person types them, a remark behind `#`."""
-    old_options: Mapping[str, str] = {}
-    """Options by their names of the last release, and what they are called now."""
     gone: Mapping[str, str] = {}
     """Options that are no more, and what to do instead."""
 
@@ -74,7 +72,7 @@ class LazyCommand(NamedTuple):
 class LazyGroup(TyperGroup):
     """A command line of `LazyCommand`s.
 
-    `aliases` are hidden former names; `gone` commands are no more, and what to do instead.
+    `gone`: commands that are no more, and what to do instead.
     """
 
     def __init__(
@@ -82,7 +80,6 @@ class LazyGroup(TyperGroup):
         commands: Mapping[str, LazyCommand],
         help: str,
         epilog: str,
-        aliases: Mapping[str, str] = {},
         gone: Mapping[str, str] = {},
     ) -> None:
         super().__init__(
@@ -94,7 +91,7 @@ class LazyGroup(TyperGroup):
             context_settings=_HELP_KEYS,
             params=_group_options(),
         )
-        self._lazy, self._aliases, self._gone = commands, aliases, gone
+        self._lazy, self._gone = commands, gone
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command's line in the group's help."""
@@ -105,15 +102,14 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The loaded command in place of its line in the group's help."""
-        asked = self._aliases.get(args[0], args[0])
-        _refuse_gone(asked, self._gone)
-        name, _, rest = super().resolve_command(ctx, [asked, *args[1:]])
+        _refuse_gone(args[0], self._gone)
+        name, _, rest = super().resolve_command(ctx, args)
         if name is None:
             return None, None, rest
         command = self._lazy[name]
         for word in rest:
             _refuse_gone(word.partition("=")[0], command.gone)
-        return name, command.load(name), [_renamed(word, command.old_options) for word in rest]
+        return name, command.load(name), rest
 
 
 def _print_version(asked: bool) -> None:
@@ -142,11 +138,6 @@ def _group_options() -> list[Any]:
 def _refuse_gone(word: str, gone: Mapping[str, str]) -> None:
     if word in gone:
         raise GoneError(word=word, instead=gone[word])
-
-
-def _renamed(word: str, old_options: Mapping[str, str]) -> str:
-    option, equals, value = word.partition("=")
-    return old_options.get(option, option) + equals + value
 
 
 def run(name: str, group: LazyGroup) -> None:

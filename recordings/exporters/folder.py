@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,10 @@ from recordings.files import sync_folder
 from recordings.images import encode_png, mosaic_encoding, viewable
 from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE
 from recordings.reader import Recording
-from recordings.schema.messages import ClockReading, Stamps, View
+from recordings.schema.messages import View
 from recordings.schema.viewing import quaternion_xyzw
 
 _EXTENSIONS = {"png": "png", "jpeg": "jpg"}
-_JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
-_STAMPS = list(Stamps.__struct_fields__)
 
 
 def export_recording(recording: Recording, output: Path, target: Target) -> Path:
@@ -92,50 +90,32 @@ def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
 
 def _write_tables(recording: Recording, folder: Path) -> None:
     """One CSV per kind of message, raw values in SI units, images only as their facts."""
-    modes = ["robot_mode", "safety_mode", "speed_scaling"]
-    states = (
-        [
-            *astuple(state.stamps),
-            *(*state.joints_rad, *state.joint_speeds_rad_s, *state.tcp_pose),
-            *(getattr(state, name) for name in modes),
-        ]
-        for state in recording.robot_states()
-    )
-    pose = ["tcp_x_m", "tcp_y_m", "tcp_z_m", "tcp_rx_rad", "tcp_ry_rad", "tcp_rz_rad"]
-    joints = [f"{joint}_rad" for joint in _JOINTS] + [f"{joint}_rad_s" for joint in _JOINTS]
-    header = [*_STAMPS, *joints, *pose, *modes]
-    _write_csv(folder / "robot_states.csv", header, states)
-    facts = [fact for segment in recording.segments for fact in segment.image_facts()]
-    columns = ["sequence", "frame_id", "width", "height", "exposure_us", "gain_db", "pixel_format"]
-    told = ["middle_host_monotonic_ns", "time_bound_s", "time_source"]
-    rows = (
-        [
-            *astuple(fact.stamps),
-            *(getattr(fact, column) for column in columns),
-            *([""] * len(told) if fact.time is None else astuple(fact.time)),
-        ]
-        for fact in facts
-    )
-    _write_csv(folder / "pictures.csv", [*_STAMPS, *columns, *told], rows)
-    readings = (list(astuple(r)) for segment in recording.segments for r in segment.clock_readings())
-    _write_csv(folder / "camera_clock.csv", list(ClockReading.__struct_fields__), readings)
-    _write_views(recording, folder)
-    events = ([*astuple(e.stamps), e.level, e.kind, e.pose_index, e.detail] for e in recording.events())
-    _write_csv(folder / "events.csv", [*_STAMPS, "level", "kind", "pose_index", "detail"], events)
+    segments = recording.segments
+    tables: dict[str, Callable[[], Iterator[msgspec.Struct]]] = {
+        "robot_states": recording.robot_states,
+        "pictures": lambda: (fact for segment in segments for fact in segment.image_facts()),
+        "camera_clock": lambda: (reading for segment in segments for reading in segment.clock_readings()),
+        "views": lambda: (view for segment in segments for view in segment.views),
+        "events": recording.events,
+    }
+    for name, messages in tables.items():
+        header = list(dict.fromkeys(column for message in messages() for column, _ in _flat(message)))
+        rows = (dict(_flat(message)) for message in messages())
+        _write_csv(folder / f"{name}.csv", header, ([row.get(c, "") for c in header] for row in rows))
 
 
-def _write_views(recording: Recording, folder: Path) -> None:
-    """Every attempt; the last column tells which ones count."""
-    counted = recording.views()
-    place = ["index", "attempt", "part", "name", "picture_sequence"]
-    header = [*place, *HEADER[1:], *_STAMPS, "time_bound_s", "used"]
-    rows = []
-    for view in (view for segment in recording.segments for view in segment.views):
-        T = view.base_from_flange
-        pose = [T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]
-        values = [getattr(view, name) for name in place]
-        rows.append([*values, *pose, *astuple(view.stamps), view.time_bound_s, int(view in counted)])
-    _write_csv(folder / "views.csv", header, rows)
+def _flat(value: Any, column: str = "") -> Iterator[tuple[str, Any]]:
+    """(column, value) of every number and text: `stamps.host_wall_ns`, `joints_rad.1` of the base's joint."""
+    if isinstance(value, msgspec.Struct):
+        inside: Iterable[tuple[object, Any]] = zip(value.__struct_fields__, astuple(value), strict=True)
+    elif isinstance(value, tuple):
+        inside = enumerate(value, 1)
+    else:
+        if value is not None:
+            yield column, value
+        return
+    for name, part in inside:
+        yield from _flat(part, f"{column}.{name}" if column else str(name))
 
 
 def _write_csv(path: Path, header: list[str], rows: Iterable[list[Any]]) -> None:

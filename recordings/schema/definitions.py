@@ -8,7 +8,6 @@ travels inside every file, and the reader refuses one that says something else t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -151,24 +150,17 @@ def encode(value: msgspec.Struct) -> bytes:
 
 
 def _content(value: msgspec.Struct) -> dict[str, Any]:
-    """A struct's fields as protobuf takes them; it leaves out those that are None."""
-    content = msgspec.structs.asdict(value)
-    for name, convert in _CONVERSIONS[type(value)]:
-        if content[name] is not None:
-            content[name] = convert(content[name])
-    for name in _FILLED_IN_BY_READER.get(type(value), ()):
-        del content[name]
+    """A struct's fields as protobuf takes them, without those that are None."""
+    content: dict[str, Any] = {}
+    for field in _PLAN[type(value)]:
+        found = getattr(value, field.name)
+        if found is not None:
+            if field.kind == "message":
+                found = _content(found)
+            elif field.kind == "matrix":
+                found = [number for row in found for number in row]
+            content[field.name] = found
     return content
-
-
-_CONVERTED: dict[str, Callable[[Any], Any]] = {
-    "message": _content,
-    "matrix": lambda rows: [number for row in rows for number in row],
-}
-_CONVERSIONS = {
-    struct: [(field.name, _CONVERTED[field.kind]) for field in fields if field.kind in _CONVERTED]
-    for struct, fields in _PLAN.items()
-}
 
 
 def decode(struct: type[S], data: bytes) -> S:
@@ -207,14 +199,10 @@ def schema_difference(ours: bytes, theirs: bytes) -> str:
     """
     if ours == theirs:
         return ""
-    known, stored = _field_table(ours), _field_table(theirs)
-    for key, meaning in stored.items():
-        if key not in known:
-            return f"unknown field {key[0]}.{meaning[0]} (a newer version wrote this file)"
-        if known[key][0] == meaning[0] and known[key] != meaning:
-            return f"{key[0]} field {key[1]} '{meaning[0]}' has another type"
-        if known[key] != meaning:
-            return f"{key[0]} field {key[1]} is '{meaning[0]}', expected '{known[key][0]}'"
+    known = _field_table(ours)
+    for (message, number), meaning in _field_table(theirs).items():
+        if known.get((message, number)) != meaning:
+            return f"field {number} of {message}, '{meaning[0]}', has another meaning in this version"
     return ""
 
 

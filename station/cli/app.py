@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from recordings.cli.lazy import LazyCommand, LazyGroup, examples
 
-_APPROVED = {"--go": "--approve"}
+_APPROVED = {"--go": "Use --approve."}
 _PLAN_DRAWN = "Plan (2) on the screen draws the plan and turns it."
 
 STATION = LazyGroup(
@@ -49,8 +49,7 @@ STATION = LazyGroup(
                 "station capture --plan plan.yaml",
                 "station capture --plan plan.yaml --headless --approve 0123456789ab",
             ),
-            _APPROVED,
-            {"--sweep": "Frame times carry their own bound; `station doctor` shows it."},
+            _APPROVED | {"--sweep": "Frame times carry their own bound; `station doctor` shows it."},
         ),
         "status": LazyCommand(
             "station.cli.control:status_command", ("station status", "station status --json")
@@ -82,13 +81,13 @@ STATION = LazyGroup(
             ("station doctor --example > station.yaml", "station doctor --config station.yaml"),
         ),
     },
-    aliases={"check": "drift-check", "verify": "touch-test", "improve": "replan", "best": "next-pose"},
     gone={
         "board": "`calibrate board` makes one.",
         "bootstrap": "`station new` finds camera and board from views that you guide by hand.",
+        "check": "Use drift-check.",
         "next-pose": "F3 on the screen adds views that you guide by hand.",
         "replan": "`station finish`, then `station plan` plans again.",
-        "touch-test": "Press h on Result of the screen: `station`.",
+        **dict.fromkeys(("touch-test", "verify"), "Press h on Result of the screen: `station`."),
         "trace": "The simulated controller's limits are in the docs: The simulator.",
     },
     help="A calibration station for a robot cell. Without a command: the operator screen.",

@@ -74,10 +74,10 @@ def test_tables_hold_every_value_in_full_precision(tmp_path: Path) -> None:
         "camera_clock": 0,
     }
     state = tables["robot_states"][3]
-    assert float(state["shoulder_rad"]) == make_state(3).joints_rad[1]
-    assert int(state["host_monotonic_ns"]) == make_state(3).stamps.host_monotonic_ns
-    assert [row["used"] for row in tables["views"]] == ["0", "1"]
-    assert float(tables["views"][0]["z"]) == TURNED[2][3]
+    assert float(state["joints_rad.2"]) == make_state(3).joints_rad[1]
+    assert int(state["stamps.host_monotonic_ns"]) == make_state(3).stamps.host_monotonic_ns
+    assert [row["attempt"] for row in tables["views"]] == ["1", "2"]
+    assert float(tables["views"][0]["base_from_flange.3.4"]) == TURNED[2][3]
 
 
 def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: Path) -> None:

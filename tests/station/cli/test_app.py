@@ -69,7 +69,7 @@ def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pyte
     plan = tmp_path / "plan.yaml"
     assert shell("plan", "--poses", "4", "-o", str(plan), "--json")[0] == 0
 
-    assert shell.refused("capture", "--plan", str(plan), "--headless", "--go", "ab" * 32) == "other-plan"
+    assert shell.refused("capture", "--plan", str(plan), "--headless", "--approve", "ab" * 32) == "other-plan"
 
     sha = plan_sha256(load_plan(plan))
     code, out, err = shell.ask("capture", "--plan", str(plan), "--headless", "--approve", sha[:12], "--json")
@@ -147,6 +147,7 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
         (("plan", "--from-list", "b"), 2, "gone"),
         (("bootstrap", "--config", "absent.yaml"), 2, "gone"),
         (("verify",), 2, "gone"),
+        (("resume", "--go=ab"), 2, "gone"),
         (("trace", "record", "192.0.2.1"), 2, "gone"),
     ],
 )

@@ -40,7 +40,6 @@ from calibrate.files.versions import (
     installed_versions,
     locked,
     make_current,
-    no_such_version,
     who,
 )
 from calibrate.geometry import difference
@@ -55,7 +54,6 @@ _CELL_OF: dict[Source, Cell] = {
     "simulated": "simulated",
     "playback": "simulated",
 }
-_ARTICLE: dict[Cell, str] = {"real": "a", "imported": "an", "simulated": "a"}
 
 WORSE_TIMES = 1.5
 """Ratio of predicted errors above which a new calibration counts as worse, not different by chance."""
@@ -99,7 +97,15 @@ def install(
     folder = calibrations_folder(root, camera)
     with locked(folder):
         before = _installed_before(root, camera)
-        _refuse_foreign_source(calibration, before, cell, path)
+        kinds = {cell} if before is None else {cell, _CELL_OF[before.source]}
+        if other := kinds - {_CELL_OF[calibration.source]}:
+            raise InstallError(
+                "other-cell",
+                path=path,
+                source=calibration.source,
+                cell=other.pop(),
+                command=install_line(calibration.source, path),
+            )
         objections = _objections(calibration, before, robot_serial, camera_serial)
         if calibration.camera.name and calibration.camera.name != camera:
             objections.append(f"It is of the camera named {calibration.camera.name}, not {camera}.")
@@ -128,17 +134,17 @@ def install(
 
 def _first_validity(calibration: Calibration, max_age_days: float | None) -> Validity:
     """Choose the validity of a new installation: valid, unless it is imported or overridden."""
-    state, reason = ValidityState.VALID, ValidityReason("installed")
+    state, reason = ValidityState.UNVERIFIED, ValidityReason("installed")
     if calibration.source == "imported":
         text = "Images and poses are of unknown origin. Check it in the cell."
-        state, reason = ValidityState.UNVERIFIED, ValidityReason("imported", text)
+        reason = ValidityReason("imported", text)
     elif calibration.override is not None:
-        text = f"Installed by override: {calibration.override.reason}"
-        state, reason = ValidityState.UNVERIFIED, ValidityReason("override", text)
-    now = datetime.now(UTC)
+        reason = ValidityReason("override", f"Installed by override: {calibration.override.reason}")
+    else:
+        state = ValidityState.VALID
     recorded_ns = calibration.provenance.recorded_wall_ns
     proven = time_text(datetime.fromtimestamp(recorded_ns / 1e9, UTC)) if recorded_ns else calibration.created
-    return Validity(0, state, time_text(now), reason, who(), proven, max_age_days)
+    return Validity(0, state, time_text(), reason, who(), proven, max_age_days)
 
 
 def _max_age_days(folder: Path, asked: float | None) -> float | None:
@@ -163,17 +169,16 @@ def rollback(
     folder = calibrations_folder(root, camera)
     with locked(folder):
         known = installed_versions(root, camera)
-        current = next((g for g in known if g.current), None)
-        if to is None:
-            older = before_current(known)
-            if older is None:
-                raise _nothing_older(root, camera, current_validity(folder))
-            target = older
-        else:
-            target = next((g for g in known if g.number == to), None) or no_such_version(folder, to, known)
+        numbered = next((g for g in known if g.number == to), None)
+        target = before_current(known) if to is None else numbered
+        if target is None and to is None:
+            raise _nothing_older(root, camera, current_validity(folder))
+        if target is None:
+            have = ", ".join(str(g.number) for g in known) or "none"
+            raise InstallError("no-such-version", folder=folder, generation=to, have=have)
         if target.calibration is None:
             raise InstallError("damaged-version", generation=target.number, why=target.problem)
-        before = None if current is None else current.calibration
+        before = next((g.calibration for g in known if g.current), None)
         change = change_text(before, target.calibration)
         validity = _validity_again(target, _max_age_days(folder, None))
         return make_current(folder, target, "rollback", validity, change, reason)
@@ -214,15 +219,11 @@ def _where(root: Path | None, camera: str) -> list[str]:
 
 def _validity_again(target: InstalledVersion, max_age_days: float | None) -> Validity:
     """Choose the validity of a version after a rollback: it was not checked while it was not current."""
-    was = target.validity or unrecorded(target.number)
+    was = replace(target.validity or unrecorded(target.number), max_age_days=max_age_days)
     if was.state is ValidityState.IN_DOUBT or target.current:
-        return replace(was, max_age_days=max_age_days)
-    text = "Rolled back to. Run a drift check."
-    now = time_text()
-    state = ValidityState.UNVERIFIED
-    return Validity(
-        target.number, state, now, ValidityReason("rolled-back", text), who(), was.verified, max_age_days
-    )
+        return was
+    reason = ValidityReason("rolled-back", "Rolled back to. Run a drift check.")
+    return replace(was, state=ValidityState.UNVERIFIED, since=time_text(), reason=reason, who=who())
 
 
 def set_validity(
@@ -332,28 +333,6 @@ def install_line(source: Source, path: Path, root: Path | None = None, override:
     return shlex.join([*words, str(path)])
 
 
-def _refuse_foreign_source(
-    calibration: Calibration, before: Calibration | None, cell: Cell, path: Path
-) -> None:
-    kind = _CELL_OF[calibration.source]
-    if kind != cell:
-        raise InstallError(
-            "other-cell",
-            path=path,
-            source=calibration.source,
-            cell=cell,
-            advice=f"Files from elsewhere have their own place: {install_line(calibration.source, path)}",
-        )
-    if before is not None and _CELL_OF[before.source] != kind:
-        raise InstallError(
-            "other-cell",
-            path=path,
-            source=calibration.source,
-            cell=_CELL_OF[before.source],
-            advice="Use another --root.",
-        )
-
-
 def _regression(calibration: Calibration, before: Calibration | None) -> list[Gate]:
     """Make a failed gate where the predicted error is much larger than that of the calibration replaced.
 
@@ -378,14 +357,12 @@ def _objections(
     calibration: Calibration, before: Calibration | None, robot_serial: str, camera_serial: str
 ) -> list[str]:
     """List objections other than gates: another robot, camera or mounting than the cell's."""
-    devices = (("robot", robot_serial), ("camera", camera_serial))
     found = []
-    for name, serial in devices:
+    for name, serial in (("robot", robot_serial), ("camera", camera_serial)):
         device = getattr(calibration, name)
         if serial and device.serial != serial:
             found.append(f"It is of {name} {device.serial or 'unknown'}, the cell has {serial}.")
-    for name, _ in devices if before is not None else ():
-        device, installed = getattr(calibration, name), getattr(before, name)
+        installed = device if before is None else getattr(before, name)
         if (installed.model, installed.serial) != (device.model, device.serial):
             found.append(
                 f"It is of {name} {device.model} {device.serial}, the installed one of {installed.model} "

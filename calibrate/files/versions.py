@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import fcntl
 import getpass
+import hashlib
 import os
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Literal
 
 import msgspec
 
@@ -135,7 +135,7 @@ def add_version(
     content = encode_calibration(calibration)
     numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := VERSION_NAME.fullmatch(p.name))]
     number = max(numbers, default=0) + 1
-    path = folder / "gen" / f"{number:04d}-{content_name(content)}.yaml"
+    path = folder / "gen" / f"{number:04d}-{hashlib.sha256(content).hexdigest()[:8]}.yaml"
     write_atomically(path, content)
     decode_calibration(read_bounded(path), str(path))
     version = InstalledVersion(number, path, True, calibration)
@@ -152,14 +152,6 @@ def make_current(
     entry = LogEntry(time_text(), action, version.number, who(), change, reason)
     append_line(folder / LOG, entry)
     return replace(version, current=True, validity=validity)
-
-
-def content_name(content: bytes) -> str:
-    """Return the first 8 hex digits of the hash that the file states."""
-    found = re.search(rb"^sha256: '?([0-9a-f]{8})", content, re.MULTILINE)
-    if found is None:
-        raise CalibrationFileError("damaged-calibration", path="This file", why="it holds no hash")
-    return found[1].decode()
 
 
 def _current_name(folder: Path) -> str:
@@ -197,25 +189,12 @@ def locked(folder: Path) -> Iterator[None]:
         before = _current_name(folder)
         yield
     except OSError as problem:
-        now = _current_name(folder)
-        switched = (
-            f"{now} is installed now, and the log may not say so" if now != before else "Nothing was switched"
-        )
+        now, why = _current_name(folder), problem.strerror or str(problem)
         raise InstallError(
-            "install-io",
-            folder=folder,
-            why=problem.strerror or str(problem),
-            now=switched,
-            switched=now != before,
+            "install-io", folder=folder, why=why, now=now or "nothing", switched=now != before
         ) from None
     finally:
         os.close(descriptor)
-
-
-def no_such_version(folder: Path, number: int, known: list[InstalledVersion]) -> NoReturn:
-    """Raise InstallError that lists the versions that exist."""
-    have = ", ".join(str(g.number) for g in known) or "none"
-    raise InstallError("no-such-version", folder=folder, generation=number, have=have)
 
 
 def who() -> str:

@@ -310,5 +310,5 @@ def remembered_detections() -> Iterator[None]:
             known[key] = detect(image, spec, **options)
         return known[key]
 
-    with patch("calibrate.load.detect", remembered):
+    with patch("calibrate.recorded_views.detect", remembered):
         yield

@@ -14,8 +14,8 @@ import yaml
 from calibrate.geometry import Array, project_to_rotation
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.load import load_views
 from calibrate.pipeline import single_threaded_opencv
+from calibrate.recorded_views import load_views
 from calibrate.views import ViewSet
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording

@@ -17,8 +17,8 @@ from calibrate.boards.model import board_from_turned, board_points, looks_same_t
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, encode_calibration
 from calibrate.geometry import Array
-from calibrate.load import Progress, load_views
 from calibrate.projection import project_pixels
+from calibrate.recorded_views import Progress, load_views
 from calibrate.views import board_in_camera
 from recordings.exporters.excerpt import copied
 from recordings.reader import Recording

@@ -34,8 +34,8 @@ from calibrate.geometry import Transform
 from calibrate.handeye.solution import Solution, TableResult, Verification
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
-from calibrate.load import LoadedViews
 from calibrate.projection import intrinsics_names
+from calibrate.recorded_views import LoadedViews
 from calibrate.results import Gate, Remark
 from calibrate.views import ViewSet
 from recordings.reader import Recording

@@ -11,8 +11,8 @@ from calibrate.errors import require_choice
 from calibrate.files.calibration import Calibration
 from calibrate.handeye.solution import Profile, Solution, Verification
 from calibrate.lens.intrinsics import Intrinsics, LensModel
-from calibrate.load import LoadedViews
 from calibrate.quality.gates import GateLimits
+from calibrate.recorded_views import LoadedViews
 from calibrate.results import Gate
 from calibrate.views import ViewSet
 from recordings.reader import Recording

@@ -23,9 +23,9 @@ from calibrate.handeye.solve import solve_views
 from calibrate.job import JobOptions, PreparedViews, SolvedRecording
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
-from calibrate.load import Progress, load_views, without_views
 from calibrate.projection import intrinsics_names
 from calibrate.quality.gates import GateInputs, judge
+from calibrate.recorded_views import Progress, load_views, without_views
 from calibrate.views import ViewSet
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import BoardSpec, CameraModel

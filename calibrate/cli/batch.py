@@ -20,8 +20,8 @@ from calibrate.cli.output import AsJson, err, out
 from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit
 from calibrate.errors import UsageError
 from calibrate.job import JobOptions
-from calibrate.load import Progress as LoadProgress
 from calibrate.quality.gates import GateLimits, read_limits
+from calibrate.recorded_views import Progress as LoadProgress
 from recordings.cli.console import progress_bar
 
 DONE_WITH_LOSS = 3

@@ -16,21 +16,14 @@ from calibrate.errors import CalibrationFileError, UsageError
 from calibrate.files.calibration import read_calibration, write_output
 from calibrate.files.folders import cameras, current_validity, current_version, readable_folder
 from calibrate.files.validity import ValidityState, parse_time
-from calibrate.quality.drift_history import read_checks
 
 _HELP = {
     "version": "Number of the installed version.",
     "validity": "1 for the state that the installed calibration is in, 0 for the others.",
-    "max_age_seconds": "Oldest that the last proof may be by the cell's rule.",
     "verified_timestamp_seconds": "Time of the last proof: the solved views, or a check that passed.",
     "readable": "0 when the installed file is damaged.",
     "translation_sigma_metres": "Standard uncertainty of the camera's position.",
     "rotation_sigma_radians": "Standard uncertainty of the camera's rotation.",
-    "drift_checks": "Drift checks of the installed version.",
-    "drift_checks_failed": "Those that failed.",
-    "drift_shift_metres": "Camera shift that the last drift check found.",
-    "drift_rotation_radians": "Camera rotation that the last drift check found.",
-    "drift_check_timestamp_seconds": "Time of the last drift check.",
 }
 
 
@@ -74,8 +67,6 @@ def _samples(root: Path | None, camera: str, now: datetime) -> Iterator[tuple[st
     yield "version", labels, number
     for state in ValidityState:
         yield "validity", f'{labels},state="{state}"', float(state is validity.state)
-    if validity.max_age_days is not None:
-        yield "max_age_seconds", labels, 86400 * validity.max_age_days
     if (verified := parse_time(validity.verified)) is not None:
         yield "verified_timestamp_seconds", labels, verified.timestamp()
     try:
@@ -86,11 +77,3 @@ def _samples(root: Path | None, camera: str, now: datetime) -> Iterator[tuple[st
     yield "readable", labels, 1.0
     yield "translation_sigma_metres", labels, sigma.translation_mm / 1e3
     yield "rotation_sigma_radians", labels, float(np.radians(sigma.rotation_deg))
-    checks = [entry for entry in read_checks(root, camera) if entry.generation == number]
-    yield "drift_checks", labels, len(checks)
-    yield "drift_checks_failed", labels, sum(not entry.passed for entry in checks)
-    if checks:
-        shift = np.array(checks[-1].shift)
-        yield "drift_shift_metres", labels, float(np.linalg.norm(shift[:3]))
-        yield "drift_rotation_radians", labels, float(np.linalg.norm(shift[3:]))
-        yield "drift_check_timestamp_seconds", labels, checks[-1].wall_s

@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from calibrate.errors import CalibrationFileError, UsageError
-from calibrate.files.calibration import FORMAT, read_calibration
-from calibrate.load import Progress as LoadProgress
+from calibrate.errors import UsageError
+from calibrate.files.calibration import FORMAT
+from calibrate.recorded_views import Progress as LoadProgress
 from recordings.cli.console import AsJson as AsJson
 from recordings.cli.console import plain_console, progress_bar
 from recordings.cli.console import print_json as print_json
@@ -26,7 +26,7 @@ err = plain_console(stderr=True)
 def check_target(target: Path, kind: Literal["calibration", "report", "export"]) -> None:
     """Raise UsageError, before the work, where no file can be written or another thing would be lost.
 
-    A calibration replaces a whole calibration file only, a report a report only; an export replaces neither a
+    A calibration replaces a calibration only, a report a report only; an export replaces neither a
     recording nor a calibration.
     """
     try:
@@ -34,29 +34,15 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
             raise UsageError(
                 path=target, why="its folder does not exist", advice="Create it, or name another."
             )
-        if target.exists() and not target.is_file():
-            raise UsageError(path=target, why="it is a folder, a device or a pipe", advice="Name a file.")
         if not target.exists():
             return
         start = read_beginning(target, 64)
     except OSError as problem:
         raise UsageError(path=target, why=problem.strerror, advice="Name another place.") from None
-    if kind == "calibration":
-        spared = not _is_calibration(target)
-    elif kind == "report":
-        spared = not start.startswith(b"<!doctype html>")
-    else:
-        spared = start.startswith((MAGIC, f"format: {FORMAT}".encode()))
-    if spared:
+    replaced = {"calibration": f"format: {FORMAT}".encode(), "report": b"<!doctype html>"}
+    others = start.startswith((MAGIC, replaced["calibration"]))
+    if others if kind == "export" else not start.startswith(replaced[kind]):
         raise UsageError("target-exists", path=target, by=f"this {kind}")
-
-
-def _is_calibration(target: Path) -> bool:
-    try:
-        read_calibration(target)
-    except CalibrationFileError:
-        return False
-    return True
 
 
 @contextmanager

@@ -32,13 +32,13 @@ from calibrate.files.install import note_check
 from calibrate.files.lines import share
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
 from calibrate.kinematics import MODELS
-from calibrate.load import detect_all
 from calibrate.pipeline import single_threaded_opencv
 from calibrate.quality.drift import CellIdentity, require_same_cell
 from calibrate.quality.movement.evidence import Moved
 from calibrate.quality.movement.log import FILE, MonitorLog, WatchedTag, WatchEntry
 from calibrate.quality.movement.monitor import LARGEST_MISFIT_PX, NAMED_AFTER, EventKind, MovementEvent
 from calibrate.quality.movement.pictures import CellModel
+from calibrate.recorded_views import detect_all
 from recordings.cli.console import progress_bar
 from recordings.errors import BadImageError, ImportSourceError, Value
 from recordings.files import MAIN_CAMERA, open_regular

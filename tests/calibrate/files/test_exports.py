@@ -33,7 +33,7 @@ from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_
 from calibrate.handeye.arm import corrected_model
 from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, forward, with_near_axes
-from calibrate.load import arm_of_ros
+from calibrate.recorded_views import arm_of_ros
 from tests.calibrate.calling import raises_code
 
 

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from calibrate.errors import BadViewsError, SquaresCountedError, TooFewViewsError
 from calibrate.geometry import pose, rotation_exp
 from calibrate.kinematics import forward
-from calibrate.load import arm_of_ros, load_views, without_views
 from calibrate.pipeline import solve_recording
+from calibrate.recorded_views import arm_of_ros, load_views, without_views
 from calibrate.report.page import report_page
 from recordings.errors import CorruptRecordingError, MissingSegmentError
 from recordings.images import encode_png

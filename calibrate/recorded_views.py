@@ -1,10 +1,10 @@
-"""Views of a recording: images decoded, boards detected, in bounded memory and in a fixed order."""
+"""The board in the images of a recording, in bounded memory and in a fixed order."""
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -13,7 +13,7 @@ import numpy as np
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, MirroredImagesError, SquaresCountedError, TooFewViewsError
-from calibrate.geometry import Array, pose, rotation_exp
+from calibrate.geometry import pose, rotation_exp
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.kinematics import MODELS, RobotModel, table_of_axes
 from calibrate.results import RejectedView
@@ -77,19 +77,15 @@ def load_views(
             missing.append(RejectedView(view.index, view.name, str(detection), "unreadable-picture"))
             continue
         seen[view.index] = detection
-        if detection.found:
-            views.append(_image_view(view, detection, spec))
-        else:
+        if not detection.found:
             missing.append(RejectedView(view.index, view.name, detection.reason, "corners"))
-    pictures = len(seen) + sum(view.kind == "unreadable-picture" for view in missing)
+            continue
+        points = board_points(spec)[detection.indices]
+        flange = np.array(view.base_from_flange, dtype=float)
+        joints = None if view.joints_rad is None else np.array(view.joints_rad)
+        views.append(BoardView(view.index, view.name, flange, points, detection.pixels, joints))
     if len(views) < fewest:
-        counted = sum(detection.cause == "squares-counted" for detection in seen.values())
-        if counted >= max(1, len(missing) / 2):
-            raise _squares_counted(recording, spec, counted, pictures)
-        mirrored = sum(detection.cause == "mirrored" for detection in seen.values())
-        if mirrored >= max(1, len(missing) / 2):
-            raise MirroredImagesError(path=recording.path, mirrored=mirrored, images=pictures)
-        raise _too_few(recording, len(views), pictures, missing, fewest)
+        raise _too_few(recording, spec, len(views), seen, missing, fewest)
     if not (model.width and model.height):
         first = next(iter(seen.values()))
         model = msgspec.structs.replace(model, width=first.width, height=first.height)
@@ -120,49 +116,27 @@ def _calibrated_arm(recording: Recording) -> RobotModel | None:
     return replace(published, a_m=a, d_m=d, alpha_rad=alpha, theta_rad=theta)
 
 
-class _Origin(msgspec.Struct):
-    """Of a link before its joint turns about z, as URDF has it: metres, and roll, pitch, yaw in radians."""
-
-    x: float
-    y: float
-    z: float
-    roll: float
-    pitch: float
-    yaw: float
-
-    @property
-    def matrix(self) -> Array:
-        turns = ((2, self.yaw), (1, self.pitch), (0, self.roll))
-        z, y, x = (rotation_exp(angle * np.eye(3)[axis]) for axis, angle in turns)
-        return pose(z @ y @ x, [self.x, self.y, self.z])
-
-
-class _RosArm(msgspec.Struct):
-    """`kinematics` of the file that `ur_calibration` writes for ROS 2's UR driver."""
-
-    shoulder: _Origin
-    upper_arm: _Origin
-    forearm: _Origin
-    wrist_1: _Origin
-    wrist_2: _Origin
-    wrist_3: _Origin
-
-
-class _RosFile(msgspec.Struct):
-    kinematics: _RosArm
+_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+_ORIGIN = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 def arm_of_ros(content: bytes, robot: str) -> RobotModel:
-    """Read the file of `ur_calibration`. ValueError where it is none, or not of this robot."""
+    """Read the file that `ur_calibration` writes for ROS 2's UR driver: the links' origins, as URDF has them.
+
+    ValueError where it is none, or not of this robot.
+    """
     if robot not in MODELS:
         raise ValueError(f"no robot {robot} is known")
-    try:
-        links = msgspec.convert(strict_yaml.load_plain(content), _RosFile, strict=False).kinematics
-    except msgspec.ValidationError as problem:
-        raise ValueError(str(problem)) from None
     chain = [np.eye(4)]
-    for name in links.__struct_fields__:
-        chain.append(chain[-1] @ getattr(links, name).matrix)
+    try:
+        links = strict_yaml.load_plain(content)["kinematics"]
+        for link in _LINKS:
+            *origin, roll, pitch, yaw = (float(links[link][name]) for name in _ORIGIN)
+            turns = zip((yaw, pitch, roll), np.eye(3)[::-1], strict=True)
+            z, y, x = (rotation_exp(angle * axis) for angle, axis in turns)
+            chain.append(chain[-1] @ pose(z @ y @ x, origin))
+    except (KeyError, TypeError) as problem:
+        raise ValueError(f"not as ur_calibration writes it: {problem!r}") from None
     frames = np.array(chain)
     return table_of_axes(MODELS[robot], frames[1:, :3, 2], frames[1:, :3, 3], frames[6])
 
@@ -207,33 +181,21 @@ def detect_all(
     progress: Progress | None = None,
     threads: int | None = None,
 ) -> Iterator[tuple[View, Detection | BadImageError]]:
-    """Look for the board in these views, in their order, with at most a few pictures in memory."""
-    workers = threads or usable_cores()
-    total = len(views)
-    waiting: deque[tuple[View, Future[Detection]]] = deque()
-    done = 0
-
-    def finished() -> tuple[View, Detection | BadImageError]:
-        nonlocal done
-        view, future = waiting.popleft()
-        done += 1
-        if progress:
-            progress(done, total, view.name)
-        try:
-            return view, future.result()
-        except BadImageError as problem:
-            return view, problem
-        except ValueError as problem:
-            raise BadViewsError(view=view.index + 1, name=view.name, reason=str(problem)) from None
-
-    pool = ThreadPoolExecutor(workers, thread_name_prefix="detect")
+    """Look for the board in these views, in their order; an image is in memory only while it is searched."""
+    pool = ThreadPoolExecutor(threads or usable_cores(), thread_name_prefix="detect")
     try:
-        for view in views:
-            waiting.append((view, pool.submit(_decode_and_detect, recording, view, spec, camera)))
-            while len(waiting) > 2 * workers:
-                yield finished()
-        while waiting:
-            yield finished()
+        futures = [pool.submit(_decode_and_detect, recording, view, spec, camera) for view in views]
+        for done, (view, future) in enumerate(zip(views, futures, strict=True), 1):
+            found: Detection | BadImageError
+            try:
+                found = future.result()
+            except BadImageError as problem:
+                found = problem
+            except ValueError as problem:
+                raise BadViewsError(view=view.index + 1, name=view.name, reason=str(problem)) from None
+            if progress:
+                progress(done, len(views), view.name)
+            yield view, found
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -253,36 +215,33 @@ def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera
     return detect(viewable(picture.pixels, picture.pixel_format), spec, with_quality=False)
 
 
-def _image_view(view: View, detection: Detection, spec: BoardSpec) -> BoardView:
-    return BoardView(
-        index=view.index,
-        name=view.name,
-        base_from_flange=np.array(view.base_from_flange, dtype=float),
-        board_points=board_points(spec)[detection.indices],
-        pixels=detection.pixels,
-        joints_rad=None if view.joints_rad is None else np.array(view.joints_rad),
-    )
-
-
-def _squares_counted(recording: Recording, spec: BoardSpec, counted: int, total: int) -> SquaresCountedError:
-    return SquaresCountedError(
-        path=recording.path,
-        counted=counted,
-        images=total,
-        declared=f"{spec.columns}×{spec.rows}",
-        columns=spec.columns - 1,
-        rows=spec.rows - 1,
-    )
-
-
 def _too_few(
-    recording: Recording, found: int, total: int, missing: list[RejectedView], fewest: int
+    recording: Recording,
+    spec: BoardSpec,
+    found: int,
+    seen: dict[int, Detection],
+    missing: list[RejectedView],
+    fewest: int,
 ) -> TooFewViewsError:
-    counted = f"{recording.path}: the board is seen in {found} of {total} images"
+    images = len(seen) + sum(view.kind == "unreadable-picture" for view in missing)
+    causes = Counter(detection.cause for detection in seen.values())
+    often = max(1, len(missing) / 2)
+    if causes["squares-counted"] >= often:
+        return SquaresCountedError(
+            path=recording.path,
+            counted=causes["squares-counted"],
+            images=images,
+            declared=f"{spec.columns}×{spec.rows}",
+            columns=spec.columns - 1,
+            rows=spec.rows - 1,
+        )
+    if causes["mirrored"] >= often:
+        return MirroredImagesError(path=recording.path, mirrored=causes["mirrored"], images=images)
+    counted = f"{recording.path}: the board is seen in {found} of {images} images"
     advice = "Check the board's kind, columns and rows; solve again with --board to try another."
-    if total == 0:
+    if images == 0:
         counted = f"{recording.path}: no image has a robot pose"
         advice = "Images of a sweep have none: record poses with `station capture`."
     elif missing:
         counted += f" (first reason, view {missing[0].index + 1} ({missing[0].name}): {missing[0].reason})"
-    return TooFewViewsError(counted=counted, views=found, images=total, needed=fewest, advice=advice)
+    return TooFewViewsError(counted=counted, views=found, images=images, needed=fewest, advice=advice)

@@ -175,8 +175,6 @@ class PeerResult:
     """(4, 4); None where the method failed (see `note`)."""
     e_t_m: float | None = None
     e_R: float | None = None
-    samples_e_t_m: NDArray[np.float64] | None = None
-    samples_e_R: NDArray[np.float64] | None = None
     board_spread_m: float | None = None
     board_spread_rad: float | None = None
     reprojection_px: float | None = None

@@ -19,9 +19,8 @@ _LARGEST_HALF_WINDOW_PX = 16
 _IRREGULAR_SHARE = 0.3
 _REFINEMENT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 5e-3)
 _SMOOTHING_PX = 1.0
-_PATCH_MARGIN_PX, _PATCH_REACH_PX, _MOST_PATCHES = 8, 2.0, 8
-"""Around a window: 4 for the smoothing, 1 for the gradient, 2 for the way to the saddle; one that is farther
-away gets a new patch."""
+_MARGIN_PX = 16
+"""Around the corners, beside a window: for the smoothing, and for the way to the saddle."""
 _SMOOTH_FROM_PX = 9.5
 """Below this spacing the smoothing would mix a corner with its neighbours."""
 
@@ -88,42 +87,21 @@ def refine(grey: Grey, corners: Array, spacing_px: Array) -> Array:
     began, and a saddle stays where it is under any symmetric smoothing.
     """
     half = np.clip(np.floor(spacing_px * _WINDOW_SHARE), 2, _LARGEST_HALF_WINDOW_PX).astype(int)
-    smooth = float(np.median(spacing_px)) >= _SMOOTH_FROM_PX
-    refined, last = corners.copy(), np.array([grey.shape[1] - 1, grey.shape[0] - 1])
-    for size in np.unique(half):
-        chosen = np.flatnonzero(half == size)
-        for _ in range(_MOST_PATCHES):
-            before = refined[chosen]
-            refined[chosen] = _saddles(grey, before, int(size), smooth)
-            after = refined[chosen]
-            far = np.abs(after - before).max(axis=1) > _PATCH_REACH_PX
-            chosen = chosen[far & (after >= 0).all(axis=1) & (after <= last).all(axis=1)]
-            if not len(chosen):
-                break
+    margin = int(half.max(initial=2)) + _MARGIN_PX
+    low = np.clip(np.floor(corners.min(axis=0)).astype(int) - margin, 0, None)
+    high = np.ceil(corners.max(axis=0)).astype(int) + margin
+    part: Any = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    if float(np.median(spacing_px)) >= _SMOOTH_FROM_PX:
+        part = cv2.GaussianBlur(part, (0, 0), _SMOOTHING_PX)
+    refined = corners.copy()
+    for size in np.unique(half).tolist():
+        chosen = half == size
+        points = np.ascontiguousarray((corners[chosen] - low).reshape(-1, 1, 2), dtype=np.float32)
+        cv2.cornerSubPix(part, points, (size, size), (-1, -1), _REFINEMENT_STEPS)
+        refined[chosen] = points.reshape(-1, 2) + low
     ran = np.linalg.norm(refined - corners, axis=1) > 0.4 * spacing_px
     refined[ran] = corners[ran]
     return refined
-
-
-def _saddles(grey: Grey, corners: Array, half: int, smooth: bool) -> Array:
-    """The saddles near `corners` (n, 2). Only what lies around them is smoothed: a column of patches."""
-    side = 2 * (half + _PATCH_MARGIN_PX) + 1
-    first = np.round(corners).astype(int) - side // 2
-    beyond = max(0, -int(first.min()), int((first + side - [grey.shape[1], grey.shape[0]]).max()))
-    if beyond:
-        around: Any = cv2.copyMakeBorder(grey, *(beyond,) * 4, cv2.BORDER_REPLICATE)
-        grey = around
-    patches = np.lib.stride_tricks.sliding_window_view(grey, (side, side))[
-        first[:, 1] + beyond, first[:, 0] + beyond
-    ]
-    column: Any = patches.reshape(-1, side).astype(np.float32)
-    if smooth:
-        column = cv2.GaussianBlur(column, (0, 0), _SMOOTHING_PX)
-    shift = first.astype(float)
-    shift[:, 1] -= side * np.arange(len(first))
-    points = np.ascontiguousarray((corners - shift).reshape(-1, 1, 2), dtype=np.float32)
-    cv2.cornerSubPix(column, points, (half, half), (-1, -1), _REFINEMENT_STEPS)
-    return np.asarray(points.reshape(-1, 2) + shift)
 
 
 def sample(grey: Grey, pixels: Array) -> Array:

@@ -123,22 +123,12 @@ def origin_mm(spec: BoardSpec, height: float) -> tuple[float, float]:
 def _paper(paper: str, need_w: float, need_h: float, spec: BoardSpec) -> tuple[float, float]:
     if paper not in PAPER_MM:
         raise BoardError("paper-unknown", paper=paper, papers=", ".join(PAPER_MM))
-    fitting = {
-        name: size
-        for name, sides in PAPER_MM.items()
-        for size in (sides[::-1], sides)  # the wide way where both fit
-        if need_w <= size[0] and need_h <= size[1]
-    }
-    if paper not in fitting:
-        raise BoardError(
-            "paper-too-small",
-            board=describe_board(spec),
-            paper=paper,
-            width_mm=need_w,
-            height_mm=need_h,
-            advice=f"Print on {next(iter(fitting))}." if fitting else "Make the squares smaller.",
-        )
-    return fitting[paper]
+    short, long = sorted(PAPER_MM[paper])
+    fits = [size for size in ((long, short), (short, long)) if need_w <= size[0] and need_h <= size[1]]
+    if not fits:
+        board = describe_board(spec)
+        raise BoardError("paper-too-small", board=board, paper=paper, width_mm=need_w, height_mm=need_h)
+    return fits[0]
 
 
 _Drawn = tuple[Array, Array, float, float]

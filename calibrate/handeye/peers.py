@@ -79,8 +79,6 @@ def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[Pee
             final,
             e_t_m=ours.holdout.e_t_m,
             e_R=ours.holdout.e_R,
-            samples_e_t_m=np.array(ours.holdout.samples_e_t_m),
-            samples_e_R=np.array(ours.holdout.samples_e_R),
         )
     return [*rows, replace(final, time_ms=ours_ms, note="time with held-out scores, outliers and proof")]
 
@@ -183,7 +181,7 @@ def _with_samples(row: PeerResult, partial_X: Array | None, pairs: Pairs) -> Pee
     if partial_X is None or not np.isfinite(partial_X).all():
         return row
     e_t, e_R = motion_errors(partial_X, pairs)
-    return replace(row, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()), samples_e_t_m=e_t, samples_e_R=e_R)
+    return replace(row, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()))
 
 
 def reprojection_px(views: ViewSet, X: Array) -> float | None:

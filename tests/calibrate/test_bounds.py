@@ -17,7 +17,7 @@ import pytest
 
 from calibrate.bounds import SolveLimitError, bounded
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import read_calibration, write_calibration
+from calibrate.files.calibration import write_calibration
 from calibrate.job import SolvedRecording
 from tests.calibrate.calling import raises_code
 from tests.patience import PATIENCE_S
@@ -106,17 +106,3 @@ def test_the_command_ends_with_1_and_the_old_file_stays(
     assert option in done.stderr, "the remedy names it"
     assert "Traceback" not in done.stderr
     assert old_file.read_bytes() == content
-
-
-def test_killed_at_any_moment_it_leaves_a_whole_file(real_session_file: Path, old_file: Path) -> None:
-    whole = read_calibration(old_file)
-    for after_s in (0.4, 1.2):
-        child = subprocess.Popen(
-            [*PROGRAM, str(real_session_file), "-o", str(old_file)],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        time.sleep(after_s)
-        child.kill()
-        child.wait()
-        assert read_calibration(old_file).result == whole.result

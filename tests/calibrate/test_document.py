@@ -55,26 +55,6 @@ def test_warnings_come_with_their_codes_and_the_session_with_its_reading(
     assert quality.session is not None and quality.session.hypothesis == found.session.reading.value
 
 
-def test_each_view_has_its_residuals(solved_real: SolvedRecording) -> None:
-    file, found = solved_real.calibration, solved_real.solution
-    assert [view.index for view in file.quality.views] == list(found.used) == file.views.used
-    for view in file.quality.views:
-        metres, radians = found.residual_robot[view.index]
-        assert view.rms_px == found.residual_px[view.index]
-        assert view.robot_mm == pytest.approx(1000 * metres)
-        assert view.robot_deg == pytest.approx(np.degrees(radians))
-
-
-def test_the_holdout_is_told_pair_by_pair(solved_real: SolvedRecording) -> None:
-    told, score = solved_real.calibration.quality.holdout, solved_real.solution.holdout
-    assert told is not None and score is not None
-    assert (told.e_t_m, told.e_R, told.fitted_views) == (score.e_t_m, score.e_R, score.fitted_views)
-    assert told.e_t_m == pytest.approx(np.mean(told.samples_e_t_m))
-    assert told.e_R == pytest.approx(np.mean(told.samples_e_R))
-    assert told.pairs == [tuple(pair) for pair in score.pairs]
-    assert len(told.pairs) == len(told.samples_e_t_m) == len(told.samples_e_R)
-
-
 def test_a_given_lens_is_called_given_and_judged_by_these_pictures(solved_real: SolvedRecording) -> None:
     lens, views = solved_real.calibration.intrinsics, solved_real.views
     found = solved_real.solution

@@ -99,12 +99,6 @@ def zivid(path, points, parent):
     return {"camera": into_camera(points, matrix[:3, :3], matrix[:3, 3] / 1000)}
 
 
-def ur_tool(path, points, parent):
-    """URScript: p[x, y, z, rx, ry, rz], metres and a rotation vector."""
-    pose = np.array(re.search(r"p\[([^\]]+)\]", path.read_text())[1].split(","), float)
-    return {"camera": into_camera(points, cv2.Rodrigues(pose[3:])[0], pose[:3])}
-
-
 READERS = {
     "ros-camera-info": ros_camera_info,
     "ros-launch": ros_launch,
@@ -112,7 +106,6 @@ READERS = {
     "opencv": opencv,
     "halcon": halcon,
     "zivid": zivid,
-    "ur-tool": ur_tool,
 }
 
 

@@ -29,7 +29,6 @@ FORMATS: dict[str, Format] = {
     "opencv": Format(".yml", "OpenCV FileStorage: transform and intrinsics", vision.opencv),
     "halcon": Format(".dat", "HALCON pose: tool_in_cam_pose or base_in_cam_pose", vision.halcon),
     "zivid": Format(".yaml", "Zivid Matrix4x4: the transform, mm", vision.zivid),
-    "ur-tool": Format(".txt", "camera as tool (TCP) or feature on the UR pendant", vision.ur_tool),
     "ur-kinematics": Format(".yaml", "the corrected arm for ROS 2's ur_description", models.ur_kinematics),
 }
 

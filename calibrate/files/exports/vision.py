@@ -12,7 +12,7 @@ from calibrate.files.exports.frames import (
     commented_yaml,
     roll_pitch_yaw,
 )
-from calibrate.geometry import inverse, rotation_log
+from calibrate.geometry import inverse
 from calibrate.projection import camera_matrix, distortion
 
 
@@ -34,27 +34,6 @@ def opencv(calibration: Calibration, frames: FrameNames) -> str:
     storage.write("camera_matrix", camera_matrix(camera))
     storage.write("distortion_coefficients", distortion(camera)[None])
     return storage.releaseAndGetString()
-
-
-def ur_tool(calibration: Calibration, frames: FrameNames) -> str:
-    """Make a text with the numbers to type on the UR pendant: mm, and a rotation vector in radians."""
-    matrix = calibration.transform.matrix
-    x, y, z = matrix[:3, 3] * 1000
-    rx, ry, rz = rotation_log(matrix[:3, :3])
-    in_hand = calibration.mount == "eye-in-hand"
-    what = (
-        "Installation > TCP: the camera's optical frame, in the flange"
-        if in_hand
-        else ("Installation > Features: the camera's optical frame, in the base")
-    )
-    pose = ", ".join(repr(float(v)) for v in (x / 1000, y / 1000, z / 1000, rx, ry, rz))
-    call = f"set_tcp(p[{pose}])" if in_hand else f"camera = p[{pose}]"
-    return (
-        f"# {comment(calibration, frames)}\n# {what}\n"
-        f"X  {x:.3f} mm\nY  {y:.3f} mm\nZ  {z:.3f} mm\n"
-        f"RX {rx:.6f} rad\nRY {ry:.6f} rad\nRZ {rz:.6f} rad\n"
-        f"# the same in URScript (metres):\n{call}\n"
-    )
 
 
 def zivid(calibration: Calibration, frames: FrameNames) -> str:

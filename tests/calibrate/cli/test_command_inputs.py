@@ -21,7 +21,6 @@ from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel
 from tests.calibrate.calling import refused, run
-from tests.calibrate.sessions import Scene, write_session
 
 UNFINISHED = UnfinishedRecordingError.code
 
@@ -141,11 +140,6 @@ def test_a_lens_that_is_none_is_never_used(tmp_path: Path, field: str, value: ob
     path.write_text(yaml.safe_dump(info | {field: value}))
     with pytest.raises(CalibrationError):
         read_camera(path)
-
-
-def test_few_views_are_refused(tmp_path: Path) -> None:
-    path = write_session(tmp_path / "few.mcap", Scene(views=3), known_lens=True)
-    refused(run("solve", path, cwd=tmp_path), 1, "too-few-views")
 
 
 def test_another_camera_is_no_drift(real_session_file: Path, real_file: Path, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 import yaml
 
@@ -18,7 +17,6 @@ from calibrate.files.calibration import (
     write_calibration,
     write_output,
 )
-from calibrate.geometry import FrameMismatchError, Transform
 from calibrate.job import SolvedRecording
 from tests.calibrate.calling import raises_code
 
@@ -38,37 +36,18 @@ def test_the_format_stands_first_and_is_plain_yaml(real_file: Path) -> None:
     assert plain["provenance"]["recording_sha256"]
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("translation_m:", "translation_m: "),
-        ("eye-in-hand", "eye-to-hand"),
-        ("passed: true", "passed: false"),
-    ],
-)
-def test_any_edit_is_noticed(real_file: Path, old: str, new: str) -> None:
-    """Fault 49. Layout may change, content may not."""
+def test_layout_may_change_and_content_may_not(real_file: Path) -> None:
+    """Fault 49: no flipped digit of the result passes."""
     text = real_file.read_text()
-    assert old in text
-    edited = text.replace(old, new, 1)
-    if yaml.safe_load(edited) == yaml.safe_load(text):
-        decode_calibration(edited.encode(), "x")
-    else:
-        with raises_code(CalibrationFileError, "damaged-calibration"):
-            decode_calibration(edited.encode(), "x")
-
-
-def test_no_flipped_digit_of_the_result_passes(real_file: Path) -> None:
-    lines = real_file.read_text().splitlines(keepends=True)
-    place = next(k for k, line in enumerate(lines) if "translation_m" in line)
-    for column, letter in enumerate(lines[place]):
-        if not letter.isdigit() or lines[place][:column].count("[") == 0:
-            continue
-        changed = lines[place][:column] + str((int(letter) + 1) % 10) + lines[place][column + 1 :]
-        if yaml.safe_load(changed) == yaml.safe_load(lines[place]):
-            continue
-        with pytest.raises(CalibrationFileError):
-            decode_calibration("".join([*lines[:place], changed, *lines[place + 1 :]]).encode(), "x")
+    decode_calibration(text.replace("translation_m:", "translation_m: ", 1).encode(), "x")
+    begins = text.index("translation_m: [")
+    ends = text.index("]", begins) + 1
+    for place in range(begins, ends):
+        digit = text[place].translate(str.maketrans("0123456789", "1234567890"))
+        changed = text[:place] + digit + text[place + 1 :]
+        if yaml.safe_load(changed[begins:ends]) != yaml.safe_load(text[begins:ends]):
+            with raises_code(CalibrationFileError, "damaged-calibration"):
+                decode_calibration(changed.encode(), "x")
 
 
 def test_a_cut_file_is_refused_at_every_length(real_file: Path) -> None:
@@ -122,15 +101,6 @@ def test_a_covariance_that_is_none_is_refused_even_with_a_right_hash(
     wrong = msgspec.structs.replace(good, covariance=tuple(tuple(line) for line in rows))
     with pytest.raises(CalibrationFileError):
         decode_calibration(encode_calibration(wrong), "x")
-
-
-def test_frames_that_do_not_touch_are_refused(real_file: Path) -> None:
-    """Fault 43: the loaded transform knows its frames."""
-    flange_from_camera = read_calibration(real_file).transform
-    camera_from_board = Transform("camera", "board", np.eye(4))
-    assert (flange_from_camera @ camera_from_board).parent == "flange"
-    with pytest.raises(FrameMismatchError):
-        camera_from_board @ flange_from_camera
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_scraps(

@@ -104,12 +104,14 @@ def test_files_of_others_beside_the_generations_are_left_alone(make_file, tmp_pa
     assert install(make_file(0.001), root).number == 2
 
 
-def test_rollback_passes_over_a_damaged_generation(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_rollback_passes_over_a_damaged_version(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     root = tmp_path / "s"
     for k in range(3):
         install(make_file(0.0001 * k), root)
     middle = installed_versions(root)[1]
     middle.path.write_bytes(middle.path.read_bytes()[:-40])
+    with pytest.raises(CalibrationFileError):
+        install(middle.path, root)
     assert rollback(root).number == 1
     with raises_code(InstallError, "damaged-version", generation=2):
         rollback(root, to=2)

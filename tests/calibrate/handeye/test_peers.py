@@ -38,7 +38,6 @@ def test_columns_are_filled_and_ours_is_the_reference():
     for row in rows.values():
         assert row.e_t_m > 0
         assert row.e_R > 0
-        assert len(row.samples_e_t_m) == len(row.samples_e_R) == 15
         assert row.time_ms > 0
         if row.rigid:
             assert row.board_spread_m > 0
@@ -55,9 +54,8 @@ def test_with_the_papers_profile_all_are_scored_on_the_papers_own_samples():
     cell = make_cell(np.random.default_rng(1), 25, MID)
     published = solve_views(cell.views, SolveOptions(profile="paper"))
     rows = {row.name: row for row in compare_all(cell.views, SolveOptions(profile="paper"))}
-    assert all(len(row.samples_e_t_m) == len(row.samples_e_R) == 6 for row in rows.values())
-    np.testing.assert_array_equal(rows["DE, paper"].samples_e_t_m, published.holdout.samples_e_t_m)
-    np.testing.assert_array_equal(rows["DE, paper"].samples_e_R, published.holdout.samples_e_R)
+    assert rows["DE, paper"].e_t_m == published.holdout.e_t_m
+    assert rows["DE, paper"].e_R == published.holdout.e_R
 
 
 def test_the_papers_row_says_when_its_answer_lies_on_the_box():

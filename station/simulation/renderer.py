@@ -131,25 +131,18 @@ def _window(
     along = np.linspace(0.0, 1.0, 9)[:, None, None]
     points = (corners + along * (np.roll(corners, -1, axis=0) - corners)).reshape(-1, 3)
     in_camera = points @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
-    whole = (slice(0, camera.height), slice(0, camera.width))
-    if (in_camera[:, 2] <= 0.01).all():
+    ahead = in_camera[:, 2] > 0.01
+    if not ahead.any():
         return None
-    if (in_camera[:, 2] <= 0.01).any():
-        return whole
-    rotation, _ = cv2.Rodrigues(camera_from_board[:3, :3])
-    pixels, _ = cv2.projectPoints(
-        points, rotation, camera_from_board[:3, 3], np.array(camera.matrix), np.array(camera.distortion)
-    )
     # The distortion polynomial may map points far outside back into the image: then use the whole image.
-    if np.abs(in_camera[:, :2] / in_camera[:, 2:]).max() > 1.0:
-        return whole
-    low = np.floor(pixels.reshape(-1, 2).min(axis=0)).astype(int) - margin_px
-    high = np.ceil(pixels.reshape(-1, 2).max(axis=0)).astype(int) + margin_px + 1
-    left, top = np.clip(low, 0, (camera.width, camera.height))
-    right, bottom = np.clip(high, 0, (camera.width, camera.height))
-    if right <= left or bottom <= top:
-        return None
-    return slice(int(top), int(bottom)), slice(int(left), int(right))
+    if not ahead.all() or np.abs(in_camera[:, :2] / in_camera[:, 2:]).max() > 1.0:
+        return slice(0, camera.height), slice(0, camera.width)
+    lens = np.array(camera.matrix), np.array(camera.distortion)
+    pixels, _ = cv2.projectPoints(in_camera, np.zeros(3), np.zeros(3), *lens)
+    size = camera.width, camera.height
+    low = np.clip(np.floor(pixels.min(axis=(0, 1))).astype(int) - margin_px, 0, size)
+    high = np.clip(np.ceil(pixels.max(axis=(0, 1))).astype(int) + margin_px + 1, 0, size)
+    return (slice(low[1], high[1]), slice(low[0], high[0])) if (low < high).all() else None
 
 
 def _reflectance(

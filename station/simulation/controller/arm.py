@@ -14,7 +14,7 @@ from station.simulation.controller.kinematics import (
     between,
     compose,
     forward,
-    place,
+    position,
 )
 from station.simulation.controller.paths import (
     Braking,
@@ -154,7 +154,7 @@ class SimulatedArm:
         later = tuple(q + step_s * v for q, v in zip(self.command, self.command_speed, strict=True))
         here = compose(forward(self.table, self.command), self.flange_from_tcp)
         there = compose(forward(self.table, later), self.flange_from_tcp)
-        return dist(place(here), place(there)) / step_s
+        return dist(position(here), position(there)) / step_s
 
     def _brake_in(self, duration_s: float) -> None:
         self._drop_next()

@@ -58,9 +58,15 @@ TABLES = {
 }
 
 
-def place(T: Rigid) -> Vector:
+def position(T: Rigid) -> Vector:
     """(3,) where its origin is."""
     return (T[3], T[7], T[11])
+
+
+def moved_to(T: Rigid, position: Vector) -> Rigid:
+    """The same rotation at another position (3,)."""
+    x, y, z = position
+    return (*T[:3], x, *T[4:7], y, *T[8:11], z)
 
 
 def between(first: Vector, second: Vector, share: float) -> Vector:

@@ -21,8 +21,9 @@ from station.simulation.controller.kinematics import (
     from_rotvec,
     inverse_nearest,
     invert,
-    place,
+    moved_to,
     plus,
+    position,
     to_rotvec,
 )
 
@@ -61,7 +62,7 @@ class LinePath:
         self._table = table
         self._tcp_from_flange = invert(flange_from_tcp)
         self._first = compose(forward(table, start), flange_from_tcp)
-        self._way = plus(place(base_from_goal), place(self._first), -1)
+        self._way = plus(position(base_from_goal), position(self._first), -1)
         x, y, z = to_rotvec(compose(invert(self._first), base_from_goal))
         self._turn = (x, y, z)
         distance, angle = hypot(*self._way), hypot(x, y, z)
@@ -75,8 +76,7 @@ class LinePath:
         u = min(s / self.length, 1.0) if self.length > 0 else 1.0
         x, y, z = self._turn
         turned = compose(self._first, from_rotvec(u * x, u * y, u * z))
-        px, py, pz = plus(place(self._first), self._way, u)
-        tcp = (*turned[:3], px, *turned[4:7], py, *turned[8:11], pz)
+        tcp = moved_to(turned, plus(position(self._first), self._way, u))
         joints = inverse_nearest(self._table, compose(tcp, self._tcp_from_flange), self._joints)
         if joints is None:
             raise UnreachableError("the straight line leaves the arm's reach")

@@ -13,8 +13,8 @@ import zlib
 from station.devices.rtde import RuntimeState
 from station.simulation.controller.kinematics import JOINT_LIMIT_RAD
 from station.simulation.controller.network import Connection, Service
-from station.simulation.controller.programs import UploadReader
 from station.simulation.controller.robot import SimulatedRobot
+from station.simulation.controller.uploads import UploadReader
 
 PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT = 30001, 30002, 30003
 STATE_PERIOD_S = 0.1

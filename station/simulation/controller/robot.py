@@ -17,10 +17,13 @@ from station.simulation.controller.kinematics import (
     compose,
     forward,
     from_rotvec,
+    moved_to,
+    plus,
+    position,
 )
 from station.simulation.controller.paths import UnreachableError
-from station.simulation.controller.programs import Upload
 from station.simulation.controller.state import DIGITAL_BANKS, ControllerState, Journal, Settings
+from station.simulation.controller.uploads import Upload
 from station.simulation.controller.urscript_parser import ScriptError, ScriptSyntaxError
 
 log = logging.getLogger(__name__)
@@ -260,7 +263,4 @@ class SimulatedRobot(ControllerState):
     def true_flange(self, joints: Vector, miss: Vector) -> Rigid:
         """base_from_flange with the arm's real lengths and its repeatability error."""
         T = forward(self.true_table, joints)
-        turned = compose(from_rotvec(*miss[3:]), T)
-        return (
-            *turned[:3], T[3] + miss[0], *turned[4:7], T[7] + miss[1], *turned[8:11], T[11] + miss[2],
-        )  # fmt: skip
+        return moved_to(compose(from_rotvec(*miss[3:]), T), plus(position(T), miss))

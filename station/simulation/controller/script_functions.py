@@ -16,8 +16,8 @@ from station.simulation.controller.kinematics import (
     forward,
     from_pose,
     invert,
-    place,
     plus,
+    position,
     to_pose,
 )
 from station.simulation.controller.state import DIGITAL_BANKS, ControllerState
@@ -57,7 +57,7 @@ def _pose_add(p_1: Pose, p_2: Pose, sign: float = 1.0) -> Pose:
     """Positions are added in base, rotations multiplied."""
     first, second = rigid(p_1), rigid(p_2)
     turn = compose(first, second if sign > 0 else invert(second))
-    return Pose([*plus(place(first), place(second), sign), *to_pose(turn)[3:]])
+    return Pose([*plus(position(first), position(second), sign), *to_pose(turn)[3:]])
 
 
 def text_of(value: Value) -> str:
@@ -77,7 +77,7 @@ PURE: dict[str, Builtin] = {name: getattr(math, name) for name in _MATHEMATICS} 
     "pose_inv": lambda p_from: pose_of(invert(rigid(p_from))),
     "pose_add": _pose_add,
     "pose_sub": partial(_pose_add, sign=-1.0),
-    "pose_dist": lambda p_from, p_to: math.dist(place(rigid(p_from)), place(rigid(p_to))),
+    "pose_dist": lambda p_from, p_to: math.dist(position(rigid(p_from)), position(rigid(p_to))),
 }
 
 
@@ -85,24 +85,11 @@ PURE: dict[str, Builtin] = {name: getattr(math, name) for name in _MATHEMATICS} 
 
 
 def _registers(robot: ControllerState) -> dict[str, Builtin]:
-    """`read_input_…_register`, `read_output_…` and `write_output_…` for integers, floats and booleans."""
-
     def name(side: str, kind: str, address: int) -> str:
         found = f"{side}_{kind}_register_{address}"
         if found not in robot.outputs.types:
             raise ScriptRuntimeError(f"there is no {found}")
         return found
-
-    def bits(side: str, address: int) -> tuple[str, int]:
-        """The variable, and the bit in it."""
-        if 0 <= address < 64:
-            return f"{side}_bit_registers{'0_to_31' if address < 32 else '32_to_63'}", address % 32
-        return name(side, "bit", address), 0
-
-    def write_bit(address: int, value: bool) -> None:
-        variable, bit = bits("output", address)
-        others = int(robot.outputs.get(variable)) & ~(1 << bit)
-        robot.outputs.set(variable, others | bool(value) << bit)
 
     def write_integer(address: int, value: int) -> None:
         if type(value) is not int or not -(2**31) <= value < 2**31:
@@ -112,48 +99,23 @@ def _registers(robot: ControllerState) -> dict[str, Builtin]:
     def write_float(address: int, value: float) -> None:
         robot.outputs.set(name("output", "double", address), float(value))
 
-    def read(side: str) -> dict[str, Builtin]:
-        store = robot.inputs if side == "input" else robot.outputs
-
-        def boolean(address: int) -> bool:
-            variable, bit = bits(side, address)
-            return bool(int(robot.outputs.get(variable)) >> bit & 1)
-
-        return {
-            f"read_{side}_boolean_register": boolean,
-            f"read_{side}_integer_register": lambda address: int(store.get(name(side, "int", address))),
-            f"read_{side}_float_register": lambda address: float(store.get(name(side, "double", address))),
-        }
-
     return {
-        "write_output_boolean_register": write_bit,
+        "read_input_integer_register": lambda address: int(robot.inputs.get(name("input", "int", address))),
+        "read_input_float_register": lambda address: robot.inputs.get(name("input", "double", address)),
         "write_output_integer_register": write_integer,
         "write_output_float_register": write_float,
-        **read("input"),
-        **read("output"),
     }
 
 
 def _digital(robot: ControllerState) -> dict[str, Builtin]:
-    def place_of(bank: str, number: int) -> int:
-        first, count = DIGITAL_BANKS[bank]
-        if not 0 <= number < count:
-            raise ScriptRuntimeError(f"there is no {bank} digital {number}")
-        return first + number
-
-    def read(side: str, bank: str, n: int) -> bool:
-        return bool(int(robot.outputs.get(f"actual_digital_{side}_bits")) >> place_of(bank, n) & 1)
-
     def write(bank: str, n: int, b: bool) -> None:
-        bit = place_of(bank, n)
-        robot.set_digital_outputs(1 << bit, bool(b) << bit)
+        first, count = DIGITAL_BANKS[bank]
+        if not 0 <= n < count:
+            raise ScriptRuntimeError(f"there is no {bank} digital output {n}")
+        robot.set_digital_outputs(1 << first + n, bool(b) << first + n)
 
-    found: dict[str, Builtin] = {"set_digital_out": partial(write, "standard")}
-    for bank in DIGITAL_BANKS:
-        found[f"set_{bank}_digital_out"] = partial(write, bank)
-        found[f"get_{bank}_digital_out"] = partial(read, "output", bank)
-        found[f"get_{bank}_digital_in"] = partial(read, "input", bank)
-    return found
+    banks = {"set_digital_out": "standard"} | {f"set_{bank}_digital_out": bank for bank in DIGITAL_BANKS}
+    return {name: partial(write, bank) for name, bank in banks.items()}
 
 
 # -- the robot's state ----------------------------------------------------------------------------------

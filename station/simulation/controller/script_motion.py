@@ -20,6 +20,9 @@ from station.simulation.controller.kinematics import (
     from_rotvec,
     inverse_nearest,
     invert,
+    moved_to,
+    plus,
+    position,
     to_pose,
 )
 from station.simulation.controller.paths import JointPath, LinePath, Path, UnreachableError
@@ -217,14 +220,13 @@ class _ToolSpeed:
 
     def joint_speeds(self, joints: Vector, dt_s: float) -> Vector:
         """Raises UnreachableError."""
-        place = self._at(joints)
+        tool = self._at(joints)
         change = max(abs(g - x) for g, x in zip(self.goal, self.twist, strict=True))
         most = self._acceleration * dt_s
         share = most / change if change > most else 1.0
         self.twist = self.goal if share == 1.0 else between(self.twist, self.goal, share)
         x, y, z, *turn = (v * dt_s for v in self.twist)
-        moved = compose(from_rotvec(*turn), place)
-        goes = (*moved[:3], place[3] + x, *moved[4:7], place[7] + y, *moved[8:11], place[11] + z)
+        goes = moved_to(compose(from_rotvec(*turn), tool), plus(position(tool), (x, y, z)))
         solved = inverse_nearest(self._table, compose(goes, invert(self._flange_from_tcp)), joints)
         if solved is None:
             raise UnreachableError("the tool's way leaves the arm's reach")

@@ -23,9 +23,9 @@ from station.devices.ur_script import (
     State,
     script,
 )
-from station.simulation.controller.programs import Upload
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
+from station.simulation.controller.uploads import Upload
 from station.simulation.controller.urscript import ScriptRun
 from station.simulation.controller.urscript_parser import ScriptSyntaxError
 from station.simulation.launch import AdminClient, SimulatedController

@@ -7,8 +7,8 @@ import pytest
 from recordings.schema.messages import RobotState, Stamps
 from station.cell.arm_acceptance import ArmSubject, Figure, StopTestMove, StopWay
 from station.operate.stop_judge import judge
-from station.simulation.controller.programs import Upload
 from station.simulation.controller.state import Journal, Settings
+from station.simulation.controller.uploads import Upload
 from tests.weak_controller import WEAKNESSES, WeakRobot, weak
 
 START = (0.3, -1.6, 1.9, -1.9, -1.57, 0.0)

@@ -22,9 +22,9 @@ from station.devices.rtde import (
     packet,
     split_names,
 )
-from station.simulation.controller.programs import UploadReader
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
+from station.simulation.controller.uploads import UploadReader
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from tests.patience import PATIENCE_S
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.simulation.controller.programs import LIMIT, UploadReader
+from station.simulation.controller.uploads import LIMIT, UploadReader
 
 SCRIPT = """def rtde_control():
   global reg_offset_float = # float register offset

@@ -75,32 +75,24 @@ def _advice(advice: str, width: int) -> str:
     return f". {advice}" if advice and len(advice) < width - 36 else ""
 
 
-_HEAT = ("$dim on $h0", "$foreground on $h1", "$strong on $h2", "$onaccent on $h3", "$onaccent on $h4")
+_HEAT = ("$foreground on $h1", "$strong on $h2", "$onaccent on $h3", "$onaccent on $h4")
 
 
 def coverage_lines(known: Known, width: int, height: int) -> Content:
     """Draw the image as a grid: in how many images each part showed the board."""
-    status = known.shown
-    views = status.estimate.image_views
+    views = known.shown.estimate.image_views
     if not views:
         return dim("no image of the board yet")
-    columns = len(views[0])
-    cell = max(3, min(9, (width - 2) // columns - 1))
-    most = max(1, max(max(row) for row in views))
-    tall = 2 if height >= 2 * len(views) + 1 else 1
-    rows: list[Content] = []
-    for row in views:
-        words = [("empty" if cell > 5 else "--") if not count else str(count) for count in row]
-        heat = [0 if not count else 1 + min(3, 4 * count // (most + 1)) for count in row]
-        shown = [
-            Content.styled(word.center(cell), _HEAT[h] if h else "$warn on $h0")
-            for word, h in zip(words, heat, strict=True)
-        ]
-        rows.append(Content(" ").join(shown))
-        if tall == 2:
-            rows.append(Content(" ").join(Content.styled(" " * cell, _HEAT[h]) for h in heat))
-    if len(rows) < height:
-        empty = sum(not count for row in views for count in row)
-        said = f"{empty} of {len(views) * columns} parts empty"
-        rows.append(mark("look", said) if empty else mark("done", "the board was seen in every part"))
+    cell = max(3, min(9, (width - 2) // len(views[0]) - 1))
+    counts = [count for row in views for count in row]
+
+    def part(count: int) -> Content:
+        if not count:
+            return Content.styled("--".center(cell), "$warn on $h0")
+        return Content.styled(str(count).center(cell), _HEAT[min(3, 4 * count // (max(counts) + 1))])
+
+    rows = [Content(" ").join(map(part, row)) for row in views]
+    empty = counts.count(0)
+    said = f"{empty} of {len(counts)} parts empty"
+    rows.append(mark("look", said) if empty else mark("done", "the board was seen in every part"))
     return lines(*rows[:height])

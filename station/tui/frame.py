@@ -134,19 +134,12 @@ def _bar_parts(known: Known, title: str) -> Iterator[Content]:
         yield Content.styled(" ▲ NO DAEMON ", "bold $onstop on $stop")
         yield dim("  to stop the arm use the pendant")
         return
-    if status.playback:
-        chip, style = state_of(status)
-        yield Content.styled(" PLAYBACK, no live arm ", "bold $sim on $simbg")
-        yield dim(f" {chip} ")
-        if status.simulated:
-            yield Content.styled(" SIMULATED ", "bold $sim on $simbg")
-        yield dim(f"  {status.robot.model}")
-        return
     chip, style = state_of(status)
-    yield Content.styled(f" {chip} ", style)
+    playback = Content.styled(" PLAYBACK, no live arm ", "bold $sim on $simbg")
+    yield playback + dim(f" {chip} ") if status.playback else Content.styled(f" {chip} ", style)
     if status.simulated:
         yield Content.styled(" SIMULATED ", "bold $sim on $simbg")
-    yield from _robot_parts(status)
+    yield from [dim(f"  {status.robot.model}")] if status.playback else _robot_parts(status)
 
 
 def _robot_parts(status: StationStatus) -> Iterator[Content]:

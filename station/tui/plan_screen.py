@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from typing import ClassVar, Literal
 
 from textual.app import ComposeResult
@@ -11,17 +10,16 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
 
-from station.cell.layout import CellLayout
 from station.cell.status import PoseStatus, StationStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import MakePlan, Retake, Skip
 from station.tui.frame import Line
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw, view_of
-from station.tui.words import MARKS, UNKNOWN, Mark, degrees, dim, facts, limit_bar, lines, many, mark, mm
+from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
+from station.tui.words import MARKS, UNKNOWN, Mark, dim, facts, limit_bar, lines, many, mark
 
-COLUMNS = ("#", "error after", "", "distance", "tilt", "state", "reason")
+COLUMNS = ("#", "error after", "", "state", "reason")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves)."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
@@ -31,9 +29,6 @@ POSE_VERBS = {"retake": Retake, "skip": Skip}
 SIGMA_SHOWN_MM = 100.0
 """Larger errors are not shown: after the first poses they are metres, which say nothing."""
 BAR_CELLS = 7
-TURN_DEG = 15.0
-_SEEN = re.compile(r"^\d+ mm, tilt \d+°, |board ")
-"""Part of a reason that other columns show already."""
 _STATES: dict[str, tuple[Mark, str]] = {
     "planned": ("todo", "planned"),
     "done": ("done", "saved"),
@@ -42,32 +37,26 @@ _STATES: dict[str, tuple[Mark, str]] = {
 }
 
 
-def row_of(pose: PoseStatus, goal_mm: float, scene: CellLayout | None) -> tuple[Content, ...]:
+def row_of(pose: PoseStatus, goal_mm: float) -> tuple[Content, ...]:
     """Make a row of the table."""
     sigma_mm = pose.estimated_sigma_mm or pose.predicted_sigma_mm
-    shown = sigma_mm is not None and sigma_mm <= SIGMA_SHOWN_MM
-    view = None if scene is None else view_of(scene, pose)
+    shown = f"{sigma_mm:7.2f}" if sigma_mm and sigma_mm <= SIGMA_SHOWN_MM else f"{UNKNOWN:>7}"
     kind, word = _STATES.get(pose.state, ("now", pose.state))
-    state = f"{word}: {pose.reason}" if pose.state == "failed" and pose.reason else word
-    kind = "look" if pose.kept else kind
+    if pose.kept:
+        kind, word = "look", "to be captured again"
+    elif pose.state == "failed" and pose.reason:
+        word = f"failed: {pose.reason}"
     bar = Content()
-    if sigma_mm:
-        colour = "$ok" if sigma_mm <= goal_mm else "$warn"
-        bar = limit_bar(_log(sigma_mm, goal_mm), 1.0, BAR_CELLS, colour, 0.5)
+    if sigma_mm:  # 1 at the goal, 0 at a tenth of it, 2 at ten times as much
+        reach = max(0.05, 1 + math.log10(max(sigma_mm, 1e-6) / goal_mm))
+        bar = limit_bar(reach, 1.0, BAR_CELLS, "$ok" if sigma_mm <= goal_mm else "$warn", 0.5)
     return (
         Content.styled(f"{pose.index + 1:>3} ", "$foreground") + mark(kind),
-        facts(("", f"{sigma_mm:7.2f}" if shown else f"{UNKNOWN:>7}", "mm")),
+        facts(("", shown, "mm")),
         bar,
-        Content.styled(mm(view[0], 0) if view else UNKNOWN, "$foreground"),
-        Content.styled(f"{degrees(view[1], 0):>4}" if view else UNKNOWN, "$foreground"),
-        Content.styled("to be captured again" if pose.kept else state, MARKS[kind][1]),
-        Content.styled(_SEEN.sub("", pose.why) if view else pose.why or pose.name, "$foreground"),
+        Content.styled(word, MARKS[kind][1]),
+        Content.styled(pose.why or pose.name, "$foreground"),
     )
-
-
-def _log(sigma_mm: float, goal_mm: float) -> float:
-    """Scale an error for its bar: 1 at the goal, 0 at a tenth of it, 2 at ten times as much."""
-    return max(0.05, 1 + math.log10(max(sigma_mm, 1e-6) / goal_mm))
 
 
 def facts_line(status: StationStatus) -> Content:
@@ -85,16 +74,13 @@ def facts_line(status: StationStatus) -> Content:
     return line + dim(f"   {many(left_out, 'pose')} skipped" * bool(left_out))
 
 
-def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: CellLayout | None) -> Content:
-    """Describe one pose: its reason, gain, view of the board, and what went wrong."""
-    view = None if scene is None else view_of(scene, pose)
-    seen = "" if pose.corners is None else f"{many(pose.corners, 'corner')} in attempt {pose.attempt}"
+def detail_of(pose: PoseStatus, before: PoseStatus | None) -> Content:
+    """Describe one pose: its reason, what it brings, and what went wrong."""
     rows = [Content.assemble((f"{pose.name}  ", "bold $strong"), pose.why or "added by hand")]
     gains = [p.predicted_sigma_mm for p in (before, pose) if p is not None and p.predicted_sigma_mm]
     if len(gains) == 2 and max(gains) <= SIGMA_SHOWN_MM:
         rows.append(facts(("brings", f"± {gains[0]:.2f} → ± {gains[1]:.2f}", "mm")))
-    if view is not None:
-        rows.append(facts(("board", mm(view[0], 0), "away"), ("tilted", degrees(view[1], 0), "")))
+    seen = "" if pose.corners is None else f"{many(pose.corners, 'corner')} in attempt {pose.attempt}"
     if pose.reason or seen:
         kind: Mark = "failed" if pose.state == "failed" else "look" if pose.reason else "done"
         rows.append(mark(kind, ". ".join(words for words in (pose.reason, seen) if words)))
@@ -115,13 +101,7 @@ class PlanScreen(StationScreen):
         Binding("m", "make('both')", "New+arm", tooltip=NEW_FOR_ARM),
         Binding("r", "pose('retake')", "Retake", tooltip=RETAKE),
         Binding("s", "pose('skip')", "Skip", tooltip=SKIP),
-        Binding("left_square_bracket", "turn(-1)", "Turn", show=False, tooltip="Turn the view of the cell"),
-        Binding("right_square_bracket", "turn(1)", "Turn", show=False, tooltip="Turn it the other way"),
     ]
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._turn_deg = -60.0
 
     def body(self) -> ComposeResult:
         yield Line(lambda known, _: facts_line(known.shown), id="plan-facts")
@@ -130,49 +110,36 @@ class PlanScreen(StationScreen):
                 with Box("Poses", id="plan-poses"):
                     yield Rows(*COLUMNS, id="plan-table")
                 yield Panel("Why", self._why, id="plan-detail")
-            with Vertical(id="plan-right"):
-                yield Panel("The cell", self._cell, id="plan-cell", below=LEGEND)
+            yield Panel("The cell", self._cell, id="plan-cell", below=LEGEND)
 
     def show(self, known: Known) -> None:
         super().show(known)
         if (status := known.status) is None:
             return
-        poses, goal_mm = status.session.poses, status.estimate.goal_mm or 0.5
-        scene = cell_scene(known.configuration, status)
+        goal_mm = status.estimate.goal_mm or 0.5
         self.query_one("#plan-facts", Line).show(known)
-        self.table.show([row_of(pose, goal_mm, scene) for pose in poses])
+        self.table.show([row_of(pose, goal_mm) for pose in status.session.poses])
         self.draw_panels(known)
 
     def _why(self, known: Known, width: int, height: int) -> Content:
-        status = known.shown
-        poses, line = status.session.poses, self.table.cursor_row
+        poses, line = known.shown.session.poses, self.table.cursor_row
         if not line < len(poses):
             return dim(NO_PLAN)
-        before = poses[line - 1] if line else None
-        return detail_of(poses[line], before, cell_scene(known.configuration, status))
+        return detail_of(poses[line], poses[line - 1] if line else None)
 
     def _cell(self, known: Known, width: int, height: int) -> Content:
-        status = known.shown
-        scene = cell_scene(known.configuration, status)
+        scene = cell_scene(known.configuration, known.shown)
         if scene is None:
             return dim("To draw the cell, the configuration needs initial camera and board poses.")
-        chosen = self.table.cursor_row if status.session.poses else None
-        return draw(scene, status, chosen, width, height, turn_deg=self._turn_deg)
+        chosen = self.table.cursor_row if known.shown.session.poses else None
+        return draw(scene, known.shown, chosen, width, height)
 
-    def action_turn(self, by: int) -> None:
-        self._turn_deg += by * TURN_DEG
-        self.draw_panels(self.known)
-
-    def _selected(self) -> int | None:
+    def action_pose(self, verb: str) -> None:
         status = self.known.live
         if status is None or not status.session.poses:
             self.notify("No plan is loaded: n makes one, or `station plan` in a shell.", severity="warning")
-            return None
-        return status.session.poses[self.table.cursor_row].index
-
-    def action_pose(self, verb: str) -> None:
-        if (index := self._selected()) is not None:
-            self.ask(POSE_VERBS[verb](index))
+        else:
+            self.ask(POSE_VERBS[verb](status.session.poses[self.table.cursor_row].index))
 
     def action_make(self, aim: Literal["camera", "both"]) -> None:
         self.ask(MakePlan(25, seed=1, aim=aim), PREPARE_S)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
+from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Container, Vertical
 from textual.content import Content
-from textual.coordinate import Coordinate
 from textual.reactive import reactive
 from textual.widgets import DataTable, Footer
 
@@ -64,25 +64,17 @@ class Rows(DataTable[object]):
     def __init__(self, *columns: str, id: str) -> None:
         super().__init__(id=id, cursor_type="row")
         self.add_columns(*columns)
-        self._cells: Sequence[tuple[Content, ...]] = ()
-        self._variables: dict[str, str] = {}
+        self._texts: list[list[Text]] = []
 
     def show(self, cells: Sequence[tuple[Content, ...]]) -> None:
-        """Draw these rows; of as many as before only cells that differ. The cursor stays on its line."""
-        variables = self.app.theme_variables
-        if len(cells) == len(self._cells) and variables == self._variables:
-            for line, (row, before) in enumerate(zip(cells, self._cells, strict=True)):
-                for column, (cell, was) in enumerate(zip(row, before, strict=True)):
-                    if not cell.is_same(was):
-                        text = rich_text(cell, variables)
-                        self.update_cell_at(Coordinate(line, column), text, update_width=True)
-        else:
-            at = self.cursor_row
-            self.clear()
-            for row in cells:
-                self.add_row(*(rich_text(cell, variables) for cell in row))
-            self.move_cursor(row=at)
-        self._cells, self._variables = cells, variables
+        """Draw these rows, unless they stand there. The cursor stays on its line."""
+        texts = [[rich_text(cell, self.app.theme_variables) for cell in row] for row in cells]
+        if texts == self._texts:
+            return
+        at, self._texts = self.cursor_row, texts
+        self.clear()
+        self.add_rows(texts)
+        self.move_cursor(row=at)
 
 
 class StationScreen(Framed[None]):

@@ -19,8 +19,8 @@ from station.tui.capture_panels import coverage_lines, error_lines
 from station.tui.progress import chips, counted_line, pose_line
 from station.tui.stopped import stopped_text
 from station.tui.task import Known
-from station.tui.widgets.canvas import Canvas, Series, curve
-from station.tui.widgets.cell_drawing import draw, view_of
+from station.tui.widgets.canvas import Series, curve
+from station.tui.widgets.cell_drawing import draw
 from station.tui.words import limit_bar
 from tests.recordings.small_recording import make_state
 from tests.tui.conftest import CELL, FakeLink, idle, opened, until
@@ -128,11 +128,6 @@ def test_the_parts_of_the_image_without_the_board_are_counted() -> None:
         assert said in coverage_lines(known, 60, 12).plain
 
 
-def test_distance_and_tilt_of_the_board_are_those_that_a_pose_sees() -> None:
-    view = view_of(layout_of(CELL), seeing(0.6, 0.0))
-    assert view is not None and 0.3 < view[0] < 0.7 and view[1] < 0.01
-
-
 @pytest.mark.parametrize("term", ["xterm-256color", "linux"])
 def test_the_scene_shows_arm_board_and_table(term: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", term)
@@ -144,16 +139,6 @@ def test_the_scene_shows_arm_board_and_table(term: str, monkeypatch: pytest.Monk
     signs = {letter for letter in drawn if ord(letter) > 0x2500}
     assert all(letter in "▀▄█" for letter in signs) is (term == "linux")
     assert len(signs) > 2
-
-
-def test_a_letter_has_the_colour_of_its_highest_rank() -> None:
-    canvas = Canvas(2, 1)
-    canvas.points(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 0.0]]), 1)
-    canvas.points(np.array([[0.0, 3.0], [-5.0, 0.0], [99.0, 0.0]]), 2)
-    assert [(span.start, str(span.style)) for span in canvas.content(["red", "blue"]).spans] == [
-        (0, "blue"),
-        (1, "red"),
-    ]
 
 
 @pytest.mark.parametrize(("value", "reach"), [(0.0, 0), (0.5, 5), (1.0, 10), (9.0, 19)])

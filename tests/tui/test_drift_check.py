@@ -12,7 +12,6 @@ from textual.pilot import Pilot
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
 from calibrate.quality.drift_history import CheckEntry, append_check
-from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
 from station.operate.drift_check import POSES, SEED
@@ -85,43 +84,6 @@ async def test_nothing_is_planned_where_nothing_is_installed(link: FakeLink, tmp
         assert link.verbs == []
 
 
-async def test_what_the_daemon_refuses_is_said(link: FakeLink, installed: Path) -> None:
-    link.refuse["make_plan"] = refused = RefusedError("session-open")
-    app = app_on(link)
-    async with app.run_test(size=(80, 24), notifications=True) as pilot:
-        await ask_for_it(pilot)
-        await until(pilot, lambda: said(app, str(refused)))
-        assert "prepare" not in link.verbs and not app.known.busy
-
-
-async def test_a_no_leaves_arm_and_plan_as_they_were(link: FakeLink, installed: Path) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await ask_for_it(pilot)
-        await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
-        assert "Change    replaces the loaded plan of 3 poses" in text_of(pilot.app, "#confirm-body")
-        await pilot.press("escape")
-        await until(pilot, lambda: link.verbs[-1] == "load_plan")
-        assert verbs.LoadPlan(LOADED) in link.asked
-        assert "go" not in link.verbs
-
-
-async def test_a_plan_that_was_used_is_not_missed(link: FakeLink, installed: Path) -> None:
-    status = idle()
-    poses = (msgspec.structs.replace(status.session.poses[0], attempt=1), *status.session.poses[1:])
-    link.show(msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, poses=poses)))
-    app = app_on(link)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: app.known.status is not None and app.known.status.session.poses == poses)
-        await ask_for_it(pilot)
-        await until(pilot, lambda: app.screen.query("#confirm-body"))
-        assert "plan" not in link.verbs
-        assert "Change" not in text_of(app, "#confirm-body")
-        await pilot.press("escape")
-        await until(pilot, lambda: not isinstance(app.screen, ConfirmMotion))
-        await pilot.pause()
-        assert "load_plan" not in link.verbs
-
-
 async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, installed: Path) -> None:
     recording = str(installed / "root/sessions/s-2/session.mcap")
     app = app_on(link)
@@ -143,20 +105,6 @@ async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, in
         asked = json.loads((installed / "asked").read_text())
         assert asked == ["drift-check", recording, "--root", str(installed / "root")]
         await until(pilot, lambda: any("holds" in line for line in app.screen.said))  # type: ignore[attr-defined]
-
-
-async def test_another_plan_ends_it_without_a_verdict(link: FakeLink, installed: Path) -> None:
-    app = app_on(link)
-    async with app.run_test(size=(80, 24), notifications=True) as pilot:
-        await ask_for_it(pilot)
-        await until(pilot, lambda: isinstance(app.screen, ConfirmMotion))
-        await pilot.press("tab", "enter")
-        link.show(check_session(installed))
-        await until(pilot, lambda: app.known.status == check_session(installed))
-        await pilot.pause(0.3)
-        link.show(idle())
-        await until(pilot, lambda: said(app, "no verdict"))
-        assert not (installed / "asked").exists()
 
 
 async def test_planning_it_is_said_on_every_screen(tmp_path: Path) -> None:

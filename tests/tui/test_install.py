@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 from pathlib import Path
 
 import msgspec
@@ -21,7 +20,7 @@ from calibrate.files.validity import Validity, ValidityReason, ValidityState
 from calibrate.files.versions import installed_versions, note_installed
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.tui.dialogs import Confirm, Reason
-from station.tui.installed import Installed, Result, local
+from station.tui.installed import Installed, Result
 from station.tui.result import evidence, verdict_lines
 from station.tui.task import next_action
 from tests.station.calibrated_cell import calibration_of
@@ -186,17 +185,6 @@ async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready
         told = text_of(pilot.app, "#verdict")
         assert "PASS WITH A REASON, installs only with a reason" in told
         assert "Regression" in told
-
-
-def test_times_are_the_wall_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TZ", "UTC-2")
-    time.tzset()
-    try:
-        assert local("2026-01-31T23:30:00+00:00") == "2026-02-01 01:30"
-        assert local("some time ago") == "some time ago"
-    finally:
-        monkeypatch.undo()
-        time.tzset()
 
 
 def test_a_calibration_that_no_longer_holds_says_so_where_it_said_installed() -> None:

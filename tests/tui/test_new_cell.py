@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +20,6 @@ from station.cell.layout import guess_matrix
 from station.operate.draft import CellStep, load_draft
 from station.simulation.cells import make_cell
 from station.simulation.launch import SimulatedController, start_controller
-from station.simulation.netns import isolated_command
 from station.simulation.truth import CellTruth, write_truth
 from station.tui.new_cell import NewCell
 from tests.conftest import check_allow_list
@@ -31,7 +27,7 @@ from tests.station.operate.guided_views import guided_joints
 from tests.tui.new_cell_rig import SimulatedHardware
 
 pytestmark = pytest.mark.process
-PATIENCE_S = 120.0
+PATIENCE_S = 60.0
 
 
 def other_cell() -> CellTruth:
@@ -82,7 +78,6 @@ class Operator:
         await asyncio.to_thread(lead)
 
 
-@pytest.mark.soak
 async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
     truth = other_cell()
     write_truth(truth, tmp_path / "truth.json")
@@ -134,21 +129,5 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
         off = difference(guess_matrix(guess), np.array(true))
         assert np.linalg.norm(off[:3]) < 3 * guess.sigma_m and np.linalg.norm(off[3:]) < 3 * guess.sigma_rad
     assert b"# " in content
-    assert person.keys <= 40
+    assert person.keys <= 30
     assert load_draft(tmp_path).written
-
-
-@pytest.mark.soak
-@pytest.mark.gige
-@pytest.mark.timeout(1800)
-def test_from_an_empty_home_to_an_installed_calibration(tmp_path: Path) -> None:
-    """By keys alone, with the real drivers; needs Aravis."""
-    pytest.importorskip("gi")
-    command = isolated_command([sys.executable, "-m", "tests.tui.whole_cell", str(tmp_path / "cell")])
-    done = subprocess.run(command, capture_output=True, text=True, timeout=1800)
-    assert done.returncode == 0, done.stdout + done.stderr
-    told = json.loads(done.stdout.splitlines()[-1])
-    print(told)
-    assert told["keys"] <= 40 and told["minutes"] <= 10
-    assert told["off_m"] < 3 * told["sigma_m"]
-    assert told["chi2"] < 22.5  # the 99.9 % quantile with 6 degrees of freedom

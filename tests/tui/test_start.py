@@ -56,13 +56,6 @@ async def test_what_was_missing_is_looked_for_on_every_screen(
         assert isinstance(pilot.app.screen, CaptureScreen)
 
 
-async def test_later_the_live_screen_comes_first(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
-        await pilot.pause()
-        assert isinstance(pilot.app.screen, CaptureScreen)
-
-
 async def test_a_key_that_can_do_nothing_says_why(link: FakeLink, tmp_path: Path) -> None:
     reasons = [
         ("3", "f7", "no session is running"),

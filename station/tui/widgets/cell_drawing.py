@@ -15,15 +15,15 @@ from station.cell.collision import body_segments
 from station.cell.config import StationConfig
 from station.cell.errors import StationError
 from station.cell.layout import CellLayout, board_extent, frustum, layout_of
-from station.cell.status import PoseStatus, StationStatus
+from station.cell.status import StationStatus
 from station.tui.widgets.canvas import Canvas
 
 STYLES = ("$line", "$bad", "$accent", "$ok", "$strong", "bold $strong", "bold $warn")
 FLOOR, KEEP_OUT, PLANNED, SAVED, ARM, BOARD, CHOSEN = range(1, 8)
 """Ranks on the canvas: the higher is drawn over the lower."""
 LEGEND = "saved green  planned blue  chosen amber  keep-out red"
-_LIFT_DEG = 22.0
-"""Height of the eye above the floor."""
+_TURN_DEG, _LIFT_DEG = -60.0, 22.0
+"""Direction of view about the base's z axis, and height of the eye above the floor."""
 _SHORT_M = 0.07
 """Length of a frustum that is not the chosen one."""
 
@@ -46,16 +46,6 @@ def cell_scene(config: StationConfig | None, status: StationStatus) -> CellLayou
     return replace(scene, X=np.array(estimate.camera_pose), Y=np.array(estimate.board_pose))
 
 
-def view_of(scene: CellLayout, pose: PoseStatus) -> tuple[float, float] | None:
-    """Return distance (m) and tilt (rad) of the board, seen from this pose."""
-    if pose.base_from_flange is None:
-        return None
-    seen = scene.camera_from_board(np.array(pose.base_from_flange))
-    low, high = board_extent(scene.board)
-    middle = transform_points(seen, np.array([[*(low + high) / 2, 0.0]]))[0]
-    return float(np.linalg.norm(middle)), float(np.arccos(min(1.0, abs(seen[2, 2]))))
-
-
 def _board_corners(scene: CellLayout) -> Array:
     low, high = board_extent(scene.board)
     return np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
@@ -67,15 +57,10 @@ def draw(
     chosen: int | None,
     width: int,
     height: int,
-    *,
-    turn_deg: float = -60.0,
 ) -> Content:
-    """Draw the cell. `chosen`: place in `session.poses`.
-
-    `turn_deg`: direction of view, about the base's z axis.
-    """
+    """Draw the cell. `chosen`: place in `session.poses`."""
     canvas = Canvas(width, height)
-    turn, lift = np.radians([turn_deg, _LIFT_DEG])
+    turn, lift = np.radians([_TURN_DEG, _LIFT_DEG])
     right = np.array([-np.sin(turn), np.cos(turn), 0.0])
     up = np.array([-np.cos(turn) * np.sin(lift), -np.sin(turn) * np.sin(lift), np.cos(lift)])
     poses = [(i, p) for i, p in enumerate(status.session.poses) if p.base_from_flange is not None]

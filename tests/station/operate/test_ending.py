@@ -11,7 +11,7 @@ from calibrate.quality.drift_history import CheckEntry
 from calibrate.results import Gate
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.status import PoseStatus, SessionStatus
-from station.operate.ending import Way, after_capture, after_drift_check, after_solve, after_touches
+from station.operate.ending import Way, after_capture, after_drift_check, after_solve
 from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
 
@@ -47,12 +47,6 @@ def test_a_solve(calibration: Calibration, objections: tuple[str, ...], way: Way
 def test_a_retake_names_the_view_as_screens_count() -> None:
     assert "view 7" in after_solve(failed("weight", rejected=(REJECTED,))).text
     assert "mend coverage" in after_solve(failed("coverage", rejected=(REJECTED,))).text
-
-
-def test_a_touch_test() -> None:
-    assert after_touches([HIT]).way is Way.INSTALL
-    end = after_touches([HIT, MISS])
-    assert end.way is Way.LOOK_FOR and "9.0 mm" in end.text
 
 
 def test_a_capture() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -78,44 +77,14 @@ def session_metadata(info: SessionInfo | None = None, file_format: str = FORMATS
     return metadata("session", with_crc({"format": file_format, "session": described}))
 
 
-@dataclass
-class Counts:
-    """Content of the statistics record."""
-
-    messages: int = 0
-    schemas: int = 0
-    channels: int = 0
-    attachments: int = 0
-    metadata: int = 1
-    chunks: int = 0
-    per_channel: dict[int, int] = field(default_factory=dict)
-
-    def record(self) -> bytes:
-        time_ns = 5 if self.messages else 0
-        fixed = struct.pack(
-            "<QHIIIIQQ",
-            self.messages,
-            self.schemas,
-            self.channels,
-            self.attachments,
-            self.metadata,
-            self.chunks,
-            time_ns,
-            time_ns,
-        )
-        pairs = b"".join(struct.pack("<HQ", *pair) for pair in self.per_channel.items())
-        return record(Opcode.STATISTICS, fixed + text(pairs))
-
-
-def sealed(data: bytes, counts: Counts, declarations: bytes = b"", profile: str = "") -> bytes:
+def sealed(data: bytes, declarations: bytes = b"", profile: str = "") -> bytes:
     """A whole file with right checksums around these records; `declarations` are repeated in the summary."""
     start = MAGIC + record(Opcode.HEADER, text(profile) + text("crafted")) + data
     end = record(Opcode.DATA_END, struct.pack("<I", zlib.crc32(start)))
     summary_start = len(start) + len(end)
-    summary = declarations + counts.record()
     footer_head = struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, 0)
-    crc = zlib.crc32(footer_head, zlib.crc32(summary))
-    return start + end + summary + footer_head + struct.pack("<I", crc) + MAGIC
+    crc = zlib.crc32(footer_head, zlib.crc32(declarations))
+    return start + end + declarations + footer_head + struct.pack("<I", crc) + MAGIC
 
 
 def write(tmp_path: Path, content: bytes) -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -205,37 +204,3 @@ def test_the_time_between_two_parts_is_no_gap(tmp_path: Path) -> None:
 def test_unknown_options_and_no_arguments_are_usage_errors() -> None:
     assert run("info").returncode == 2
     assert run("export", "a", "--to", "bag", "-o", "b").returncode == 2
-
-
-STATES = 200_000
-LIMIT_MIB = 128
-# VmHWM: rusage would count what the parent had before exec.
-_PROGRAM = """
-import json, re, sys
-from pathlib import Path
-from recordings.info import recording_info
-from recordings.reader import open_recording
-facts = recording_info(open_recording(Path(sys.argv[1])))
-peak_kib = re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]
-print(json.dumps([facts.robot_states.count, int(peak_kib) / 1024]))
-"""
-
-
-def test_the_memory_of_info_does_not_grow_with_the_robot_states(tmp_path: Path) -> None:
-    state = make_state(0)
-    with RecordingWriter(tmp_path / "long.mcap", make_info()) as writer:
-        for count in range(STATES):
-            now_ns = count * 2_000_000
-            stamps = Stamps(now_ns + 7_000_000_000, START_NS + now_ns, 50 + count * 0.002)
-            writer.robot_state(msgspec.structs.replace(state, stamps=stamps))
-        path = writer.finish()
-    done = subprocess.run(
-        [sys.executable, "-c", _PROGRAM, str(path)],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=Path(__file__).parents[2],
-    )
-    count, peak_mib = json.loads(done.stdout)
-    assert count == STATES
-    assert peak_mib < LIMIT_MIB

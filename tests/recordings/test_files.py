@@ -48,23 +48,11 @@ def test_content_name_and_folder_reach_the_disk_in_this_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After a power loss there is the whole file under its name, or the `.part` file; nothing between."""
-    order: list[str] = []
-    real_sync, real_rename = os.fsync, Path.rename
-
-    def fsync(descriptor: int) -> None:
-        order.append(f"sync {Path(f'/proc/self/fd/{descriptor}').readlink().name}")
-        real_sync(descriptor)
-
-    def rename(source: Path, target: Path) -> Path:
-        order.append(f"rename {target.name}")
-        return real_rename(source, target)
-
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.image(make_picture(0))
-        monkeypatch.setattr(os, "fsync", fsync)
-        monkeypatch.setattr(Path, "rename", rename)
-        writer.finish()
-    assert order == ["sync a.mcap.part", "rename a.mcap", f"sync {tmp_path.name}"]
+        with disk_order(monkeypatch) as order:
+            writer.finish()
+    assert order == ["sync a.mcap.part", "rename a.mcap.part a.mcap", f"sync {tmp_path.name}"]
 
 
 def test_an_unfinished_file_names_recover(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from recordings.schema.definitions import PictureFacts, encode
 from recordings.schema.messages import CameraModel
 from recordings.schema.topics import Topic
 from recordings.writer import RecordingWriter
-from tests.recordings.crafted import Counts, channel, chunk, message, schema, sealed, session_metadata, write
+from tests.recordings.crafted import channel, chunk, message, schema, sealed, session_metadata, write
 from tests.recordings.small_recording import (
     HEIGHT,
     WIDTH,
@@ -43,8 +43,7 @@ def picture_file(tmp_path: Path, image: object, topic: Topic, **facts: object) -
         + message(2, image.SerializeToString())  # type: ignore[attr-defined]
         + message(3, encode(make_view(0)))
     )
-    counts = Counts(messages=3, schemas=3, channels=3, chunks=1, per_channel={1: 1, 2: 1, 3: 1})
-    return write(tmp_path, sealed(session_metadata() + data, counts, declared))
+    return write(tmp_path, sealed(session_metadata() + data, declared))
 
 
 def png(width: int = WIDTH, height: int = HEIGHT) -> bytes:

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from recordings.errors import CorruptRecordingError
 from recordings.exporters.excerpt import write_excerpt
 from recordings.manifest import MANIFEST_FILE, Manifest, enter_part, read_manifest
 from recordings.reader import open_recording
@@ -34,8 +29,11 @@ def session(tmp_path: Path) -> Path:
 
 
 def test_the_list_names_every_part(session: Path) -> None:
-    manifest = read_manifest(session)
-    assert manifest == Manifest("test-cell", {1: "session.mcap", 2: "session-2.mcap", 3: "session-3.mcap"})
+    assert msgspec.json.decode((session / MANIFEST_FILE).read_bytes()) == {
+        "format": "station-session/1",
+        "session": "test-cell",
+        "parts": {"1": "session.mcap", "2": "session-2.mcap", "3": "session-3.mcap"},
+    }
     recording = open_recording(session)
     assert (recording.missing, recording.losses) == ((), ())
 
@@ -146,17 +144,6 @@ def test_a_damaged_list_is_refused(session: Path, content: bytes) -> None:
             read()
 
 
-@given(st.binary(max_size=300), st.integers(0, 130))
-def test_any_edit_of_a_list_is_a_list_or_is_refused(piece: bytes, at: int) -> None:
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        enter_part(folder, "test-cell", 1, "session.mcap")
-        content = (folder / MANIFEST_FILE).read_bytes()
-        (folder / MANIFEST_FILE).write_bytes(content[:at] + piece + content[at + len(piece) :])
-        with suppress(CorruptRecordingError):
-            assert isinstance(read_manifest(folder), Manifest)
-
-
 def test_a_list_that_is_no_file_does_not_hang_its_reader(session: Path) -> None:
     (session / MANIFEST_FILE).unlink()
     os.mkfifo(session / MANIFEST_FILE)
@@ -175,11 +162,3 @@ def test_a_part_number_is_bounded(tmp_path: Path) -> None:
         writer.finish()
     with refused("contradiction"):
         open_recording(tmp_path / "a.mcap")
-
-
-def test_the_list_reads_as_plain_json(session: Path) -> None:
-    assert msgspec.json.decode((session / MANIFEST_FILE).read_bytes()) == {
-        "format": "station-session/1",
-        "session": "test-cell",
-        "parts": {"1": "session.mcap", "2": "session-2.mcap", "3": "session-3.mcap"},
-    }

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from recordings.reader import open_recording
-from recordings.recover import recover_recording
 from recordings.schema.messages import CameraIdentity, CameraModel
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import (
@@ -93,16 +92,3 @@ def test_parts_of_different_sessions_do_not_mix(tmp_path: Path, changes: dict[st
 def test_an_empty_folder_says_so(tmp_path: Path) -> None:
     with refused("no-recording"):
         open_recording(tmp_path)
-
-
-def test_a_part_that_never_got_anything_is_set_aside_and_the_session_goes_on(tmp_path: Path) -> None:
-    write_part(tmp_path / "session.mcap", [(0, 1)])
-    (tmp_path / "session-2.mcap.part").write_bytes(b"\x89MCAP0\r\n")
-    write_part(tmp_path / "session-3.mcap", [(1, 1)], part=3)
-    results = recover_recording(tmp_path)
-    assert {result.path.name: result.poses for result in results} == {
-        "session.mcap": 1,
-        "session-2.mcap.part": 0,
-        "session-3.mcap": 1,
-    }
-    assert [view.index for view in open_recording(tmp_path).views()] == [0, 1]

@@ -86,7 +86,12 @@ REAL_DRIVERS = ("aravis", "webcam")
 
 
 class CameraConfig(Section, frozen=True):
-    GONE: ClassVar = frozenset({"playback_pace", "ptp", "time_offset"})
+    GONE: ClassVar = frozenset(
+        {
+            "playback_pace", "ptp", "time_offset", "gain", "packet_delay_us", "invert_trigger_line",
+            "exposure_line",
+        }
+    )  # fmt: skip
 
     name: Annotated[str, msgspec.Meta(pattern="^[a-z0-9-]{1,40}$")] = MAIN_CAMERA
     """Name among the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""
@@ -99,23 +104,17 @@ class CameraConfig(Section, frozen=True):
     """Frame rate of a webcam; None: its own"""
     exposure_us: Positive = 10_000.0
     gain_db: float = 0.0
-    gain: float | None = None
-    """Gain in the camera's own unit, instead of `gain_db`, for cameras without dB."""
+    """Gain; only 0, for the smallest one, where the camera does not state it in dB"""
     region: tuple[int, int, int, int] | None = None
     """x, y, width, height, pixels"""
     packet_size: int | None = None
     """Packet size, bytes; None: negotiated"""
-    packet_delay_us: float | None = None
-    """Gap between packets; None: 0, raised after each frame that lost packets"""
     trigger_line: str = "Line0"
     """Input that the trigger box is wired to, for `trigger: hardware`"""
     trigger_activation: Literal["RisingEdge", "FallingEdge", "AnyEdge", "LevelHigh", "LevelLow"] = (
         "RisingEdge"
     )
     trigger_delay_us: float = 0.0
-    invert_trigger_line: bool = False
-    exposure_line: str = ""
-    """Output that is active during exposure; empty: none"""
     model: CameraModel | None = None
     """Known intrinsics; None: estimated from the session's images."""
     model_is_rough: bool = False
@@ -123,11 +122,10 @@ class CameraConfig(Section, frozen=True):
 
 
 class TriggerConfig(Section, frozen=True):
-    GONE: ClassVar = frozenset({"mode"})
+    GONE: ClassVar = frozenset({"mode", "light_level"})
 
     port: str
     pulse_us: Annotated[int, msgspec.Meta(gt=0)] = 1000
-    light_level: float | None = None
 
 
 class Capsule(Section, frozen=True):

@@ -20,10 +20,10 @@ from station.cell.socket_folder import default_socket
 from station.cli.console import err
 from station.cli.daemon import answers, ensure_daemon, own_daemon, tell_what_goes_on, user_config
 from station.devices.aravis import AravisCamera
-from station.devices.aravis_device import found_cameras
+from station.devices.discovery import discover, discover_usb
 from station.devices.ur_dashboard import STOP, DashboardError
 from station.devices.ur_link import UrLink
-from station.devices.ur_probe import probe, unsupported_model
+from station.devices.ur_probe import identify, open_dashboard, unsupported_model
 from station.operate.draft import ArmReader, CameraChoice, CameraReader
 
 
@@ -82,12 +82,9 @@ class RealHardware:
     async def arm(self, host: str) -> ArmReader:
         """`host` may be followed by the model, for a controller that does not tell it."""
         address, _, told = host.partition(" ")
-        found = await probe(address)
-        if not found.answers:
-            raise RobotError("no-robot-answers", host=address)
-        if found.problems:
-            who = found.model or "something"
-            raise RobotError("robot-incomplete", what=who, host=address, problem=found.problems[0])
+        dashboard = await open_dashboard(address)
+        found = await identify(dashboard)
+        await dashboard.close()
         model = told or found.model
         if found.model and found.model not in MODELS:
             raise unsupported_model(found.model, address)
@@ -98,10 +95,9 @@ class RealHardware:
         return arm
 
     async def cameras(self) -> tuple[CameraChoice, ...]:
-        return tuple(
-            CameraChoice("aravis", serial or address, f"{model} {serial}")
-            for model, serial, address in await asyncio.to_thread(found_cameras)
-        )
+        network, usb = await asyncio.to_thread(lambda: (discover(), discover_usb()))
+        found = [(c.model, c.serial) for c in network] + [(c.model, c.serial) for c in usb]
+        return tuple(CameraChoice("aravis", serial, f"{model} {serial}") for model, serial in found)
 
     async def camera(self, found: CameraChoice) -> CameraReader:
         reader = GenicamReader(found.device)

@@ -15,7 +15,6 @@ from station.cell.status import CameraCounts, FrameTiming, StreamCounts
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import DeviceThread, Trigger
 from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
-from station.devices.genicam_settings import CHUNKS, TIME_CHUNKS
 
 _CLOCK_READINGS = 8
 _GLIMPSE_S = 1.0
@@ -80,12 +79,12 @@ class AravisCamera:
             self.counter.lost(count)
             raise
         sequence = self.counter.accept(picture.frame_id, count, sequenced=sequenced)
-        told = msgspec.structs.replace(picture, sequence=sequence, trigger_count=count)
-        chunks = self._live().chunks
-        if not chunks.issuperset(CHUNKS):  # checked before the exposure: a change during it must show, too
-            exposure_us, gain_db = await self._worker.run(lambda: self._live().check_settings())
-            told = msgspec.structs.replace(told, exposure_us=exposure_us, gain_db=gain_db)
-        return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse, chunk=chunks.issuperset(TIME_CHUNKS))
+        # Read after the exposure: a change during it must show, too.
+        exposure_us, gain_db = await self._worker.run(lambda: self._live().check_settings())
+        told = msgspec.structs.replace(
+            picture, sequence=sequence, trigger_count=count, exposure_us=exposure_us, gain_db=gain_db
+        )
+        return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
 
     async def preview(self) -> Image | None:
         """Take a new image where the camera is idle and software-triggered, else return the newest one."""
@@ -122,12 +121,11 @@ class AravisCamera:
             self._open()
         return self._device
 
-    def _prepare(self) -> tuple[float, float]:
+    def _prepare(self) -> None:
         device = self._live()
         if extra := device.drain():
             raise self.counter.surplus(extra)
         device.latch(self._clock.readings)
-        return device.check_settings()
 
     def _take(self, timeout_s: float) -> Image:
         device = self._live()

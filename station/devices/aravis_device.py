@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 import warnings
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
@@ -16,13 +14,7 @@ from station.cell.status import StreamCounts
 from station.devices.clocks import monotonic_from_wall_ns
 from station.devices.frame_ids import FrameIds
 from station.devices.frame_time import DeviceClock
-from station.devices.genicam_settings import (
-    Applied,
-    apply_settings,
-    read_settings,
-    require_exposed,
-    require_settings,
-)
+from station.devices.genicam_settings import Applied, apply_settings, read_settings, require_settings
 from station.devices.pixels import bits_per_pixel, decode
 
 if TYPE_CHECKING:
@@ -33,8 +25,6 @@ FRAME_RETENTION_S = 0.5
 """Time for which a frame waits for missing packets before it counts as incomplete."""
 SOCKET_BUFFER_BYTES = 32 * 2**20
 """Requested size of the kernel's packet queue; the kernel limits it to net.core.rmem_max."""
-_STREAM_PRIORITY = -15
-"""Niceness of Aravis's receiving thread: the kernel buffers only a fifth of a second of packets."""
 _LATCH_WAIT_S = 0.02
 _POP_S = 0.1
 """Period at which a waiting capture checks whether the camera was lost."""
@@ -64,7 +54,6 @@ class GenicamDevice:
         self._camera: Any = None
         self._stream: Any = None
         self._applied: Applied | None = None
-        self._parser: Any = None
         self._latched_ns: int | None = None
         self._controls = False
         self._lost = False
@@ -115,11 +104,8 @@ class GenicamDevice:
             )
         with self._explained("setting up the camera"):
             self._applied = apply_settings(self._aravis, self._camera, self._config)
-            self._parser = self._camera.create_chunk_parser() if self._applied.chunks else None
         with self._explained("starting the camera"):
-            before = _threads()
             self._stream = self._camera.create_stream(None, None)
-            _hurry(_threads() - before)
             if self._camera.is_gv_device():
                 self._stream.set_property("frame-retention", round(FRAME_RETENTION_S * 1e6))
                 # By default Aravis requests the size of one image, even if the system permits more.
@@ -164,11 +150,6 @@ class GenicamDevice:
         if self._applied is None:
             raise CameraError("not-open")
         return self._applied
-
-    @property
-    def chunks(self) -> frozenset[str]:
-        """Those of `genicam_settings.CHUNKS` that come with every frame."""
-        return frozenset() if self._applied is None else self._applied.chunks
 
     def latch(self, clock: DeviceClock) -> None:
         """Add a reading of the camera's clock to `clock`, where the camera supports latching it."""
@@ -251,43 +232,20 @@ class GenicamDevice:
             raise CameraError("settings-changed", found=f"{width}×{height}", wanted=wanted)
         wall_ns = buffer.get_system_timestamp()
         arrival_ns = monotonic_from_wall_ns(wall_ns)
-        if applied.chunks and not buffer.has_chunks():  # Aravis 0.8 reads them of GigE Vision 2 only
-            applied = self._applied = applied._replace(chunks=frozenset())
-        device_ns, exposure_us, gain = self._told(buffer, applied)
         image = decode(buffer.get_data(), width, height, self._config.pixel_format)
         return Image(
             pixels=image,
-            stamps=Stamps(host_monotonic_ns=arrival_ns, host_wall_ns=wall_ns, device_ns=device_ns),
+            stamps=Stamps(arrival_ns, wall_ns, device_ns=int(buffer.get_timestamp())),
             frame_id=self._frame_id(buffer),
             sequence=0,
-            exposure_us=exposure_us,
-            gain_db=gain if applied.gain_in_db else 0.0,
+            exposure_us=self._config.exposure_us,
             pixel_format="BGR8" if image.ndim == 3 else self._config.pixel_format,
         )
 
-    def _told(self, buffer: Any, applied: Applied) -> tuple[int, float, float]:
-        """Return stamp (ns), exposure (µs) and gain of a frame: from its chunks, else from the settings."""
-        device_ns, exposure_us, gain = int(buffer.get_timestamp()), self._config.exposure_us, applied.gain
-        if not applied.chunks:
-            return device_ns, exposure_us, gain
-        with self._explained("reading what came with the frame"):
-            if "Timestamp" in applied.chunks:
-                device_ns = self._to_ns(self._parser.get_integer_value(buffer, "ChunkTimestamp"))
-            if "ExposureTime" in applied.chunks:
-                exposure_us = float(self._parser.get_float_value(buffer, "ChunkExposureTime"))
-            if "Gain" in applied.chunks:
-                gain = float(self._parser.get_float_value(buffer, "ChunkGain"))
-        require_exposed(exposure_us, gain, self._config.exposure_us, applied)
-        return device_ns, exposure_us, gain
-
     def _calm_down(self) -> None:
-        """Lengthen the gaps between packets after a frame that lost some, unless they are configured."""
-        camera, config = self._camera, self._config
-        if (
-            config.packet_delay_us is not None
-            or not camera.is_gv_device()
-            or not camera.is_feature_available("GevSCPD")
-        ):
+        """Lengthen the gaps between packets after a frame that lost some."""
+        camera = self._camera
+        if not camera.is_gv_device() or not camera.is_feature_available("GevSCPD"):
             return
         with suppress(self._glib.Error):  # beyond the camera's range: keep the present gap
             size = camera.gv_get_packet_size()
@@ -318,28 +276,6 @@ class GenicamDevice:
             gone = (self._aravis.DeviceError.TIMEOUT, self._aravis.DeviceError.NOT_CONNECTED)
             self._lost |= any(error.matches(self._aravis.device_error_quark(), code) for code in gone)
             raise CameraError("camera-refused", doing=doing, reason=error.message) from error
-
-
-def _threads() -> set[int]:
-    return {int(task.name) for task in Path("/proc/self/task").iterdir()}
-
-
-def _hurry(threads: set[int]) -> None:
-    """Raise the priority of Aravis's receiving thread, where the system permits."""
-    for thread in threads:
-        with suppress(OSError):
-            if (Path("/proc/self/task") / str(thread) / "comm").read_text().strip() == "arv_gv_stream":
-                os.setpriority(os.PRIO_PROCESS, thread, _STREAM_PRIORITY)
-
-
-def found_cameras() -> list[tuple[str, str, str]]:
-    """List model, serial number and address of every camera that answers. CameraError without Aravis."""
-    aravis, _ = _aravis()
-    aravis.update_device_list()
-    return [
-        (aravis.get_device_model(i), aravis.get_device_serial_nbr(i), aravis.get_device_address(i) or "")
-        for i in range(aravis.get_n_devices())
-    ]
 
 
 def _find(aravis: Any, wanted: str) -> str:

@@ -101,9 +101,6 @@ class Robot(ArmNews, Protocol):
     def condition(self, state: RobotState) -> ArmCondition:
         """Describe the arm's condition in one of its states."""
 
-    async def missing(self) -> str:
-        """Find what keeps the arm's states from coming, with the remedy; takes at most a few seconds."""
-
     @property
     def kinematics(self) -> ArmKinematics | None:
         """The maker's calibration of this arm, with which its poses are computed; None: unknown."""

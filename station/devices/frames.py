@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from recordings.schema.messages import FrameTime, Image, TimeSource
+from recordings.schema.messages import FrameTime, Image
 from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming, StreamCounts
 from station.devices.frame_ids import LAST_BLOCK_ID, FrameIds, frames_between
@@ -128,18 +128,10 @@ class FrameClock:
             return FrameTiming("arrival", UNKNOWN_READOUT_S / 2) if self._opened else None
         return FrameTiming("latched", fit.bound_s, fit)
 
-    def timed(
-        self,
-        image: Image,
-        *,
-        asked_ns: int | None = None,
-        pulse: TriggerPulse | None = None,
-        chunk: bool = False,
-    ) -> Image:
+    def timed(self, image: Image, *, asked_ns: int | None = None, pulse: TriggerPulse | None = None) -> Image:
         """Return the image with its time and the clock readings since the previous image.
 
         `asked_ns`: host time just before its trigger; None: not triggered. `pulse`: of the trigger box.
-        `chunk`: stamp and exposure came with the frame.
         """
         arrival_ns, fit = image.stamps.host_monotonic_ns, self.readings.fit
         self._newest = by_arrival(arrival_ns, image.exposure_us, asked_ns)
@@ -147,8 +139,7 @@ class FrameClock:
             fired = pulse.host_monotonic_ns, pulse.bound_s
             self._newest = by_trigger(*fired, self._delay_us, image.exposure_us, arrival_ns)
         if fit is not None and image.stamps.device_ns:
-            source: TimeSource = "chunk" if chunk else "latched"
-            told = by_clock(image.stamps.device_ns, image.exposure_us, fit, source)
+            told = by_clock(image.stamps.device_ns, image.exposure_us, fit, "latched")
             if _possible(told, image, asked_ns):
                 self._newest = told
             else:

@@ -12,9 +12,6 @@ Region = tuple[int, int, int, int]
 _EXPOSURE_TOLERANCE = 0.02
 _GAIN_TOLERANCE = 0.2
 """Largest accepted difference between set and read gain, dB or the camera's unit"""
-TIME_CHUNKS = ("Timestamp", "ExposureTime")
-CHUNKS = (*TIME_CHUNKS, "Gain")
-"""Chunk data that a frame may carry"""
 
 
 class Applied(NamedTuple):
@@ -24,8 +21,6 @@ class Applied(NamedTuple):
     gain: float
     """In the camera's unit"""
     gain_in_db: bool
-    chunks: frozenset[str]
-    """Those of `CHUNKS` that come with every frame"""
 
 
 def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
@@ -51,24 +46,12 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
         else:
             camera.gv_set_packet_size(config.packet_size)
         if camera.is_feature_available("GevSCPD"):
-            camera.gv_set_packet_delay(round(1000 * (config.packet_delay_us or 0.0)))
+            camera.gv_set_packet_delay(0)  # raised after each frame that lost packets
+    if camera.are_chunks_available():
+        camera.set_chunk_mode(False)
     camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
     _set_trigger(camera, config)
-    if config.exposure_line:
-        _set_line(camera, config.exposure_line, {"LineMode": "Output", "LineSource": "ExposureActive"})
-    return Applied(region, gain, _knows_db(camera), _set_chunks(aravis, camera))
-
-
-def _set_chunks(aravis: Any, camera: Any) -> frozenset[str]:
-    """Switch on chunk data (stamp and settings in each frame), where the camera supports it."""
-    if not camera.are_chunks_available():
-        return frozenset()
-    offered = set(camera.dup_available_enumerations_as_strings("ChunkSelector"))
-    wanted = [name for name in CHUNKS if name in offered]
-    camera.set_chunk_mode(bool(wanted))
-    for name in wanted:
-        camera.set_chunk_state(name, True)
-    return frozenset(wanted)
+    return Applied(region, gain, _knows_db(camera))
 
 
 def _set_trigger(camera: Any, config: CameraConfig) -> None:
@@ -80,37 +63,20 @@ def _set_trigger(camera: Any, config: CameraConfig) -> None:
     if delays:
         camera.set_float(delays[0], delay_us)
     elif delay_us:
-        raise _cannot("delay its trigger", "camera.trigger_delay_us")
+        raise CameraError("camera-cannot", what="delay its trigger", key="camera.trigger_delay_us")
     if not hardware:
         return
     if camera.is_feature_available("TriggerActivation"):
         camera.set_string("TriggerActivation", config.trigger_activation)
     elif config.trigger_activation != "RisingEdge":
-        raise _cannot(f"trigger on {config.trigger_activation}", "camera.trigger_activation")
-    _set_line(camera, config.trigger_line, {"LineMode": "Input"}, inverted=config.invert_trigger_line)
-
-
-def _set_line(camera: Any, line: str, values: dict[str, str], inverted: bool = False) -> None:
-    """Apply settings of an I/O line; an input of a camera without LineSelector needs none."""
-    output = values["LineMode"] == "Output"
-    if not camera.is_feature_available("LineSelector"):
-        if output or inverted:
-            raise _cannot(
-                f"set up {line}", "camera.exposure_line" if output else "camera.invert_trigger_line"
-            )
-        return
-    camera.set_string("LineSelector", line)
-    for name, value in values.items():
-        if camera.is_feature_available(name) and camera.get_string(name) != value:
-            camera.set_string(name, value)
-    if camera.is_feature_available("LineInverter"):
-        camera.set_boolean("LineInverter", inverted)
-    elif inverted:
-        raise _cannot(f"invert {line}", "camera.invert_trigger_line")
-
-
-def _cannot(what: str, key: str) -> CameraError:
-    return CameraError("camera-cannot", what=what, key=key)
+        what = f"trigger on {config.trigger_activation}"
+        raise CameraError("camera-cannot", what=what, key="camera.trigger_activation")
+    if camera.is_feature_available("LineSelector"):
+        camera.set_string("LineSelector", config.trigger_line)
+        if camera.is_feature_available("LineMode") and camera.get_string("LineMode") != "Input":
+            camera.set_string("LineMode", "Input")
+        if camera.is_feature_available("LineInverter"):
+            camera.set_boolean("LineInverter", False)
 
 
 def gain_unit(camera: Any) -> str:
@@ -128,8 +94,6 @@ def _knows_db(camera: Any) -> bool:
 
 def _wanted_gain(camera: Any, config: CameraConfig) -> float:
     """Return the configured gain in the camera's unit; without dB, 0 dB is the camera's smallest gain."""
-    if config.gain is not None:
-        return config.gain
     if _knows_db(camera):
         return config.gain_db
     low, high = camera.get_gain_bounds()
@@ -161,33 +125,20 @@ def read_settings(camera: Any) -> dict[str, object]:
 
 
 def require_settings(camera: Any, wanted_us: float, applied: Applied) -> tuple[float, float]:
-    """Read exposure (µs) and gain (camera's unit); CameraError when they are not as set."""
-    exposure_us = float(camera.get_exposure_time())
+    """Read exposure (µs) and gain (camera's unit); CameraError when they or the region are not as set."""
+    exposure_us, region = float(camera.get_exposure_time()), _region(camera)
     gain = float(camera.get_gain()) if camera.is_gain_available() else 0.0
-    require_exposed(exposure_us, gain, wanted_us, applied)
-    if (actual := _region(camera)) != applied.region:
-        raise _changed(exposure_us, gain, wanted_us, applied, f", region {actual}")
+    exposed = abs(exposure_us - wanted_us) <= _EXPOSURE_TOLERANCE * wanted_us
+    if not exposed or abs(gain - applied.gain) > _GAIN_TOLERANCE or region != applied.region:
+        unit = " dB" if applied.gain_in_db else ""
+        raise CameraError(
+            "settings-changed",
+            found=f"{exposure_us:g} µs, gain {gain:g}{unit}, region {region}",
+            wanted=f"{wanted_us:g} µs, gain {applied.gain:g}{unit}, region {applied.region}",
+            exposure_us=exposure_us,
+            wanted_exposure_us=wanted_us,
+        )
     return exposure_us, gain
-
-
-def require_exposed(exposure_us: float, gain: float, wanted_us: float, applied: Applied) -> None:
-    """Check a frame's own exposure (µs) and gain; CameraError when they are not as set."""
-    off_us = abs(exposure_us - wanted_us)
-    if off_us > _EXPOSURE_TOLERANCE * wanted_us or abs(gain - applied.gain) > _GAIN_TOLERANCE:
-        raise _changed(exposure_us, gain, wanted_us, applied)
-
-
-def _changed(
-    exposure_us: float, gain: float, wanted_us: float, applied: Applied, region: str = ""
-) -> CameraError:
-    unit = " dB" if applied.gain_in_db else ""
-    return CameraError(
-        "settings-changed",
-        found=f"{exposure_us:g} µs, gain {gain:g}{unit}{region}",
-        wanted=f"{wanted_us:g} µs, gain {applied.gain:g}{unit}{region and f', region {applied.region}'}",
-        exposure_us=exposure_us,
-        wanted_exposure_us=wanted_us,
-    )
 
 
 def _region(camera: Any) -> Region:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrate.geometry import interpolate, pose_from_rotvec
+from calibrate.geometry import pose_from_rotvec
 from recordings import strict_yaml
 from recordings.errors import RecordingError
 from recordings.reader import Recording, open_recording
@@ -105,7 +104,10 @@ class PlaybackCamera:
 
 
 class PlaybackRobot:
-    """Robot that stands where the recorded arm stood, and moves only to joints of recorded images."""
+    """Robot that stands where the recorded arm stood, and moves only to joints of recorded images.
+
+    It stays at one until it is at the next, as nothing was recorded on the way.
+    """
 
     def __init__(self, recording: Path) -> None:
         """Raises RobotError for a recording that cannot be read or has no joints."""
@@ -118,13 +120,11 @@ class PlaybackRobot:
         poses, with_joints = len(self.views), sum(len(v.joints_rad or ()) == 6 for v in self.views)
         if not poses or with_joints < poses:
             raise RobotError("no-joints", path=recording, poses=poses, with_joints=with_joints)
-        self._lock = threading.Lock()
         self._from = self._to = self.views[0]
-        self._move_start_s = -MOVE_S
-        self._halted_at: float | None = None
+        self._arrives_s = 0.0
+        """When the newest move ends (host monotonic)."""
         self._callbacks: list[Callable[[RobotState], None]] = []
-        self._ending = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._publishing: asyncio.Task[None] | None = None
         self.control = False
         self.identity, self.camera = self._recording.info.robot, self._recording.info.camera_identity
         self.control_path, self.notice, self.remote, self.kinematics = "", "", None, None
@@ -140,18 +140,16 @@ class PlaybackRobot:
 
     def picture(self) -> Image:
         """Return the image of the view at which the arm stands. CameraError during a move, or undecodable."""
-        view, moving = self._standing()
-        if moving:
+        if time.monotonic() < self._arrives_s:
             raise CameraError("not-recorded")
         try:
-            return self._recording.image(view)
+            return self._recording.image(self._to)
         except RecordingError as error:
             raise CameraError.from_data(error.data) from error
 
     async def connect(self) -> RobotIdentity:
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._publish, name="playback robot", daemon=True)
-            self._thread.start()
+        if self._publishing is None:
+            self._publishing = asyncio.create_task(self._publish(), name="playback robot")
         return self.identity
 
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
@@ -164,21 +162,20 @@ class PlaybackRobot:
         age_s = (time.monotonic_ns() - host_monotonic_ns) / 1e9
         if not -0.01 <= age_s <= 10.0:
             raise StaleStateError("no-history")
-        with self._lock:
-            before, after, fraction = self._from, self._to, self._fraction(host_monotonic_ns / 1e9)
-        a, b = np.array(before.joints_rad), np.array(after.joints_rad)
-        flange = interpolate(np.array(before.base_from_flange), np.array(after.base_from_flange), fraction)
-        speed = (b - a) / MOVE_S if 0 < fraction < 1 and self._halted_at is None else np.zeros(6)
-        tool = flange @ pose_from_rotvec(self.identity.tcp_offset[:3], self.identity.tcp_offset[3:])
+        left_s = self._arrives_s - host_monotonic_ns / 1e9
+        view = self._from if left_s > 0 else self._to
+        way = np.subtract(_joints(self._to), _joints(self._from)) * (0 < left_s <= MOVE_S)
+        tcp = self.identity.tcp_offset
+        tool = np.array(view.base_from_flange) @ pose_from_rotvec(tcp[:3], tcp[3:])
         return RobotState(
             stamps=Stamps(
                 host_monotonic_ns=host_monotonic_ns,
                 host_wall_ns=time.time_ns() - round(age_s * 1e9),
                 controller_s=host_monotonic_ns / 1e9,
             ),
-            joints_rad=vector6(a + fraction * (b - a)),
-            joint_speeds_rad_s=vector6(speed),
-            target_joints_rad=_joints(after),
+            joints_rad=_joints(view),
+            joint_speeds_rad_s=vector6(way / MOVE_S),
+            target_joints_rad=_joints(self._to),
             tcp_pose=pose_vector(tool),
             robot_mode=7,
             safety_mode=1,
@@ -213,9 +210,8 @@ class PlaybackRobot:
             raise RobotError("control-not-started", why="")
         if off[nearest] > _SAME_JOINTS_RAD:
             raise RobotError("not-recorded")
-        with self._lock:
-            self._from, self._to, self._halted_at = self._to, self.views[nearest], None
-            self._move_start_s = time.monotonic()
+        self._from, self._to = self._to, self.views[nearest]
+        self._arrives_s = time.monotonic() + MOVE_S
         await asyncio.sleep(MOVE_S)
 
     def heartbeat(self) -> None: ...
@@ -227,46 +223,33 @@ class PlaybackRobot:
         """Describe it as running, as the recorded arm holds nobody up."""
         return ArmCondition("RUNNING", "NORMAL", "stopped", "")
 
-    async def missing(self) -> str:
-        return "play a recording that can be read"
-
     def stop_one_way(self, way: StopWay) -> None:
         raise RobotError("playback")
 
     async def stop(self, reason: str) -> None:
-        with self._lock:
-            if self._fraction(time.monotonic()) < 1 and self._halted_at is None:
-                self._halted_at = self._fraction(time.monotonic())
+        if time.monotonic() < self._arrives_s:
+            self._to, self._arrives_s = self._from, 0.0
         self.control = False
 
     async def end_control(self) -> None:
         self.control = False
 
     async def close(self) -> None:
-        self._ending.set()
-        if self._thread is not None:
-            await asyncio.to_thread(self._thread.join)
+        if self._publishing is not None:
+            self._publishing.cancel()
+            self._publishing = None
 
-    def _standing(self) -> tuple[View, bool]:
-        with self._lock:
-            return self._to, self._fraction(time.monotonic()) < 1
-
-    def _fraction(self, at_s: float) -> float:
-        """Return the share of the current move that is done, 0 … 1."""
-        if self._halted_at is not None:
-            return self._halted_at
-        return float(np.clip((at_s - self._move_start_s) / MOVE_S, 0.0, 1.0))
-
-    def _publish(self) -> None:
-        while not self._ending.wait(1 / STATE_RATE_HZ):
+    async def _publish(self) -> None:
+        while True:
             state = self.latest()
             for callback in self._callbacks:
                 callback(state)
+            await asyncio.sleep(1 / STATE_RATE_HZ)
 
 
 def _joints(view: View) -> Vector6:
     assert view.joints_rad is not None
-    return vector6(np.array(view.joints_rad))
+    return vector6(view.joints_rad)
 
 
 def playback_cell(recording: Path) -> Cell:

@@ -18,7 +18,7 @@ from station.devices.frames import TriggerPulse
 ANSWER_TIMEOUT_S = 1.0
 HANDSHAKE_TIMEOUT_S = 3.0
 """Time for the first answer: many boards restart when their port is opened, which takes two seconds."""
-BAD_LINES_LIMIT = 50
+GARBLED_LIMIT = 50
 _COUNTS = 1 << 32
 LINE_LIMIT = 120
 """Longest valid line, bytes."""
@@ -36,34 +36,14 @@ def frame(text: str) -> bytes:
     return f"{text}*{checksum(text)}\n".encode("ascii")
 
 
-class LineReader:
-    """Splits bytes into lines with a valid checksum; other lines are counted and skipped."""
-
-    def __init__(self) -> None:
-        self.bad_lines = 0
-        self._pending = b""
-
-    def feed(self, data: bytes) -> list[str]:
-        """Add bytes; return the complete valid lines, without checksum. Never raises; memory is bounded."""
-        *lines, rest = (self._pending + data).split(b"\n")
-        self._pending = rest[: LINE_LIMIT + 1]  # enough to see that a line is too long
-        texts = [_checked(line) for line in lines]
-        self.bad_lines += texts.count(None)
-        return [text for text in texts if text is not None]
-
-    def restart(self) -> None:
-        """Forget an incomplete line: the next byte begins a new one."""
-        self.bad_lines += bool(self._pending)
-        self._pending = b""
-
-
-def _checked(line: bytes) -> str | None:
+def unframe(line: bytes) -> str | None:
+    """Return a line's text, without checksum; None for an invalid line."""
     try:
         # Trailing spaces are part of the checksum, a carriage return follows it.
-        text, _, given = line.decode("ascii").rstrip("\r").rpartition("*")
+        text, _, given = line.decode("ascii").rstrip("\r\n").rpartition("*")
     except UnicodeDecodeError:
         return None
-    return text if text and len(line) <= LINE_LIMIT and given == checksum(text) else None
+    return text if text and given == checksum(text) else None
 
 
 class SerialTrigger:
@@ -73,16 +53,10 @@ class SerialTrigger:
         self._config = config
         self._port: Any = None
         self._worker = DeviceThread("trigger")
-        self._lines = LineReader()
         self._boot_id = ""
         self._opened = False
         self._count = self._first_count = 0
         """Pulses now and at opening, unwrapped: the box's own count overflows at 2^32."""
-
-    @property
-    def bad_lines(self) -> int:
-        """Number of invalid lines so far."""
-        return self._lines.bad_lines
 
     @property
     def pulses(self) -> int:
@@ -106,16 +80,12 @@ class SerialTrigger:
             self._port = _open_port(self._config.port)
         except (OSError, ValueError) as error:
             raise TriggerError("trigger-port", port=self._config.port, reason=str(error)) from error
-        self._lines = LineReader()
         self._count = self._first_count = 0
         try:
-            identity = self._handshake()
-            if (level := self._config.light_level) is not None:  # 0 = off, 1 = full
-                self._ask(f"LIGHT {round(1000 * min(max(level, 0.0), 1.0))}", "LIGHT", 1)
+            return self._handshake()
         except TriggerError:
             self._disconnect()
             raise
-        return identity
 
     def _handshake(self) -> str:
         end_s = time.monotonic() + HANDSHAKE_TIMEOUT_S
@@ -139,7 +109,7 @@ class SerialTrigger:
             self._connect()  # it was lost; counting restarts
         asked_ns = time.monotonic_ns()
         try:
-            boot_id, count, _ = self._ask(f"FIRE {self._config.pulse_us}", "FIRED", 3)
+            boot_id, count = self._ask(f"FIRE {self._config.pulse_us}", "FIRED", 2)
         except _BoxSilentError:
             # Ask whether the camera was triggered: its next frame must not be taken for another trigger's.
             before = self._count
@@ -161,30 +131,29 @@ class SerialTrigger:
     def _status(self) -> tuple[str, int]:
         """Ask for boot id and count of pulses."""
         try:
-            boot_id, count, _ = self._ask("STATUS?", "STATUS", 3)
+            boot_id, count = self._ask("STATUS?", "STATUS", 2)
         except _BoxSilentError as error:
             raise TriggerError("trigger-lost", port=self._config.port, reason=str(error)) from error
         return boot_id, _number(count)
 
     def _ask(self, request: str, answer: str, fields: int, timeout_s: float = ANSWER_TIMEOUT_S) -> list[str]:
-        """Send a request; return the fields of its answer. Other lines are skipped, invalid ones counted."""
-        port = self._require_port()
+        """Send a request; return the first fields of its answer. Other lines are skipped."""
+        port, garbled = self._require_port(), 0
         end_s = time.monotonic() + timeout_s
         try:
             port.reset_input_buffer()
-            self._lines.restart()
-            bad_before = self._lines.bad_lines
             port.write(frame(request))
             while time.monotonic() < end_s:
-                texts = self._lines.feed(port.read(port.in_waiting or 1))
-                if self._lines.bad_lines - bad_before > BAD_LINES_LIMIT:
-                    raise TriggerError("garbled-lines", what=f"more than {BAD_LINES_LIMIT} garbled lines")
-                for text in texts:
-                    words = text.split()
-                    if words[:1] == [answer] and len(words) == fields + 1:
-                        return words[1:]
-                    if words[:1] == ["ERR"]:
-                        raise TriggerError("trigger-refused", request=request, reason=text[4:])
+                line = port.read_until(b"\n", LINE_LIMIT)
+                text = unframe(line)
+                garbled += bool(line) and text is None
+                if garbled > GARBLED_LIMIT:
+                    raise TriggerError("garbled-lines", what=f"more than {GARBLED_LIMIT} garbled lines")
+                words = (text or "").split()
+                if words[:1] == [answer] and len(words) > fields:
+                    return words[1 : fields + 1]
+                if words[:1] == ["ERR"]:
+                    raise TriggerError("trigger-refused", request=request, reason=" ".join(words[1:]))
         except (OSError, termios.error) as error:  # pyserial's SerialException is an OSError
             self._disconnect()
             raise TriggerError("trigger-lost", port=self._config.port, reason=str(error)) from error

@@ -23,12 +23,12 @@ from station.cell.errors import RobotError
 from station.devices.base import fresh, ready
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
-from station.devices.ur_condition import arm_held, control_ended, foreign_program, local_control
+from station.devices.ur_condition import arm_held, control_ended, foreign_program
 from station.devices.ur_dashboard import STOP, Dashboard, DashboardError, came
 from station.devices.ur_end_cause import cause_of_end
 from station.devices.ur_link import UrLink, link_lost
 from station.devices.ur_moves import MoveWatch, check_goal
-from station.devices.ur_probe import SCRIPT_PORT, check_port
+from station.devices.ur_probe import check_script_port
 from station.devices.ur_state import POLL_S
 
 log = logging.getLogger(__name__)
@@ -142,13 +142,13 @@ class UrRobot(UrLink):
         self.remote = await dashboard.remote()
         state = await fresh(self)
         if self.remote is False:
-            raise local_control()
+            raise RobotError("local-control")
         _, _, program = (await dashboard.ask("programState")).partition(" ")
         if self._primary is not None:
             self._primary.started = ""
         if (trouble := arm_held(state) or foreign_program(state, program)) is not None:
             raise trouble
-        await check_port(self.config.host, SCRIPT_PORT)
+        await check_script_port(self.config.host)
 
     def heartbeat(self) -> None:
         """Keep the arm's watchdog from stopping it: call at least every 50 ms while control is started."""
@@ -357,7 +357,7 @@ class UrRobot(UrLink):
     def _program_trouble(self, state: RobotState) -> RobotError | None:
         """Find what is wrong with the control program by state and dashboard; None: nothing."""
         if self.remote is False:
-            return local_control()
+            return RobotError("local-control")
         return control_ended(state)
 
     async def close(self) -> None:

@@ -12,51 +12,24 @@ from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStat
 _RELEASE = "Release the brakes on the pendant"
 _ACKNOWLEDGE = " Then acknowledge here and approve motion again."
 """End of the remedy of a safety stop, where one is latched."""
-# Safety conditions that hold the arm, the gravest first: bits, modes, error code.
-_SAFETY: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str], ...] = (
+_SAFETY = {
+    "EMERGENCY": "emergency-stop",
+    "FAULT": "safety-fault",
+    "VIOLATION": "safety-fault",
+    "PROTECTIVE": "protective-stop",
+    "SAFEGUARD": "safeguard-stop",
+    "THREE_POSITION": "enabling-stop",
+    "RECOVERY": "recovery-mode",
+    "STOPPED_DUE_TO_SAFETY": "safety-stop",
+}
+"""Part of the names of bits and modes that hold the arm → error code, the gravest first."""
+_HOLDING = tuple(
     (
-        SafetyStatus.EMERGENCY_STOPPED
-        | SafetyStatus.ROBOT_EMERGENCY_STOPPED
-        | SafetyStatus.SYSTEM_EMERGENCY_STOPPED,
-        frozenset(
-            {
-                SafetyMode.ROBOT_EMERGENCY_STOP,
-                SafetyMode.SYSTEM_EMERGENCY_STOP,
-                SafetyMode.IMMI_EMERGENCY_STOP,
-                SafetyMode.PROFISAFE_EMERGENCY_STOP,
-            }
-        ),
-        "emergency-stop",
-    ),
-    (
-        SafetyStatus.FAULT | SafetyStatus.VIOLATION,
-        frozenset({SafetyMode.FAULT, SafetyMode.VIOLATION}),
-        "safety-fault",
-    ),
-    (SafetyStatus.PROTECTIVE_STOPPED, frozenset({SafetyMode.PROTECTIVE_STOP}), "protective-stop"),
-    (
-        SafetyStatus.SAFEGUARD_STOPPED,
-        frozenset(
-            {
-                SafetyMode.SAFEGUARD_STOP,
-                SafetyMode.AUTOMATIC_MODE_SAFEGUARD_STOP,
-                SafetyMode.IMMI_SAFEGUARD_STOP,
-                SafetyMode.PROFISAFE_AUTOMATIC_MODE_SAFEGUARD_STOP,
-                SafetyMode.PROFISAFE_SAFEGUARD_STOP,
-                SafetyMode.SAFETY_API_SAFEGUARD_STOP,
-            }
-        ),
-        "safeguard-stop",
-    ),
-    (
-        SafetyStatus(0),
-        frozenset(
-            {SafetyMode.SYSTEM_THREE_POSITION_ENABLING_STOP, SafetyMode.TP_THREE_POSITION_ENABLING_STOP}
-        ),
-        "enabling-stop",
-    ),
-    (SafetyStatus.RECOVERY, frozenset({SafetyMode.RECOVERY}), "recovery-mode"),
-    (SafetyStatus.STOPPED_DUE_TO_SAFETY, frozenset(), "safety-stop"),
+        sum(bit for bit in SafetyStatus if word in str(bit.name)),
+        frozenset(mode for mode in SafetyMode if word in mode.name),
+        code,
+    )
+    for word, code in _SAFETY.items()
 )
 _MODES: dict[int, tuple[str, str]] = {
     RobotMode.NO_CONTROLLER: ("the controller is not running", "Restart the robot"),
@@ -72,7 +45,7 @@ _MODES: dict[int, tuple[str, str]] = {
 
 def safety_stop(state: RobotState) -> SafetyStopError | None:
     """Make the error for a safety stop; None without one. Bits and mode both count: either may come first."""
-    for bits, modes, code in _SAFETY:
+    for bits, modes, code in _HOLDING:
         if state.safety_status_bits & bits or state.safety_mode in modes:
             return SafetyStopError(code, mode=safety_word(state))
     if state.safety_mode > SafetyMode.FAULT:  # all modes that were added later are stops
@@ -107,10 +80,6 @@ def control_ended(state: RobotState) -> RobotError | None:
     return arm_held(state) or (None if playing else program_ended(state.runtime_state))
 
 
-def local_control() -> RobotError:
-    return RobotError("local-control")
-
-
 def program_ended(runtime_state: int) -> RobotError:
     """Make the error for a control program that stopped or paused."""
     by = (
@@ -121,11 +90,6 @@ def program_ended(runtime_state: int) -> RobotError:
         by = "on the pendant"
     state = _word(RuntimeState, runtime_state, "IN STATE").lower()
     return RobotError("program-ended", state=state, by=by, runtime_state=runtime_state)
-
-
-def program_replaced(name: str) -> RobotError:
-    """Make the error for another client's program that replaced the control program."""
-    return RobotError("program-replaced", program=name, called=f" ({name})" if name else "")
 
 
 def foreign_program(state: RobotState, name: str) -> RobotError | None:

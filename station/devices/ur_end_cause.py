@@ -17,7 +17,7 @@ from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.news import RESTING_S, Evidence, longest_silence_s
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
-from station.devices.ur_condition import arm_held, local_control, program_ended, program_replaced
+from station.devices.ur_condition import arm_held, program_ended
 from station.devices.ur_link import UrLink
 from station.devices.ur_state import POLL_S
 
@@ -47,11 +47,11 @@ async def cause_of_end(link: UrLink, child: ControlChild, error: RobotError) -> 
             async with asyncio.timeout(REMOTE_WAIT_S):
                 link.remote = await link.dashboard.remote()
     if link.remote is False:
-        return local_control()
+        return RobotError("local-control")
     if error.code in MAY_BE_REPLACED:
         other = await _other_program(link, child.started_s, REPLACED_S if ended else 0.0)
         if other is not None:
-            return program_replaced(other)
+            return RobotError("program-replaced", program=other, called=f" ({other})" if other else "")
     if late and after is not None:
         return link.evidence(0.0, begun_s - OUTLIVED_S, time.monotonic()).error() or error
     if ended and (delayed := _evidence_of_end(link, child, states).error()) is not None:

@@ -22,15 +22,12 @@ from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_lo
 from station.devices.ur_condition import condition, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_probe import (
-    SCRIPT_PORT,
-    ProbeResult,
+    Found,
     RobotLock,
-    check_port,
+    check_script_port,
     identify,
-    lock_name,
-    probe,
+    open_dashboard,
     unsupported_model,
-    why_no_dashboard,
 )
 from station.devices.ur_state import POLL_S, Payload, Sample, StateReader, state_at
 from station.devices.ur_tool import Installation, PrimaryReader, TcpCheck, check_payload
@@ -89,14 +86,11 @@ class UrLink:
 
     async def _open(self) -> None:
         host = self.config.host
-        try:
-            found = await identify(await self.renew_dashboard())
-        except DashboardError as error:
-            raise await why_no_dashboard(host, error) from None
+        found = await identify(await self.renew_dashboard())
         self._check_identity(found)
-        if self._lock is None:
-            self._lock = RobotLock(lock_name(host, found.serial))
-        await check_port(host, SCRIPT_PORT)
+        if self._lock is None:  # simulated robots share a serial number
+            self._lock = RobotLock(host if is_loopback(host) or not found.serial else found.serial)
+        await check_script_port(host)
         reader = self.reader = StateReader(host, self._deliver, self.on_link_lost)
         first = await reader.open()
         self._primary = PrimaryReader(host)
@@ -107,7 +101,7 @@ class UrLink:
             )
         self._adopt(found, first, reader, installation)
 
-    def _check_identity(self, found: ProbeResult) -> None:
+    def _check_identity(self, found: Found) -> None:
         wanted, host = self.config, self.config.host
         if found.model and found.model not in MODELS:
             raise unsupported_model(found.model, host)
@@ -119,9 +113,7 @@ class UrLink:
             raise RobotError("robot-exchanged", host=host, serial=found.serial)
         self.remote = found.remote
 
-    def _adopt(
-        self, found: ProbeResult, first: Sample, reader: StateReader, installation: Installation
-    ) -> None:
+    def _adopt(self, found: Found, first: Sample, reader: StateReader, installation: Installation) -> None:
         if self._payload is None:
             self._payload = first.payload
         if self._tool is None:
@@ -305,16 +297,6 @@ class UrLink:
     def condition(self, state: RobotState) -> ArmCondition:
         return condition(state)
 
-    async def missing(self) -> str:
-        host = self.config.host
-        if not host:
-            return "give robot.host in the configuration"
-        found = await probe(host)
-        if not found.answers:
-            return f"switch the robot on, plug in its network cable, and check robot.host ({host})"
-        who = f"{found.model} {found.serial}" if found.model else "something"
-        return "; ".join([f"{who} answers at {host}", *found.problems])
-
     def check_tool(self, sample: Sample) -> None:
         """Raise RobotError when TCP or payload differ from those at connect; works in motion, too."""
         if self._tool is not None and self._primary is not None:
@@ -346,8 +328,8 @@ class UrLink:
                 log.exception("the robot's supervision failed; it goes on")
 
     async def renew_dashboard(self) -> Dashboard:
-        """Replace the dashboard connection by a new one. Raises DashboardError."""
-        fresh = await Dashboard.open(self.config.host)
+        """Replace the dashboard connection by a new one. Raises RobotError."""
+        fresh = await open_dashboard(self.config.host)
         old, self.dashboard = self.dashboard, fresh
         if old is not None:
             await old.close()

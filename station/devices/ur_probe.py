@@ -1,13 +1,12 @@
-"""Read-only check whether a robot is reachable, and of which model; every query has a time-out."""
+"""Questions to a robot before it is connected: who it is, and which ports answer. Read-only."""
 
 from __future__ import annotations
 
 import asyncio
 import errno
-import ipaddress
 import re
 import socket
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 from calibrate.kinematics import MODELS
 from station.cell.errors import RobotError
@@ -19,36 +18,23 @@ from station.devices.ur_dashboard import Dashboard, DashboardError, connect_trou
 SCRIPT_PORT = 30002
 POLYSCOPE_X = 10
 """First major version of PolyScope X, which has no dashboard server, the second stop path."""
-_SERVICES = {SCRIPT_PORT: "Secondary Client interface", RTDE_PORT: "RTDE service"}
+_SERVICE = "Secondary Client interface"
 CONNECT_S = 2.0
 ASIDE_S = 0.7
 """Time-out of a query that only makes an error message clearer."""
 
 
 @dataclass(frozen=True)
-class ProbeResult:
+class Found:
     """Answers of the dashboard; empty or None where the controller gives none."""
 
     model: str = ""
     serial: str = ""
     version: tuple[int, ...] = ()
     remote: bool | None = None
-    problems: tuple[str, ...] = field(default=())
-    """Problems, each with its remedy; empty = reachable and complete."""
-    answers: bool = True
-    """True when any port answers."""
 
 
-async def probe(host: str) -> ProbeResult:
-    """Query all ports in parallel; takes at most a few seconds and never raises."""
-    result, *answers = await asyncio.gather(
-        _ask_dashboard(host), _port_problem(host, SCRIPT_PORT), _port_problem(host, RTDE_PORT)
-    )
-    silent = bool(result.problems) and all(answers)
-    return replace(result, problems=(*result.problems, *(str(p) for p in answers if p)), answers=not silent)
-
-
-async def identify(dashboard: Dashboard) -> ProbeResult:
+async def identify(dashboard: Dashboard) -> Found:
     """Ask an open dashboard connection for model, serial, version and mode. Raises DashboardError."""
     version = _version(await dashboard.ask("PolyscopeVersion"))
     model = (await dashboard.ask("get robot model")).strip()
@@ -56,7 +42,7 @@ async def identify(dashboard: Dashboard) -> ProbeResult:
     e_series = bool(version) and version[0] >= 5
     if re.fullmatch(r"UR\d+", model) and e_series and model in ("UR3", "UR5", "UR10", "UR16"):
         model += "e"  # the e-Series dashboard leaves the letter out
-    return ProbeResult(
+    return Found(
         model=model if re.fullmatch(r"UR\d+e?", model) else "",
         serial=serial if serial.isdigit() else "",  # CB3 before 3.12 does not know the question
         version=version,
@@ -64,28 +50,15 @@ async def identify(dashboard: Dashboard) -> ProbeResult:
     )
 
 
-def lock_name(host: str, serial: str) -> str:
-    """Make the name of a robot's lock: by address if simulated, as these share a serial number."""
+async def open_dashboard(host: str) -> Dashboard:
+    """Connect to the dashboard server; RobotError that says why there is none."""
     try:
-        loopback = ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        loopback = host == "localhost"
-    return host if loopback or not serial else serial
-
-
-async def _ask_dashboard(host: str) -> ProbeResult:
-    dashboard = None
-    try:
-        dashboard = await Dashboard.open(host, CONNECT_S)
-        return await identify(dashboard)
+        return await Dashboard.open(host, CONNECT_S)
     except DashboardError as error:
-        return ProbeResult(problems=(str(await why_no_dashboard(host, error)),))
-    finally:
-        if dashboard is not None:
-            await dashboard.close()
+        raise await _why_no_dashboard(host, error) from None
 
 
-async def why_no_dashboard(host: str, error: DashboardError) -> RobotError:
+async def _why_no_dashboard(host: str, error: DashboardError) -> RobotError:
     """Return `error`, or that this controller has no dashboard server, by its version over RTDE."""
     try:
         async with asyncio.timeout(ASIDE_S):
@@ -106,34 +79,24 @@ def unsupported_model(model: str, host: str) -> RobotError:
     return RobotError("unsupported-model", host=host, model=model, models=", ".join(MODELS))
 
 
-async def check_port(host: str, port: int) -> None:
-    """Raise RobotError unless the port accepts a connection, and sends a greeting where it must."""
-    if problem := await _port_problem(host, port):
-        raise problem
-
-
-async def _port_problem(host: str, port: int) -> RobotError | None:
-    """Find what is wrong with a port, within 2 s; None: nothing.
-
-    On the script port a controller sends its state as soon as a client connects.
-    """
-    where, accepted = f"{host}:{port}", False
+async def check_script_port(host: str) -> None:
+    """Raise RobotError unless the controller sends its state on the port for scripts."""
+    where, accepted = f"{host}:{SCRIPT_PORT}", False
     try:
         async with asyncio.timeout(CONNECT_S):
-            reader, writer = await asyncio.open_connection(host, port)
+            reader, writer = await asyncio.open_connection(host, SCRIPT_PORT)
             accepted = True
             try:
-                if port == SCRIPT_PORT and not await reader.read(1):
+                if not await reader.read(1):
                     raise ConnectionResetError(errno.ECONNRESET, "closed at once")
             finally:
                 writer.transport.abort()
     except TimeoutError:
         if accepted:
-            return RobotError("port-silent", where=where, service=_SERVICES[port])
-        return RobotError("port-closed", where=where, reason=f"no answer within {CONNECT_S:g} s")
+            raise RobotError("port-silent", where=where, service=_SERVICE) from None
+        raise RobotError("port-closed", where=where, reason=f"no answer within {CONNECT_S:g} s") from None
     except OSError as error:
-        return RobotError("port-closed", where=where, reason=connect_trouble(error, _SERVICES[port]))
-    return None
+        raise RobotError("port-closed", where=where, reason=connect_trouble(error, _SERVICE)) from None
 
 
 def _version(text: str) -> tuple[int, ...]:

@@ -41,7 +41,8 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
     try:
         state = robot.latest()
     except RobotError as error:
-        return [Check("robot", "failed", troubles.get("robot", str(error)), await robot.missing())]
+        remedy = "check that it is on, its network cable, and robot.host"
+        return [Check("robot", "failed", troubles.get("robot", str(error)), remedy)]
     identity, condition = robot.identity, robot.condition(state)
     checks = [
         Check("robot", "ok", f"{identity.model} {identity.serial} at {host}, {condition.mode}"),

@@ -9,7 +9,7 @@ import time
 import tty
 from collections.abc import Callable
 
-from station.devices.serial_trigger import PRODUCT, PROTOCOL, LineReader, frame
+from station.devices.serial_trigger import PRODUCT, PROTOCOL, frame, unframe
 
 _COUNTS = 1 << 32
 _SERIAL = "SIM1"
@@ -26,7 +26,6 @@ class SimulatedTriggerBox:
         self.product = PRODUCT
         """Product name; another one simulates another device on this port"""
         self.count = 0
-        self.light_permille = 0
         self.silent = False
         self.garbage = b""
         """Bytes sent before every answer"""
@@ -34,7 +33,6 @@ class SimulatedTriggerBox:
         """Number of next answers that are cut in the middle, without a newline"""
         self._boot_id = "00000001"
         self._start_s = time.monotonic()
-        self._lines = LineReader()
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         self.port = os.ttyname(self._slave)
@@ -43,9 +41,9 @@ class SimulatedTriggerBox:
         self._thread.start()
 
     def reset(self) -> None:
-        """Simulate a short power failure: count and light are 0, the boot id changes."""
+        """Simulate a short power failure: the count is 0, the boot id changes."""
         self._boot_id = f"{int(self._boot_id, 16) + 1:08x}"
-        self.count = self.light_permille = 0
+        self.count = 0
         self._start_s = time.monotonic()
 
     def unplug(self) -> None:
@@ -63,11 +61,13 @@ class SimulatedTriggerBox:
         self.unplug()
 
     def _serve(self) -> None:
+        rest = b""
         while True:
             ready, _, _ = select.select([self._master, self._stop_read], [], [])
             if self._stop_read in ready:
                 return
-            for text in self._lines.feed(os.read(self._master, 4096)):
+            *lines, rest = (rest + os.read(self._master, 4096)).split(b"\n")
+            for text in filter(None, map(unframe, lines)):
                 answer = self._answer(text.split())
                 if not self.silent:
                     self._send(frame(answer))
@@ -83,14 +83,11 @@ class SimulatedTriggerBox:
             case ["ID?"]:
                 return f"ID {self.product} {PROTOCOL} {_SERIAL}"
             case ["STATUS?"]:
-                return f"STATUS {self._boot_id} {self.count} {self.light_permille}"
+                return f"STATUS {self._boot_id} {self.count}"
             case ["FIRE", width] if width.isdecimal() and 10 <= int(width) <= 100_000:
                 self.count = (self.count + 1) % _COUNTS
                 self.on_pulse()
                 return f"FIRED {self._boot_id} {self.count} {self._uptime_us()}"
-            case ["LIGHT", level] if level.isdecimal() and int(level) <= 1000:
-                self.light_permille = int(level)
-                return f"LIGHT {self.light_permille}"
         return f"ERR {' '.join(words)}"
 
     def _uptime_us(self) -> int:

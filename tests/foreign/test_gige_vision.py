@@ -117,15 +117,6 @@ async def test_loss_other_order_and_copies_cost_no_bit(
     assert emulated.resent <= counts.resend_requests
 
 
-async def test_chunks_that_aravis_cannot_read_cost_no_picture(lonely_network: None) -> None:
-    with EmulatedCamera(size=SIZE, chunk_payload=0x0005) as emulated:  # as GigE Vision 1 marks them
-        async with opened() as camera:
-            for _ in range(2):
-                image = await camera.capture()
-                assert image.time is not None and image.time.source == "latched"
-                assert np.array_equal(image.pixels, numbered_picture(emulated.frames - 1, *SIZE))
-
-
 async def test_packets_that_are_gone_for_good_cost_one_frame(emulated: EmulatedCamera) -> None:
     async with opened() as camera:
         await to_the_bit(emulated, camera, 1)

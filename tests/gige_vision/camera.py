@@ -2,7 +2,7 @@
 
 It judges the driver: simulator and driver share Aravis, so neither can show the other's faults. It speaks
 GVCP (discovery, registers, control privilege, heartbeat, packet resend, test packets) and GVSP (16- and
-64-bit ids, chunks), and can be told to do wrong. Run it only where there is no network but `lo`.
+64-bit ids), and can be told to do wrong. Run it only where there is no network but `lo`.
 Facts of the protocol: GigE Vision 2.0 as Wireshark's dissectors (packet-gvcp.c, packet-gvsp.c) name them.
 """
 
@@ -36,9 +36,9 @@ _CAPABILITIES = (
 )  # serial number, IEEE 1588, resend, write memory, concatenation
 _EXTENDED_IDS, _FIRE_TEST, _LATCH = 0x4000_0000, 0x8000_0000, 2
 _LEADER, _TRAILER, _PAYLOAD, _EXTENDED = 1, 2, 3, 0x80
+_IMAGE = 0x0001
+"""Type of payload"""
 _IP_UDP = 28
-_CHUNK_LAYOUT = 1
-"""Another one would say that chunks were switched on or off"""
 _KEPT_FRAMES = 8
 Picture = Callable[[int, int, int], NDArray[np.uint8]]
 """(number, width, height) → grey, (height, width)"""
@@ -65,7 +65,6 @@ class EmulatedCamera:
         ids: Iterable[int] | None = None,
         extended_ids: bool = False,
         tick_hz: int = 125_000_000,
-        chunk_payload: int = 0x4001,
     ) -> None:
         """`ids`: of the frames; by default 1 … 65535 and again, with `extended_ids` 0, 1, 2 …"""
         self.address, self.serial, self.size = address, serial, size
@@ -78,9 +77,7 @@ class EmulatedCamera:
         self.mangle: Callable[[Packets], Iterable[bytes]] = lambda packets: packets
         """Lose, reorder or copy a frame's packets as they are sent first."""
         self.stamp_error_ns = 0
-        """Added to every stamp, chunks too"""
-        self.chunk_exposure_us: float | None = None
-        """The chunk's value instead of the register's"""
+        """Added to every stamp"""
         self.mtu = 9000
         """Larger packets do not arrive."""
         self.readout_s = 0.002
@@ -93,10 +90,9 @@ class EmulatedCamera:
         self.frames = self.resent = self.unavailable = self.refused = self.ignored_triggers = 0
         self.exposed_ns: list[tuple[int, int]] = []
         """Host monotonic start and end of every exposure"""
-        self._tick_hz, self._chunk_payload = tick_hz, chunk_payload
+        self._tick_hz = tick_hz
         self._memory = bytearray(at.XML_AT)
         self._xml = at.zipped()
-        self._chunks = {name: name == "Image" for name in at.CHUNKS}
         self._controller: tuple[str, int] | None = None
         self._heard_s = 0.0
         self._kept: dict[int, Packets] = {}
@@ -238,9 +234,7 @@ class EmulatedCamera:
         if address % 4 or address + length > len(self._memory):
             raise _RefusedError(_INVALID_ADDRESS)
         if address <= at.PAYLOAD_SIZE < address + length:
-            self.set_register(at.PAYLOAD_SIZE, self._payload_size())
-        if address <= at.CHUNK_ENABLE < address + length:
-            self.set_register(at.CHUNK_ENABLE, self._chunks[self._selected_chunk()])
+            self.set_register(at.PAYLOAD_SIZE, self._image_size())
         return bytes(self._memory[address : address + length])
 
     def _write(self, address: int, data: bytes, client: tuple[str, int]) -> None:
@@ -267,8 +261,6 @@ class EmulatedCamera:
             case at.TRIGGER_SOFTWARE:
                 if self.register(at.TRIGGER_SOURCE) == at.TRIGGER_SOURCES["Software"]:
                     self._trigger()
-            case at.CHUNK_ENABLE:
-                self._chunks[self._selected_chunk()] = bool(value)
             case at.ACQUISITION:
                 self._triggered.clear()
 
@@ -286,9 +278,6 @@ class EmulatedCamera:
         self._controller = None
         for address in (_PRIVILEGE, at.ACQUISITION, _STREAM_PORT):
             self.set_register(address, 0)
-
-    def _selected_chunk(self) -> str:
-        return list(at.CHUNKS)[self.register(at.CHUNK_SELECTOR) % len(at.CHUNKS)]
 
     # -- stream
 
@@ -351,40 +340,17 @@ class EmulatedCamera:
         bits = self.register(at.PIXEL_FORMAT) >> 16 & 0xFF
         return (self.register(at.WIDTH) * self.register(at.HEIGHT) * bits + 7) // 8
 
-    def _payload_size(self) -> int:
-        chunks = sum(16 for name, on in self._chunks.items() if on and name != "Image")
-        return self._image_size() + (8 + chunks if self.register(at.CHUNK_MODE) else 0)
-
     def _packets(self, frame_id: int, ticks: int, image: bytes) -> Packets:
         extended = bool(self.register(at.GVSP_CONFIGURATION) & _EXTENDED_IDS)
-        chunks = bool(self.register(at.CHUNK_MODE))
-        payload_type = self._chunk_payload if chunks else 0x0001
         infos = [at.PIXEL_FORMAT, at.WIDTH, at.HEIGHT, at.OFFSET_X, at.OFFSET_Y]
         leader = struct.pack(
-            ">HHQ5IHH", 0, payload_type, ticks & (1 << 64) - 1, *(self.register(a) for a in infos), 0, 0
+            ">HHQ5IHH", 0, _IMAGE, ticks & (1 << 64) - 1, *(self.register(a) for a in infos), 0, 0
         )
-        data = image + (self._chunk_data(frame_id, ticks, len(image)) if chunks else b"")
         room = (self.register(at.PACKET_SIZE) & 0xFFFF) - _IP_UDP - (20 if extended else 8)
-        blocks = [data[i : i + room] for i in range(0, len(data), room)]
-        trailer = struct.pack(">HHI", 0, payload_type, self.register(at.HEIGHT))
-        trailer += struct.pack(">II", len(data), _CHUNK_LAYOUT) if chunks else b""
+        blocks = [image[i : i + room] for i in range(0, len(image), room)]
+        trailer = struct.pack(">HHI", 0, _IMAGE, self.register(at.HEIGHT))
         parts = [(_LEADER, leader), *((_PAYLOAD, b) for b in blocks), (_TRAILER, trailer)]
         return [_packet(0, frame_id, kind, n, part, extended) for n, (kind, part) in enumerate(parts)]
-
-    def _chunk_data(self, frame_id: int, ticks: int, image_size: int) -> bytes:
-        """Each chunk is followed by its id and its length; the image comes first."""
-        exposure_us = self.number(at.EXPOSURE) if self.chunk_exposure_us is None else self.chunk_exposure_us
-        values = {
-            "Timestamp": struct.pack(">Q", ticks),
-            "ExposureTime": struct.pack(">d", exposure_us),
-            "FrameID": struct.pack(">Q", frame_id),
-            "Gain": struct.pack(">d", self.number(at.GAIN)),
-        }
-        told = struct.pack(">II", at.CHUNKS["Image"], image_size)
-        for name, value in values.items():
-            if self._chunks[name]:
-                told += value + struct.pack(">II", at.CHUNKS[name], len(value))
-        return told
 
     def _send(self, packets: Iterable[bytes]) -> None:
         client, delay_s = self._client(), self.register(at.PACKET_DELAY) / self._tick_hz

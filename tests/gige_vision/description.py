@@ -35,7 +35,6 @@ EXPOSURE, EXPOSURE_AUTO, GAIN, GAIN_AUTO, FRAME_RATE = map(
 TRIGGER_MODE, TRIGGER_SOURCE, TRIGGER_ACTIVATION, TRIGGER_DELAY, TRIGGER_SOFTWARE = map(
     _address, ("TriggerMode", "TriggerSource", "TriggerActivation", "TriggerDelay", "TriggerSoftware")
 )
-CHUNK_MODE, CHUNK_SELECTOR, CHUNK_ENABLE = map(_address, ("ChunkModeActive", "ChunkSelector", "ChunkEnable"))
 LINE_SELECTOR, LINE_MODE, LINE_SOURCE = map(_address, ("LineSelector", "LineMode", "LineSource"))
 TICK_HZ, TIMESTAMP = _address("GevTimestampTickFrequency"), _address("GevTimestampValue")
 TIMESTAMP_CONTROL, GVSP_CONFIGURATION = (
@@ -45,7 +44,6 @@ TIMESTAMP_CONTROL, GVSP_CONFIGURATION = (
 PACKET_SIZE, PACKET_DELAY = _address("GevSCPSPacketSize"), _address("GevSCPD")
 
 PIXEL_FORMATS, TRIGGER_SOURCES = _values("PixelFormat"), _values("TriggerSource")
-CHUNKS = {"Image": 0x0001, "Timestamp": 0xA001, "ExposureTime": 0xA002, "FrameID": 0xA003, "Gain": 0xA004}
 
 
 def zipped() -> bytes:

@@ -167,9 +167,6 @@ class ArmInMemory:
     def condition(self, state: RobotState) -> ArmCondition:
         return condition(state)
 
-    async def missing(self) -> str:
-        return "switch it on"
-
     def stop_one_way(self, way: StopWay) -> None:
         self.log.append(f"stop by {way.value}")
         self._stopped.set()

@@ -137,18 +137,11 @@ class Box:
         self.count = 100
         self.wired = True
 
-    async def open(self) -> str:
-        return "box"
-
     async def fire(self) -> TriggerPulse:
         self.count += 1
         if self.wired:
             self.server.inject("pulse")
         return TriggerPulse(self.count, time.monotonic_ns())
-
-    async def light(self, level: float) -> None: ...
-
-    async def close(self) -> None: ...
 
 
 async def test_hardware_trigger_pairs_by_the_boxs_count(server: SimulatedGige) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from station.devices.ur_dashboard import PORT, Dashboard, DashboardError
-from station.devices.ur_probe import ProbeResult, identify, probe
+from station.devices.ur_probe import Found, identify
 from tests.codes import raises
 from tests.patience import PATIENCE_S
 
@@ -62,15 +62,15 @@ async def test_answers_keep_their_order_without_waiting(serve: Serve) -> None:
 @pytest.mark.parametrize(
     ("answers", "found"),
     [
-        (E_SERIES, ProbeResult("UR10e", "20195500001", (5, 11, 1, 108318), False)),
+        (E_SERIES, Found("UR10e", "20195500001", (5, 11, 1, 108318), False)),
         (
             {"PolyscopeVersion": "3.5.3.10825", "get robot model": "UR10"},
-            ProbeResult("UR10", "", (3, 5, 3, 10825)),
+            Found("UR10", "", (3, 5, 3, 10825)),
         ),
     ],
     ids=["e-Series, which leaves its letter out", "an old controller that knows few questions"],
 )
-async def test_a_robot_is_identified(serve: Serve, answers: dict[str, str], found: ProbeResult) -> None:
+async def test_a_robot_is_identified(serve: Serve, answers: dict[str, str], found: Found) -> None:
     dashboard = await Dashboard.open(await serve(answers))
     assert await identify(dashboard) == found
     await dashboard.close()
@@ -109,16 +109,3 @@ async def test_a_reply_that_is_too_late_breaks_the_connection(serve: Serve) -> N
         await dashboard.ask("programState")
     assert not dashboard.alive
     await dashboard.close()
-
-
-async def test_the_probe_names_every_port_that_does_not_answer(serve: Serve) -> None:
-    found = await probe(await serve(E_SERIES))
-    assert found.model == "UR10e"
-    assert len(found.problems) == 2
-    assert ":30002" in found.problems[0] and ":30004" in found.problems[1]
-
-
-async def test_the_probe_of_nobody_has_remedies_and_does_not_raise() -> None:
-    found = await probe("127.255.3.9")
-    assert found.model == "" and len(found.problems) == 3
-    assert "Services" in found.problems[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import random
 import struct
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,8 +16,7 @@ import pytest
 from station.cell.config import RobotConfig
 from station.devices.rtde import HEADER, PORT, PacketType, packet
 from station.devices.ur_link import UrLink
-from station.devices.ur_probe import ProbeResult, RobotLock
-from station.simulation.launch import SimulatedController
+from station.devices.ur_probe import Found, RobotLock
 from tests.codes import raises
 from tests.station.devices.test_ur_moves import STATE
 
@@ -47,26 +45,26 @@ def test_a_listener_that_fails_is_dropped_alone(link: Any) -> None:
 @pytest.mark.parametrize(
     ("found", "code"),
     [
-        (ProbeResult(model="UR5", serial="2016"), "other-model"),
-        (ProbeResult(model="UR10", serial="1999"), "other-robot"),
-        *((ProbeResult(model=model), "unsupported-model") for model in ("UR20", "UR7e", "UR12e")),
+        (Found(model="UR5", serial="2016"), "other-model"),
+        (Found(model="UR10", serial="1999"), "other-robot"),
+        *((Found(model=model), "unsupported-model") for model in ("UR20", "UR7e", "UR12e")),
     ],
 )
-def test_another_robot_than_configured_is_refused(link: Any, found: ProbeResult, code: str) -> None:
-    link._check_identity(ProbeResult(model="UR10", serial="2016"))
-    link._check_identity(ProbeResult())  # an old controller does not say
+def test_another_robot_than_configured_is_refused(link: Any, found: Found, code: str) -> None:
+    link._check_identity(Found(model="UR10", serial="2016"))
+    link._check_identity(Found())  # an old controller does not say
     with raises(code):
         link._check_identity(found)
 
 
 def test_another_robot_than_before_is_refused_when_the_link_comes_back(tmp_path: Path) -> None:
     link: Any = UrLink(msgspec.structs.replace(CONFIG, serial=""))
-    link._check_identity(ProbeResult(serial="2016"))
+    link._check_identity(Found(serial="2016"))
     link._lock = RobotLock("2016-test")
     link.identity = msgspec.structs.replace(link.identity, serial="2016")
-    link._check_identity(ProbeResult(serial="2016"))
+    link._check_identity(Found(serial="2016"))
     with raises("robot-exchanged"):
-        link._check_identity(ProbeResult(serial="1999"))
+        link._check_identity(Found(serial="1999"))
     link._unlock()
 
 
@@ -110,22 +108,3 @@ async def test_a_controller_that_has_no_dashboard_server_is_told_from_one_that_d
     async with await asyncio.start_server(talk, host, PORT):
         with raises(code):
             await UrLink(RobotConfig(model="UR10e", host=host)).connect()
-
-
-@pytest.mark.parametrize(
-    ("host", "remedy"),
-    [
-        ("", "give robot.host in the configuration"),
-        ("127.77.1.9", "switch the robot on, plug in its network cable, and check robot.host (127.77.1.9)"),
-    ],
-)
-async def test_where_nothing_answers_the_remedy_is_one_sentence(host: str, remedy: str) -> None:
-    assert await UrLink(RobotConfig(host=host)).missing() == remedy
-
-
-@pytest.mark.process
-async def test_a_robot_that_only_lacks_its_stream_is_told_by_name(
-    controller: Callable[..., SimulatedController],
-) -> None:
-    host = controller("UR10e").host
-    assert f"UR10e 20263000001 answers at {host}" in await UrLink(RobotConfig(host=host)).missing()

@@ -15,7 +15,7 @@ from station.devices.clocks import monotonic_from_wall_ns
 from station.devices.frame_ids import FrameIds
 from station.devices.frame_time import DeviceClock
 from station.devices.genicam_settings import Applied, apply_settings, read_settings, require_settings
-from station.devices.pixels import bits_per_pixel, decode
+from station.devices.pixels import bytes_per_pixel, decode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -84,7 +84,7 @@ class GenicamDevice:
 
     def open(self, serial: str = "") -> CameraIdentity:
         """Find, set up and start the camera. `serial`: accept only this one; empty: as configured."""
-        bits_per_pixel(self._config.pixel_format)
+        bytes_per_pixel(self._config.pixel_format)
         try:
             self._open(serial or self._config.device)
         except BaseException:

@@ -90,6 +90,8 @@ class StateReader:
         self._on_state = on_state
         self._on_end = on_end
         self._link = socket.socket()
+        self._following = False
+        """True while states come: after the handshake, until the end."""
         self._heard_s = 0.0
         """When data came last (host monotonic)."""
         self._wall_ahead_ns = _wall_ahead_ns()
@@ -117,7 +119,7 @@ class StateReader:
 
     def _end(self, why: str) -> None:
         if self.ended is None:
-            self.ended = why
+            self.ended, self._following = why, False
             asyncio.get_running_loop().remove_reader(self._link)
             self._link.close()
             self._on_end(why)
@@ -130,7 +132,7 @@ class StateReader:
         """
         try:
             for _ in range(RECEIVE_BUFFER_BYTES // READ_BYTES):
-                if self.ended is not None or self._read_once() < READ_BYTES:
+                if not self._following or self._read_once() < READ_BYTES:
                     return
         except BlockingIOError:
             pass
@@ -175,7 +177,7 @@ class StateReader:
     def _follow(self) -> None:
         self._link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._link.setblocking(False)
-        self._heard_s = time.monotonic()
+        self._heard_s, self._following = time.monotonic(), True
         for kind, payload in self._rtde.pending:
             self._take(kind, payload, time.monotonic_ns(), time.time_ns())
         asyncio.get_running_loop().add_reader(self._link, self.read)
@@ -184,9 +186,9 @@ class StateReader:
     def _expect(self) -> None:
         """End a connection that is silent for `SILENCE_S`."""
         self.read()
-        if self.ended is None and time.monotonic() > self._heard_s + SILENCE_S:
+        if self._following and time.monotonic() > self._heard_s + SILENCE_S:
             self._end(f"no data from the robot for {SILENCE_S:g} s")
-        elif self.ended is None:
+        elif self._following:
             asyncio.get_running_loop().call_later(SILENCE_S / 4, self._expect)
 
     def _take(self, kind: int, payload: bytes, monotonic_ns: int, wall_ns: int) -> None:

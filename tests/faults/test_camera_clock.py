@@ -72,10 +72,3 @@ def test_25_offset_and_drift_are_within_their_bound(drift_ppm: float) -> None:
         inside += abs(told.host_monotonic_ns - host_ns) / 1e9 <= told.bound_s
         assert told.bound_s < 0.003
     assert inside >= 93
-
-
-def test_25_a_camera_that_restarts_its_clock_is_followed() -> None:
-    clock, _ = simulated_readings(np.random.default_rng(1), 20.0, seconds=20)
-    assert clock.fit is not None
-    clock.restart()
-    assert clock.fit is None

@@ -46,14 +46,6 @@ async def test_19_a_second_frame_for_one_trigger_is_never_taken_for_the_next_pos
     assert first.frame_id and third.frame_id and frames_between(first.frame_id, third.frame_id) == 2
 
 
-def test_19_an_extra_pulse_is_noticed_by_the_boxs_count() -> None:
-    counter = FrameCounter(FrameIds.BLOCK)
-    counter.accept(10, 100)
-    with raises("pulse-count", pulses=2):
-        counter.accept(11, 102)
-    assert counter.accept(12, 103) == 1, "from there on, all is well again"
-
-
 def test_18_a_gap_in_the_frame_ids_is_an_error_even_where_a_picture_came() -> None:
     counter = FrameCounter(FrameIds.BLOCK)
     counter.accept(LAST_BLOCK_ID)

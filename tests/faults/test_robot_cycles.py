@@ -7,7 +7,7 @@ import gc
 import os
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,11 @@ import pytest
 from recordings.schema.messages import RobotState
 from station.cell.errors import RobotError
 from station.simulation.launch import SimulatedController
+from tests.faults.conftest import Cell, MakeCell
 from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.process
 
-Make = Callable[..., Awaitable[Any]]
 WARM_UP = 6
 
 
@@ -38,24 +38,24 @@ def memory_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-async def drop(c: Any, how: str) -> None:
+async def drop(c: Cell, how: str) -> None:
     """Asks again when the drop came before the controller had accepted the link that just came back."""
     reader, begun_s, asked_s = c.robot.reader, time.monotonic(), 0.0
-    while c.robot.reader is reader and reader.ended is None:
+    while reader is not None and c.robot.reader is reader and reader.ended is None:
         assert time.monotonic() - begun_s < PATIENCE_S, "the robot's loss was not noticed"
         if time.monotonic() - asked_s > 1.0:
             asked_s = time.monotonic()
-            c.admin.ask("drop", how=how)
+            await c.ask("drop", how=how)
         await asyncio.sleep(0.01)
 
 
-async def cycle(c: Any, number: int) -> None:
+async def cycle(c: Cell, number: int) -> None:
     """One drop and recovery; every fifth with control alive, every tenth with the arm in motion."""
     move = None
     if number % 5 == 0:
         await c.robot.start_control()
         if number % 10 == 0:
-            move = c.far_move() if c.joints_rad()[0] < 2.0 else None
+            move = c.far_move() if (await c.joints_rad())[0] < 2.0 else None
     await drop(c, "rst" if number % 2 else "fin")
     if move is not None:
         with pytest.raises(RobotError):
@@ -64,7 +64,7 @@ async def cycle(c: Any, number: int) -> None:
     await asyncio.wait_for(c.robot.idle(), PATIENCE_S)
 
 
-async def run_cycles(c: Any, count: int) -> None:
+async def run_cycles(c: Cell, count: int) -> None:
     before: dict[str, Any] = {}
     for number in range(count):
         await cycle(c, number)
@@ -81,13 +81,13 @@ async def run_cycles(c: Any, count: int) -> None:
     assert growth_mb < 5 + 0.01 * count, f"grew by {growth_mb:.1f} MB in {count} cycles"
 
 
-async def test_twenty_cycles(cell: Make) -> None:
+async def test_twenty_cycles(cell: MakeCell) -> None:
     await run_cycles(await cell(control=False), 20)
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-async def test_a_thousand_cycles(cell: Make) -> None:
+async def test_a_thousand_cycles(cell: MakeCell) -> None:
     await run_cycles(await cell(control=False), 1000)
 
 

@@ -8,13 +8,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from station.cell.errors import RobotError
+from tests.faults.conftest import MakeCell
 from tests.patience import until
 
 pytestmark = pytest.mark.process
@@ -47,41 +45,26 @@ asyncio.run(main(sys.argv[1], Path(sys.argv[2]), sys.argv[3]))
 """
 
 
-async def moving_driver(c: Any, arguments: list[str]) -> tuple[subprocess.Popen[str], int]:
-    """A process that moves the arm, and its child's pid; again where a busy computer ended the move first."""
-    driver = subprocess.Popen([sys.executable, "-c", DRIVER, *arguments], stdout=subprocess.PIPE, text=True)
-    assert driver.stdout is not None
-    child_pid = int(await asyncio.to_thread(driver.stdout.readline))
-    await until(lambda: c.speed_rad_s() > 0.4 or driver.poll() is not None)
-    if driver.poll() is None:
-        return driver, child_pid
-    driver.stdout.close()
-    return await moving_driver(c, arguments)
-
-
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGSTOP], ids=["SIGKILL", "SIGSTOP"])
-async def test_driving_process(
-    cell: Callable[..., Awaitable[Any]], fault_times: Callable[[Any], None], tmp_path: Path, kill: int
-) -> None:
+async def test_driving_process(cell: MakeCell, tmp_path: Path, kill: int) -> None:
     c = await cell(control=False)
     await c.robot.close()
-    arguments = [c.controller.host, str(tmp_path), c.robot.control_path]
-    driver, child_pid = await moving_driver(c, arguments)
-    with driver:
+    command = [sys.executable, "-c", DRIVER, c.controller.host, str(tmp_path), c.robot.control_path]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as driver:
         assert driver.stdout is not None
+        child_pid = int(await asyncio.to_thread(driver.stdout.readline))
+        await c.until(lambda state: max(map(abs, state["joint_speeds_rad_s"])) > 0.4)
         os.kill(driver.pid, kill)
         begun = time.monotonic()
         await c.stops()  # 1/5 s of silence, then the controller decelerates
-        stopped_s = time.monotonic() - begun
-        fault_times(type("O", (), {"noticed_s": 0.0, "stopped_s": stopped_s, "error": RobotError()}))
+        c.note_times(0.0, time.monotonic() - begun)
         await c.stays_at_rest()
         if kill == signal.SIGSTOP:
             driver.send_signal(signal.SIGCONT)
             assert (await asyncio.to_thread(driver.stdout.readline)).strip() == "computer-late"
         driver.kill()
-        driver.wait()
     await until(lambda: not Path(f"/proc/{child_pid}").exists() or _is_zombie(child_pid))
-    assert c.admin.ask("state")["program"] is None
+    await c.until(lambda state: state["program"] is None)
 
 
 def _is_zombie(pid: int) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from typing import Any
 
@@ -14,44 +13,29 @@ import pytest
 from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
 from tests.codes import raises
+from tests.faults.conftest import Cell, MakeCell
 from tests.patience import PATIENCE_S, until
 
 pytestmark = pytest.mark.process
 
-Make = Callable[..., Awaitable[Any]]
-Start = Callable[..., Awaitable[tuple[Any, asyncio.Task[None]]]]
+
+async def unheard(cell: MakeCell, model: str = "UR10") -> tuple[Cell, asyncio.Task[None]]:
+    """Control starts, its program runs, and no heartbeat has come yet."""
+    c = await cell(model, control=False)
+    c.beating = False
+    starting = asyncio.create_task(c.robot.start_control())
+    await c.until(lambda state: state["runtime_state"] == "PLAYING")
+    await asyncio.sleep(0.3)  # the process says it is ready
+    assert not starting.done() and not c.robot.control
+    return c, starting
 
 
-@pytest.fixture
-async def unheard(cell: Make) -> AsyncIterator[Start]:
-    """`await unheard("UR10")`: control starts, its program runs, and no heartbeat has come yet."""
-
-    async def start(model: str = "UR10") -> tuple[Any, asyncio.Task[None]]:
-        c = await cell(model, control=False)
-        c.beating = False
-        starting = asyncio.create_task(c.robot.start_control())
-        await until(lambda: c.admin.ask("state")["runtime_state"] == "PLAYING")
-        await asyncio.sleep(0.3)  # the process says it is ready
-        assert not starting.done() and not c.robot.control
-        return c, starting
-
-    yield start
-
-
-async def ends(starting: asyncio.Task[None]) -> str:
-    """Why: the error's code."""
-    with pytest.raises(RobotError) as caught:
-        async with asyncio.timeout(PATIENCE_S):
-            await starting
-    return caught.value.code
-
-
-async def gone(c: Any) -> None:
-    """Nothing of control is left, nothing moved, and a new go works."""
+async def gone(c: Cell) -> None:
+    """Nothing of control is left, and nothing moved."""
     await c.robot.idle()
     assert not c.robot.control and c.robot.control_pid is None
     await c.stays_at_rest()
-    assert c.asked("move") == 0
+    assert await c.asked("move") == 0
 
 
 def is_well(robot: UrRobot) -> bool:
@@ -62,29 +46,26 @@ def is_well(robot: UrRobot) -> bool:
     return False
 
 
-async def test_a_move_right_after_the_start_is_taken(cell: Make) -> None:
+async def test_a_move_right_after_the_start_is_taken(cell: MakeCell) -> None:
     c = await cell(control=False)
-    for _ in range(3):
+    for _ in range(2):
         await c.robot.start_control()
-        goal = c.joints_rad()
-        goal[5] += 0.02
-        await c.robot.move(goal, 0.5, 1.0)
+        await c.robot.move(c.near(), 0.5, 1.0)
         await c.robot.end_control()
 
 
-async def test_a_move_waits_for_a_session_that_was_busy_for_a_moment(cell: Make) -> None:
+async def test_a_move_waits_for_a_session_that_was_busy_for_a_moment(cell: MakeCell) -> None:
     c = await cell(time_scale=0.5)  # the arm's watchdog waits twice as long: only the child's limit is passed
-    goal = c.joints_rad()
-    goal[5] += 0.02
     c.beating = False
     await asyncio.sleep(0.12)  # too old for a move, too young for the watchdog
     asyncio.get_running_loop().call_later(0.03, setattr, c, "beating", True)
-    await c.robot.move(goal, 0.5, 1.0)
+    await c.robot.move(c.near(), 0.5, 1.0)
 
 
-async def test_a_stop_before_the_move_was_sent(cell: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_stop_before_the_move_was_sent(cell: MakeCell, monkeypatch: pytest.MonkeyPatch) -> None:
     c = await cell()
-    goal, heard = c.far_goal(), c.robot._child.heard
+    assert c.robot._child is not None
+    heard = c.robot._child.heard
     stops: list[asyncio.Task[None]] = []
 
     async def stop_comes_now() -> None:
@@ -94,105 +75,68 @@ async def test_a_stop_before_the_move_was_sent(cell: Make, monkeypatch: pytest.M
 
     monkeypatch.setattr(c.robot._child, "heard", stop_comes_now)
     with raises("stopped"):
-        await c.robot.move(goal, 0.5, 1.0)
+        await c.far_move()
     await stops[0]
     await gone(c)
 
 
-async def test_a_heart_that_does_not_beat_ends_the_start(unheard: Start) -> None:
-    c, starting = await unheard()
-    assert await ends(starting) == "no-heartbeat"
-    await gone(c)
-    c.beating = True
-    await c.robot.start_control()
-
-
-async def test_a_heart_that_beats_late_is_in_time(unheard: Start) -> None:
-    c, starting = await unheard()
+async def test_a_heart_that_beats_late_is_in_time(cell: MakeCell) -> None:
+    c, starting = await unheard(cell)
     c.beating = True
     await starting
     assert c.robot.control
 
 
-async def test_stop_while_no_heartbeat_was_heard(unheard: Start) -> None:
-    c, starting = await unheard()
-    await c.robot.stop("changed my mind")
-    assert await ends(starting) == "stopped"
-    await gone(c)
+def child_gets(number: signal.Signals) -> Any:
+    return lambda c: os.kill(c.robot.control_pid, number)
 
 
-@pytest.mark.parametrize("beating", [True, False])
-async def test_a_protective_stop_while_no_heartbeat_was_heard(unheard: Start, beating: bool) -> None:
-    c, starting = await unheard()
-    c.admin.ask("pstop")
-    await c.told()
-    c.beating = beating
-    assert await ends(starting) == "protective-stop"
-    await gone(c)
+BEFORE_THE_FIRST: dict[str, tuple[Any, bool, str]] = {
+    "no heartbeat": (lambda c: None, False, "no-heartbeat"),
+    "STOP": (lambda c: c.robot.stop("changed my mind"), False, "stopped"),
+    "protective stop": (lambda c: c.ask("pstop"), True, "protective-stop"),
+    "protective stop, no heartbeat": (lambda c: c.ask("pstop"), False, "protective-stop"),
+    "child segfault": (child_gets(signal.SIGSEGV), True, "control-process"),
+    "child held up": (child_gets(signal.SIGSTOP), True, "control-process"),
+    "program stopped": (lambda c: c.ask("stop_program"), True, "program-ended"),
+    "local control": (lambda c: c.ask("remote", on=False), True, "local-control"),
+    "link cut": (lambda c: c.ask("drop", how="rst"), True, "stopped"),
+    "cable pulled": (lambda c: c.ask("black_hole"), True, "stale-state"),
+    "controller restarts": (lambda c: c.ask("restart", down_s=0.5, running=True), True, "stopped"),
+}
+"""What happens before the first heartbeat; does one come then? how the start ends"""
 
 
-@pytest.mark.parametrize(
-    ("kill", "code"), [(signal.SIGSEGV, "control-process"), (signal.SIGSTOP, "control-process")]
-)
-async def test_a_control_process_that_fails_before_the_first_heartbeat(
-    unheard: Start, kill: signal.Signals, code: str
-) -> None:
-    c, starting = await unheard()
-    os.kill(c.robot.control_pid, kill)
-    c.beating = True
-    assert await ends(starting) == code
-    await gone(c)
-
-
-@pytest.mark.parametrize(
-    ("fault", "code"),
-    [
-        ({"cmd": "drop", "how": "rst"}, "stopped"),
-        ({"cmd": "black_hole"}, "stale-state"),
-        ({"cmd": "restart", "down_s": 0.5, "running": True}, "stopped"),
-    ],
-    ids=["link cut", "cable pulled", "controller restarts"],
-)
-async def test_a_link_that_fails_before_the_first_heartbeat(
-    unheard: Start, fault: dict[str, Any], code: str
-) -> None:
-    c, starting = await unheard()
-    c.admin.ask(**fault)
-    c.beating = True
-    assert await ends(starting) == code
-    if fault["cmd"] == "black_hole":
+@pytest.mark.parametrize("name", BEFORE_THE_FIRST)
+async def test_before_the_first_heartbeat(cell: MakeCell, name: str) -> None:
+    happens, beats, code = BEFORE_THE_FIRST[name]
+    c, starting = await unheard(cell, "UR10e")
+    if (doing := happens(c)) is not None:
+        await doing
+    if code in ("protective-stop", "program-ended", "local-control"):
+        await c.told()
+    c.beating = beats
+    with raises(code):
+        async with asyncio.timeout(PATIENCE_S):
+            await starting
+    if name == "cable pulled":
         # Nobody could tell the controller: its program waits, moves nothing, and is not silently replaced.
         await c.robot.idle()
-        c.admin.ask("black_hole", on=False)
+        await c.ask("black_hole", on=False)
         await until(lambda: is_well(c.robot))
         with raises("foreign-program"):
             await c.robot.start_control()
         await c.robot.stop("operator")
-    await until(lambda: c.admin.ask("state")["program"] is None)
+    if code != "protective-stop":
+        await c.until(lambda state: state["program"] is None)
     await gone(c)
 
 
-@pytest.mark.parametrize(
-    ("fault", "code"),
-    [
-        ({"cmd": "stop_program"}, "program-ended"),
-        ({"cmd": "remote", "on": False}, "local-control"),
-    ],
-)
-async def test_the_pendant_before_the_first_heartbeat(
-    unheard: Start, fault: dict[str, Any], code: str
-) -> None:
-    c, starting = await unheard("UR10e")
-    c.admin.ask(**fault)
-    await c.told()
-    c.beating = True
-    assert await ends(starting) == code
-    await gone(c)
-
-
-async def test_a_cancelled_start_leaves_nothing(unheard: Start) -> None:
-    c, starting = await unheard()
+async def test_a_cancelled_start_leaves_nothing_and_control_can_be_started_again(cell: MakeCell) -> None:
+    c, starting = await unheard(cell)
     starting.cancel()
     with pytest.raises(asyncio.CancelledError):
         await starting
     await gone(c)
+    c.beating = True
+    await c.robot.start_control()

@@ -1,13 +1,11 @@
-"""STOP: two paths, from any state, quickly, and for good."""
+"""STOP: two paths, from any state, and for good. What leaves in the call itself: test_ur_stop.py."""
 
 from __future__ import annotations
 
 import asyncio
 import os
 import signal
-from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -15,15 +13,14 @@ from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
 from tests.codes import raises
+from tests.faults.conftest import MakeCell
 from tests.patience import until
 
 pytestmark = pytest.mark.process
 
-Make = Callable[..., Awaitable[Any]]
-
 
 @pytest.mark.parametrize("model", ["UR10", "UR10e"])
-async def test_stop_in_mid_move(cell: Make, model: str) -> None:
+async def test_stop_in_mid_move(cell: MakeCell, model: str) -> None:
     c = await cell(model)
     move = await c.cruising()
     await c.robot.stop("operator")
@@ -32,51 +29,44 @@ async def test_stop_in_mid_move(cell: Make, model: str) -> None:
     await c.stops()
     await c.stays_at_rest()
     with raises("control-not-started"):
-        await c.robot.move(c.joints_rad(), 0.5, 1.0)
+        await c.robot.move(c.near(), 0.5, 1.0)
 
 
-async def test_both_paths_are_used(cell: Make) -> None:
-    c = await cell()
-    move = await c.cruising()
-    await c.robot.stop("operator")
-    with pytest.raises(RobotError):
-        await move
-    await until(lambda: c.asked("dashboard: stop") > 0)
-    # The script may have been ended by the dashboard's stop before it read the child's.
-    assert c.asked("stop") + c.asked("controller: program stopped") > 0
-
-
+@pytest.mark.parametrize("silent", [False, True], ids=["first connection", "new connection"])
 async def test_with_a_hung_child_the_dashboard_stops_the_arm(
-    cell: Make, monkeypatch: pytest.MonkeyPatch
+    cell: MakeCell, monkeypatch: pytest.MonkeyPatch, silent: bool
 ) -> None:
-    """By the connection that is open: a new one, behind the stop, is for one that does not answer."""
     c = await cell()
 
     async def no_other() -> None:
         return None
 
-    monkeypatch.setattr(c.robot, "_dashboard_stop_anew", no_other)
-    move = await c.cruising()
+    move, loop = await c.cruising(), asyncio.get_running_loop()
+    if silent:
+        monkeypatch.setattr(c.robot.dashboard, "send", lambda command: loop.create_future())
+    else:
+        monkeypatch.setattr(c.robot, "_dashboard_stop_anew", no_other)
+    assert c.robot.control_pid is not None
     os.kill(c.robot.control_pid, signal.SIGSTOP)
     await c.robot.stop("operator")
     await c.stops()
-    assert c.asked("stop") == 0 and c.asked("dashboard: stop") >= 1
+    assert await c.asked("stop") == 0 and await c.asked("dashboard: stop") >= 1
     with pytest.raises(RobotError):
         await move
 
 
-async def test_with_a_silent_dashboard_the_child_stops_the_arm(cell: Make) -> None:
+async def test_with_a_silent_dashboard_the_child_stops_the_arm(cell: MakeCell) -> None:
     c = await cell()
-    c.admin.ask("mute", ports=["dashboard"])
+    await c.ask("mute", ports=["dashboard"])
     move = await c.cruising()
     await c.robot.stop("operator")
     await c.stops()
-    assert c.asked("stop") == 1
+    assert await c.asked("stop") == 1
     with pytest.raises(RobotError):
         await move
 
 
-async def test_stop_is_welcome_in_any_state(cell: Make, tmp_path: Path) -> None:
+async def test_stop_is_welcome_in_any_state(cell: MakeCell, tmp_path: Path) -> None:
     stranger = UrRobot(RobotConfig(host="127.255.3.9"), tmp_path / "log")
     await stranger.stop("never connected")
     await stranger.close()
@@ -90,7 +80,7 @@ async def test_stop_is_welcome_in_any_state(cell: Make, tmp_path: Path) -> None:
     await c.robot.stop("closed")
 
 
-async def test_stop_while_control_starts(cell: Make) -> None:
+async def test_stop_while_control_starts(cell: MakeCell) -> None:
     c = await cell(control=False)
     start = asyncio.create_task(c.robot.start_control())
     await until(lambda: c.robot.control_pid is not None)
@@ -98,11 +88,13 @@ async def test_stop_while_control_starts(cell: Make) -> None:
     with raises("stopped"):
         await start
     await asyncio.sleep(0.4)
-    await until(lambda: c.admin.ask("state")["program"] is None)
+    await c.until(lambda state: state["program"] is None)
     assert not c.robot.control and c.robot.control_pid is None
 
 
-async def test_stop_before_the_control_process_exists(cell: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_stop_before_the_control_process_exists(
+    cell: MakeCell, monkeypatch: pytest.MonkeyPatch
+) -> None:
     c = await cell(control=False)
     checks = c.robot._may_start
 
@@ -113,38 +105,22 @@ async def test_stop_before_the_control_process_exists(cell: Make, monkeypatch: p
     monkeypatch.setattr(c.robot, "_may_start", stop_comes_now)
     with raises("stopped"):
         await c.robot.start_control()
-    assert c.robot.control_pid is None and c.asked("upload") == 0
+    assert c.robot.control_pid is None and await c.asked("upload") == 0
 
 
-async def test_a_dashboard_connection_that_does_not_answer_is_replaced(
-    cell: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_new_approval_right_after_a_stop(cell: MakeCell) -> None:
     c = await cell()
-    move = await c.cruising()
-    loop = asyncio.get_running_loop()
-    monkeypatch.setattr(c.robot.dashboard, "send", lambda command: loop.create_future())
-    os.kill(c.robot.control_pid, signal.SIGSTOP)
-    await c.robot.stop("operator")
-    await until(lambda: c.asked("dashboard: stop") >= 1)
-    with pytest.raises(RobotError):
-        await move
-
-
-async def test_a_new_go_right_after_a_stop(cell: Make) -> None:
-    c = await cell()
-    for _ in range(3):
+    for _ in range(2):
         move = await c.cruising()
         await c.robot.stop("operator")
         with pytest.raises(RobotError):
             await move
         await c.robot.start_control()  # waits for the old control to be gone
     assert c.robot.control
-    goal = c.joints_rad()
-    goal[5] += 0.05
-    await c.robot.move(goal, 0.5, 1.0)
+    await c.robot.move(c.near(), 0.5, 1.0)
 
 
-async def test_a_cancelled_move_stops_the_arm(cell: Make) -> None:
+async def test_a_cancelled_move_stops_the_arm(cell: MakeCell) -> None:
     c = await cell()
     move = await c.cruising()
     move.cancel()

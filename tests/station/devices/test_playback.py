@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import time
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -23,9 +25,10 @@ from recordings.schema.messages import (
     View,
 )
 from recordings.writer import RecordingWriter
-from station.cell.config import PAPER_BOARD
+from station.cell.config import PAPER_BOARD, CameraConfig, RobotConfig, StationConfig
 from station.cell.errors import StaleStateError
-from station.devices.playback import PlaybackCamera, PlaybackRobot
+from station.cli.serve import serve_command
+from station.devices.playback import PlaybackCamera, PlaybackRobot, playback_cell
 from tests.codes import raises
 from tests.patience import until
 
@@ -42,7 +45,7 @@ def recording(tmp_path: Path) -> Path:
     return record(tmp_path / "session.mcap", joints=True)
 
 
-def record(path: Path, *, joints: bool, cut: int | None = None) -> Path:
+def record(path: Path, *, joints: bool, cut: int | None = None, config: bytes | None = None) -> Path:
     """`cut`: this picture's file lacks its end."""
     info = SessionInfo(
         name="session",
@@ -61,6 +64,8 @@ def record(path: Path, *, joints: bool, cut: int | None = None) -> Path:
         flange = forward(MODELS["UR10"], start)
         matrix = tuple(tuple(float(x) for x in row) for row in flange)
         writer.view(View(i, f"pose {i}", i, matrix, joints_rad=start if joints else None, stamps=stamps))
+    if config is not None:
+        writer.attach("config.yaml", "application/yaml", config)
     return writer.finish()
 
 
@@ -139,6 +144,39 @@ async def test_states_are_published_and_stop_ends_a_move(recording: Path) -> Non
     assert robot.latest().joints_rad == STARTS[0] and not any(robot.latest().joint_speeds_rad_s)
 
 
-def test_a_recording_without_joints_plays_as_a_camera_only(tmp_path: Path) -> None:
-    with raises("no-joints"):
-        PlaybackRobot(record(tmp_path / "imported.mcap", joints=False))
+CONFIG = StationConfig(
+    robot=RobotConfig(model="UR10", host="192.168.1.9", serial="R1"),
+    camera=CameraConfig(driver="aravis", device="KJ1", trigger="hardware"),
+    board=PAPER_BOARD,
+    name="cell-3",
+)
+
+
+async def test_a_cell_plays_the_recorded_poses_and_can_reach_no_hardware(tmp_path: Path) -> None:
+    cell = playback_cell(record(tmp_path / "s.mcap", joints=True, config=msgspec.yaml.encode(CONFIG)))
+    assert cell.source == "playback" and not cell.simulated
+    assert cell.config.robot.host == "" and cell.config.camera.driver == "playback"
+    assert cell.config.trigger is None and cell.trigger is None and cell.config.name == "playback"
+    assert cell.plan is not None and len(cell.plan.poses) == len(STARTS)
+    assert (await cell.camera.open()).driver == "playback"
+    assert np.array_equal((await cell.camera.capture()).pixels, image(0)), "the arm stands at the first pose"
+
+
+@pytest.mark.parametrize(
+    ("how", "code"),
+    [
+        ({"joints": True}, "no-config"),
+        ({"joints": True, "config": b"robot: {arms: 3}"}, "no-config"),
+        ({"joints": False, "config": msgspec.yaml.encode(CONFIG)}, "no-joints"),
+    ],
+)
+def test_what_cannot_be_played_as_a_cell_says_why(tmp_path: Path, how: Any, code: str) -> None:
+    with raises(code):
+        playback_cell(record(tmp_path / "a.mcap", **how))
+
+
+def test_exactly_one_cell_is_served(tmp_path: Path) -> None:
+    with raises("usage"):
+        serve_command(simulate=True, replay=tmp_path)
+    with raises("usage"):
+        serve_command()

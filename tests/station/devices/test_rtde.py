@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -25,36 +26,33 @@ MOVE = Recipe(
 )
 
 
-def test_a_joint_move_is_76_bytes() -> None:
-    data = MOVE.pack([1, 0.0, -1.0, 1.5, 0.0, 0.0, 0.25, 1.05, 1.4, 1])
-    assert len(data) == 76
-    assert data[:8] == bytes.fromhex("004C5501") + struct.pack(">i", 1)
-    assert data[8:16] == struct.pack(">d", 0.0)
-    assert data[-12:] == struct.pack(">di", 1.4, 1)
+STOP = Recipe(
+    19,
+    ("input_int_register_0", "input_double_register_0", "input_int_register_1"),
+    ("INT32", "DOUBLE", "INT32"),
+)
+SLIDER = Recipe(
+    4,
+    ("input_int_register_23", "speed_slider_mask", "speed_slider_fraction"),
+    ("INT32", "UINT32", "DOUBLE"),
+)
 
 
-def test_clear_is_8_bytes() -> None:
-    assert Recipe(4, ("input_int_register_0",), ("INT32",)).pack([0]) == bytes.fromhex("0008550400000000")
-
-
-def test_stop_joint_is_20_bytes() -> None:
-    stop = Recipe(
-        19, ("input_int_register_0", "input_double_register_0", "input_int_register_1"),
-        ("INT32", "DOUBLE", "INT32"),
-    )  # fmt: skip
-    assert stop.pack([34, 2.0, 0]) == bytes.fromhex("00145513") + struct.pack(">idi", 34, 2.0, 0)
-
-
-def test_speed_slider_is_20_bytes() -> None:
-    slider = Recipe(
-        4, ("input_int_register_23", "speed_slider_mask", "speed_slider_fraction"),
-        ("INT32", "UINT32", "DOUBLE"),
-    )  # fmt: skip
-    assert slider.pack([22, 1, 0.5]) == bytes.fromhex("00145504") + struct.pack(">iId", 22, 1, 0.5)
-
-
-def test_controller_version_request_is_a_bare_header() -> None:
-    assert packet(PacketType.CONTROLLER_VERSION) == bytes.fromhex("000376")
+@pytest.mark.parametrize(
+    ("sent", "seen"),
+    [
+        (
+            MOVE.pack([1, 0.0, -1.0, 1.5, 0.0, 0.0, 0.25, 1.05, 1.4, 1]),
+            "004C5501" + struct.pack(">i8di", 1, 0.0, -1.0, 1.5, 0.0, 0.0, 0.25, 1.05, 1.4, 1).hex(),
+        ),
+        (Recipe(4, ("input_int_register_0",), ("INT32",)).pack([0]), "0008550400000000"),
+        (STOP.pack([34, 2.0, 0]), "00145513" + struct.pack(">idi", 34, 2.0, 0).hex()),
+        (SLIDER.pack([22, 1, 0.5]), "00145504" + struct.pack(">iId", 22, 1, 0.5).hex()),
+        (packet(PacketType.CONTROLLER_VERSION), "000376"),
+    ],
+)
+def test_packets_are_as_seen_on_the_wire(sent: bytes, seen: str) -> None:
+    assert sent == bytes.fromhex(seen)
 
 
 @given(

@@ -102,6 +102,15 @@ async def test_the_end_of_a_link_is_told_once(stream: Follow, fault: dict[str, s
     assert s.ends == [words] == [s.reader.ended]
 
 
+async def test_a_connection_that_is_still_being_opened_is_not_read() -> None:
+    """The age of news is judged while a lost connection comes back, too."""
+    ends: list[str] = []
+    reader = StateReader("127.91.7.3", lambda _: None, ends.append)
+    reader.read()
+    assert reader.ended is None and not ends
+    reader.close()
+
+
 async def test_a_port_that_is_no_rtde_is_refused() -> None:
     async def babble(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"\x00\x01HTTP/1.1 400 Bad Request")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -110,12 +109,6 @@ def datasets() -> Path:
     if not os.access(DATASETS, os.R_OK | os.X_OK):
         pytest.skip(f"no real recordings to be read at {DATASETS} (set STATION_DATASETS)")
     return DATASETS
-
-
-def functions_called(text: str) -> set[str]:
-    """By a URScript program, beside its own."""
-    own = set(re.findall(r"\b(?:def|thread)\s+(\w+)", text))
-    return set(re.findall(r"\b([A-Za-z_]\w*)\(", text)) - own
 
 
 def rests_short_of_its_goal(admin: AdminClient) -> None:

@@ -9,7 +9,6 @@ into the bound.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 
@@ -46,7 +45,7 @@ def monotonic_from_wall_ns(wall_ns: int) -> int:
 
 
 class ClockEstimator:
-    """Feed it every arrival; memory and time per call are bounded. Usable from several threads.
+    """Feed it every arrival; memory and time per call are bounded.
 
     `window_s`: how far back arrivals count. `latency_s`: what is known of the shortest delay (half of the
     best round trip, for instance). A device time that goes back starts afresh: the device restarted.
@@ -60,35 +59,24 @@ class ClockEstimator:
         """(device time, smallest host − device in ns) of each stretch of time, oldest first."""
         self._bin_start_s = 0.0
         self._newest_s = 0.0
-        self._samples = 0
         self._fit: ClockFit | None = None
-        self._lock = threading.Lock()
 
     def add(self, device_s: float, host_monotonic_ns: int) -> None:
         gap_ns = host_monotonic_ns - device_s * 1e9
-        with self._lock:
-            if self._bins and device_s < self._newest_s - self._bin_s:
-                self._forget()
-            self._newest_s = device_s
-            self._samples += 1
-            if not self._bins or device_s >= self._bin_start_s + self._bin_s:
-                self._bins.append((device_s, gap_ns))
-                self._bin_start_s = device_s
-                while self._bins[0][0] < device_s - self._window_s:
-                    self._bins.popleft()
-                if len(self._bins) > 2 * BINS:
-                    self._merge()
-            elif gap_ns < self._bins[-1][1]:
-                self._bins[-1] = (device_s, gap_ns)
-
-    def reset(self) -> None:
-        with self._lock:
-            self._forget()
-
-    def _forget(self) -> None:
-        self._bins.clear()
-        self._bin_s = min(FIRST_BIN_S, self._window_s / BINS)
-        self._samples, self._fit = 0, None
+        if self._bins and device_s < self._newest_s - self._bin_s:
+            self._bins.clear()
+            self._bin_s = min(FIRST_BIN_S, self._window_s / BINS)
+            self._fit = None
+        self._newest_s = device_s
+        if not self._bins or device_s >= self._bin_start_s + self._bin_s:
+            self._bins.append((device_s, gap_ns))
+            self._bin_start_s = device_s
+            while self._bins[0][0] < device_s - self._window_s:
+                self._bins.popleft()
+            if len(self._bins) > 2 * BINS:
+                self._merge()
+        elif gap_ns < self._bins[-1][1]:
+            self._bins[-1] = (device_s, gap_ns)
 
     def _merge(self) -> None:
         """Pairs of bins become one: short bins are for the beginning, when there is little else."""
@@ -98,19 +86,10 @@ class ClockEstimator:
         self._bin_s *= 2
 
     def fit(self) -> ClockFit | None:
-        """The newest estimate; None before there is enough to say anything.
-
-        Whoever adds arrivals waits for copying only, never for the estimate.
-        """
-        with self._lock:
-            if len(self._bins) < LEAST_BINS or self._is_fresh(self._fit):
-                return self._fit
-            points, newest_s, samples = np.array(self._bins), self._newest_s, self._samples
-        fit = _estimate(points, newest_s, self.latency_s)
-        with self._lock:
-            if self._bins and self._samples >= samples:  # not forgotten meanwhile
-                self._fit = fit
-        return fit
+        """The newest estimate; None before there is enough to say anything."""
+        if len(self._bins) >= LEAST_BINS and not self._is_fresh(self._fit):
+            self._fit = _estimate(np.array(self._bins), self._newest_s, self.latency_s)
+        return self._fit
 
     def _is_fresh(self, fit: ClockFit | None) -> bool:
         return fit is not None and self._newest_s - fit.reference_s < min(REFIT_S, REFIT_SHARE * fit.span_s)

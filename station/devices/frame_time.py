@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from typing import NamedTuple
 
 from recordings.schema.messages import ClockReading, FrameTime, TimeSource
@@ -29,11 +28,9 @@ class DeviceClock:
     The newest good reading gives the offset, the quickest ones early and late in the window the drift.
     """
 
-    def __init__(self, readings: Iterable[ClockReading] = ()) -> None:
+    def __init__(self) -> None:
         self._readings: deque[_Reading] = deque(maxlen=READINGS_KEPT)
         self._fresh: list[ClockReading] = []
-        for reading in readings:
-            self.add(reading)
 
     def add(self, reading: ClockReading) -> None:
         """A reading that no earlier one agrees with begins anew: the clock was set or started again."""

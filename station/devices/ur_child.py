@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import msgspec
 
@@ -25,6 +25,7 @@ from station.cell.config import ControlPath
 from station.cell.errors import RobotError
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 CONNECT_S = 8.0
 HEARD_S = 1.0
@@ -49,9 +50,8 @@ class _Answer(msgspec.Struct):
     ns: int = 0
     kicked: bool = False
     lost: bool = False
-    id: int | None = None
-    ok: bool = False
-    error: str = ""
+    moved: str | None = None
+    """Why the move was not taken; empty: it was."""
     stopped: bool = False
     died: bool = False
 
@@ -72,8 +72,8 @@ class ControlChild:
         self._kicked_ns = 0
         """Time of the newest heartbeat that reset the watchdog (host monotonic)."""
         self._news = asyncio.Event()
-        self._moves: dict[int, asyncio.Future[_Answer]] = {}
-        self._number = 0
+        self._moved: asyncio.Future[_Answer] = self._loop.create_future()
+        """Answer to the newest request for a move."""
         self._beat_ns = 0
         self._answered_ns = 0
         self.started_s = 0.0
@@ -156,29 +156,19 @@ class ControlChild:
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Request an asynchronous move; return when the control program accepted it. Raises RobotError."""
-        self._number += 1
-        answer: asyncio.Future[_Answer] = self._loop.create_future()
-        self._moves[self._number] = answer
-        request = {
-            "do": "move",
-            "id": self._number,
-            "joints": list(joints_rad),
-            "speed": speed_rad_s,
-            "acceleration": acceleration_rad_s2,
-        }
+        self._moved = self._loop.create_future()
+        speeds = {"speed": speed_rad_s, "acceleration": acceleration_rad_s2}
+        if not self._send({"do": "move", "joints": list(joints_rad), **speeds}):
+            raise self._trouble(f"takes no requests{self._exit()}")
         try:
-            if not self._send(request):
-                raise self._trouble(f"takes no requests{self.exit_description()}")
             async with asyncio.timeout(ACKNOWLEDGE_S):
-                reply = await answer
+                reply = await self._moved
         except TimeoutError:
             raise self._trouble(f"did not acknowledge the move within {ACKNOWLEDGE_S:g} s") from None
-        finally:
-            self._moves.pop(self._number, None)
         if reply.died:
             raise self._death()
-        if not reply.ok:
-            raise RobotError("move-refused", reason=reply.error)
+        if reply.moved:
+            raise RobotError("move-refused", reason=reply.moved)
 
     def stop(self) -> None:
         """Send the stop request to the child now. Never raises."""
@@ -194,7 +184,7 @@ class ControlChild:
             raise RobotError("watchdog")
 
     def _death(self) -> RobotError:
-        return self._trouble(f"died{self.exit_description()}")
+        return self._trouble(f"died{self._exit()}")
 
     def _trouble(self, what: str) -> RobotError:
         return RobotError("control-process", what=what, log=self._log_path)
@@ -241,14 +231,11 @@ class ControlChild:
                 return
             await asyncio.sleep(0.005)
 
-    def exit_description(self) -> str:
-        """Signal or exit code; empty while it lives or after a normal end."""
-        code = self._process.poll()
-        if code is None or code == 0:
-            return ""
-        if code < 0:
-            return f" (signal {-code}, {signal.Signals(-code).name})"
-        return f" (exit code {code})"
+    def _exit(self) -> str:
+        """Name signal or exit code; empty while it lives or after a normal end."""
+        code = self._process.poll() or 0
+        how = f"signal {-code}, {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        return f" ({how})" if code else ""
 
     def _receive(self) -> bool:
         """Read and handle one message; False: there was none."""
@@ -269,15 +256,12 @@ class ControlChild:
                 self._kicked_ns = answer.beat
                 self.kicks_s.append(answer.ns / 1e9)
             self._news.set()
-        elif answer.id is not None:
-            waiter = self._moves.get(answer.id)
-            if waiter is not None and not waiter.done():
-                waiter.set_result(answer)
+        elif answer.moved is not None:
+            _resolve(self._moved, answer)
         elif answer.stopped:
-            if not self.stop_acknowledged.done():
-                self.stop_acknowledged.set_result(None)
-        elif not self._ready.done():
-            self._ready.set_result(answer)
+            _resolve(self.stop_acknowledged, None)
+        else:
+            _resolve(self._ready, answer)
         return True
 
     def _close(self) -> None:
@@ -286,11 +270,14 @@ class ControlChild:
             self._channel.close()
         self.gone.set()
         self._news.set()
-        for waiter in (*self._moves.values(), self._ready):
-            if not waiter.done():
-                waiter.set_result(_Answer(died=True))
-        if not self.stop_acknowledged.done():
-            self.stop_acknowledged.set_result(None)
+        for waiter in (self._moved, self._ready):
+            _resolve(waiter, _Answer(died=True))
+        _resolve(self.stop_acknowledged, None)
+
+
+def _resolve(waiter: asyncio.Future[T], result: T) -> None:
+    if not waiter.done():
+        waiter.set_result(result)
 
 
 def _log(path: Path) -> BinaryIO:

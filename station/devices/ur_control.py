@@ -5,13 +5,13 @@ ur_rtde may hang, crash or abort, so it runs in this process, which can be kille
 It never reconnects, never uploads its script twice and never moves without a request.
 
 Requests: {"do": "beat", "ns": N}   N: host monotonic time of the session loop; resets the watchdog if fresh
-          {"do": "move", "id": I, "joints": [6], "speed": rad/s, "acceleration": rad/s²}
+          {"do": "move", "joints": [6], "speed": rad/s, "acceleration": rad/s²}
           {"do": "stop", "deceleration": …}
           {"do": "end"}
 Answers:  {"ready": true, "tcp": [6] | null} · {"refused": an `ErrorData`}
           {"beat": N, "ns": N, "kicked": bool, "lost": bool}   kicked: the beat was fresh and the script took
                                                                it, at `ns`; lost: the script is gone
-          {"id": I, "ok": bool, "error": text} · {"stopped": true}
+          {"moved": why not, empty: it was taken} · {"stopped": true}
 """
 
 from __future__ import annotations
@@ -63,8 +63,7 @@ class MotionServer:
             if verb == "beat":
                 self._beat(int(request["ns"]))
             elif verb == "move":
-                error = self._move(request)
-                self.answer({"id": request["id"], "ok": not error, "error": error})
+                self.answer({"moved": self._move(request)})
             elif verb == "stop":
                 self._stopped = True
                 # Synchronously, because ur_rtde 1.6.5 carries out an asynchronous stopJ as a stopl of the
@@ -88,13 +87,8 @@ class MotionServer:
             armed = self._armed or self._arm()
             kicked = bool(armed and self._control.kickWatchdog())
             self._script_lost = not kicked
-        told: dict[str, object] = {
-            "beat": beat_ns,
-            "ns": time.monotonic_ns(),
-            "kicked": kicked,
-            "lost": self._script_lost,
-        }
-        self.answer(told)
+        now_ns, lost = time.monotonic_ns(), self._script_lost
+        self.answer({"beat": beat_ns, "ns": now_ns, "kicked": kicked, "lost": lost})
 
     def _arm(self) -> bool:
         """Arm the watchdog: from now on the script ends without regular resets."""

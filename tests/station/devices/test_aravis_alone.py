@@ -145,13 +145,6 @@ async def test_settings_are_read_after_the_exposure() -> None:
     await camera.close()
 
 
-async def test_a_camera_that_was_not_opened_says_so() -> None:
-    camera = AravisCamera(CameraConfig())
-    with raises("not-open"):
-        await camera.capture()
-    await camera.close()
-
-
 class Settable:
     """In place of `Aravis.Camera`: notes what is set and tells of what stands."""
 

@@ -103,14 +103,6 @@ def test_a_device_that_restarts_starts_afresh() -> None:
     assert fit(clock).to_host_ns(0.1) == pytest.approx(77_100_000_000, abs=2_000_000)
 
 
-def test_a_reset_clock_knows_nothing_of_before() -> None:
-    clock = ClockEstimator()
-    feed(clock, 10, 125, 0.0, 0.0005, seed=4)
-    assert clock.fit() is not None
-    clock.reset()
-    assert clock.fit() is None
-
-
 def test_memory_is_bounded_and_old_arrivals_are_forgotten() -> None:
     clock = ClockEstimator(window_s=10.0)
     feed(clock, 200, 500, 0.0, 0.0002, seed=5)

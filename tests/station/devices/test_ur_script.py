@@ -272,13 +272,6 @@ def test_the_calls_mean_what_they_mean_in_ur_rtde(
 
 
 @pytest.mark.process
-def test_the_end_of_the_script(running: SimulatedController, connect: Connect, admin: AdminClient) -> None:
-    control = connect(running.host)
-    control.stopScript()
-    assert admin.ask("state")["runtime_state"] == "STOPPED"
-
-
-@pytest.mark.process
 def test_a_move_that_a_paused_script_did_not_answer_is_not_made_when_it_goes_on(
     running: SimulatedController, connect: Connect, admin: AdminClient
 ) -> None:
@@ -339,16 +332,6 @@ def test_a_start_is_refused(
     assert uploads(admin) == (code == "script-not-started")
     if code == "program-playing":
         assert admin.ask("state")["program"] == "palletising.urp"
-
-
-@pytest.mark.process
-def test_a_second_client_is_refused_and_does_not_disturb(
-    running: SimulatedController, connect: Connect, admin: AdminClient
-) -> None:
-    control = connect(running.host)
-    with pytest.raises(RobotError) as caught:
-        connect(running.host)
-    assert caught.value.code == "registers-in-use" and control.setWatchdog(WATCHDOG_HZ)
 
 
 def test_nothing_is_written_behind_half_a_packet() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import gc
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -13,18 +12,12 @@ import pytest
 
 from recordings.reader import open_recording
 from station.analysis.worker import board_box, image_motion
-from station.cell.config import StillnessConfig
 from station.cell.errors import CameraError
 from station.cell.pose_plan import ExpectedView
 from station.cell.status import StationState as S
-from station.cell.stillness import StillnessMonitor
 from station.session.capture import ImageWatch
-from station.session.queue import PoseQueue
-from station.simulation.camera import RenderedCamera
-from station.simulation.launch import SimulatedController
-from station.simulation.truth import write_truth
 from tests.patience import until
-from tests.station.session_rig import POSES, TRUTH, Rig
+from tests.station.session_rig import POSES, Rig
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(4).normal(128, 150, (600, 760)), (0, 0), 1.5)
 
@@ -147,31 +140,3 @@ async def test_a_camera_that_fails_when_nobody_looks_any_more_is_no_traceback(
     gc.collect()
     await asyncio.sleep(0)
     assert logged == []
-
-
-@pytest.mark.process
-async def test_a_ringing_bracket_is_waited_for(
-    rig: Rig, controller: Callable[..., SimulatedController], tmp_path: Path
-) -> None:
-    write_truth(TRUTH, tmp_path / "truth.json")
-    rendered = RenderedCamera(TRUTH, controller(truth=tmp_path / "truth.json").host)
-    await rendered.open()
-    context = rig.session.context
-    context.queue = PoseQueue(context.require_queue().plan)
-    context.stillness = StillnessMonitor(context.geometry.model, StillnessConfig(timeout_s=20.0))
-    rig.arm.subscribe(context.stillness.add)
-    rig.arm.rest()
-    object.__setattr__(context.cell, "camera", rendered)
-    await rendered.inject("ringing", {"amplitude_rad": 0.01, "frequency_hz": 6.3})
-    async with ImageWatch(context, 0) as watch:
-        settling = asyncio.ensure_future(context.stillness.settle(lambda: True, watch.look))
-        look = None
-        while look is None:
-            await asyncio.sleep(0.02)
-            look = watch.look(0)
-        assert look > 0.5 and not settling.done()
-        await rendered.inject("ringing")
-        motion_px = (await settling).image_motion_px
-        assert motion_px is not None and motion_px < 0.3
-    assert await rendered.capture()  # the camera is free
-    await rendered.close()

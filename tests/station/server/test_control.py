@@ -19,7 +19,7 @@ import pytest
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
-from station.protocol.messages import LINE_LIMIT_BYTES, USER_CLIENT_LIMIT, Reply
+from station.protocol.messages import LINE_LIMIT_BYTES, Reply
 from station.protocol.verbs import Go
 from station.server.approval import Peer
 from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer
@@ -79,11 +79,15 @@ async def raw(path: Path, *lines: bytes) -> list[dict[str, Any]]:
     return answers
 
 
-async def test_the_socket_is_the_groups_and_knows_its_peer(server: Served) -> None:
+async def test_the_socket_is_the_groups_and_knows_its_peer(server: Served, handler: RecordingHandler) -> None:
     _, path = server
     assert stat.S_IMODE(path.stat().st_mode) == 0o660
     async with Client(path) as client:
         assert (await client.request("doctor"))["pid"] == os.getpid()
+        with pytest.raises(RefusedError) as refused:
+            await client.call(Go("x"))
+    assert refused.value.data == RefusedError("no-control", holder="anna").data
+    await until(lambda: handler.lost)
 
 
 async def test_stop_passes_everything_that_is_queued(server: Served, handler: RecordingHandler) -> None:
@@ -97,14 +101,6 @@ async def test_stop_passes_everything_that_is_queued(server: Served, handler: Re
         assert "make_plan" not in handler.order
         handler.release.set()
         await planning
-
-
-async def test_refusals_keep_their_code_values_and_remedy(server: Served) -> None:
-    _, path = server
-    async with Client(path) as client:
-        with pytest.raises(RefusedError) as refused:
-            await client.call(Go("x"))
-    assert refused.value.data == RefusedError("no-control", holder="anna").data
 
 
 async def test_watchers_get_everything_once_then_only_changes(server: Served) -> None:
@@ -231,22 +227,6 @@ async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: R
         assert await client.request("doctor")
         assert len(handler.lost) == 1
     stuck.close()
-
-
-async def test_more_clients_than_seats_are_told(server: Served) -> None:
-    _, path = server
-    clients = [await Client(path).open() for _ in range(USER_CLIENT_LIMIT)]
-    answers = await raw(path)
-    assert answers[0]["problem"]["code"] == "house-full"
-    for client in clients:
-        await client.close()
-
-
-async def test_a_lost_connection_is_told_to_the_handler(server: Served, handler: RecordingHandler) -> None:
-    _, path = server
-    client = await Client(path).open()
-    await client.close()
-    await until(lambda: handler.lost)
 
 
 async def test_a_stale_socket_is_replaced_a_living_one_is_not(server: Served, tmp_path: Path) -> None:

@@ -214,21 +214,26 @@ async def test_a_defect_in_the_estimate_costs_one_estimate(rig: Rig, monkeypatch
     assert rig.pose_states == ["done"] * POSES
 
 
-def _hang(seconds: float = 0.5) -> None:
-    time.sleep(seconds)
-
-
-async def test_a_worker_that_hangs_is_ended_without_holding_up_the_loop(
+async def test_a_call_that_hangs_costs_its_own_answer_only_and_nobody_waits_for_its_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     workers = Workers(start_worker, warm_up)
-    await workers.call(_hang, 0.0)
+    await workers.start()
     assert workers._pool is not None
     ended, waited = threading.Event(), list[bool]()
     for process in workers._pool._processes.values():  # ones that take their time to end
         monkeypatch.setattr(process, "join", lambda *_: waited.append(ended.wait(PATIENCE_S)))
-    with pytest.raises(WorkerError):
-        await workers.call(_hang, PATIENCE_S, timeout_s=0.1)
-    assert not waited
+    slow = asyncio.ensure_future(workers.call(time.sleep, 0.6))
+    hanging = asyncio.ensure_future(workers.call(time.sleep, PATIENCE_S, timeout_s=0.5))
+    # Neither the calls before it nor the worker that starts anew count as its own time.
+    behind = asyncio.ensure_future(workers.call(time.sleep, 0.0, timeout_s=0.5))
+    results = await asyncio.gather(slow, hanging, behind, return_exceptions=True)
+    assert results[0] is None and results[2] is None and not waited
+    assert isinstance(results[1], WorkerError) and results[1].code == "worker-late"
     ended.set()
+    # At the station's end a call that waits starts no worker.
+    calls = [asyncio.ensure_future(workers.call(time.sleep, s)) for s in (PATIENCE_S, 0.0)]
+    await asyncio.sleep(0.05)
     workers.close()
+    results = await asyncio.gather(*calls, return_exceptions=True)
+    assert [type(result) for result in results] == [WorkerError] * 2 and workers._pool is None

@@ -49,40 +49,6 @@ async def test_a_picture_that_ends_oddly_leaves_no_state_of_work(
     assert bare_rig.pose_states == ["planned"]
 
 
-async def _begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> tuple[asyncio.Event, asyncio.Future[None]]:
-    """Free drive, for as long as its recording is not opened: until the event is set."""
-    opened, settings = asyncio.Event(), rig.camera.settings
-
-    async def slow() -> dict[str, object]:
-        await opened.wait()
-        return await settings()
-
-    monkeypatch.setattr(rig.camera, "settings", slow)
-    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True))
-    await asyncio.sleep(0.02)
-    return opened, beginning
-
-
-async def test_stop_while_free_drive_begins_stays_latched(
-    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened, beginning = await _begins(bare_rig, monkeypatch)
-    await bare_rig.session.stop("bert")
-    opened.set()
-    with raises("wrong-state"):
-        await beginning
-    assert bare_rig.state is S.STOPPED and bare_rig.session.context.requests.halt
-
-
-async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened, beginning = await _begins(rig, monkeypatch)
-    with raises("wrong-state"):
-        await rig.session.prepare(1, Purpose.RUN)
-    opened.set()
-    await beginning
-    assert rig.state is S.FREE_DRIVE
-
-
 async def test_free_drive_does_not_begin_beside_a_picture_that_a_lost_lease_left(
     bare_rig: Rig, held_camera: asyncio.Event
 ) -> None:
@@ -101,10 +67,10 @@ async def test_free_drive_does_not_begin_beside_a_picture_that_a_lost_lease_left
 
 
 @pytest.mark.parametrize("fails", [False, True])
-async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
-    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch, fails: bool
+async def test_while_free_drive_begins_no_go_is_given_and_stop_leaves_a_way_on(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, fails: bool
 ) -> None:
-    rig, disk, opening = bare_rig, asyncio.Event(), SessionRecording.open
+    disk, opening = asyncio.Event(), SessionRecording.open
 
     async def slow(recording: SessionRecording, queue: PoseQueue, picture: Image | None = None) -> None:
         await disk.wait()
@@ -115,7 +81,10 @@ async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
     monkeypatch.setattr(SessionRecording, "open", slow)
     beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True))
     await rig.until(S.FREE_DRIVE)
+    with raises("wrong-state"):
+        await rig.session.prepare(1, Purpose.RUN)
     await rig.session.stop("bert")
+    assert rig.state is S.STOPPED and rig.session.context.requests.halt
     await rig.session.acknowledge("anna")
     disk.set()
     with pytest.raises(RecordingError if fails else RefusedError):

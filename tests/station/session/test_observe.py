@@ -47,33 +47,20 @@ async def test_corners_and_the_arms_pose_of_mid_exposure_without_control_or_sess
     assert not list(rig.session.context.root.rglob("*.mcap*"))
 
 
-async def test_no_picture_is_taken_of_an_arm_that_moves(rig: Rig) -> None:
+async def test_no_picture_of_an_arm_that_moves_or_of_a_session_is_told(rig: Rig) -> None:
     rig.arm.rest()
-    state = rig.arm.latest()
-    moving = msgspec.structs.replace(state, joint_speeds_rad_s=(0.1,) * 6)
-    rig.session.context.stillness.add(
-        msgspec.structs.replace(
-            moving,
-            stamps=msgspec.structs.replace(state.stamps, controller_s=state.stamps.controller_s + 0.008),
-        )
-    )
-    with raises("arm-moves"):
-        await rig.session.previews.observe(TAG)
-    assert rig.camera.taken == 0
-
-
-async def test_a_picture_that_the_arm_moved_in_is_not_told(rig: Rig) -> None:
-    rig.arm.rest()
-    at = rig.arm.at
+    at, state = rig.arm.at, rig.arm.latest()
     rig.arm.at = lambda ns: msgspec.structs.replace(at(ns), joint_speeds_rad_s=(0.1,) * 6)  # type: ignore[method-assign]
     with raises("moved-in-exposure"):
         await rig.session.previews.observe(TAG)
-
-
-async def test_a_session_has_the_camera_for_itself(rig: Rig) -> None:
-    rig.arm.rest()
+    taken, later_s = rig.camera.taken, state.stamps.controller_s + 0.008
+    stamps = msgspec.structs.replace(state.stamps, controller_s=later_s)
+    rig.session.context.stillness.add(
+        msgspec.structs.replace(state, stamps=stamps, joint_speeds_rad_s=(0.1,) * 6)
+    )
+    with raises("arm-moves"):
+        await rig.session.previews.observe(TAG)
     await rig.go_until_it_moves()
-    taken = rig.camera.taken
     with raises("wrong-state"):
         await rig.session.previews.observe(TAG)
     assert rig.camera.taken == taken

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,6 @@ import msgspec
 import pytest
 
 from recordings.recorder import Recorder
-from station.analysis.pool import WorkerError, Workers
-from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import StationError
 from station.cell.pose_plan import Plan
 from station.cell.status import LeaseStatus
@@ -234,33 +231,6 @@ async def test_a_disk_that_hangs_does_not_hang_the_station(rig: Rig, monkeypatch
     await rig.give_go()
     await rig.until(S.FAULT)
     await until(went_on.is_set)
-
-
-async def test_a_call_that_hangs_costs_its_own_answer_only() -> None:
-    workers = Workers(start_worker, warm_up)
-    try:
-        await workers.start()
-        slow = asyncio.ensure_future(workers.call(time.sleep, 1.0))
-        hanging = asyncio.ensure_future(workers.call(time.sleep, 30.0, timeout_s=0.5))
-        # Neither the calls before it nor the worker that starts anew count as its own time.
-        behind = asyncio.ensure_future(workers.call(time.sleep, 0.0, timeout_s=0.5))
-        results = await asyncio.gather(slow, hanging, behind, return_exceptions=True)
-        assert results[0] is None and results[2] is None
-        assert isinstance(results[1], WorkerError) and results[1].code == "worker-late"
-    finally:
-        workers.close()
-
-
-async def test_a_call_that_waits_when_the_station_ends_starts_no_worker() -> None:
-    workers = Workers(start_worker, warm_up)
-    await workers.start()
-    running = asyncio.ensure_future(workers.call(time.sleep, 30.0))
-    behind = asyncio.ensure_future(workers.call(time.sleep, 0.0))
-    await asyncio.sleep(0.05)
-    workers.close()
-    results = await asyncio.gather(running, behind, return_exceptions=True)
-    assert [type(result) for result in results] == [WorkerError] * 2
-    assert workers._pool is None
 
 
 async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> None:

@@ -132,21 +132,15 @@ class ControlServer:
 
     def _full_for(self, uid: int) -> RefusedError | None:
         """Make the error where this user may not connect now; None: there is room."""
-        if len(self._serving) >= CLIENT_LIMIT:
-            return RefusedError("house-full", limit=CLIENT_LIMIT, what="clients are connected already")
-        if list(self._serving.values()).count(uid) >= USER_CLIENT_LIMIT:
-            return RefusedError(
-                "house-full",
-                what="clients of this user are connected already",
-                limit=USER_CLIENT_LIMIT,
-            )
-        newest = self._opened[uid]
-        if len(newest) == NEW_PER_S and asyncio.get_running_loop().time() - newest[0] < 1.0:
-            return RefusedError(
-                "house-full",
-                what="connections of this user within a second",
-                limit=NEW_PER_S,
-            )
+        recent_s = asyncio.get_running_loop().time() - 1.0
+        own, opened = list(self._serving.values()).count(uid), sum(s > recent_s for s in self._opened[uid])
+        for number, limit, what in (
+            (len(self._serving), CLIENT_LIMIT, "clients are connected already"),
+            (own, USER_CLIENT_LIMIT, "clients of this user are connected already"),
+            (opened, NEW_PER_S, "connections of this user within a second"),
+        ):
+            if number >= limit:
+                return RefusedError("house-full", limit=limit, what=what)
         return None
 
     async def _serve(self, link: socket.socket, peer: Peer) -> None:

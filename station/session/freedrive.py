@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 
-from recordings.errors import RecordingError
-from station.cell.errors import RefusedError, RobotError, StaleStateError, StationError, TriggerError
+from station.cell.errors import RefusedError, StaleStateError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState
 from station.cell.stillness import NotStillError
@@ -15,7 +14,7 @@ from station.protocol.verbs import Freedrive, Record
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
 from station.session.queue import PoseQueue
-from station.session.run import disk_failed, internal_error, unmark_busy
+from station.session.run import failed
 
 log = logging.getLogger(__name__)
 
@@ -109,16 +108,9 @@ class FreedriveCapture:
         except (PoseFailedError, NotStillError, StaleStateError) as error:  # late states: no move to stop
             queue.mark(index, "failed", error)
             store.problem(error, "warning", index)
-        except RecordingError as error:
-            disk_failed(context, error)
-            return index
-        except (RobotError, TriggerError) as error:
-            self._failed(error, index)
-            return index
         except Exception as error:
-            if not context.requests.halt:  # after STOP its state stays
-                log.exception("an image failed")
-            self._failed(internal_error(error), index)
+            failed(context, error)
+            return index
         if not context.requests.halt and store.state is not StationState.FAULT:
             store.enter(StationState.FREE_DRIVE, _GUIDE)
         context.show_poses(index)
@@ -126,9 +118,3 @@ class FreedriveCapture:
             context.requests.pause_by = ""
             self.end()
         return index
-
-    def _failed(self, error: StationError, index: int) -> None:
-        unmark_busy(self._context)
-        if not self._context.requests.halt:
-            self._context.store.enter(StationState.FAULT, error)
-            self._context.store.problem(error, "error", index)

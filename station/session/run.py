@@ -14,10 +14,8 @@ from recordings.schema.messages import Vector6
 from station.cell.collision import CellGeometry
 from station.cell.errors import (
     LimitError,
-    RobotError,
     SafetyStopError,
     StationError,
-    TriggerError,
 )
 from station.cell.layout import cell_geometry
 from station.cell.limits import check_path, with_plan_speeds
@@ -64,7 +62,7 @@ class Run:
         """Carry out the approval, ending in paused, stopped, fault or idle; raises only when cancelled."""
         while (late := await self._drive_once()) is not None:
             if not await self._approve_again(late):
-                self._halt(StationState.FAULT, late)
+                failed(self._context, late)
                 return
 
     async def _drive_once(self) -> StationError | None:
@@ -73,21 +71,12 @@ class Run:
             if await self._begin():
                 await self._motion()
         except SafetyStopError as error:
-            self._halt(StationState.STOPPED, error)  # the controller itself stopped the arm
-        except (RobotError, TriggerError) as error:
-            await self._context.cell.robot.stop(str(error))
-            if self._may_go_on(error):
-                return error
-            self._halt(StationState.FAULT, error)
-        except RecordingError as error:
-            await self._context.cell.robot.stop("the disk failed")
-            disk_failed(self._context, error)
+            failed(self._context, error)  # the controller itself stopped the arm
         except Exception as error:
-            # A defect of this program: stop the arm and report it.
-            log.exception("the run failed")
-            defect = internal_error(error)
-            await self._context.cell.robot.stop(str(defect))
-            self._halt(StationState.FAULT, defect)
+            await self._context.cell.robot.stop(str(error))
+            if isinstance(error, StationError) and self._may_go_on(error):
+                return error
+            failed(self._context, error)
         finally:
             await self._context.cell.robot.end_control()
         return None
@@ -132,15 +121,6 @@ class Run:
         store.update_session(approved_again=count)
         store.event("approved-again", self._go.said, "warning", None, count=count)
         return True
-
-    def _halt(self, state: StationState, error: StationError) -> None:
-        """End the run for an error; does nothing when STOP or lost control already ended it."""
-        context = self._context
-        if self._halted:
-            return
-        context.store.enter(state, error)
-        context.store.problem(error, "error", context.store.status.session.current)
-        unmark_busy(context)
 
     async def _begin(self) -> bool:
         """Start control and open the recording. False when refused: the state is as before the approval."""
@@ -307,9 +287,20 @@ def _numbers(indices: Sequence[int]) -> str:
     return f"pose{'s' * (len(indices) > 1)} " + ", ".join(str(index + 1) for index in indices)
 
 
-def internal_error(error: Exception) -> StationError:
-    """Make the error that reports a defect of this program."""
-    return StationError("internal", error=repr(error))
+def failed(context: SessionContext, error: Exception) -> None:
+    """End a run, or an image by hand, for an error; a STOP or lost control that ended it before stays."""
+    if isinstance(error, RecordingError):
+        disk_failed(context, error)
+        return
+    unmark_busy(context)
+    if context.requests.halt:
+        return
+    if not isinstance(error, StationError):
+        log.error("a defect of this program", exc_info=error)
+        error = StationError("internal", error=repr(error))
+    state = StationState.STOPPED if isinstance(error, SafetyStopError) else StationState.FAULT
+    context.store.enter(state, error)
+    context.store.problem(error, "error", context.store.status.session.current)
 
 
 async def seal(context: SessionContext) -> None:

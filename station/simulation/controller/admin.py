@@ -33,7 +33,6 @@ Json = dict[str, Any]
 Command = Callable[..., Awaitable[Json | None] | Json | None]
 Share = Annotated[float, Meta(ge=0, le=1)]
 NotNegative = Annotated[float, Meta(ge=0)]
-Count = Annotated[int, Meta(ge=0)]
 JointSpeed = Annotated[float, Meta(ge=1e-3, le=100)]
 Three = tuple[float, float, float]
 
@@ -62,14 +61,12 @@ def restart(
     machine.reboot(down_s, running)
 
 
-def in_use(machine: Machine, inputs: list[str], on: bool = True) -> None:
+def in_use(machine: Machine, inputs: list[str]) -> None:
     """Another RTDE client owns these input variables (e.g. "input_int_register_0")."""
     for name in inputs:
         if name not in machine.robot.inputs.types:
             raise ValueError(f"there is no input variable {name}")
-        if not on:
-            machine.rtde.claims.pop(name, None)
-        elif not machine.rtde.claim(name, ADMIN):
+        if not machine.rtde.claim(name, ADMIN):
             raise ValueError(f"{name} is owned by a client already")
 
 
@@ -173,7 +170,7 @@ def help_(_: Machine) -> Json:
 _SHORT: dict[str, tuple[str, Command]] = {
     "pstop": ("Protective stop now.", lambda m: m.robot.protective_stop("admin")),
     "estop": (
-        "Emergency stop button pressed (on) or pulled out again; afterwards the arm has no power: `run`.",
+        "Emergency stop button pressed (on) or pulled out again; afterwards the arm has no power.",
         lambda m, on=True: m.robot.emergency_stop(on),
     ),
     "safeguard": (
@@ -189,20 +186,11 @@ _SHORT: dict[str, tuple[str, Command]] = {
         "RTDE sends the same packet for ever: the timestamp stands still on a live link.",
         lambda m, on=True: setattr(m.rtde, "frozen", on),
     ),
-    "unlock": (
-        "A person clears the protective stop (refused within 5 s of it). Not in the dashboard's log.",
-        lambda m: {"unlocked": m.robot.unlock()},
-    ),
-    "run": ("A person powers the arm on and releases the brakes.", lambda m: m.robot.run()),
     "stop_program": ("Stop pressed on the pendant.", lambda m: m.robot.stop_program("pendant")),
     "pause": ("Pause pressed on the pendant.", lambda m: {"paused": m.robot.pause_program()}),
     "play": (
         "Play pressed on the pendant: a paused program goes on.",
         lambda m: {"playing": m.robot.play_program()},
-    ),
-    "program": (
-        "The text of the program that plays.",
-        lambda m: {"text": m.robot.program.text if m.robot.program else ""},
     ),
 }
 COMMANDS = _SHORT | {

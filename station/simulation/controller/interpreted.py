@@ -16,7 +16,7 @@ class InterpretedProgram:
     """A text from a script port. Raises ScriptSyntaxError for one that this interpreter cannot run."""
 
     def __init__(self, robot: ControllerState, name: str, text: str) -> None:
-        self.name, self.text = name, text
+        self.name = name
         self._robot = robot
         self._motions = ArmMotions(robot, lambda: self._run.thread)
         builtins = {name: self._logged(name, function) for name, function in functions(robot).items()}

@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import difference
-from calibrate.handeye.axxb.global_start import solve_global
-from calibrate.handeye.axxb.pairs import all_pairs
-from calibrate.handeye.metrics import distance_in_sigmas
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solve import solve_views
 from calibrate.projection import intrinsics_vector
@@ -26,9 +23,7 @@ from tests.calibrate.cells import (
     inside,
     make_cell,
     real_cell,
-    seen_through,
     sigmas_of,
-    with_focal,
 )
 
 SAME = replace(QUICK, intrinsics_from_same_pictures=True)
@@ -117,43 +112,15 @@ def test_a_scaled_unequal_and_bent_board_is_found_with_its_numbers(mount):
     assert error_mm_deg(believed.matrix, cell.X)[0] > 3 * error_mm_deg(solution.matrix, cell.X)[0]
 
 
-@MOUNTS
-def test_a_given_lens_that_is_off_by_its_usual_error_is_absorbed(mount):
-    for factor in (0.998, 1.002):
-        cell = make_cell(np.random.default_rng(3), 25, LOW, mount=mount)
-        true = solve_views(cell.views, QUICK)
-        off = solve_views(seen_through(cell.views, with_focal(cell.camera, factor)), QUICK)
-        assert distance_in_sigmas(off.matrix, true.matrix, true.covariance) < 0.5
-        assert inside(off, cell.X)
-        assert off.camera.matrix[0][0] == pytest.approx(cell.camera.matrix[0][0], rel=5e-4)
-        assert off.lens_finding.unexplained_m == 0.0
-
-
-def test_a_lens_that_was_measured_well_is_believed_more():
-    cell = make_cell(np.random.default_rng(2), 12, MID)
-    usual = solve_views(cell.views, QUICK)
-    size = len(intrinsics_vector(cell.camera))
-    known = solve_views(cell.views, replace(QUICK, lens_sigma=(0.05,) * 4 + (1e-5,) * (size - 4)))
-    unknown = solve_views(cell.views, SAME)
-    assert known.sigma_translation_m < usual.sigma_translation_m < unknown.sigma_translation_m
-
-
-def test_a_measured_board_earns_a_smaller_error():
+def test_what_was_measured_well_earns_a_smaller_error():
     cell = make_cell(np.random.default_rng(2), 20, LOW)
-    usual = solve_views(cell.views, QUICK)
-    measured = solve_views(cell.views, replace(QUICK, board=BoardTolerance(1e-5, 2e-5)))
+    lens = replace(QUICK, lens_sigma=(0.05,) * 4 + (1e-5,) * (len(intrinsics_vector(cell.camera)) - 4))
+    board = replace(QUICK, board=BoardTolerance(1e-5, 2e-5))
+    usual, known, measured, unknown = (solve_views(cell.views, o) for o in (QUICK, lens, board, SAME))
+    assert known.sigma_translation_m < usual.sigma_translation_m < unknown.sigma_translation_m
     assert measured.sigma_translation_m < usual.sigma_translation_m
     assert measured.error_shares["board"] < usual.error_shares["board"]
-
-
-def test_it_beats_the_certified_pair_solution_clearly():
-    ours, pairs = [], []
-    for seed in range(6):
-        cell = make_cell(np.random.default_rng(seed), 25, LOW)
-        ours.append(error_mm_deg(solve_views(cell.views, QUICK).matrix, cell.X)[0])
-        start = solve_global(all_pairs(cell.views.base_from_flange, cell.views.camera_from_board))
-        pairs.append(error_mm_deg(start.X, cell.X)[0])
-    assert np.mean(ours) < 0.7 * np.mean(pairs)
+    assert unknown.error_shares["intrinsics"] > 0.2
 
 
 def test_wrong_corners_hardly_move_it():
@@ -184,13 +151,6 @@ def test_the_dominant_source_of_noise_is_named(noise, expected):
     assert max(("corners", "robot_translation", "robot_rotation"), key=lambda name: shares[name]) == expected
     assert sum(shares.values()) == pytest.approx(1.0, abs=1e-6)
     assert set(shares) > {"intrinsics", "board", "kinematics"}
-
-
-def test_a_lens_of_the_same_pictures_has_its_share():
-    cell = make_cell(np.random.default_rng(0), 15, LOW, refit_camera=True)
-    given, free = solve_views(cell.views, QUICK), solve_views(cell.views, SAME)
-    assert free.error_shares["intrinsics"] > 0.2
-    assert free.sigma_rotation_rad > given.sigma_rotation_rad
 
 
 def test_every_seed_ends_in_the_same_camera():

@@ -66,7 +66,7 @@ def test_elimination_equals_the_dense_solution(mount, with_table):
     scales = Scales(np.array([3e-4, 5e-4]), 0.5, 0.2, 0.1, ONE_CLASS)
     linear = Linear.at(observed, state, weights, information=1.0)
     priors = Priors(LensPrior.given(state.camera), BoardTolerance())
-    prior = replace_table(priors, state) if with_table else priors.linearise(state, 0.0)
+    prior = priors.linearise(state, 1.0)
     solved = linear.solve(prior, scales, "nothing")
 
     r, e, by_r, by_e, size = differences(observed, state)
@@ -100,18 +100,6 @@ def test_elimination_equals_the_dense_solution(mount, with_table):
     )
     unit = np.outer(sigma[:size], sigma[:size])
     np.testing.assert_allclose(ours / unit, covariance[:size, :size] / unit, atol=1e-3)
-
-
-def replace_table(priors, state):
-    """The prior of three made-up errors of a table, 1 mm or mrad each."""
-    at = Layout.of(state)
-    plain = priors.linearise(replace(state, table=np.zeros(0)), 0.0)
-    N, right = np.zeros((at.size, at.size)), np.zeros(at.size)
-    kept = np.setdiff1d(np.arange(at.size), np.arange(at.table.start, at.table.stop))
-    N[np.ix_(kept, kept)], right[kept] = plain.N, plain.right
-    N[at.table, at.table] = np.eye(3) * 1e6
-    right[at.table] = -1e6 * state.table
-    return replace(plain, N=N, right=right)
 
 
 def test_noise_scales_come_out_as_they_went_in():

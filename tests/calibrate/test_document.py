@@ -46,15 +46,6 @@ def test_figures_are_the_solutions_in_the_units_that_their_names_say(solved_real
     assert sum(quality.error_shares.values()) == pytest.approx(1.0)
 
 
-def test_warnings_come_with_their_codes_and_the_session_with_its_reading(
-    solved_real: SolvedRecording,
-) -> None:
-    quality, found = solved_real.calibration.quality, solved_real.solution
-    assert len(quality.warning_codes) == len(quality.warnings)
-    assert {w.code for w in found.warnings} <= set(quality.warning_codes)
-    assert quality.session is not None and quality.session.hypothesis == found.session.reading.value
-
-
 def test_a_given_lens_is_called_given_and_judged_by_these_pictures(solved_real: SolvedRecording) -> None:
     lens, views = solved_real.calibration.intrinsics, solved_real.views
     found = solved_real.solution

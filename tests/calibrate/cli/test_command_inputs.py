@@ -90,13 +90,6 @@ def test_a_check_of_the_wrong_kind_is_refused(session_file: Path, real_file: Pat
     refused(done, 2, "views-of-another-cell", "simulated", "real")
 
 
-def test_mixed_picture_sizes_name_the_view(session_file: Path, tmp_path: Path) -> None:
-    (tmp_path / "camera.yaml").write_text(
-        "width: 640\nheight: 480\nmatrix: [[600, 0, 320], [0, 600, 240], [0, 0, 1]]\n"
-    )
-    refused(run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 1, "image-size", "640×480")
-
-
 def test_a_lens_known_before_can_be_given(session_file: Path, real_file: Path, tmp_path: Path) -> None:
     exported = run("export", real_file, "--to", "ros-camera-info", "-o", "info.yaml", cwd=tmp_path)
     assert exported.returncode == 0, exported.stderr

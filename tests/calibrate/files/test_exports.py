@@ -260,11 +260,6 @@ def test_camera_info_of_other_lenses(
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_equal_calibrations_give_equal_bytes(calibration: Calibration, name: str) -> None:
-    assert exports.export(calibration, name) == exports.export(calibration, name)
-
-
-@pytest.mark.parametrize("name", FORMATS)
 def test_every_format_says_whether_the_installed_one_holds(calibration: Calibration, name: str) -> None:
     names = FrameNames(validity=unrecorded(3, "2026-01-01T00:00:00+00:00"))
     assert "unverified" in export(calibration, name, names)
@@ -274,31 +269,18 @@ def test_every_format_says_whether_the_installed_one_holds(calibration: Calibrat
             export(calibration, name, FrameNames(validity=held))
 
 
-def test_camera_info_is_named_by_the_body_frame(calibration: Calibration) -> None:
-    for body, name in (("left_eye_link", "left_eye"), ("_link", "camera")):
-        assert (
-            yaml.safe_load(export(calibration, "ros-camera-info", FrameNames(body=body)))["camera_name"]
-            == name
-        )
-
-
 def test_opencv_file_storage(calibration: Calibration, tmp_path: Path) -> None:
     path = tmp_path / "c.yml"
     path.write_text(export(calibration, "opencv"))
-    assert path.read_text().startswith("%YAML:1.0")
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    result = calibration.result
-    same(storage.getNode(f"{result.parent_frame}_from_camera").mat(), calibration, 1e-15)
-    K = storage.getNode("camera_matrix").mat()
-    assert K.tolist() == [list(r) for r in calibration.intrinsics.matrix]
+    same(storage.getNode(f"{calibration.result.parent_frame}_from_camera").mat(), calibration, 1e-15)
+    assert storage.getNode("camera_matrix").mat().tolist() == [list(r) for r in calibration.intrinsics.matrix]
     assert storage.getNode("distortion_coefficients").mat().shape == (1, 5)
-    assert storage.getNode("mount").string() == calibration.mount
-    assert storage.getNode("source").string() == calibration.source
-    assert storage.getNode("distortion_model").string() == "plumb_bob"
+    said = [storage.getNode(name).string() for name in ("mount", "source", "distortion_model")]
+    assert said == [calibration.mount, calibration.source, "plumb_bob"]
     size = (storage.getNode("image_width").real(), storage.getNode("image_height").real())
     assert size == (calibration.intrinsics.width, calibration.intrinsics.height)
     np.testing.assert_array_equal(storage.getNode("covariance").mat(), calibration.covariance)
-    assert calibration.provenance.session in path.read_text()
 
 
 @pytest.mark.parametrize("name", FORMATS)

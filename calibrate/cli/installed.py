@@ -20,9 +20,8 @@ from calibrate.files.calibration import Calibration, read_calibration, write_out
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.folders import cameras, current_validity, readable_folder
 from calibrate.files.formatting import override_text, pose_text, summary, verdict_text
-from calibrate.files.lines import read_lines
 from calibrate.files.validity import Validity, ValidityState, validity_text
-from calibrate.files.versions import LOG, InstalledVersion, LogEntry, installed_versions
+from calibrate.files.versions import InstalledVersion, installed_versions
 from recordings.files import MAIN_CAMERA, state_root
 
 Root = Annotated[
@@ -179,10 +178,9 @@ def _switched(version: InstalledVersion, as_json: bool) -> None:
         place = str(version.path), str(stable)
         print_json(InstalledJson(version.number, *place, version.validity))
         return
-    log = read_lines(folder / LOG, LogEntry)
     out.print(f"Installed: version {version.number}, {stable}", soft_wrap=True)
-    if log and log[-1].change:
-        out.print(f"Change: {log[-1].change}")
+    if version.change:
+        out.print(f"Change: {version.change}")
     if version.validity is not None:
         out.print(f"Validity: {validity_text(version.validity)}")
 

@@ -203,16 +203,15 @@ def arm_sentences(calibration: Calibration) -> Iterator[str]:
         f"Over the arm's workspace {point} is placed to {arm.with_table_mm:.2f} mm (1σ) with the arm's "
         f"corrected table, to {arm.without_table_mm:.2f} mm without it."
     )
-    if arm.held_out is not None:
-        yield (
-            f"Views predicted from poses elsewhere: {arm.held_out.with_table_mm:.2f} mm with the table, "
-            f"{arm.held_out.without_table_mm:.2f} mm without ({arm.held_out.views} views)."
-        )
-    if (seen := arm.verified) is not None:
-        yield (
-            f"Verified at {seen.views} poses of {seen.recording}: {seen.with_table_mm:.2f} mm with the "
-            f"table, {seen.without_table_mm:.2f} mm without."
-        )
+    for seen, poses in (
+        (arm.held_out, "Views predicted from poses elsewhere"),
+        (arm.verified, f"Verified by {arm.verified.recording}" if arm.verified else ""),
+    ):
+        if seen is not None:
+            yield (
+                f"{poses}: {seen.with_table_mm:.2f} mm with the table, {seen.without_table_mm:.2f} mm "
+                f"without ({seen.views} views)."
+            )
     if arm.offered:
         yield (
             "Where points far from the board count, give the robot program the corrected table (calibrate "

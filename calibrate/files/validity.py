@@ -1,6 +1,7 @@
 """Validity of an installed calibration: valid, unverified, in doubt or withdrawn; since when, and why.
 
-    …/validity.jsonl     one line for each install, check, doubt and withdrawal; a version's last line counts
+    …/validity.jsonl     one line for each install, check, doubt and withdrawal; a version's last line counts;
+                         a line with `switch` is also the log of an install or a rollback
 
 Needs only the standard library, because programs that use the camera load it too (`loader`).
 """
@@ -158,6 +159,7 @@ def unrecorded(version: int, installed: str = "") -> Validity:
 def _parse(line: bytes) -> Validity | None:
     try:
         plain = json.loads(line)
+        plain.pop("switch", None)
         reason = ValidityReason(**plain.pop("reason"))
         return Validity(**plain | {"state": ValidityState(plain["state"]), "reason": reason})
     except (ValueError, TypeError, KeyError, AttributeError):

@@ -2,8 +2,7 @@
 
     ROOT/calibrations/gen/0007-1a2b3c4d.yaml     every calibration ever installed, never changed
     ROOT/calibrations/current -> gen/0007-…      the installed calibration, which programs read
-    ROOT/calibrations/log.jsonl                  who switched to what, when and why
-    ROOT/calibrations/validity.jsonl             validity of each version (`validity`)
+    ROOT/calibrations/validity.jsonl             who switched to what, when and why; validity (`validity`)
 
 Camera `main` lies there, any other in ROOT/calibrations/cameras/NAME (`folders.calibrations_folder`).
 
@@ -18,7 +17,7 @@ import hashlib
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -47,7 +46,6 @@ from calibrate.files.validity import (
 )
 from recordings.files import MAIN_CAMERA, open_regular, sync_folder, write_atomically
 
-LOG = "log.jsonl"
 Action = Literal["install", "rollback", "verify"]
 
 
@@ -61,6 +59,8 @@ class InstalledVersion:
     problem: str = ""
     validity: Validity | None = None
     """Validity now; for a version that is not current, as when it was replaced."""
+    change: str = ""
+    """Difference to the version before; of the one that was just switched to."""
 
 
 class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -71,6 +71,12 @@ class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     change: str = ""
     """Difference to the version before; for "verify", the result of the touch test."""
     reason: str = ""
+
+
+class _Line(msgspec.Struct):
+    """What the log reads of a line in the file of validities."""
+
+    switch: LogEntry | None = None
 
 
 def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[InstalledVersion]:
@@ -121,8 +127,12 @@ def before_current(known: list[InstalledVersion]) -> InstalledVersion | None:
 
 
 def read_log(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[LogEntry]:
-    """Oldest first."""
-    return read_lines(readable_folder(root, camera) / LOG, LogEntry)
+    """List every switch, oldest first."""
+    folder = readable_folder(root, camera)
+    entries = [line.switch for line in read_lines(folder / VALIDITY_FILE, _Line) if line.switch is not None]
+    if entries and not _current_name(folder).startswith(f"{entries[-1].generation:04d}-"):
+        entries.pop()  # it is written before the switch, which a crash prevented
+    return entries
 
 
 def add_version(
@@ -147,11 +157,11 @@ def make_current(
 ) -> InstalledVersion:
     """Switch to a version and log it. Call inside `locked` only. InstallError where it reads back wrong."""
     validity = replace(validity, version=version.number)
-    append_line(folder / VALIDITY_FILE, validity)  # before the switch, so that it is never missing
-    _switch(folder, version.path.name, read_bounded(version.path))
     entry = LogEntry(time_text(), action, version.number, who(), change, reason)
-    append_line(folder / LOG, entry)
-    return replace(version, current=True, validity=validity)
+    line = asdict(validity) | {"switch": entry}
+    append_line(folder / VALIDITY_FILE, line)  # before the switch, so that it is never missing
+    _switch(folder, version.path.name, read_bounded(version.path))
+    return replace(version, current=True, validity=validity, change=change)
 
 
 def _current_name(folder: Path) -> str:

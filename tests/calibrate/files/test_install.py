@@ -230,6 +230,8 @@ def test_a_kill_at_any_system_call_leaves_old_or_new(  # type: ignore[no-untyped
         found = installed_calibration(root)
         assert found in results.values(), (name, place)
         seen.append("new" if found == results["new"] else "old")
+        (current,) = (g.number for g in installed_versions(root) if g.current)
+        assert read_log(root)[-1].generation == current, (name, place)
         assert all(not g.problem for g in installed_versions(root)), (name, place)
         install(new, root)  # what a person does next works
         assert installed_calibration(root) == results["new"]
@@ -255,7 +257,7 @@ def _touching_calls(new: Path, template: Path, tmp_path: Path) -> list[tuple[str
     found: list[tuple[str, int]] = []
     begun = False
     lines = trace.read_text().splitlines()
-    last = max(k for k, line in enumerate(lines) if "log.jsonl" in line)
+    last = max(k for k, line in enumerate(lines) if "/current" in line)
     for line in lines[: last + 4]:
         match = re.match(r"\d+ +(\w+)\(", line)
         if match is None:

@@ -256,24 +256,18 @@ def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeo
 
 def with_plan_speeds(geometry: CellGeometry, plan: Plan) -> CellGeometry:
     """Return the geometry with a plan's speed limits where these are lower than the configured ones."""
-    return slower(geometry, np.inf, plan.joint_speed_rad_s, plan.joint_acceleration_rad_s2)
-
-
-def slower(
-    geometry: CellGeometry,
-    speed_m_s: float = np.inf,
-    joint_speed_rad_s: float = np.inf,
-    joint_acceleration_rad_s2: float = np.inf,
-) -> CellGeometry:
-    """Return the geometry with speed limits that are at most these."""
-    limits = geometry.limits
-    lower = msgspec.structs.replace(
-        limits,
-        speed_m_s=min(limits.speed_m_s, speed_m_s),
-        joint_speed_rad_s=min(limits.joint_speed_rad_s, joint_speed_rad_s),
-        joint_acceleration_rad_s2=min(limits.joint_acceleration_rad_s2, joint_acceleration_rad_s2),
+    return slower(
+        geometry,
+        joint_speed_rad_s=plan.joint_speed_rad_s,
+        joint_acceleration_rad_s2=plan.joint_acceleration_rad_s2,
     )
-    return replace(geometry, limits=lower)
+
+
+def slower(geometry: CellGeometry, **most: float) -> CellGeometry:
+    """Return the geometry with limits, by their names, that are at most these."""
+    limits = geometry.limits
+    lower = {name: min(getattr(limits, name), value) for name, value in most.items()}
+    return replace(geometry, limits=msgspec.structs.replace(limits, **lower))
 
 
 def _plan_problems(plan: Plan, geometry: CellGeometry) -> list[Problem]:

@@ -68,7 +68,7 @@ async def stop_motion(context: SessionContext, test: StopTest) -> Motion:
 def _free_move(context: SessionContext, test: StopTest, start: Vector6) -> Plan:
     """Plan the first turn with a free path; longer turns, and the wanted direction, are tried first."""
     config = context.cell.config
-    geometry = slower(cell_geometry(config), test.speed_m_s)
+    geometry = slower(cell_geometry(config), speed_m_s=test.speed_m_s)
     joint, refused = JOINT_NAMES[test.joint], ""
 
     def turned(turn_rad: float) -> tuple[Vector6, MoveCheck]:

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import signal
-import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,8 +11,6 @@ import pytest
 from recordings.reader import open_recording
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
-from station.protocol.client import Client, DaemonGoneError
-from station.protocol.stop_client import Outcome, stop
 from tests.patience import PATIENCE_S, until
 from tests.system.conftest import SystemRig, both_paths, go, status_when
 
@@ -128,51 +122,3 @@ async def test_a_daemon_told_to_end_ends_whatever_hangs(
     if hangs == "camera":
         assert not list(folder.glob("*.part"))
         assert len(open_recording(folder).views()) == 1
-
-
-async def test_one_station_per_socket_and_per_robot(rig: SystemRig) -> None:
-    daemon = await rig.daemon()
-    command = [sys.executable, "-m", "tests.system.cell_daemon", rig.controller.host]
-    command += [str(rig.folder / "truth.json"), str(rig.root), str(daemon.socket)]
-    twin = await asyncio.to_thread(
-        subprocess.run, command, input="", capture_output=True, text=True, timeout=PATIENCE_S
-    )
-    assert twin.returncode != 0
-    assert "already serves" in twin.stderr
-    async with await daemon.client() as anna:
-        await status_when(anna, lambda s: s.robot.connected)
-    other = await rig.daemon()
-    async with await other.client() as bert:
-        said = await status_when(bert, lambda s: any("owned by another station" in e.text for e in s.events))
-        assert said.state is S.DISCONNECTED
-
-
-async def test_a_crowd_does_not_keep_stop_out(rig: SystemRig, short_plan: Plan) -> None:
-    daemon = await rig.daemon()
-    async with await daemon.client() as anna:
-        await go(anna, short_plan)
-        crowd = []
-        for _ in range(200):
-            link = socket.socket(socket.AF_UNIX)
-            link.settimeout(1.0)
-            with contextlib.suppress(OSError):
-                link.connect(str(daemon.socket))
-            crowd.append(link)
-        await rig.moving()
-        assert (await asyncio.to_thread(stop, daemon.socket))[0] is Outcome.RESTS
-        await rig.stops()
-        for link in crowd:
-            link.close()
-
-
-async def test_a_stale_socket_of_a_crash_is_no_obstacle(rig: SystemRig) -> None:
-    first = await rig.daemon()
-    first.process.kill()
-    await asyncio.to_thread(first.process.wait)
-    assert first.socket.exists()
-    with pytest.raises(DaemonGoneError):
-        await Client(first.socket).open()
-    first.socket.rename(rig.folder / "2.sock")
-    second = await rig.daemon()
-    async with await second.client() as anna:
-        await status_when(anna, lambda s: s.robot.connected)

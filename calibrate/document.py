@@ -137,7 +137,8 @@ def software_versions() -> dict[str, str]:
 
 
 def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> Lens:
-    camera = solution.camera
+    camera, covariance = solution.camera, solution.lens_covariance
+    sigma = [] if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     if intrinsics is not None:
         rms_px = intrinsics.rms_px
     else:
@@ -151,7 +152,7 @@ def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> 
         distortion_model=camera.distortion_model,
         rms_px=rms_px,
         found="given" if intrinsics is None else "from these pictures",
-        sigma=_lens_sigma(solution),
+        sigma=dict(zip(intrinsics_names(camera), sigma, strict=False)),
     )
 
 
@@ -210,13 +211,6 @@ def _remarks(solution: Solution, loaded: LoadedViews, intrinsics: Intrinsics | N
         ),
         *solution.warnings,
     ]
-
-
-def _lens_sigma(solution: Solution) -> dict[str, float]:
-    if solution.lens_covariance is None:
-        return {}
-    sigma = np.sqrt(np.maximum(np.diag(solution.lens_covariance), 0.0)).tolist()
-    return dict(zip(intrinsics_names(solution.camera), sigma, strict=True))
 
 
 def _scaled(value: float | None, factor: float) -> float | None:

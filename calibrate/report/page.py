@@ -26,7 +26,7 @@ from calibrate.geometry import Array, difference
 from calibrate.handeye.reprojection import bent_points
 from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import project_at
+from calibrate.projection import intrinsics_names, intrinsics_vector, project_at
 from calibrate.report import html, plots
 from calibrate.results import SHAPE
 from calibrate.views import observe_views
@@ -174,26 +174,13 @@ def _lens(job: SolvedRecording) -> Iterator[str]:
     origin = "estimated from these images" if job.intrinsics is not None else "fixed, refined with X"
     rms = "" if lens.rms_px is None else f", RMS {lens.rms_px:.3f} px"
     yield html.paragraph(f"{lens.distortion_model}, {lens.width}×{lens.height}, {origin}{rms}.")
-    values = {
-        "fx": lens.matrix[0][0],
-        "fy": lens.matrix[1][1],
-        "cx": lens.matrix[0][2],
-        "cy": lens.matrix[1][2],
-    } | dict(zip(_distortion_names(lens.distortion_model), lens.distortion, strict=False))
+    values = zip(intrinsics_names(lens.model), intrinsics_vector(lens.model), strict=True)
     rows = [
         (name, f"{value:.6g}", f"{lens.sigma[name]:.2g}" if name in lens.sigma else "–")
-        for name, value in values.items()
+        for name, value in values
     ]
     yield html.table(("", "value", "1σ"), rows, (1, 2))
     yield html.paragraph(f"Image coverage by corners: {job.coverage:.0%}.")
-
-
-def _distortion_names(model: str) -> tuple[str, ...]:
-    return (
-        ("k1", "k2", "k3", "k4")
-        if model == "equidistant"
-        else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    )
 
 
 def _views(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import itertools
+from dataclasses import replace
 
 import numpy as np
 from scipy import special
@@ -30,7 +31,7 @@ from calibrate.results import SHAPE
 from calibrate.views import BoardView, Observations, Places, ViewSet, observe_views
 
 FEWEST_FOR_TABLE = 8
-"""Fewest views from which 18 errors of a table can be told from noise."""
+"""Fewest views from which errors of the arm can be told from noise."""
 FEWEST_USED = 3
 """Fewest views that must not be rejected: two motions need three views."""
 _NARROW = 0.5
@@ -57,16 +58,11 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     if with_table and len(views) >= FEWEST_FOR_TABLE:
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
         flex = flex_motion(views.mount, views.base_from_flange, held)
-        motion = flex
-        if arm is not None:
-            by_arm = arm.chain.by_links(arm.joints_rad)
-            motion = np.concatenate([by_arm, flex], axis=2)
+        links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
+        modelled = replace(observed, table=np.concatenate([links, flex], axis=2))
         try:
-            errors_of_table = motion.shape[2] - flex.shape[2]
-            found, log_bayes = allow_for_table(
-                replace(observed, table=motion), found, priors, errors_of_table
-            )
-            observed = replace(observed, table=motion)
+            found, log_bayes = allow_for_table(modelled, found, priors, links.shape[2])
+            observed = modelled
         except np.linalg.LinAlgError as problem:
             failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used))
@@ -77,9 +73,9 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
 
 
 _SIZES = np.array([0.03, 0.06, 0.12, 0.25, 0.5, 1.0])
-"""1σ of the errors of an arm's table, mm and mrad: no arm is exactly its table."""
+"""1σ of the errors of the arm's links, mm and mrad: no arm is exactly as its controller computes it."""
 _NONE = 1e-6
-"""1σ, mm and mrad, that stands for none: no error of the table, or a rigid bracket."""
+"""1σ, mm and mrad, that stands for none: no error of the links, or a rigid bracket."""
 _BENDS = np.array([_NONE, 0.1, 0.4, 1.6])
 """1σ of a bracket's compliance, mrad; a rigid bracket has probability ½."""
 _BENDS_BEFOREHAND = np.array([3.0, 1.0, 1.0, 1.0]) / 6
@@ -89,30 +85,12 @@ _WORTH_SOLVING = 1e-3
 """Probability below which a pair of sizes is dropped after the first step."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Sizes:
-    """Pairs of assumed sizes, of the table's errors and of the bracket's, that the estimate averages over."""
-
-    sigma: Array
-    """(s, q) 1σ of each error, mm and mrad."""
-    beforehand: Array
-    """(s,) prior probabilities; the first pair, no errors at all, has 0 and is for comparison only."""
-
-    @classmethod
-    def of(cls, table: int, bracket: int) -> _Sizes:
-        """Combine the sizes of `table` errors of a table and of `bracket` numbers of a bracket."""
-        by_table = _SIZES if table else np.array([_NONE])
-        pairs = np.array([(_NONE, _NONE), *((size, bend) for size in by_table for bend in _BENDS)])
-        chances = np.outer(np.full(len(by_table), 1 / len(by_table)), _BENDS_BEFOREHAND).ravel()
-        return cls(np.repeat(pairs, [table, bracket], axis=1), np.concatenate([[0.0], chances]))
-
-
 def allow_for_table(
-    observed: Observations, plain: Estimate, priors: Priors, errors_of_table: int
+    observed: Observations, plain: Estimate, priors: Priors, link_errors: int
 ) -> tuple[Estimate, float]:
     """Estimate again with systematic errors of arm and bracket, starting from the estimate without them.
 
-    The first `errors_of_table` errors are those of the arm's table, the others a bracket's. How large each of
+    The first `link_errors` errors are those of the arm's links, the others a bracket's. How large each of
     the two is, is not fitted but averaged over: one solution for each pair of sizes, weighed by its evidence.
     So the uncertainty grows little for an arm without errors, and enough for one with errors.
 
@@ -120,10 +98,14 @@ def allow_for_table(
     Raises LinAlgError where it fails.
     """
     columns = np.asarray(observed.table).shape[2]
-    sizes = _Sizes.of(errors_of_table, columns - errors_of_table)
+    by_links = _SIZES if link_errors else [_NONE]
+    # The first pair, no errors at all, has probability 0 and is for comparison only.
+    pairs = np.array([(_NONE, _NONE), *itertools.product(by_links, _BENDS)])
+    sigma = np.repeat(pairs, [link_errors, columns - link_errors], axis=1)
+    beforehand = np.append(0.0, np.tile(_BENDS_BEFOREHAND, len(by_links)) / len(by_links))
     state = replace(plain.state, table=np.zeros(columns))
     scales, weights = plain.scales, plain.corner_weights
-    chances, log_bayes = sizes.beforehand, 0.0
+    chances, log_bayes = beforehand, 0.0
     kept = np.arange(len(chances))
     converged, steps = False, 0
     while steps < MAX_STEPS and not converged:
@@ -133,10 +115,10 @@ def allow_for_table(
         solutions: list[LinearSolution] = []
         for i in kept:  # neighbours have nearly the same noise
             start = solutions[-1].scales if solutions else scales
-            solutions.append(linear.solve(priors.linearise(state, sizes.sigma[i]), start, "robot", _ROUNDS))
+            solutions.append(linear.solve(priors.linearise(state, sigma[i]), start, "robot", _ROUNDS))
         log_evidence = np.array([solution.log_evidence for solution in solutions])
-        log_all = special.logsumexp(log_evidence, b=sizes.beforehand[kept])
-        chances = sizes.beforehand[kept] * np.exp(log_evidence - log_all)
+        log_all = special.logsumexp(log_evidence, b=beforehand[kept])
+        chances = beforehand[kept] * np.exp(log_evidence - log_all)
         step = chances @ np.array([s.step for s in solutions])
         by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
         covariances = [linear.covariance(solution) for solution in solutions]
@@ -154,7 +136,7 @@ def allow_for_table(
     with_table = replace(
         plain,
         state=state,
-        scales=replace(best.scales, table=chances @ sizes.sigma[kept]),
+        scales=replace(best.scales, table=chances @ sigma[kept]),
         chances=np.einsum("s,snk->nk", chances, [s.chances for s in solutions]),
         covariance=covariance,
         robot=linear.m + linear.J @ step,

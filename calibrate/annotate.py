@@ -22,9 +22,8 @@ from calibrate.recorded_views import Progress, load_views
 from calibrate.views import board_in_camera
 from recordings.exporters.excerpt import copied
 from recordings.reader import Recording
-from recordings.scene import Entity, Polyline
 from recordings.schema.messages import CameraModel, Matrix4, View
-from recordings.schema.viewing import DETECTED, Marks
+from recordings.schema.viewing import DETECTED, Entity, Marks, Polyline
 from recordings.writer import derived_recording
 
 USED, REJECTED, PREDICTED = DETECTED, (0.95, 0.1, 0.1), (1.0, 0.8, 0.1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 
 from recordings.errors import (
@@ -87,14 +87,11 @@ class Recording:
 
     def attachments(self) -> dict[str, bytes]:
         """Return the attachments of all segments; the latest where a name is in several."""
-        merged: dict[str, bytes] = {}
-        for segment in self.segments:
-            merged.update(segment.attachments)
-        return merged
+        return {name: a.data for segment in self.segments for name, a in segment.attachments.items()}
 
     def media_types(self) -> dict[str, str]:
         """Media types of the attachments."""
-        return {name: kind for segment in self.segments for name, kind in segment.media_types.items()}
+        return {name: a.media_type for segment in self.segments for name, a in segment.attachments.items()}
 
 
 def open_recording(path: Path, *, incomplete: bool = False) -> Recording:
@@ -155,7 +152,7 @@ def _open_folder(folder: Path) -> Recording:
             missing=len(manifest.parts),
         )
     if len(files) > PARTS_LIMIT:
-        raise _several_sessions(f"{folder} holds {len(files)} recordings")
+        raise RecordingError("several-sessions", difference=f"{folder} holds {len(files)} recordings")
     segments = sorted((RecordingSegment(folder / name) for name in files), key=lambda found: found.info.part)
     _check_one_session(segments, manifest)
     missing = missing_parts(folder, manifest, {segment.info.part for segment in segments})
@@ -172,29 +169,23 @@ def _unfinished(path: Path, recover: Path | None = None) -> UnfinishedRecordingE
     )
 
 
-def _several_sessions(text: str) -> RecordingError:
-    return RecordingError("several-sessions", difference=text)
-
-
 def _check_one_session(segments: list[RecordingSegment], manifest: Manifest | None) -> None:
     first, path = segments[0].info, segments[0].path
     if manifest is not None and manifest.session != first.name:
-        raise _several_sessions(f"{path} is of session '{first.name}', its folder of '{manifest.session}'")
-    for before, segment in zip([None, *segments], segments, strict=False):
-        info = segment.info
-        if (info.name, info.mount, info.board, info.source) != (
-            first.name,
-            first.mount,
-            first.board,
-            first.source,
-        ):
-            raise _several_sessions(f"{segment.path} and {path} are of different sessions")
-        if info.camera != first.camera or info.camera_identity.serial != first.camera_identity.serial:
-            raise _several_sessions(f"{segment.path} was recorded with another camera than {path}")
-        if before and before.info.part == info.part:
-            raise CorruptRecordingError(
-                "segment-twice", path=before.path, other=segment.path, segment=info.part
-            )
+        text = f"{path} is of session '{first.name}', its folder of '{manifest.session}'"
+        raise RecordingError("several-sessions", difference=text)
+    for segment in segments:
+        if _whose(segment.info) != _whose(first):
+            text = f"{segment.path} and {path} are of different sessions or cameras"
+            raise RecordingError("several-sessions", difference=text)
+    for before, segment in pairwise(segments):
+        if before.info.part == (part := segment.info.part):
+            raise CorruptRecordingError("segment-twice", path=before.path, other=segment.path, segment=part)
+
+
+def _whose(info: SessionInfo) -> tuple[object, ...]:
+    """What all segments of a session have in common."""
+    return info.name, info.mount, info.board, info.source, info.camera, info.camera_identity.serial
 
 
 def _losses(segments: list[RecordingSegment], manifest: Manifest | None) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.records import Message
+from mcap.records import Attachment, Message
 
 from recordings.errors import BadImageError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name, open_file
@@ -59,10 +59,10 @@ class RecordingSegment:
             self._check_channels()
             self.lost_bytes = self._recovery_loss()
             self.attachments = self._checked_attachments()
-            self._facts = self._index_images(Topic.PICTURE_FACTS)
-            self._raw = self._index_images(Topic.RAW_IMAGE)
-            self._compressed = self._index_images(Topic.COMPRESSED_IMAGE)
-            self._check_image_pairs()
+            self._facts = self._by_sequence(Topic.PICTURE_FACTS)
+            self._images = self._by_sequence(Topic.RAW_IMAGE, Topic.COMPRESSED_IMAGE)
+            if self._facts.keys() != self._images.keys():
+                raise self._unusable("some images lack their description, or the other way round")
             self.views = self._checked_views()
         except BaseException:
             self._close()
@@ -104,10 +104,8 @@ class RecordingSegment:
 
     def image(self, sequence: int) -> Image:
         """Decoded; its array is read-only. BadImageError when it cannot be; KeyError when there is none."""
-        facts = self._message(Topic.PICTURE_FACTS, self._facts[sequence], PictureFacts)
-        compressed = sequence in self._compressed
-        topic = Topic.COMPRESSED_IMAGE if compressed else Topic.RAW_IMAGE
-        address = (self._compressed if compressed else self._raw)[sequence]
+        facts = self._message(*self._facts[sequence], PictureFacts)
+        topic, address = self._images[sequence]
         size = (self.info.camera.width, self.info.camera.height)
         try:
             if (facts.width, facts.height) != size:
@@ -134,9 +132,10 @@ class RecordingSegment:
 
     def stored_image(self, sequence: int) -> tuple[str, bytes] | None:
         """(format, file bytes) of an image that is kept compressed; None when it is kept raw."""
-        if sequence not in self._compressed:
+        topic, address = self._images.get(sequence, (None, 0))
+        if topic is not Topic.COMPRESSED_IMAGE:
             return None
-        message = self.parsed_at(Topic.COMPRESSED_IMAGE, self._compressed[sequence])
+        message = self.parsed_at(topic, address)
         return str(message.format), bytes(message.data)
 
     def _corrupt(self, topic: Topic, address: int, reason: str) -> CorruptRecordingError:
@@ -235,31 +234,21 @@ class RecordingSegment:
             raise self._unusable(f"it says that '{stated[:20]}' bytes were lost")
         return int(stated)
 
-    def _checked_attachments(self) -> dict[str, bytes]:
+    def _checked_attachments(self) -> dict[str, Attachment]:
         for name in self._contents.attachments:
             if not is_attachment_name(name):
                 raise self._unusable(f"an attachment is named '{name[:60]}'")
-        return {name: record.data for name, record in self._contents.attachments.items()}
+        return self._contents.attachments
 
-    @property
-    def media_types(self) -> dict[str, str]:
-        """Media types of the attachments."""
-        return {name: record.media_type for name, record in self._contents.attachments.items()}
-
-    def _index_images(self, topic: Topic) -> dict[int, int]:
-        """Sequence → address of the message."""
-        found: dict[int, int] = {}
-        for address in self.messages(topic).addresses:
-            sequence = self._source.sequence(address)
-            if found.setdefault(sequence, address) != address:
-                raise self._corrupt(topic, address, f"image {sequence} stands twice in the file")
+    def _by_sequence(self, *topics: Topic) -> dict[int, tuple[Topic, int]]:
+        """Sequence → topic and address of the message."""
+        found: dict[int, tuple[Topic, int]] = {}
+        for topic in topics:
+            for address in self.messages(topic).addresses:
+                sequence = self._source.sequence(address)
+                if found.setdefault(sequence, (topic, address)) != (topic, address):
+                    raise self._corrupt(topic, address, f"image {sequence} stands twice in the file")
         return found
-
-    def _check_image_pairs(self) -> None:
-        if self._raw.keys() & self._compressed.keys():
-            raise self._unusable("an image is stored both raw and compressed")
-        if self._facts.keys() != self._raw.keys() | self._compressed.keys():
-            raise self._unusable("some images lack their description, or the other way round")
 
     def _checked_views(self) -> list[View]:
         """All attempts in file order, each with this file's segment number."""

@@ -24,7 +24,6 @@ from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, r
 from recordings.images import ImageError, encode_png, read_header
 from recordings.mcap.output import OutputFile
 from recordings.mcap.records import with_crc
-from recordings.scene import Entity, scene_update
 from recordings.schema import viewing
 from recordings.schema.definitions import CHANNEL_RECORDS, FORMATS, SESSION_RECORDS, PictureFacts, encode
 from recordings.schema.messages import (
@@ -165,10 +164,10 @@ class RecordingWriter:
         if (time_ns := self._images.get(sequence)) is not None:
             self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
 
-    def scene(self, sequence: int, entities: Sequence[Entity]) -> None:
+    def scene(self, sequence: int, entities: Sequence[viewing.Entity]) -> None:
         """Shapes in space as they are at a recorded image's time, for viewers."""
         time_ns = self._images[sequence]
-        self._show(Topic.SCENE, scene_update(entities, time_ns), time_ns)
+        self._show(Topic.SCENE, viewing.scene_update(entities, time_ns), time_ns)
 
     def frame(
         self, parent: str, child: str, parent_from_child: Matrix4, stamps: Stamps | None = None

@@ -67,30 +67,24 @@ class FrameTree:
             edge.stamps_ns.append(frame.stamp_ns)
             edge.numbers.extend(numbers)
 
-    def chain(self, base: str, flange: str) -> list[tuple[tuple[str, str], bool]] | None:
-        """The edges from base to flange, each with whether it is walked from parent to child."""
-        before: dict[str, tuple[str, tuple[str, str], bool]] = {}
+    def chain(self, base: str, flange: str) -> list[tuple[tuple[str, str], bool]]:
+        """The edges from base to flange, each with whether it is walked from parent to child; [] if none."""
+        chains: dict[str, list[tuple[tuple[str, str], bool]]] = {base: []}
         waiting = deque([base])
-        while waiting:
+        while waiting and flange not in chains:
             name = waiting.popleft()
-            if name == flange:
-                path = []
-                while name != base:
-                    name, pair, forward = before[name]
-                    path.append((pair, forward))
-                return path[::-1]
             for pair in self.edges:
-                for end, other, forward in ((pair[0], pair[1], True), (pair[1], pair[0], False)):
-                    if end == name and other not in before and other != base:
-                        before[other] = (name, pair, forward)
+                for end, other in (pair, pair[::-1]):
+                    if end == name and other not in chains:
+                        chains[other] = [*chains[name], (pair, end == pair[0])]
                         waiting.append(other)
-        return None
+        return chains.get(flange, [])
 
     def find(self, base: str | None, flange: str | None) -> tuple[str, str]:
         """The names of base and flange: as given, or the best known pair that a moving chain joins."""
         for known_base, known_flange in KNOWN_PAIRS:
             pair = (base or known_base, flange or known_flange)
-            if (path := self.chain(*pair)) and any(self.moves(edge) for edge, _ in path):
+            if any(self.moves(edge) for edge, _ in self.chain(*pair)):
                 return pair
         raise self._no_chain(base or "a known base", flange or "a known flange")
 

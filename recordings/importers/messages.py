@@ -156,7 +156,7 @@ def _value(kind: Kind, message: Any, time_ns: int) -> Value:
     stamp_ns = _stamp_ns(message, time_ns)
     if kind is Kind.POSE:
         frame = message.header.frame_id if hasattr(message, "header") else message.frame_id
-        return [_frame(stamp_ns, frame, "", message.pose.position, message.pose.orientation)]
+        return [_frame(stamp_ns, frame or "base", "flange", message.pose.position, message.pose.orientation)]
     if kind is Kind.CAMERA:
         K, D = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)  # ROS 2
         return _lens(message.width, message.height, K, D, message.distortion_model)

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from recordings.errors import ImportSourceError
 from recordings.importers.bags import Bag, BagTopic
 from recordings.importers.frames import FrameTree, Track
-from recordings.importers.messages import Array, FrameMessage, JointMessage, Kind
+from recordings.importers.messages import Array, JointMessage, Kind
 from recordings.schema.messages import CameraModel, Joints
 
 _UR_ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-_FLANGE, _POSE_CHILD = "flange", "flange of the pose topic"
 
 
 @dataclass(frozen=True)
@@ -65,22 +64,29 @@ class JointTrack:
 def select(bag: Bag, wanted: Wanted) -> Selection:
     """Reads everything but the images. Raises ImportSourceError that names what is there."""
     image = _one(bag, Kind.IMAGE, wanted.image_topic, "--image-topic")
-    if wanted.pose_topic is not None:
-        topic = _one(bag, Kind.POSE, wanted.pose_topic, "--pose-topic")
-        track, said = _from_poses(bag, topic.name)
+    frames, poses = _of(bag, Kind.TRANSFORMS), _of(bag, Kind.POSE)
+    by_names = wanted.base is not None or wanted.flange is not None
+    if wanted.pose_topic is not None or (not frames and len(poses) == 1 and not by_names):
+        topic = _one(bag, Kind.POSE, wanted.pose_topic, "--pose-topic").name
+        tree = _tree(bag, [topic])
+        if len(tree.edges) != 1:
+            raise ImportSourceError("several-frames", topic=topic)
+        ((base, flange),) = tree.edges
+        said = f"poses on {topic} in {base}"
     else:
-        tree = FrameTree()
-        for topic in _of(bag, Kind.TRANSFORMS):
-            for frames in bag.values(topic.name):
-                assert isinstance(frames, list)
-                tree.add(frames)
-        poses = _of(bag, Kind.POSE)
-        if not tree.edges and len(poses) == 1 and wanted.base is None and wanted.flange is None:
-            track, said = _from_poses(bag, poses[0].name)
-        else:
-            base, flange = tree.find(wanted.base, wanted.flange)
-            track, said = tree.track(base, flange), f"frames {base} → {flange}"
-    return Selection(image, _camera(bag, image), track, said, _joints(bag))
+        tree = _tree(bag, [topic.name for topic in frames])
+        base, flange = tree.find(wanted.base, wanted.flange)
+        said = f"frames {base} → {flange}"
+    return Selection(image, _camera(bag, image), tree.track(base, flange), said, _joints(bag))
+
+
+def _tree(bag: Bag, topics: list[str]) -> FrameTree:
+    tree = FrameTree()
+    for topic in topics:
+        for frames in bag.values(topic):
+            assert isinstance(frames, list)
+            tree.add(frames)
+    return tree
 
 
 def _of(bag: Bag, kind: Kind) -> list[BagTopic]:
@@ -89,30 +95,13 @@ def _of(bag: Bag, kind: Kind) -> list[BagTopic]:
 
 def _one(bag: Bag, kind: Kind, name: str | None, option: str) -> BagTopic:
     topics = _of(bag, kind)
-    there = ", ".join(f"{t.name} ({t.schema}, {t.messages})" for t in topics) or "none"
-    if name is not None:
-        found = [topic for topic in topics if topic.name == name]
-        if not found:
-            raise ImportSourceError("no-topic", kind=kind.value, topic=name, there=there)
+    found = [topic for topic in topics if name in (None, topic.name)]
+    if len(found) == 1:
         return found[0]
-    if not topics:
-        there = ", ".join(bag.others[:10]) or "none"
-        raise ImportSourceError("no-topic", kind=kind.value, topic="any topic", there=there)
-    if len(topics) > 1:
+    there = ", ".join([f"{t.name} ({t.schema}, {t.messages})" for t in topics] or bag.others[:10]) or "none"
+    if found:
         raise ImportSourceError("several-topics", kind=kind.value, there=there, option=option)
-    return topics[0]
-
-
-def _from_poses(bag: Bag, topic: str) -> tuple[Track, str]:
-    tree, base = FrameTree(), ""
-    for frames in bag.values(topic):
-        assert isinstance(frames, list)
-        base = frames[0].parent or "base"
-        if tree.edges and (base.lstrip("/"), _POSE_CHILD) not in tree.edges:
-            raise ImportSourceError("several-frames", topic=topic)
-        pose = frames[0]
-        tree.add([FrameMessage(pose.stamp_ns, base, _POSE_CHILD, pose.position_m, pose.rotation_xyzw)])
-    return tree.track(base.lstrip("/"), _POSE_CHILD), f"poses on {topic} in {base}"
+    raise ImportSourceError("no-topic", kind=kind.value, topic=name or "any topic", there=there)
 
 
 def _camera(bag: Bag, image: BagTopic) -> CameraModel | None:

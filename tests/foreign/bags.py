@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -133,17 +134,20 @@ def write_rosbag2(path: Path, storage: str, compression: str = "none") -> Path:
     """`storage`: sqlite3 or mcap, by `rosbags`."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-    ros = RosMessages()
     writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     if compression != "none":
         writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    return _filled(path, writer, RosMessages(), "serialize_cdr")
+
+
+def _filled(path: Path, writer: Any, ros: RosMessages, serialize: str) -> Path:
     with writer:
         connections: dict[str, Any] = {}
         for stamp_ns, kind, time_s in moments():
             topic, message = ros.message(stamp_ns, kind, time_s, "mono8")
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
-            data = ros.store.serialize_cdr(message, message.__msgtype__)
+            data = getattr(ros.store, serialize)(message, message.__msgtype__)
             writer.write(connections[topic], stamp_ns + 3_000_000, data)
     return path
 
@@ -167,16 +171,7 @@ def write_rosbag1(path: Path) -> Path:
     """A ROS 1 bag, by `rosbags`."""
     from rosbags.rosbag1 import Writer
 
-    ros = Ros1Messages()
-    with Writer(path) as writer:
-        connections: dict[str, Any] = {}
-        for stamp_ns, kind, time_s in moments():
-            topic, message = ros.message(stamp_ns, kind, time_s, "mono8")
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
-            data = ros.store.serialize_ros1(message, message.__msgtype__)
-            writer.write(connections[topic], stamp_ns + 3_000_000, data)
-    return path
+    return _filled(path, Writer(path), Ros1Messages(), "serialize_ros1")
 
 
 def write_ros_mcap(path: Path, poses: bool = False, encoding: str = "mono8", **options: Any) -> Path:
@@ -263,46 +258,17 @@ def _foxglove_fields(kind: str, time_s: float) -> tuple[str, str, dict[str, Any]
 
 
 def write_foxglove_mcap(path: Path) -> Path:
-    """Foxglove's schemas in protobuf, by Foxglove's Python library; a topic of JSON beside them."""
-    from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-    from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-    from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
-    from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+    """The same in protobuf, by Foxglove's Python library."""
+    from google.protobuf.json_format import ParseDict
     from mcap_protobuf.writer import Writer
 
     with path.open("wb") as stream:
         writer = Writer(stream)
         for stamp_ns, kind, time_s in moments():
-            seconds, nanos = divmod(stamp_ns, 10**9)
-            message: Any
-            if kind == "tf":
-                topic, message = "/frames", FrameTransforms()
-                frame = message.transforms.add(parent_frame_id="base_link", child_frame_id="tool0")
-                frame.timestamp.seconds, frame.timestamp.nanos = seconds, nanos
-                (frame.translation.x, frame.translation.y, frame.translation.z), q = pose(time_s)
-                frame.rotation.x, frame.rotation.y, frame.rotation.z, frame.rotation.w = q
-            elif kind == "joints":
-                topic, message = "/joints", JointStates()
-                for name in JOINTS:
-                    message.joints.add(name=name, position=progress_of(time_s))
-            elif kind == "info":
-                topic, message = (
-                    "/cam/calibration",
-                    CameraCalibration(width=WIDTH, height=HEIGHT, K=K, D=[0] * 5),
-                )
-            else:
-                topic, message = (
-                    "/cam/image",
-                    RawImage(
-                        width=WIDTH,
-                        height=HEIGHT,
-                        encoding="mono8",
-                        step=WIDTH,
-                        data=picture(time_s).tobytes(),
-                    ),
-                )
-            if kind != "tf":
-                message.timestamp.seconds, message.timestamp.nanos = seconds, nanos
+            topic, name, fields = _foxglove_fields(kind, time_s)
+            made = getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
+            message = ParseDict(fields, made())
+            message.timestamp.seconds, message.timestamp.nanos = divmod(stamp_ns, 10**9)
             writer.write_message(topic, message, stamp_ns, stamp_ns)
         writer.finish()
     return path

@@ -10,9 +10,8 @@ import pytest
 from recordings.exporters.excerpt import write_excerpt
 from recordings.reader import open_recording
 from recordings.recover import recover_recording
-from recordings.scene import Entity, Polyline
 from recordings.schema.messages import CaptureEvent, Stamps
-from recordings.schema.viewing import DETECTED, Marks
+from recordings.schema.viewing import DETECTED, Entity, Marks, Polyline
 from recordings.writer import RecordingWriter
 from tests.foreign.judges import JUDGES, rerun
 from tests.recordings.small_recording import START_NS, TURNED, make_info, make_picture, make_state, make_view

@@ -55,8 +55,11 @@ def _run_and_release(job: Callable[[], T]) -> T:
         raise
 
 
-class ArmNews(Protocol):
-    """The states that an arm reports. `devices.news` defines how late they may be."""
+class Robot(Protocol):
+    """An arm. Connecting only reads; `start_control`, after an approval, replaces the robot's program.
+
+    `devices.news` defines how late the states that it reports may be.
+    """
 
     guided: bool
     """True while a person moves the arm by hand: states may then be no later than during a move."""
@@ -79,10 +82,6 @@ class ArmNews(Protocol):
 
     def check(self) -> RobotState | None:
         """Return `news`; RobotError where nothing may be captured, as after a safety stop or TCP change."""
-
-
-class Robot(ArmNews, Protocol):
-    """An arm. Connecting only reads; `start_control`, after an approval, replaces the robot's program."""
 
     @property
     def identity(self) -> RobotIdentity: ...
@@ -153,15 +152,15 @@ class Robot(ArmNews, Protocol):
 NEWS_POLL_S = 0.005
 
 
-async def fresh(robot: ArmNews) -> RobotState:
+async def fresh(robot: Robot) -> RobotState:
     """Wait for a current state of the arm and return it. StaleStateError when none comes."""
     while (state := robot.news()) is None:
         await asyncio.sleep(NEWS_POLL_S)
     return state
 
 
-async def ready(robot: ArmNews) -> RobotState:
-    """Wait as `fresh` does; RobotError where nothing may be captured now (see `ArmNews.check`)."""
+async def ready(robot: Robot) -> RobotState:
+    """Wait as `fresh` does; RobotError where nothing may be captured now (see `Robot.check`)."""
     while (state := robot.check()) is None:
         await asyncio.sleep(NEWS_POLL_S)
     return state

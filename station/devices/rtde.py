@@ -114,25 +114,19 @@ class RobotStatusBits(IntFlag):
     POWER_BUTTON = 1 << 3
 
 
-@dataclass(frozen=True)
-class DataType:
-    code: str
-    """`struct`'s code for one element."""
-    count: int = 1
-
-
-DATA_TYPES: dict[str, DataType] = {
-    "BOOL": DataType("?"),
-    "UINT8": DataType("B"),
-    "UINT32": DataType("I"),
-    "UINT64": DataType("Q"),
-    "INT32": DataType("i"),
-    "DOUBLE": DataType("d"),
-    "VECTOR3D": DataType("d", 3),
-    "VECTOR6D": DataType("d", 6),
-    "VECTOR6INT32": DataType("i", 6),
-    "VECTOR6UINT32": DataType("I", 6),
+DATA_TYPES = {
+    "BOOL": "?",
+    "UINT8": "B",
+    "UINT32": "I",
+    "UINT64": "Q",
+    "INT32": "i",
+    "DOUBLE": "d",
+    "VECTOR3D": "ddd",
+    "VECTOR6D": "dddddd",
+    "VECTOR6INT32": "iiiiii",
+    "VECTOR6UINT32": "IIIIII",
 }
+"""Name → `struct`'s code of each element."""
 NOT_FOUND = "NOT_FOUND"
 IN_USE = "IN_USE"
 
@@ -178,7 +172,7 @@ class Recipe:
         refused = [n for n, t in zip(self.names, self.types, strict=True) if t not in DATA_TYPES]
         if refused:
             raise RtdeError("rtde-variables", names=", ".join(refused))
-        codes = "".join(DATA_TYPES[t].code * DATA_TYPES[t].count for t in self.types)
+        codes = "".join(DATA_TYPES[t] for t in self.types)
         object.__setattr__(self, "packer", struct.Struct(">HBB" + codes))
 
     def pack(self, elements: Sequence[bool | int | float]) -> bytes:

@@ -181,12 +181,12 @@ async def test_an_arm_that_goes_another_way_than_the_checked_one_is_stopped(
     await c.stays_at_rest()
 
 
-async def test_at_five_percent_of_the_slider_the_move_arrives(cell: MakeCell) -> None:
+async def test_at_a_slow_slider_the_move_arrives(cell: MakeCell) -> None:
     c = await cell()
-    await c.ask("slider", fraction=0.05)
+    await c.ask("slider", fraction=0.2)
     goal = c.near()
     move = asyncio.create_task(c.robot.move(goal, 0.8, 1.0))
-    await until(lambda: c.robot.notice == "speed slider at 5 %")
+    await until(lambda: c.robot.notice == "speed slider at 20 %")
     await move
     assert max(abs(a - b) for a, b in zip(await c.joints_rad(), goal, strict=True)) < 1e-3
     assert c.robot.notice == ""

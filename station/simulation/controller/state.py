@@ -183,9 +183,9 @@ class VariableStore:
         self._slots: dict[str, slice] = {}
         self.elements: list[float] = []
         for name, variable in variables.items():
-            start, kind = len(self.elements), DATA_TYPES[variable.type]
-            make = float if kind.code == "d" else int
-            self.elements += map(make, variable.rest or (0,) * kind.count)
+            start, codes = len(self.elements), DATA_TYPES[variable.type]
+            make = float if codes[0] == "d" else int
+            self.elements += map(make, variable.rest or (0,) * len(codes))
             self._slots[name] = slice(start, len(self.elements))
 
     def indices(self, names: Sequence[str]) -> list[int]:

@@ -80,8 +80,7 @@ def test_recipes_round_trip(types: list[str], data: st.DataObject) -> None:
         "I": st.integers(0, 2**32 - 1), "Q": st.integers(0, 2**64 - 1),
         "i": st.integers(-(2**31), 2**31 - 1), "d": st.floats(allow_nan=False),
     }  # fmt: skip
-    kinds = [DATA_TYPES[name] for name in types]
-    elements = [data.draw(strategies[kind.code]) for kind in kinds for _ in range(kind.count)]
+    elements = [data.draw(strategies[code]) for name in types for code in DATA_TYPES[name]]
     recipe = Recipe(1, tuple(f"v{i}" for i in range(len(types))), tuple(types))
     assert recipe.unpack_elements(recipe.pack(elements)[3:]) == tuple(elements)
 

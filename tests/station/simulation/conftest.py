@@ -101,7 +101,7 @@ class RtdeClient:
         assert kind == PacketType.DATA and self.output is not None
         recipe, elements = self.output, iter(self.output.unpack_elements(payload))
         types = dict(zip(recipe.names, recipe.types, strict=True))
-        counts = {name: DATA_TYPES[kind].count for name, kind in types.items()}
+        counts = {name: len(DATA_TYPES[kind]) for name, kind in types.items()}
         taken = {name: tuple(islice(elements, count)) for name, count in counts.items()}
         return {name: found if counts[name] > 1 else found[0] for name, found in taken.items()}
 

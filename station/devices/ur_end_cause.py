@@ -54,9 +54,16 @@ async def cause_of_end(link: UrLink, child: ControlChild, error: RobotError) -> 
             return RobotError("program-replaced", program=other, called=f" ({other})" if other else "")
     if late and after is not None:
         return link.evidence(0.0, begun_s - OUTLIVED_S, time.monotonic()).error() or error
-    if ended and (delayed := _evidence_of_end(link, child, states).error()) is not None:
-        return delayed
-    return program_ended(RuntimeState.STOPPED) if error.code == "watchdog" else error
+    if not ended:
+        return error
+    if any(
+        state.runtime_state in (RuntimeState.PAUSING, RuntimeState.PAUSED)
+        for state in states
+        if state.stamps.host_monotonic_ns > child.started_s * 1e9
+    ):  # a watchdog ends a program; only a person pauses it
+        return program_ended(RuntimeState.PAUSED)
+    delayed = _evidence_of_end(link, child, states).error()
+    return delayed or (program_ended(RuntimeState.STOPPED) if error.code == "watchdog" else error)
 
 
 def _evidence_of_end(link: UrLink, child: ControlChild, states: Sequence[RobotState]) -> Evidence:

@@ -73,7 +73,8 @@ async def test_fault(cell: MakeCell, name: str) -> None:
     c, (fault, code) = await cell("UR10e"), FAULTS[name]
     child_pid = c.robot.control_pid
     assert child_pid is not None
-    assert (await c.strike(fault)).code == code
+    error = await c.strike(fault)
+    assert error.code == code, error
     if code == "stale-state":
         await c.ask(**fault, on=False)
     await until(lambda: c.robot.age_s() < 0.1)

@@ -74,7 +74,10 @@ async def test_fault(cell: MakeCell, name: str) -> None:
     child_pid = c.robot.control_pid
     assert child_pid is not None
     error = await c.strike(fault)
-    assert error.code == code, error
+    late_too = (
+        name == "program stopped" and error.code == Delay.CONTROLLER
+    )  # where a busy computer simulates it
+    assert error.code == code or late_too, error
     if code == "stale-state":
         await c.ask(**fault, on=False)
     await until(lambda: c.robot.age_s() < 0.1)

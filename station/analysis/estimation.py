@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +52,7 @@ def running_estimate(
         views, X, Y = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return msgspec.structs.replace(blank, advice="the motion says too little yet")
-    sigma_m, sigma_rad = quick_sigma(views, config.board, X, Y, not lens_is_known)
+    sigma_m, _ = quick_sigma(views, config.board, X, Y, not lens_is_known)
     x, y, z = (float(v) for v in 1000 * X[:3, 3])
     return msgspec.structs.replace(
         blank,
@@ -61,7 +60,6 @@ def running_estimate(
         camera_pose=matrix4(X),
         board_pose=matrix4(Y),
         sigma_translation_mm=round(1000 * sigma_m, 3),
-        sigma_rotation_deg=round(math.degrees(sigma_rad), 4),
         enough=sigma_m <= goal_m,
         advice=f"enough for {1000 * goal_m:.2g} mm: you may finish"
         if sigma_m <= goal_m

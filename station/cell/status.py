@@ -187,7 +187,6 @@ class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     path: str = ""
     bytes: int = 0
     drops: int = 0
-    sync_ms: float = 0.0
     free_bytes: int | None = None
     """Free space on the sessions' disk; None: not known."""
     error: str = ""
@@ -198,7 +197,6 @@ class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     identity: str = ""
     pulses: int = 0
     frames: int = 0
-    light: float | None = None
 
 
 class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -207,7 +205,6 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     views: int = 0
     translation_mm: tuple[float, float, float] | None = None
     sigma_translation_mm: float | None = None
-    sigma_rotation_deg: float | None = None
     camera_pose: Matrix4 | None = None
     """Pose of the camera in the flange (eye-in-hand) or the base."""
     board_pose: Matrix4 | None = None
@@ -244,7 +241,6 @@ class LeaseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     holder: str = ""
     """Client that has control, as 'anna on tty1 (pid 4711)'; empty: none"""
     client_id: int | None = None
-    since_wall_ns: int = 0
 
 
 Level = Literal["debug", "info", "warning", "error"]
@@ -300,7 +296,6 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     playback: bool = False
     cell: str = ""
     mount: Mount = "eye-in-hand"
-    software: str = ""
     robot: RobotStatus = RobotStatus()
     camera: CameraStatus = CameraStatus()
     trigger: TriggerStatus = TriggerStatus()

@@ -85,8 +85,6 @@ class Done(msgspec.Struct, frozen=True):
 
 
 class Welcome(msgspec.Struct, frozen=True):
-    version: str
-    pid: int
     client_id: int
     """Number of this connection, by which the lease names it."""
     root: str

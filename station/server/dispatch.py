@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 from collections.abc import Awaitable, Callable, Coroutine
 
 import msgspec
@@ -14,7 +13,6 @@ from station.protocol import verbs
 from station.protocol.verbs import VERBS, Verb
 from station.server.approval import ApprovalRule, Peer, Process, process
 from station.session.checklist import checklist
-from station.session.recording import software
 from station.session.session import Session
 from station.session.threads import NAMES
 
@@ -28,7 +26,6 @@ class SessionDispatcher:
         self._session, self._see = session, see
         cell = session.context.cell
         self._rule = ApprovalRule(cell.config.approval, cell.simulated, see)
-        self._version = software()["calibration-station"]
         self._callers: dict[int, Peer] = {}
         self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
@@ -137,8 +134,6 @@ class SessionDispatcher:
         caller.told = said if said.split(" ")[0] == user else f"{user} ({said})"
         context = self._session.context
         return verbs.Welcome(
-            self._version,
-            os.getpid(),
             caller.client_id,
             str(context.root),
             context.cell.config.camera.name,

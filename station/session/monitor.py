@@ -121,7 +121,6 @@ class Monitor:
             path=str(recorder.part_path),
             bytes=recorder.bytes_written,
             drops=recorder.dropped,
-            sync_ms=round(1000 * recorder.last_sync_s, 1),
             free_bytes=free_bytes,
             error=str(recorder.error or ""),
         )

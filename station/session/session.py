@@ -258,7 +258,7 @@ class Session:
     def take_lease(self, client_id: int, who: str) -> None:
         """Give control to a client, which may already have it. RefusedError names another that has it."""
         if self.store.status.lease.client_id is None:
-            self.store.update(lease=LeaseStatus(who, client_id, time.time_ns()))
+            self.store.update(lease=LeaseStatus(who, client_id))
         self._require_control(client_id)
 
     def _require_control(self, client_id: int) -> None:

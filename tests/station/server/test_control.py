@@ -47,7 +47,7 @@ class RecordingHandler(SessionDispatcher):
         if verb == "skip":
             return {"index": msgspec.json.decode(args)["index"]}
         self.order.append(verb)
-        return {"version": "0", "pid": peer.pid, "client_id": peer.client_id, "root": "/"}
+        return {"pid": peer.pid, "client_id": peer.client_id, "root": "/"}
 
     def gone(self, peer: Peer) -> None:
         self.lost.append(peer.client_id)

@@ -34,7 +34,7 @@ from station.tui.attendance import Attendance
 from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
 from station.tui.desk import Desk, KnowingApp, StatusChanged
-from station.tui.dialogs import Confirm, ConfirmMotion, Help
+from station.tui.dialogs import Confirm, ConfirmMotion
 from station.tui.installed import Marks, marks, read_result, read_sessions, state_root
 from station.tui.jobs import check_drift, solve_session
 from station.tui.log_screen import LogScreen
@@ -290,13 +290,6 @@ class StationApp(KnowingApp):
         """Write F5 as it is printed on the key."""
         shown = super().get_key_display(binding)
         return shown.upper() if shown[0] == "f" and shown[1:].isdigit() else shown
-
-    def action_help(self) -> None:
-        """Show the keys in a window that fits a console; Textual's own panel halves the screen."""
-        screen = self.screen
-        if isinstance(screen, StationScreen):
-            own = screen.BINDINGS
-            self.push_screen(Help(screen.heading, screen.HELP or "", [*own, *self.BINDINGS]))
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_new_cell(self) -> None:

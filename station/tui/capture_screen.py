@@ -20,10 +20,6 @@ class CaptureScreen(StationScreen):
     """The camera's picture as large as it can be; progress, error and coverage beside it."""
 
     MODE, TIP = "capture", "The running capture"
-    HELP = (
-        "The running capture. F5 asks before the arm moves; F12 stops it at once, on every screen. Poses: "
-        f"{LEGEND}."
-    )
 
     def body(self) -> ComposeResult:
         with Horizontal(id="live"):
@@ -33,7 +29,7 @@ class CaptureScreen(StationScreen):
                     yield Line(lambda known, _: quality_line(known.shown), id="quality")
                 yield Panel("What happened", newest_events, id="events", below="6 all")
             with Vertical(id="live-right"):
-                with Box("Poses", id="progress"):
+                with Box("Poses", id="progress", below=LEGEND):
                     yield Panel("", progress_lines, id="poses")
                 yield Panel("Expected error of the camera's position (1σ)", error_lines, id="error")
                 title = "Where in the image the board was seen"

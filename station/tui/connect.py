@@ -58,7 +58,6 @@ class ConnectScreen(StationScreen):
 
     MODE, TIP = "connect", "What is missing, and its remedy"
     LOOK = "look_at_checks"
-    HELP = "The same list as `station doctor`. It only looks: nothing moves and nothing is changed."
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("r", "app.look_at_checks", "Look again", tooltip="Look at every item again")
     ]

@@ -1,4 +1,4 @@
-"""Windows over a screen: questions with consequences, choices, a reason, long work, the help."""
+"""Windows over a screen: questions with consequences, a reason, long work."""
 
 from __future__ import annotations
 
@@ -7,16 +7,12 @@ import os
 import sys
 import textwrap
 import time
-from collections.abc import Sequence
 from typing import ClassVar
 
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, VerticalScroll
+from textual.containers import Horizontal
 from textual.content import Content
 from textual.widgets import Button, Input, Label, RichLog, Static
 
@@ -33,10 +29,6 @@ WIDTH, INDENT = 54, 10
 """Width of a fact in letters, and of its name before it."""
 KEYS = "Tab marks the other answer, Enter gives it; Escape: no"
 SIMULATED = "SIMULATED cell: nothing real moves"
-HELP_END = (
-    "\nCtrl-P finds every action by name, and the colour themes. The emergency stop on the pendant is the "
-    "safety device. Escape closes this help."
-)
 
 
 class Confirm(Question[bool]):
@@ -155,29 +147,6 @@ class Reason(Question[str]):
             self.query_one("#dialog-problem", Label).update(problem)
         else:
             self.dismiss(event.value.strip())
-
-
-class Help(Question[None]):
-    """The purpose of a screen, and what each key does; scrolls on a small terminal."""
-
-    BOX, NAME, NEXT = "help", "Help", Action("Esc", "Close this help", "F12 stops the arm here too.")
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape,f1,enter", "dismiss(None)", "Close", tooltip="Close this help")
-    ]
-
-    def __init__(self, title: str, about: str, keys: Sequence[BindingType]) -> None:
-        super().__init__()
-        self.title, self._about, self._keys = title, about, keys
-
-    def body(self) -> ComposeResult:
-        table = Table.grid(padding=(0, 2))
-        for binding in self._keys:
-            # A binding without words is Textual's own.
-            if isinstance(binding, Binding) and binding.tooltip:
-                key = Text(self.app.get_key_display(binding), style="bold")
-                table.add_row(key, f"{binding.description}: {binding.tooltip}")
-        with VerticalScroll(id="help-lines"):
-            yield Static(Group(Text(self._about + "\n", style="bold"), table, Text(HELP_END)))
 
 
 READ = Action("", "Read the result", "It is done; Enter closes this window.", look=True)

@@ -253,7 +253,7 @@ class Question(ModalScreen[R], Framed[R]):
         yield Frame(self.NAME, "", self.NEXT)
         with Container(id="question"), Vertical(id=self.BOX):
             yield from self.body()
-        yield Footer(compact=True)
+        yield Footer(compact=True, show_command_palette=False)
 
     def body(self) -> ComposeResult:
         yield from ()

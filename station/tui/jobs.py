@@ -15,7 +15,7 @@ from calibrate.files.install import Cell, install, rollback, withdraw
 from calibrate.files.validity import ValidityState
 from calibrate.files.versions import InstalledVersion, before_current, installed_versions
 from station.cell.session_folder import CALIBRATION_FILE
-from station.operate.drift_check import check_arguments, judged, recorded, start_drift_check
+from station.operate.drift_check import check_arguments, recorded, start_drift_check
 from station.operate.motion import Approve
 from station.tui.desk import Desk
 from station.tui.dialogs import Confirm, JobScreen, Reason
@@ -61,8 +61,6 @@ async def check_drift(desk: Desk, approves: Approve) -> None:
         desk.app.notify(NO_VERDICT, timeout=10)
         return
     await check_session(desk, session.recording, session.folder)
-    if (end := judged(session.folder, desk.client.camera)) is not None:
-        desk.app.notify(str(end), title="Drift check", timeout=60, markup=False)
 
 
 async def install_result(desk: Desk, result: Result, calibration: Calibration) -> None:

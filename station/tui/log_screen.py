@@ -31,7 +31,6 @@ class LogScreen(StationScreen):
     """All events, newest last, to scroll through."""
 
     MODE, TIP = "log", "Event log"
-    HELP = "All events the daemon still holds; the same lines are in the journal and in the recording."
 
     def __init__(self) -> None:
         super().__init__()

@@ -91,11 +91,6 @@ class PlanScreen(StationScreen):
     """The daemon's plan as a table; every change is a request to the daemon."""
 
     MODE, TIP = "plan", "All poses, their gain and reason"
-    HELP = (
-        "Poses in capture order. Nothing moves without your approval: F5 shows the motion and asks. "
-        "Home and End go to the first and the last pose. Error after: the expected error (1σ) after this "
-        "pose, against the goal."
-    )
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("n", "make('camera')", "New", tooltip=NEW),
         Binding("m", "make('both')", "New+arm", tooltip=NEW_FOR_ARM),
@@ -107,7 +102,7 @@ class PlanScreen(StationScreen):
         yield Line(lambda known, _: facts_line(known.shown), id="plan-facts")
         with Horizontal(id="plan"):
             with Vertical(id="plan-left"):
-                with Box("Poses", id="plan-poses"):
+                with Box("Poses", id="plan-poses", below="expected error after each, 1σ"):
                     yield Rows(*COLUMNS, id="plan-table")
                 yield Panel("Why", self._why, id="plan-detail")
             yield Panel("The cell", self._cell, id="plan-cell", below=LEGEND)

@@ -225,10 +225,6 @@ class ResultScreen(StationScreen):
 
     MODE, TIP = "result", "The verdict, its checks, install and undo"
     LOOK = "look_at_disk"
-    HELP = (
-        "The newest result, or the one picked on 5. Enter on a check shows its details, Tab goes to the "
-        "views and the installations. Installing can be undone."
-    )
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("i", "act('install')", "Install", tooltip="Make this the cell's calibration; b undoes it"),
         Binding("b", "act('undo')", "Undo", tooltip="Back to the calibration before, or none"),

@@ -82,7 +82,7 @@ class StationScreen(Framed[None]):
 
     AUTO_FOCUS = "Rows, #checklist-scroll, #log"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("f1", "app.help", "Help", tooltip="What this screen is for, and all its keys")
+        Binding("f1", "app.command_palette", "Help", tooltip="Every action and its key, to search in")
     ]
     MODE: ClassVar[str] = ""
     """Its step of the rail, or its name."""
@@ -91,12 +91,6 @@ class StationScreen(Framed[None]):
 
     LOOK: ClassVar[str] = ""
     """Action of the app that reads what this screen shows."""
-    NAME: ClassVar[str] = ""
-    """Its title, if other than its mode."""
-
-    @property
-    def heading(self) -> str:
-        return self.NAME or self.MODE.title()
 
     @property
     def desk(self) -> Desk:
@@ -109,10 +103,10 @@ class StationScreen(Framed[None]):
         self.run_worker(self.desk.ask(verb, timeout_s=timeout_s), group="command", exit_on_error=False)
 
     def compose(self) -> ComposeResult:
-        yield Frame(self.heading, self.MODE)
+        yield Frame(self.MODE.title(), self.MODE)
         with Container(id="content"):
             yield from self.body()
-        yield Footer(compact=True)
+        yield Footer(compact=True, show_command_palette=False)
 
     def body(self) -> ComposeResult:
         yield from ()

@@ -25,10 +25,6 @@ class SessionsScreen(StationScreen):
 
     MODE, TIP = "sessions", "Past recordings"
     LOOK = "look_at_disk"
-    HELP = (
-        "Past recordings. Solving runs in its own process; the daemon and a running capture go on. Home and "
-        "End go to the newest and the oldest."
-    )
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f9", "act('solve')", "Solve", tooltip="Solve this recording again, outside the daemon"),
         Binding("enter", "act('show')", "Result", show=False, tooltip="Show this session's calibration"),

@@ -44,25 +44,15 @@ async def test_who_commands_a_moving_arm_is_asked_for(
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
         if answered:
             app.post_message(events.CursorPosition(0, 0))
+        if answered:  # late is not lost: an answer begins the count again
+            for _ in range(attendance.UNANSWERED):
+                await app.attendance.look()
+            app.post_message(events.CursorPosition(0, 0))
+            await until(pilot, lambda: app.attendance.unanswered == 0)
+            assert LOST not in link.asked
         for _ in range(2 * attendance.UNANSWERED):
             await app.attendance.look()
             await pilot.pause()
         assert (LOST in link.asked) is lost
         assert any("control released" in said.message for said in app._notifications) is lost
         assert len(asked) >= attendance.UNANSWERED or not lost
-
-
-async def test_a_terminal_that_answers_keeps_control(link: FakeLink, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attendance, "ASK_S", 60.0)  # only the test asks
-    link.show(commanded(StationState.MOVING))
-    app = app_on(link)
-    async with app.run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-        for _ in range(3):
-            app.post_message(events.CursorPosition(0, 0))
-            await until(pilot, lambda: app.attendance.unanswered == 0)
-            for _ in range(attendance.UNANSWERED):
-                await app.attendance.look()
-        assert LOST not in link.asked
-        await app.attendance.look()
-        assert LOST in link.asked

@@ -21,7 +21,6 @@ from station.tui.stopped import stopped_text
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
 from station.tui.widgets.cell_drawing import draw
-from station.tui.words import limit_bar
 from tests.recordings.small_recording import make_state
 from tests.tui.conftest import CELL, FakeLink, idle, opened, until
 
@@ -139,10 +138,3 @@ def test_the_scene_shows_arm_board_and_table(term: str, monkeypatch: pytest.Monk
     signs = {letter for letter in drawn if ord(letter) > 0x2500}
     assert all(letter in "▀▄█" for letter in signs) is (term == "linux")
     assert len(signs) > 2
-
-
-@pytest.mark.parametrize(("value", "reach"), [(0.0, 0), (0.5, 5), (1.0, 10), (9.0, 19)])
-def test_a_bar_reaches_its_limit_where_the_stroke_stands(value: float, reach: int) -> None:
-    bar = limit_bar(value, 1.0, 20, "$ok", 0.5).plain
-    assert len(bar) == 20 and bar[10] == "┃"
-    assert bar.count("━") == reach

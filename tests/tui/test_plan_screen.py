@@ -5,10 +5,8 @@ from __future__ import annotations
 import asyncio
 
 import msgspec
-import numpy as np
 from textual.widgets import DataTable
 
-from calibrate.geometry import pose as pose_of
 from station.cell.status import PoseStatus
 from station.protocol import verbs
 from station.tui.desk import busy_words
@@ -54,24 +52,6 @@ async def test_the_end_of_two_hundred_poses_is_told_as_the_start_is(link: FakeLi
         fewer = msgspec.structs.replace(status.session, poses=poses[:-1])
         link.show(msgspec.structs.replace(status, session=fewer))
         await until(pilot, lambda: "place 199" in text_of(pilot.app, "#plan-detail"))
-
-
-async def test_the_sketch_fills_its_place_before_anything_new_is_told(link: FakeLink) -> None:
-    status = idle()
-    places = [
-        tuple(tuple(row) for row in pose_of(np.eye(3), np.array([x, x, x])).tolist()) for x in (0.3, 0.9)
-    ]
-    poses = tuple(
-        PoseStatus(index=i, name=f"p{i}", base_from_flange=place)  # type: ignore[arg-type]
-        for i, place in enumerate(places)
-    )
-    link.show(msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, poses=poses)))
-    async with app_on(link).run_test(size=(160, 48)) as pilot:
-        await until(pilot, lambda: "0 of 2" in text_of(pilot.app, "#rail"))
-        await pilot.press("2")
-        await until(
-            pilot, lambda: max(map(len, text_of(pilot.app, "#plan-cell").splitlines()), default=0) > 30
-        )
 
 
 async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> None:

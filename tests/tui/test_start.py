@@ -14,8 +14,7 @@ from station.tui import connect
 from station.tui.app import StationApp
 from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
-from station.tui.dialogs import Help
-from station.tui.plan_screen import NO_PLAN, PlanScreen
+from station.tui.plan_screen import NO_PLAN
 from station.tui.themes import chosen_theme
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
@@ -93,20 +92,6 @@ async def test_an_empty_list_says_how_to_begin_but_not_before_it_is_known(
         session.rmdir()
         await pilot.press("3", "5")
         await until(pilot, lambda: hint.display)
-
-
-async def test_help_names_every_key_of_the_screen_and_stop_works_in_it(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 60)) as pilot:
-        await pilot.pause()
-        await pilot.press("2", "f1")
-        await until(pilot, lambda: isinstance(pilot.app.screen, Help))
-        shown = pilot.app.export_screenshot().replace("&#160;", " ")
-        for words in ("F5 ", "Retake: Capture this pose again", "^q", "4 ", "Nothing moves without"):
-            assert words in shown, words
-        await pilot.press("f12")
-        await until(pilot, lambda: link.verbs == ["stop"])
-        await pilot.press("escape")
-        await until(pilot, lambda: isinstance(pilot.app.screen, PlanScreen))
 
 
 async def test_the_highlighted_pose_is_told_in_full(link: FakeLink) -> None:

@@ -23,12 +23,11 @@ from station.cell.status import (
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import Hardware
 from station.protocol.verbs import Check
-from station.tui.dialogs import Confirm, ConfirmMotion, Help, Reason
+from station.tui.dialogs import Confirm, ConfirmMotion, Reason
 from station.tui.frame import StopBlock, bar_line, next_line, rail_line
 from station.tui.new_cell import NewCell
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from station.tui.themes import THEMES
-from station.tui.words import shortened
 from tests.recordings.small_recording import make_state
 from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, opened, text_of, until
 
@@ -145,7 +144,6 @@ WINDOWS = [
     lambda: Confirm("Finish?", "words", "Finish"),
     lambda: ConfirmMotion(SUMMARY),
     lambda: Reason("Not installed", "a gate failed", "Enter installs it."),
-    lambda: Help("Plan", "about", []),
 ]
 
 
@@ -221,13 +219,3 @@ async def test_without_colours_stop_and_chips_are_reversed(
         reversed_ = "".join(s.text for strip in strips for s in strip if s.style and s.style.reverse)
         assert "STOP F12" in reversed_ and "SIMULATED" in reversed_
         assert all(s.style is None or s.style.color is None for strip in strips for s in strip)
-
-
-@given(st.text("ab ,", max_size=40), st.integers(4, 30), st.booleans())
-def test_shortened_text_fits_and_ends_with_a_word(text: str, cells: int, parts: bool) -> None:
-    short = shortened(text, cells, parts)
-    assert len(short) <= cells
-    kept = short.removesuffix("…")
-    assert text.startswith(kept)
-    if short != text and text[:cells].rpartition(" ")[0].strip(" ,"):  # at least one word fits
-        assert text[len(kept)] in " ,"

@@ -88,6 +88,8 @@ async def _camera_check(context: SessionContext, troubles: dict[str, str]) -> Ch
     try:
         async with asyncio.timeout(6.0):
             image = await camera.preview()
+            if image is None:
+                await camera.settings()  # raises where the camera is gone
     except (CameraError, TimeoutError) as error:
         return Check("camera", "failed", str(error) or "no answer", "check cable and power of the camera")
     if image is None:

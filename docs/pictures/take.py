@@ -152,7 +152,6 @@ async def photograph(cameras: list[Camera], socket: Path) -> None:
     await everywhere("installed", "4", ready=installed)
     await everywhere("sessions", "5")
     await everywhere("log", "6")
-    await everywhere("help", "3", "f1")
 
 
 async def drive(camera: Camera, done: Callable[[], object]) -> None:

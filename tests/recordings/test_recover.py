@@ -64,13 +64,6 @@ def test_a_whole_file_that_only_missed_its_rename_is_renamed(small: Path) -> Non
     assert len(open_recording(small).views()) == 3
 
 
-def test_a_whole_file_is_left_alone(small: Path) -> None:
-    before = small.read_bytes()
-    (result,) = recover_recording(small)
-    assert not result.rebuilt
-    assert small.read_bytes() == before
-
-
 def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.image(make_picture(0))
@@ -94,14 +87,6 @@ def test_a_file_with_nothing_in_it_says_so_and_leaves_nothing(tmp_path: Path, co
     with refused("nothing-to-save"):
         recover_recording(part)
     assert list(tmp_path.iterdir()) == [part]
-
-
-def test_a_folder_is_recovered_file_by_file(tmp_path: Path) -> None:
-    write_small(tmp_path / "part-1.mcap")
-    write_unfinished(tmp_path / "part-2.mcap", part=2)
-    results = recover_recording(tmp_path)
-    assert [result.rebuilt for result in results] == [False, True]
-    assert [(v.index, v.part) for v in open_recording(tmp_path).views()] == [(0, 2), (1, 2), (2, 1)]
 
 
 def test_what_an_earlier_recovery_kept_is_kept(tmp_path: Path) -> None:

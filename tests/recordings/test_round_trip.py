@@ -41,23 +41,12 @@ def test_everything_comes_back_as_it_was(small: Path) -> None:
         Stamps(2, START_NS + 1), "finished", pose_index=2, level="warning"
     )
     assert recording.attachments() == {"plan.yaml": b"poses: 3\n"}
-    assert recording.sha256 == hashlib.sha256(small.read_bytes()).hexdigest()
-
-
-def test_pictures_are_identical_to_the_bit_and_carry_their_facts(small: Path) -> None:
-    for view, picture in open_recording(small).images():
-        expected = make_picture(view.picture_sequence)
+    for (_, picture), sequence in zip(recording.images(), range(3), strict=True):
+        expected = make_picture(sequence)
         np.testing.assert_array_equal(picture.pixels, expected.pixels)
-        for name in (
-            "stamps",
-            "frame_id",
-            "sequence",
-            "exposure_us",
-            "gain_db",
-            "pixel_format",
-            "trigger_count",
-        ):
-            assert getattr(picture, name) == getattr(expected, name)
+        facts = (msgspec.structs.replace(image, pixels=None) for image in (picture, expected))
+        assert len(set(map(repr, facts))) == 1
+    assert recording.sha256 == hashlib.sha256(small.read_bytes()).hexdigest()
 
 
 def test_times_of_frames_and_raw_readings_of_the_cameras_clock_come_back(tmp_path: Path) -> None:
@@ -95,19 +84,6 @@ def test_every_kind_of_picture_is_lossless(
     np.testing.assert_array_equal(picture.pixels, image)
     assert picture.pixels.dtype == kind
     assert picture.pixel_format == pixel_format
-
-
-def test_a_retake_supersedes_the_first_attempt(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        for sequence, index, attempt in [(0, 0, 1), (1, 1, 1), (2, 0, 2), (3, 2, 1)]:
-            writer.image(make_picture(sequence))
-            writer.view(make_view(index, sequence, attempt))
-        recording = open_recording(writer.finish())
-    assert [(v.index, v.attempt, v.picture_sequence) for v in recording.views()] == [
-        (0, 2, 2),
-        (1, 1, 1),
-        (2, 1, 3),
-    ]
 
 
 def test_compressed_bytes_are_kept_as_they_were(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import pytest
 
 from recordings.recorder import Recorder
 from recordings.schema.messages import RobotIdentity, Stamps
-from recordings.schema.viewing import DETECTED, Marks
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import (
     START_NS,
@@ -74,13 +73,3 @@ def test_corners_and_frames_reach_the_file(tmp_path: Path) -> None:
     assert [(p.x, p.y) for p in marks.points[0].points] == [(3.5, 4.5), (5.5, 6.5)]
     ((_, frame),) = shown(path, "/tf_static")
     assert (frame.parent_frame_id, frame.child_frame_id, frame.translation.x) == ("flange", "camera", 0.1)
-
-
-def test_residuals_are_lines(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.image(make_picture(0))
-        writer.marks(0, [Marks(np.zeros((2, 2)), DETECTED, np.ones((2, 2)))], "pose 1: 0.1 px")
-        path = writer.finish()
-    ((_, marks),) = shown(path, "/camera/annotations")
-    assert [(p.x, p.y) for p in marks.points[0].points] == [(0.5, 0.5), (1.5, 1.5)] * 2
-    assert marks.texts[0].text == "pose 1: 0.1 px"

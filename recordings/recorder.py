@@ -93,11 +93,6 @@ class Recorder:
         return self._writer.last_sync_s
 
     @property
-    def queued_bytes(self) -> int:
-        """Waiting for the disk."""
-        return self._queued_bytes
-
-    @property
     def alive(self) -> bool:
         """The writer's thread works; false after finish, close or an error."""
         return self._thread.is_alive()

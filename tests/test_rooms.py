@@ -102,7 +102,8 @@ READ_DIRECTLY = {
     # the kernel's files
     "station/cell/process.py", "station/server/approval.py", "station/devices/discovery.py",
     "station/devices/aravis_device.py",
-    "station/cli/control.py", "station/simulation/controller/kinematics.py",  # files of the package
+    # files of the package
+    "station/cli/control.py", "station/simulation/controller/kinematics.py", "calibrate/report/html.py",
     "station/simulation/controller/__main__.py",  # stands alone
     "station/simulation/launch_cell.py",  # what it has just written
 }  # fmt: skip

@@ -55,6 +55,13 @@ class Rig:
             await asyncio.sleep(BEAT_S)
             self.lag_s = max(self.lag_s, time.monotonic() - due_s)
 
+    async def start(self) -> None:
+        """Start control where it has ended, once what ended it is over."""
+        while not self.robot.control:
+            with contextlib.suppress(RobotError):
+                await self.robot.start_control()
+            await asyncio.sleep(BEAT_S)
+
     async def halt(self, pid: int | None, late_s: float) -> None:
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
@@ -133,8 +140,7 @@ async def at_rest(made: Rig, fault: Fault, late_s: float) -> tuple[str, str]:
 
 async def between_moves(made: Rig, fault: Fault, late_s: float) -> str:
     """What ended control, which the next move says; 'goes on': nothing did. One approval makes it go on."""
-    if not made.robot.control:
-        await made.robot.start_control()
+    await made.start()
     await fault(made, late_s)
     await asyncio.sleep(0.5)
     try:
@@ -147,8 +153,7 @@ async def between_moves(made: Rig, fault: Fault, late_s: float) -> str:
 
 async def moving(made: Rig, fault: Fault, late_s: float) -> tuple[str, float]:
     """What ended the move, '' for nothing, and when the arm rested after its news ended, seconds."""
-    if not made.robot.control:
-        await made.robot.start_control()
+    await made.start()
     joints = list(made.robot.newest().state.joints_rad)
     joints[0] += FAR_RAD if joints[0] < 0 else -FAR_RAD
     move = asyncio.create_task(made.robot.move(joints, 0.5, 1.0))

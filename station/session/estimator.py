@@ -13,7 +13,7 @@ from recordings.errors import RecordingError
 from station.analysis.estimation import running_estimate, seen_before
 from station.analysis.pool import WorkerError
 from station.cell.status import EstimateStatus
-from station.plan.predict import next_best_text
+from station.plan.next_pose import next_best_text
 from station.session.context import SessionContext
 from station.session.recording import stamps_now
 from station.session.threads import DISK

@@ -14,8 +14,8 @@ from station.cell.config import CaptureConfig
 from station.cell.layout import layout_of
 from station.cell.limits import check_path
 from station.plan.choose import informations, objective_for
+from station.plan.next_pose import next_best, next_best_text
 from station.plan.planner import PlanOptions, plan_layout
-from station.plan.predict import next_best, next_best_text
 from station.simulation.cells import cell_config, make_cell
 
 

@@ -147,6 +147,7 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
         (("plan", "--from-list", "b"), 2, "gone"),
         (("bootstrap", "--config", "absent.yaml"), 2, "gone"),
         (("verify",), 2, "gone"),
+        (("check",), 2, "gone"),
         (("resume", "--go=ab"), 2, "gone"),
         (("trace", "record", "192.0.2.1"), 2, "gone"),
     ],

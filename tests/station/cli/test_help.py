@@ -1,4 +1,4 @@
-"""The command table: light, true to the commands, and friendly to last release's names."""
+"""The command table: light, and true to the commands."""
 
 from __future__ import annotations
 
@@ -22,16 +22,6 @@ def test_a_line_of_the_table_opens_its_commands_help(name: str) -> None:
     line = STATION.get_command(typer.Context(STATION), name).help
     assert line == resolve(name)[1].help.splitlines()[0]
     assert 0 < len(line) <= 72
-
-
-def test_a_command_answers_to_its_former_name_too() -> None:
-    assert resolve("check")[0] == "drift-check"
-    assert "check" not in STATION.commands
-
-
-@pytest.mark.parametrize("command", ["capture", "resume", "drift-check"])
-def test_an_option_answers_to_its_former_name_too(command: str) -> None:
-    assert resolve(command, "--go", "ab", "--go=cd", "go")[2] == ["--approve", "ab", "--approve=cd", "go"]
 
 
 @pytest.mark.parametrize(

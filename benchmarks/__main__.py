@@ -34,8 +34,8 @@ SHOWN: dict[str, str] = {
     "mistakes": r"^\*\*",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
-    "watch": r"^\| (repeated|any) .* of ",
-    "drift": r"^\| [38] \|",
+    "drift": r"^\| (ur|seven joints) ",
+    "production": r"^\| (repeated|any) .* of ",
     "late_news": r"^\| all",
     "stop_latency": r"^\| both \| (first|bytes).* 200 \||no heartbeat \| rest",
 }

@@ -94,6 +94,7 @@ def make_calibration(
             plan_sha256=info.plan_sha256,
         ),
         arm_table=None if arm is None else _arm_table(solution, arm, verified),
+        posterior=solution.posterior,
     )
 
 

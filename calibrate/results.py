@@ -161,6 +161,47 @@ class BoardShape(msgspec.Struct, frozen=True):
         return np.array([self.scale, self.anisotropy, *self.bend_m])
 
 
+class LearnedArm(msgspec.Struct, frozen=True):
+    """The arm's kinematics as they were learned: `calibrate.chain.Chain`, metres and radians, in base."""
+
+    axes: tuple[tuple[float, ...], ...]
+    points: tuple[tuple[float, ...], ...]
+    posture_rad: tuple[float, ...]
+    flange: tuple[tuple[float, ...], ...]
+
+
+class Posterior(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What the fit leaves known of camera, lens, board and arm; a later check begins with it.
+
+    Its X belongs to flanges from which `errors` are taken off, so it need not be the installed one.
+    """
+
+    X: tuple[tuple[float, ...], ...]
+    lens: list[float]
+    shape: list[float]
+    """As `SHAPE`."""
+    errors: list[float]
+    """Of the arm's links where `arm` is given, and of the bracket; metres and radians."""
+    covariance_lower: list[float]
+    """Of [X (δt, δφ), lens, shape, errors]: the lower triangle, row by row."""
+    robot_noise: tuple[float, float]
+    """1σ per axis of an ordinary view, metres and radians."""
+    corner_noise_px: tuple[float, float, float]
+    """1σ that moves board poses, that bends lens and shape, and of a single corner."""
+    class_shares: list[float]
+    """Of ordinary, 3 and 10 times as noisy, and useless views."""
+    freedom: float
+    """Degrees of freedom of the noise estimate."""
+    board_extent_m: tuple[tuple[float, ...], ...]
+    """Middle and half size of the corners seen, to which the bends of `shape` refer."""
+    arm: LearnedArm | None = None
+    """None: the arm's errors are not known, or inside X's covariance."""
+    stated_arm_error: tuple[tuple[float, ...], ...] | None = None
+    """Covariance (6, 6) of X by the stated error of the robot: one in the fit, another in every check."""
+    gravity: tuple[float, ...] | None = None
+    """Mean direction of gravity in the flange, to which X belongs; None: no bracket's bend in `errors`."""
+
+
 SHAPE = ("scale", "anisotropy", "bend xx", "bend yy", "bend xy")
 """The board's shape: a point (x, y) of the sheet, (u, v) the same mapped to -1 … 1 over the corners, lies at
 (x + s x + a x/2, y + s y - a y/2, b1 (1 - u²) + b2 (1 - v²) + b3 u v); s and a plain, b in metres."""

@@ -16,7 +16,6 @@ from calibrate.cli.contracts import (
     InstalledJson,
     ListedJson,
     SolveJson,
-    WatchEventJson,
 )
 from calibrate.cli.follow import Followed
 from calibrate.files.calibration import Calibration
@@ -46,7 +45,6 @@ TYPES: dict[str, tuple[str, Any]] = {
     "validity": ("calibrate withdraw --json; `validity` of other commands", Validity),
     "follow": ("A line of calibrate follow", Followed),
     "drift-check": ("calibrate drift-check --json", DriftCheckJson),
-    "watch": ("A line of `calibrate watch --json`", WatchEventJson),
     "status": ("station status --json", StationStatus),
     "doctor": ("station doctor --json", DoctorJson),
     "demo": ("station demo --json", DemoJson),

@@ -69,14 +69,7 @@ COMMANDS = {
     "follow": LazyCommand("calibrate.cli.follow:follow", ("calibrate follow --camera overhead",)),
     "drift-check": LazyCommand(
         "calibrate.cli.drift_check:drift_check",
-        ("calibrate drift-check later.mcap", "calibrate drift-check later.mcap --calibration cell.yaml"),
-    ),
-    "watch": LazyCommand(
-        "calibrate.cli.watch:watch",
-        (
-            "calibrate watch monday.mcap --board tag.yaml",
-            "calibrate watch pictures --follow  # until Ctrl-C; dataset.yaml states the tag",
-        ),
+        ("calibrate drift-check later.mcap", "calibrate drift-check production-pictures --board tag.yaml"),
     ),
     "annotate": LazyCommand(
         "calibrate.cli.annotate:annotate", ("calibrate annotate session.mcap calibration.yaml -o seen.mcap",)
@@ -116,6 +109,7 @@ CALIBRATE = LazyGroup(
         "diff": "`calibrate show` shows each; `calibrate install` tells how far it is from the one before.",
         "fleet": "Run `calibrate metrics` on each cell.",
         "report": "Use `calibrate solve REC --report FILE`.",
+        "watch": "`calibrate drift-check FOLDER` tests production pictures; run it from a timer.",
         "sweep": "Frame times carry their own bound; `station doctor` shows it.",
     },
 )

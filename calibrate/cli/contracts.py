@@ -95,22 +95,3 @@ class DriftCheckJson(msgspec.Struct, frozen=True):
     views: int
     trend: str
     validity: Validity | None
-
-
-class WatchEventJson(msgspec.Struct, frozen=True):
-    """A line of `calibrate watch --json`; the last one is the summary."""
-
-    event: str
-    """learned, not-fixed, testing, alarm, named, pictures-worse, tag-unseen, summary; more may come."""
-    picture: str
-    pictures: int
-    """Pictures with the tag so far."""
-    moved: str | None
-    """Code of `named`: camera-or-joint-6, tag-base-or-joint-1, joint-2 …, cannot-tell (eye-to-hand:
-    camera-base-or-joint-1, tag-gripper-or-joint-6)."""
-    values: dict[str, str | float | int | bool | None]
-    text: str
-    next: list[str]
-    """Commands of the shortest way back, in their order."""
-    validity: Validity | None
-    """Validity of the installed calibration, where the event changed it."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from calibrate.boards.model import check_board
 from calibrate.errors import UsageError
-from calibrate.files.calibration import FORMAT, read_calibration
+from calibrate.files.calibration import read_calibration
+from calibrate.files.proof import FORMATS
 from calibrate.lens.intrinsics import LensModel
 from calibrate.projection import camera_matrix, distortion
 from recordings import strict_yaml
@@ -33,7 +34,7 @@ def read_camera(path: Path) -> tuple[CameraModel, dict[str, float]]:
     The second value: 1σ of each of the intrinsics, as a calibration file states them; else empty.
     """
     plain = _read(path, "a calibration file, a camera_info file or a camera's width, height and matrix")
-    if plain.get("format") == FORMAT:
+    if plain.get("format") in FORMATS:
         lens = read_calibration(path).intrinsics
         return lens.model, dict(lens.sigma)
     if "camera_matrix" in plain:

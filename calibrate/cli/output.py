@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal
 
 from calibrate.errors import UsageError
-from calibrate.files.calibration import FORMAT
 from calibrate.recorded_views import Progress as LoadProgress
 from recordings.cli.console import AsJson as AsJson
 from recordings.cli.console import plain_console, progress_bar
@@ -39,7 +38,7 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
         start = read_beginning(target, 64)
     except OSError as problem:
         raise UsageError(path=target, why=problem.strerror, advice="Name another place.") from None
-    replaced = {"calibration": f"format: {FORMAT}".encode(), "report": b"<!doctype html>"}
+    replaced = {"calibration": b"format: handeye-calibration/", "report": b"<!doctype html>"}
     others = start.startswith((MAGIC, replaced["calibration"]))
     if others if kind == "export" else not start.startswith(replaced[kind]):
         raise UsageError("target-exists", path=target, by=f"this {kind}")

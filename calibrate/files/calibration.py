@@ -1,4 +1,4 @@
-"""The calibration file, `format: handeye-calibration/1`: its fields, writing, and verified reading.
+"""The calibration file, `format: handeye-calibration/2`: its fields, writing, and verified reading.
 
 Field by field in docs/integrator/calibration-file.md. Metres and radians unless the name says
 otherwise; covariances are of `geometry.perturb`'s delta.
@@ -26,6 +26,7 @@ from calibrate.results import (
     CrossValidation,
     Gate,
     HoldoutScore,
+    Posterior,
     RejectedView,
     Remark,
 )
@@ -47,7 +48,7 @@ _STAMPS = {
     "imported": "IMPORTED: images and poses of unknown origin",
 }
 
-FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"
+FORMAT: Literal["handeye-calibration/2"] = "handeye-calibration/2"
 Vector3 = tuple[float, float, float]
 Verdict = Literal["PASS", "PASS WITH A REASON", "FAIL"]
 
@@ -270,7 +271,7 @@ class Override(msgspec.Struct, frozen=True):
 
 
 class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
-    format: Literal["handeye-calibration/1"]
+    format: Literal["handeye-calibration/1", "handeye-calibration/2"]
     created: str
     """Time of the solve, UTC; not in the hash. Two runs on one recording differ in nothing else."""
     source: Source
@@ -292,6 +293,8 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     """Touch tests, oldest first; see `touch`."""
     arm_table: CorrectedArm | None = None
     """The arm's corrected table, where its model is known; `result` does not depend on it."""
+    posterior: Posterior | None = None
+    """What later checks begin with; None in files of the first version."""
 
     @property
     def transform(self) -> Transform:

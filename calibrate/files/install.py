@@ -256,14 +256,14 @@ def note_check(
     reason: ValidityReason,
     *,
     passed: bool,
-    sensitive: bool,
+    proves: bool,
     when: datetime,
     camera: str = MAIN_CAMERA,
     version: int | None = None,
 ) -> Validity:
     """Record the validity after a check, by the rules of `Validity.after_check`; else as `set_validity`."""
     return _change_validity(
-        root, camera, version, lambda v: v.after_check(kind, passed, sensitive, when, reason, who())
+        root, camera, version, lambda v: v.after_check(kind, passed, proves, when, reason, who())
     )
 
 

@@ -17,7 +17,8 @@ from calibrate.geometry import Array, is_rigid, skew
 from recordings import strict_yaml
 from recordings.files import read_beginning
 
-FORMAT_NAME = "handeye-calibration/1"
+FORMATS = ("handeye-calibration/1", "handeye-calibration/2")
+"""The second adds `posterior`."""
 _MCAP = b"\x89MCAP"
 _LIMIT_BYTES = 4 * 1024 * 1024
 
@@ -43,8 +44,8 @@ def proven_plain(content: bytes, where: str) -> dict[str, Any]:
     try:
         plain = strict_yaml.load_plain(content)
         found = plain.get("format") if isinstance(plain, dict) else None
-        if not isinstance(plain, dict) or found != FORMAT_NAME:
-            raise _other(where, f"format is {found!r}, expected {FORMAT_NAME!r}")
+        if not isinstance(plain, dict) or found not in FORMATS:
+            raise _other(where, f"format is {found!r}, expected {FORMATS[-1]!r}")
         if plain.pop("sha256", None) == content_sha256(plain):
             return plain
         why = "the content does not fit its hash"

@@ -17,7 +17,7 @@ from typing import Literal
 from calibrate.errors import InstallError
 
 FILE = "validity.jsonl"
-CheckKind = Literal["drift-check", "touch-test", "watch"]
+CheckKind = Literal["drift-check", "touch-test"]
 WITHDRAWN_REMEDY = (
     "Solve a new recording and run `calibrate install FILE`, "
     "or `calibrate rollback NUMBER` to another version of `calibrate list`"
@@ -39,7 +39,7 @@ class ValidityReason:
     """Cause of a validity state."""
 
     code: str
-    """installed, override, imported, rolled-back, no-record, drift-check, touch-test, watch, robot-changed,
+    """installed, override, imported, rolled-back, no-record, drift-check, touch-test, robot-changed,
     camera-changed, too-old, withdrawn; more may come."""
     text: str = ""
     """Figures and what to do, for people."""
@@ -79,23 +79,26 @@ class Validity:
         return replace(self, state=ValidityState.IN_DOUBT, since=time_text(due), reason=reason)
 
     def after_check(
-        self, kind: CheckKind, passed: bool, sensitive: bool, when: datetime, reason: ValidityReason, who: str
+        self, kind: CheckKind, passed: bool, proves: bool, when: datetime, reason: ValidityReason, who: str
     ) -> Validity:
         """Return the validity after a check of kind `kind` on views taken at `when`.
 
-        A failure puts it in doubt, a pass makes it valid. If the check is not `sensitive` enough, a pass
-        makes it valid only after a doubt of the same kind of check; another doubt becomes unverified. Views
-        from before the last proof change nothing, and no check restores a withdrawn version.
+        A failure puts it in doubt, a pass makes it valid, where the check `proves` it: a pass by its power, a
+        failure by telling the camera's shift from other errors. Else a failure makes it unverified, and a
+        pass makes it valid only after a doubt of the same kind of check; another doubt becomes unverified.
+        Views from before the last proof change nothing, and no check restores a withdrawn version.
         """
         proven = parse_time(self.verified)
         if self.state is ValidityState.WITHDRAWN or (proven is not None and when < proven):
             return self
         doubted = self.state is ValidityState.IN_DOUBT
         changed = replace(self, reason=reason, who=who)
+        if not passed and not proves:
+            return self if doubted else replace(changed, state=ValidityState.UNVERIFIED)
         if not passed:
             since = self.since if doubted else time_text(when)
             return replace(changed, state=ValidityState.IN_DOUBT, since=since)
-        if sensitive or (doubted and self.reason.code == kind):
+        if proves or (doubted and self.reason.code == kind):
             since = self.since if self.state is ValidityState.VALID else time_text(when)
             return replace(changed, state=ValidityState.VALID, since=since, verified=time_text(when))
         return replace(changed, state=ValidityState.UNVERIFIED) if doubted else self

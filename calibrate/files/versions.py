@@ -245,7 +245,7 @@ def note_installed(
         )
         now = datetime.now(UTC)
         passed = all(map(agrees, touches))
-        validity = before.after_check("touch-test", passed, False, now, reason, who())
+        validity = before.after_check("touch-test", passed, not passed, now, reason, who())
         return add_version(folder, calibration, "verify", validity, found)
 
 

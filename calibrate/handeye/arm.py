@@ -41,7 +41,7 @@ def arm_postures(views: ViewSet) -> tuple[ArmPostures | None, str]:
     no joints and the robot's model is unknown, or neither a table nor a chain explains the flanges. The text
     says what is unusual about the joints.
     """
-    flanges, joints = views.base_from_flange, _recorded_joints(views)
+    flanges, joints = views.base_from_flange, recorded_joints(views)
     published, note = MODELS.get(views.robot_model), ""
     model = None if published is None else with_near_axes(views.arm or published)
     if joints is not None:
@@ -87,21 +87,26 @@ def _learned(joints: Array, views: ViewSet) -> tuple[LearnedChain, Array, str]:
     return learned, joints, note + f"Without pose {views.views[row].index + 1} they do: look at its joints."
 
 
-def flex_motion(mount: Mount, flange: Array, held: Array) -> Array:
+def gravity_in_flange(flange: Array) -> Array:
+    """Compute the direction of gravity (n, 3) in the flange; base's z is taken to point up."""
+    return np.asarray(-flange[:, 2, :3])
+
+
+def flex_motion(mount: Mount, flange: Array, held: Array, level: Array | None = None) -> Array:
     """Compute the motion (n, 6, 9) of the flange, in base, by each entry of a bracket's compliance (3, 3).
 
     The bracket carries the camera (eye-in-hand) or the board at `held` (4, 4) in the flange. It bends by the
-    compliance times the direction of gravity in the flange. The mean bend over the views is subtracted: it
-    belongs to X or Y. Base's z is taken to point up.
+    compliance times the direction of gravity in the flange. The bend at gravity `level` (3,), None: the mean
+    of the views, is subtracted: it belongs to X or Y.
     """
-    R = flange[:, :3, :3]
-    gravity = -R[:, 2, :]
-    gravity = gravity - gravity.mean(axis=0)
+    R, gravity = flange[:, :3, :3], gravity_in_flange(flange)
+    gravity = gravity - (gravity.mean(axis=0) if level is None else level)
     turn = np.einsum("rk,nc->nkrc", np.eye(3), gravity).reshape(len(R), 3, 9)
     return np.concatenate([-R @ skew(held[:3, 3]) @ turn, -R @ turn], axis=1)
 
 
-def _recorded_joints(views: ViewSet) -> Array | None:
+def recorded_joints(views: ViewSet) -> Array | None:
+    """Return the joints (n, k) of all views; None where a view has none, or another number of them."""
     given = [view.joints_rad for view in views if view.joints_rad is not None]
     if len(given) < len(views) or len({len(joints) for joints in given}) > 1:
         return None

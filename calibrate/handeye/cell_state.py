@@ -14,7 +14,7 @@ import numpy as np
 from calibrate.geometry import Array, difference, inverse_left_jacobian, perturb, skew
 from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
 from calibrate.results import SHAPE
-from calibrate.views import Observations, implied_flange
+from calibrate.views import Observations, Places, implied_flange
 from recordings.schema.messages import CameraModel, Mount
 
 
@@ -64,6 +64,11 @@ class Layout:
     table: slice
     size: int
 
+    @property
+    def all_but_board(self) -> Places:
+        """Positions of all but the board's pose, which a later view does not share."""
+        return np.concatenate([_places(part) for part in (self.X, self.lens, self.shape, self.table)])
+
     @classmethod
     def of(cls, state: CellState) -> Layout:
         """Lay out the unknowns of `state` one after the other."""
@@ -72,6 +77,10 @@ class Layout:
         slices = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
         X, Y, lens, shape, table = slices
         return cls(X, Y, lens, shape, table, ends[-1])
+
+
+def _places(part: slice) -> Places:
+    return np.arange(part.start, part.stop)
 
 
 def flange_residuals(observed: Observations, state: CellState) -> Array:

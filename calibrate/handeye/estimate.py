@@ -22,7 +22,7 @@ from calibrate.handeye.corner_modes import STUDENT
 from calibrate.handeye.linear import MAX_STEPS, Fit, Linear
 from calibrate.handeye.mixture import weights_of
 from calibrate.handeye.noise_scales import ROBOT_PRIOR_COUNT, WIDE, Scales
-from calibrate.handeye.priors import Priors
+from calibrate.handeye.priors import KnownBefore, Priors
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.views import Observations, ViewSet
 
@@ -81,10 +81,14 @@ class Estimate:
         return np.asarray(self.weight > REJECTED)
 
     @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the noise estimate: 3n - 6 of n views that count, and its prior's."""
+        return max(3.0 * float(self.chances[:, 0].sum()) - 6.0 + ROBOT_PRIOR_COUNT, 1.0)
+
+    @property
     def threshold(self) -> float:
         """Limit of δᵀ C⁻¹ δ that holds the true X with 95 %: 6·F(6, ν), ν = 3n - 6 of n views that count."""
-        freedom = max(3.0 * float(self.chances[:, 0].sum()) - 6.0 + ROBOT_PRIOR_COUNT, 1.0)
-        chances, ratio = self.mean_of.chances, self.mean_of.camera_ratio
+        freedom, chances, ratio = self.freedom, self.mean_of.chances, self.mean_of.camera_ratio
         one = float(6 * special.fdtri(6, freedom, 0.95))
         if len(chances) == 1:
             return one
@@ -98,20 +102,19 @@ class Estimate:
 def estimate(
     observed: Observations,
     start: CellState,
-    priors: Priors,
+    priors: Priors | KnownBefore,
     scales: Scales | None = None,
     wide: float = WIDE,
-    fit_scales: bool = True,
+    fit: Fit = "all",
 ) -> Estimate:
     """Find the maximum of the posterior from `start`.
 
-    scales: the noise to start from, or to keep (`fit_scales` False); None: from the residuals at `start`, the
-    robot's times `wide`.
+    scales: the noise to start from, of which `fit` says what is fitted; None: from the residuals at `start`,
+    the robot's times `wide`.
     Raises BadViewsError where views and priors together do not determine the unknowns.
     """
     state, weights = start, observed.present
     converged, steps = False, 0
-    fit: Fit = "all" if fit_scales else "nothing"
     linear = Linear.at(observed, state, weights)
     scales = scales or linear.first_scales(wide)
     try:

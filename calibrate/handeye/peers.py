@@ -129,7 +129,7 @@ def _reprojection_only(views: ViewSet) -> Array:
     scales = Scales(np.array([_EXACT, _EXACT]), 1.0, 1.0, 1.0, shares)
     Y = mean_pose(placed_boards(H, C, X))
     start = CellState(X, Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
-    return estimate(observed, start, priors, scales, fit_scales=False).state.X
+    return estimate(observed, start, priors, scales, fit="nothing").state.X
 
 
 def _pose_arrays(views: ViewSet) -> tuple[Array, Array]:

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibrate.geometry import Array
+from calibrate.geometry import Array, difference
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic
 from calibrate.projection import intrinsics_names, intrinsics_vector
-from calibrate.results import SHAPE
 from recordings.schema.messages import BoardSpec, CameraModel
 
 ASPECT_SIGMA = 0.001
@@ -33,6 +32,11 @@ class BoardTolerance:
     square: float = 0.003
     """Relative, of the size of the squares, and of their size in x against that in y."""
     flatness_m: float = 0.001
+
+    @property
+    def sigma(self) -> Array:
+        """1σ (5,) of the board's shape, in the order of `SHAPE`."""
+        return np.array([self.square, self.square, self.flatness_m, self.flatness_m, self.flatness_m])
 
     @classmethod
     def of(cls, board: BoardSpec) -> BoardTolerance:
@@ -109,7 +113,30 @@ class Priors:
     @property
     def board_sigma(self) -> Array:
         """1σ (5,) of the board's shape, in the order of `SHAPE`."""
-        square, bend = self.board.square, self.board.flatness_m
-        sigma = np.array([square, square, bend, bend, bend])
-        assert len(sigma) == len(SHAPE)
-        return sigma
+        return self.board.sigma
+
+
+@dataclass(frozen=True, eq=False)
+class KnownBefore:
+    """What an earlier fit left known: a normal distribution of [X, lens, board shape, errors of the arm]."""
+
+    mean: CellState
+    information: Array
+    """(G - 6, G - 6); rows of zeros for what is not taken as known."""
+
+    def away(self, state: CellState) -> Array:
+        """Compute by how much `state` (G - 6,) differs from the mean."""
+        return np.concatenate([
+            difference(state.X, self.mean.X),
+            intrinsics_vector(state.camera) - intrinsics_vector(self.mean.camera),
+            state.shape - self.mean.shape,
+            state.table - self.mean.table,
+        ])  # fmt: skip
+
+    def linearise(self, state: CellState, table: Array | float) -> Quadratic:
+        """Linearise around `state`."""
+        at = Layout.of(state)
+        N, right, places = np.zeros((at.size, at.size)), np.zeros(at.size), at.all_but_board
+        N[np.ix_(places, places)] = self.information
+        right[places] = -self.information @ self.away(state)
+        return Quadratic(N, right)

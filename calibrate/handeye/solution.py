@@ -17,7 +17,15 @@ from calibrate.geometry import Array, Transform
 from calibrate.handeye.metrics import Observability
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.kinematics import RobotModel
-from calibrate.results import BoardShape, Certificate, CrossValidation, HoldoutScore, RejectedView, Remark
+from calibrate.results import (
+    BoardShape,
+    Certificate,
+    CrossValidation,
+    HoldoutScore,
+    Posterior,
+    RejectedView,
+    Remark,
+)
 from calibrate.views import BoardView
 from recordings.schema.messages import CameraModel, Mount
 
@@ -268,6 +276,8 @@ class Solution:
     on_box: tuple[str, ...] = ()
     """Paper profile: components of X that lie on the box of equation 22."""
     warnings: tuple[Remark, ...] = ()
+    posterior: Posterior | None = None
+    """What later checks begin with; None for the paper profile and without corners."""
     seed: int = 0
 
     @property

@@ -42,6 +42,7 @@ from calibrate.handeye.metrics import (
     score_holdout,
 )
 from calibrate.handeye.pose_fit import pose_views
+from calibrate.handeye.posterior import posterior_of
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.readings import explain_recording, explain_text
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
@@ -179,6 +180,7 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
             indices[i]: (float(np.linalg.norm(found.robot[i, :3])), float(np.linalg.norm(found.robot[i, 3:])))
             for i in used
         },
+        posterior=posterior_of(fit, common),
         seed=options.seed,
     )
 

@@ -68,9 +68,6 @@ STATION = LazyGroup(
             ("station drift-check", "station drift-check --poses 12"),
             _APPROVED,
         ),
-        "watch": LazyCommand(
-            "station.cli.watch:watch_command", ("station watch --board tag.yaml", "station watch --every 10")
-        ),
         "accept": LazyCommand(
             "station.cli.accept:accept_command",
             ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.25"),
@@ -88,6 +85,7 @@ STATION = LazyGroup(
         "next-pose": "F3 on the screen adds views that you guide by hand.",
         "replan": "`station finish`, then `station plan` plans again.",
         **dict.fromkeys(("touch-test", "verify"), "Press h on Result of the screen: `station`."),
+        "watch": "`calibrate drift-check FOLDER` tests production pictures; run it from a timer.",
         "trace": "The simulated controller's limits are in the docs: The simulator.",
     },
     help="A calibration station for a robot cell. Without a command: the operator screen.",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from calibrate.check.history import read_checks
 from calibrate.files.install import installed_calibration
-from calibrate.quality.drift_history import find_trend, read_checks
 from station.cell.status import SessionStatus, StationState, StationStatus
 from station.operate.ending import Ending, after_drift_check
 from station.operate.motion import PREPARE_S, Approve, prepared_motion
@@ -72,8 +72,7 @@ def judged(folder: str, camera: str) -> Ending | None:
     entry = next((entry for entry in reversed(history) if entry.recording == path.name), None)
     if entry is None:
         return None
-    trend = find_trend(history, entry.generation)
-    return after_drift_check(entry, "" if trend is None else trend.text)
+    return after_drift_check(entry)
 
 
 def check_arguments(recording: str, folder: str) -> tuple[str, ...]:

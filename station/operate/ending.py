@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from calibrate.check.history import CheckEntry
 from calibrate.files.calibration import Calibration
 from calibrate.files.touch import Touch, agrees, touch_sigmas
-from calibrate.quality.drift_history import CheckEntry
 from station.cell.status import SessionStatus
 
 
@@ -74,10 +74,10 @@ def after_touches(touches: Sequence[Touch]) -> Ending:
     )
 
 
-def after_drift_check(entry: CheckEntry, trend: str = "") -> Ending:
-    """Recommend a step after a drift check; `trend`: trend of the checks before, empty: none."""
-    if trend:
-        return Ending(Way.LOOK_FOR, trend)
+def after_drift_check(entry: CheckEntry) -> Ending:
+    """Recommend a step after a drift check."""
+    if entry.trend is not None:
+        return Ending(Way.LOOK_FOR, entry.trend.text)
     if entry.passed:
         return Ending(Way.KEEP, "the installed calibration holds")
     return Ending(

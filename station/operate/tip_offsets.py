@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from calibrate.boards.model import board_points
+from calibrate.check.board_now import BoardNow, found_points, locate_board, offset_covariance
+from calibrate.check.same_cell import CellIdentity, require_same_cell
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
 from calibrate.files.install import installed_calibration
 from calibrate.files.touch import Touch
 from calibrate.files.versions import note_in_file, note_installed, same_solve
 from calibrate.geometry import Array, inverse, transform_points
-from calibrate.quality.board_now import BoardNow, found_points, locate_board, offset_covariance
-from calibrate.quality.drift import CellIdentity, require_same_cell
 from calibrate.views import BoardView
 from station.cell.config import Vector3
 from station.cell.errors import RefusedError
@@ -44,7 +44,6 @@ class SeenBoard:
     """Board pose by the calibration under test and one image."""
 
     calibration: Calibration
-    view: BoardView
     now: BoardNow
     tip_m: Vector3
     """The pointer's tip in `flange`."""
@@ -70,7 +69,7 @@ async def see_board(link: Client, file: Path) -> SeenBoard:
     points = board_points(calibration.board)[list(seen.corners)]
     view = BoardView(0, "touch test", np.array(seen.base_from_flange), points, np.array(seen.pixels))
     now = await asyncio.to_thread(locate_board, calibration, view, calibration.board)
-    return SeenBoard(calibration, view, now, tip_m, pointer)
+    return SeenBoard(calibration, now, tip_m, pointer)
 
 
 def read_touch(board: SeenBoard, corner: int, status: StationStatus | None) -> Touch:
@@ -87,7 +86,7 @@ def read_touch(board: SeenBoard, corner: int, status: StationStatus | None) -> T
     tip = transform_points(inverse(board.now.base_from_board), touching)
     offset_mm = _offset_mm(corner, points[corner], tip)
     at = found_points(board.calibration, board.calibration.board)[corner]
-    covariance = offset_covariance(board.calibration, board.view, board.now, at, board.tip_m)
+    covariance = offset_covariance(board.calibration, board.now, at, board.tip_m)
     return Touch(
         corner=corner,
         corner_mm=_mm(points[corner]),

@@ -8,6 +8,7 @@ from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
 
+from calibrate.check.history import CheckEntry, read_checks
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, Verdict, read_calibration
 from calibrate.files.folders import calibrations_folder, current_validity
@@ -16,7 +17,6 @@ from calibrate.files.touch import agrees
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
 from calibrate.files.versions import LogEntry, read_log, same_solve
-from calibrate.quality.drift_history import CheckEntry, read_checks
 from recordings.files import MAIN_CAMERA
 from station.cell.session_folder import SessionSummary, list_sessions
 

@@ -21,7 +21,6 @@ from calibrate.files.install import change_text
 from calibrate.files.touch import LIMIT_SIGMAS, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import ValidityState, validity_text
 from calibrate.files.versions import same_solve
-from calibrate.quality.drift_history import find_trend
 from calibrate.results import Gate
 from station.operate.ending import Way, after_drift_check, after_solve
 from station.tui.installed import Result, local
@@ -100,8 +99,7 @@ def check_rows(result: Result, calibration: Calibration) -> list[Row]:
         told = "h: a pointer's tip is brought onto corners of the board, by hand, and the arm is read."
         rows.append(_row("todo", "touch test", text=told))
     for entry in reversed(result.state.drift if result.installed else ()):
-        trend = find_trend(result.state.drift, entry.generation) if entry is result.state.drift[-1] else None
-        end = after_drift_check(entry, "" if trend is None else trend.text)
+        end = after_drift_check(entry)
         kind = "failed" if not entry.passed else "done" if end.way is Way.KEEP else "look"
         name = time.strftime("drift check %d %b", time.localtime(entry.wall_s))
         value = f"{1000 * float(np.linalg.norm(entry.shift[:3])):.2f} mm"

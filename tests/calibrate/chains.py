@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
 from calibrate.views import BoardView, ViewSet
@@ -105,7 +105,26 @@ def arm_cell(
         X, Y = held, at_home @ held @ first
     else:
         X, Y = at_home @ held @ inverse(first), held
-    q = np.zeros((0, len(home)))
+    return ArmCell(_views_of(arm, mount, X, Y, errors, rng, views, joints), X, Y, arm, errors)
+
+
+def later_views(cell: ArmCell, shift: Array, seed: int, views: int) -> ViewSet:
+    """Views at other postures of the same cell, whose camera has shifted since."""
+    rng, X = np.random.default_rng([seed, 1]), perturb(cell.X, shift)
+    return _views_of(cell.arm, cell.views.mount, X, cell.Y, cell.link_errors, rng, views, True)
+
+
+def _views_of(
+    arm: DhArm,
+    mount: Mount,
+    X: Array,
+    Y: Array,
+    errors: Array,
+    rng: np.random.Generator,
+    views: int,
+    joints: bool,
+) -> ViewSet:
+    q = np.zeros((0, len(HOME[arm.name])))
     while len(q) < views:
         tried = arm.postures(rng, 4000, 0.5)
         q = np.concatenate([q, tried[_shows(_boards(arm.forward(tried), mount, X, Y))]])
@@ -121,7 +140,7 @@ def arm_cell(
         )
         told = arm.forward(q[i : i + 1])[0]
         seen.append(BoardView(i, f"view {i}", told, POINTS, pixels, q[i] if joints else None))
-    return ArmCell(solve_pnp(ViewSet(mount, tuple(seen), CAMERA)), X, Y, arm, errors)
+    return solve_pnp(ViewSet(mount, tuple(seen), CAMERA))
 
 
 def _boards(flange: Array, mount: Mount, X: Array, Y: Array) -> Array:

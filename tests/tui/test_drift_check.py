@@ -9,9 +9,9 @@ import msgspec
 import pytest
 from textual.pilot import Pilot
 
+from calibrate.check.history import CheckEntry, append_check
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
-from calibrate.quality.drift_history import CheckEntry, append_check
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
 from station.operate.drift_check import POSES, SEED
@@ -129,7 +129,7 @@ def test_the_history_is_of_this_camera_and_of_what_is_installed(tmp_path: Path) 
     for camera in ("left", "right"):
         write_calibration(GOOD, path)
         number = install(path, root, cell="simulated", camera=camera).number
-        entry = CheckEntry(0.0, number, camera, True, (0.0,) * 6, ((0.0,) * 6,) * 6, 1.0, 12.6)
+        entry = CheckEntry(0.0, number, camera, True, (0.0,) * 6, 1.0, 12.6)
         append_check(entry, root, camera)
     assert [check.recording for check in read_installed(root, "right").drift] == ["right"]
     assert not read_installed(root).drift

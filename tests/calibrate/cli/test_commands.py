@@ -78,7 +78,12 @@ def test_solve_install_check_rollback(real_session_file: Path, real_file: Path, 
         matrix=tuple(map(tuple, moved.tolist())),
         translation_m=tuple(moved[:3, 3].tolist()),
     )
-    write_calibration(msgspec.structs.replace(calibration, result=result), second)
+    assert calibration.posterior is not None
+    arm_error = tuple(map(tuple, np.diag(np.full(6, 1e-10)).tolist()))  # stated, as by --robot-accuracy-mm
+    posterior = msgspec.structs.replace(
+        calibration.posterior, X=tuple(map(tuple, moved.tolist())), stated_arm_error=arm_error
+    )
+    write_calibration(msgspec.structs.replace(calibration, result=result, posterior=posterior), second)
     first = run("install", real_file, cwd=tmp_path)
     assert first.returncode == 0 and "calibrate withdraw" in first.stdout
     excerpt = write_excerpt(open_recording(real_session_file), tmp_path / "excerpt.mcap")

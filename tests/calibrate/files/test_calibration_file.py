@@ -30,7 +30,7 @@ def test_everything_reads_back_as_it_was(solved_real: SolvedRecording, tmp_path:
 
 def test_the_format_stands_first_and_is_plain_yaml(real_file: Path) -> None:
     lines = real_file.read_text().splitlines()
-    assert lines[0] == "format: handeye-calibration/1"
+    assert lines[0] == "format: handeye-calibration/2"
     plain = yaml.safe_load(real_file.read_text())
     assert len(plain["covariance"]) == 6
     assert plain["provenance"]["recording_sha256"]

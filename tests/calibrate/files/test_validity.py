@@ -37,9 +37,9 @@ def root(make_file: MakeFile, tmp_path: Path) -> Path:
     return tmp_path / "s"
 
 
-def check(root: Path, passed: bool, sensitive: bool = True, kind: CheckKind = "drift-check") -> Validity:
+def check(root: Path, passed: bool, proves: bool = True, kind: CheckKind = "drift-check") -> Validity:
     when = datetime.now(UTC) + timedelta(seconds=2)
-    return note_check(root, kind, MOVED, passed=passed, sensitive=sensitive, when=when)
+    return note_check(root, kind, MOVED, passed=passed, proves=proves, when=when)
 
 
 def touch(offset_mm: float) -> Touch:
@@ -63,15 +63,17 @@ def test_what_is_installed_is_valid_until_a_check_contradicts_it_and_again_when_
 def test_a_pass_that_could_have_missed_the_shift_proves_nothing(root: Path) -> None:
     check(root, passed=False)
     since = load_installed(root, require_valid=False).validity.since
-    assert check(root, passed=True, sensitive=False, kind="touch-test").state is U
+    assert check(root, passed=True, proves=False, kind="touch-test").state is U
     with raises_code(InstallError, "calibration-unverified", since=since):
         load_installed(root, require_valid=True)
     assert load_installed(root).validity.state is U
+    assert check(root, passed=True).state is V
+    assert check(root, passed=False, proves=False).state is U  # the arm's own errors may have failed it
 
 
 def test_old_views_tell_nothing_of_today(root: Path) -> None:
     long_ago = datetime(2020, 1, 1, tzinfo=UTC)
-    note_check(root, "drift-check", MOVED, passed=False, sensitive=True, when=long_ago)
+    note_check(root, "drift-check", MOVED, passed=False, proves=True, when=long_ago)
     assert load_installed(root).validity.state is V
 
 

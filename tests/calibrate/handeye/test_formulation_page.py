@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibrate.check import drift
 from calibrate.handeye import arm, corner_modes, fit, linear, mixture, noise_scales, priors, readings
 from calibrate.handeye.axxb import certificate, paper
 from calibrate.handeye.axxb.pairs import MAX_PAIRS
-from calibrate.quality import drift
 
 PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
 

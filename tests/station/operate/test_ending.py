@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from calibrate.check.history import CheckEntry, Trend
 from calibrate.files.calibration import Calibration, RejectedView
 from calibrate.files.touch import Touch
-from calibrate.quality.drift_history import CheckEntry
 from calibrate.results import Gate
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.status import PoseStatus, SessionStatus
@@ -58,7 +58,8 @@ def test_a_capture() -> None:
 
 
 def test_a_drift_check() -> None:
-    entry = CheckEntry(0.0, 1, "r", True, (0.0,) * 6, ((0.0,) * 6,) * 6, 1.0, 12.6)
+    entry = CheckEntry(0.0, 1, "r", True, (0.0,) * 6, 1.0, 12.6)
     assert after_drift_check(entry).way is Way.KEEP
-    assert after_drift_check(entry, "it wanders").way is Way.LOOK_FOR
+    wanders = msgspec.structs.replace(entry, trend=Trend(0.4, 0.0, 40.0, 8))
+    assert after_drift_check(wanders).way is Way.LOOK_FOR
     assert after_drift_check(msgspec.structs.replace(entry, passed=False)).way is Way.LOOK_FOR

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
+from calibrate.check.board_now import locate_board, offset_covariance
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import write_calibration
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, rotation_log, transform_points
 from calibrate.kinematics import MODELS, forward
-from calibrate.quality.board_now import locate_board, offset_covariance
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig, matrix4
 from station.cell.errors import RefusedError
@@ -167,7 +167,7 @@ def test_the_predicted_offset_is_what_repetitions_show() -> None:
 
         view = seen_from(truth, E, board, rng, told=perturb(E, robot_error()))
         now = locate_board(calibration, view, truth.board)
-        covariance = offset_covariance(calibration, view, now, corner, POINTER.tip_m)
+        covariance = offset_covariance(calibration, now, corner, POINTER.tip_m)
         # The arm is sent where the tip would touch the corner, and misses by its own error.
         target = transform_points(now.base_from_board, corner)
         tip = np.array(POINTER.tip_m)

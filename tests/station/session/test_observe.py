@@ -1,4 +1,4 @@
-"""A picture for `station watch`: between sessions, of an arm at rest, with its pose; nothing is kept."""
+"""A picture for the touch test: between sessions, of an arm at rest, with its pose; nothing is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Delay, false alarms and named causes of `calibrate watch`.
+"""Delay and false alarms of `calibrate drift-check FOLDER` on production pictures.
 
 The simulated cells know nothing of the test's own models: a UR10 whose table is wrong, a lens whose residual
 is a sum of waves, blur as noise and shift, a camera that creeps and swings with the day.
@@ -6,8 +6,7 @@ is a sum of waves, blur as noise and shift, a camera that creeps and swings with
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -15,20 +14,30 @@ import numpy as np
 
 from benchmarks.trials import in_processes, table, trials
 from calibrate.boards.model import board_points
+from calibrate.check.production import EARLIER, MOST_EARLIER, NEWEST, EarlierPictures
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
-from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many
+from calibrate.handeye.arm import chain_of
+from calibrate.handeye.cell_state import CellState
+from calibrate.handeye.mixture import SHARE_COUNTS
+from calibrate.handeye.noise_scales import Scales
+from calibrate.handeye.posterior import KnownCell
+from calibrate.handeye.priors import BoardTolerance, LensPrior
+from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, with_near_axes
+from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
-from calibrate.quality.movement.evidence import Moved
-from calibrate.quality.movement.monitor import EventKind, MovementMonitor
-from calibrate.quality.movement.pictures import CellModel, Picture
+from calibrate.views import BoardView, ViewSet, extent_of
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 
-_TAG = board_points(BoardSpec(BoardKind.APRIL_TAG, square_m=0.05))
+_BOARD = BoardSpec(BoardKind.APRIL_TAG, square_m=0.05)
+_TAG = board_points(_BOARD)
 _WIDTH, _HEIGHT, _PER_DAY = 1600, 1200, 1000
 _ARM = MODELS["UR10"]
 _BLURRED = 0.05
 """Share of blurred pictures."""
 _MOUNTS: tuple[Mount, Mount] = ("eye-in-hand", "eye-to-hand")
+_BEFORE, _AFTER, _NULL = 600, 150, 1200
+_MOVES = ((0.5, 0.0), (0.0, 0.05), (1.0, 0.0), (0.0, 0.1))
+"""Shifts, mm, and turns, degrees, of the camera after `_BEFORE` pictures."""
 
 
 @dataclass(frozen=True)
@@ -37,93 +46,23 @@ class Cell:
     mount: Mount
     repeated: bool
     """Few postures that come again and again in any order; else every posture is another."""
-    narrow: bool = False
-    """All views within ±5° of tilt and ±10° of roll."""
     creep_mm: float = 0.1
     """By which the camera creeps a day, from the first picture on."""
 
 
-@dataclass(frozen=True)
-class Happening:
-    """Event after `_BEFORE` pictures."""
-
-    part: str
-    """camera, tag, joint-2 … joint-5, or noise"""
-    mm: float = 0.0
-    deg: float = 0.0
-
-
-@dataclass(frozen=True)
-class Outcome:
-    happening: Happening
-    delay: float
-    """Pictures until it is noticed; infinite where it is not within `_AFTER`, NaN for an alarm before."""
-    named: Moved | None
-    worse: bool
-    """Whether pictures were called worse."""
-
-
-_BEFORE, _AFTER, _NULL = 600, 150, 1200
-NOTICED = (
-    Happening("camera", 0.5),
-    Happening("camera", 0.0, 0.05),
-    Happening("camera", 1.0),
-    Happening("camera", 0.0, 0.1),
-)
-NAMED = (
-    Happening("camera", 1.0, 0.1),
-    Happening("tag", 1.0, 0.1),
-    *(Happening(f"joint-{joint}", deg=0.1) for joint in (2, 3, 4, 5)),
-)
-WORSE = Happening("noise", 3.0)
-_RIGHT = {
-    "camera": (Moved.CAMERA, Moved.CAMERA_BASE),
-    "tag": (Moved.TAG, Moved.TAG_GRIPPER),
-    **{f"joint-{joint}": (Moved(f"joint-{joint}"),) for joint in (2, 3, 4, 5)},
-}
-
-
 def run() -> str:
-    cells, nulls, fewer = trials(100), trials(60), trials(25)
-    return text(cells, nulls, fewer, noticed_rows(cells, nulls), named_rows(fewer))
-
-
-_KINDS = [(mount, repeated) for repeated in (True, False) for mount in _MOUNTS]
-
-
-def noticed_rows(cells: int, nulls: int) -> list[tuple[str, ...]]:
+    cells, nulls = trials(100), trials(60)
     rows = []
-    for mount, repeated in _KINDS:
-        found = _outcomes([Cell(seed, mount, repeated) for seed in range(cells)], NOTICED)
-        rate = _false_alarms([Cell(seed, mount, repeated) for seed in range(1000, 1000 + nulls)])
-        rows.append((_says(repeated), mount, *(_delays(found, what) for what in NOTICED), rate))
-        print(rows[-1], flush=True)
-    return rows
-
-
-def named_rows(cells: int) -> list[tuple[str, ...]]:
-    rows = []
-    for mount, repeated in _KINDS:
-        for narrow in (False, True):
-            seeds = range(3000, 3000 + cells)
-            found = _outcomes([Cell(seed, mount, repeated, narrow) for seed in seeds], (*NAMED, WORSE))
-            rows.append((_says(repeated), mount, "±5°" if narrow else "to 40°", *_names(found)))
+    for mount in _MOUNTS:
+        for repeated in (True, False):
+            found = list(in_processes(_delays, [Cell(seed, mount, repeated) for seed in range(cells)]))
+            still = list(in_processes(_alarms, [Cell(1000 + seed, mount, repeated) for seed in range(nulls)]))
+            tested = nulls * (_NULL - EARLIER)
+            rate = f"{sum(still)} of {tested} ({1e4 * sum(still) / tested:.2f})"
+            delays = (_percentiles([each[k] for each in found]) for k in range(len(_MOVES)))
+            rows.append(("repeated" if repeated else "any", mount, *delays, rate))
             print(rows[-1], flush=True)
-    return rows
-
-
-_NAMED_HEADER = ("postures", "mounting", "tilt", "right", "wrong", "cannot tell", "not noticed",
-                 "worse pictures", "alarm")  # fmt: skip
-
-
-def text(
-    cells: int,
-    nulls: int,
-    fewer: int,
-    noticed: list[tuple[str, ...]],
-    named: list[tuple[str, ...]],
-) -> str:
-    columns = [f"{what.mm:g} mm" if what.mm else f"{what.deg:g}°" for what in NOTICED]
+    columns = [f"{mm:g} mm" if mm else f"{deg:g}°" for mm, deg in _MOVES]
     return (
         f"{cells} cells a row, one 50 mm tag at 0.4 to 0.8 m, f 1100 to "
         "1700 px, corners 0.1 to 0.3 px, 5 % of the pictures blurred, repeatability 0.03 to 0.1 mm and table "
@@ -131,78 +70,40 @@ def text(
         f"±0.05 mm, 1000 pictures a day. The camera moves in a random direction after {_BEFORE} pictures. "
         f"Pictures until it is noticed, median / 95 % (> {_AFTER}: not within {_AFTER}). False alarms: in "
         f"all pictures of {nulls} other cells a row, and per 10,000.\n\n"
-        + table(("postures", "mounting", *columns, "false alarms"), noticed)
-        + f"\n\nWhat moved, {len(NAMED) * fewer} moves a row: camera or tag by 1 mm and 0.1°, joints 2 to 5 "
-        f"by 0.1°; shares of those that were noticed. Then {fewer} cells whose corners become three times as "
-        "noisy: share in which worse pictures are said, and share with an alarm.\n\n"
-        + table(_NAMED_HEADER, named)
+        + table(("postures", "mounting", *columns, "false alarms"), rows)
     )
 
 
-def _false_alarms(cells: Sequence[Cell]) -> str:
-    """False alarms in cells in which nothing moves: 'n of tested pictures (per 10,000)'."""
-    found = list(in_processes(_run_null, list(cells)))
-    pictures, alarms = sum(pictures for pictures, _ in found), sum(alarm for _, alarm in found)
-    return f"{alarms} of {pictures} ({1e4 * alarms / pictures:.2f})"
-
-
-def _says(repeated: bool) -> str:
-    return "repeated" if repeated else "any"
-
-
-def _delays(found: list[Outcome], what: Happening) -> str:
-    delays = [o.delay for o in found if o.happening == what and not np.isnan(o.delay)]
+def _percentiles(delays: Sequence[float]) -> str:
     middle, late = np.percentile(delays, [50, 95], method="higher")
     return " / ".join(f"> {_AFTER}" if np.isinf(each) else f"{each:.0f}" for each in (middle, late))
 
 
-def _names(found: list[Outcome]) -> list[str]:
-    """Right, wrong, open, not noticed; noise said to be noise, and taken for a move."""
-    moves = [o for o in found if o.happening.part != "noise"]
-    named = [o.named for o in moves if o.named is not None]
-    right = sum(o.named in _RIGHT[o.happening.part] for o in moves if o.named is not None)
-    open_ = named.count(Moved.CANNOT_TELL)
-    noise = [o for o in found if o.happening.part == "noise"]
-    shares = [
-        *(count / max(len(named), 1) for count in (right, len(named) - right - open_, open_)),
-        float(np.mean(np.isinf([o.delay for o in moves]))),
-        float(np.mean([o.worse for o in noise])),
-        float(np.mean([np.isfinite(o.delay) for o in noise])),
-    ]
-    return [f"{100 * share:.1f} %" for share in shares]
-
-
-def _outcomes(cells: Sequence[Cell], happenings: Sequence[Happening]) -> list[Outcome]:
-    tasks = [(cell, tuple(happenings)) for cell in cells]
-    return [outcome for outcomes in in_processes(_run_cell, tasks) for outcome in outcomes]
-
-
-def _run_cell(task: tuple[Cell, tuple[Happening, ...]]) -> list[Outcome]:
-    """Each happening in the same cell, whose pictures before it are the same."""
-    cell, happenings = task
+def _delays(cell: Cell) -> list[float]:
+    """Pictures until each move is noticed; infinite where it is not within `_AFTER`."""
     found = []
-    watched: MovementMonitor | None = None
-    for what in happenings:
-        model, pictures = simulate(cell, _BEFORE + _AFTER, what)
-        if watched is None:
-            watched = MovementMonitor(model)
-            list(watched.add(pictures[:_BEFORE]))
-        monitor = copy.deepcopy(watched)
-        events = list(monitor.add(pictures[_BEFORE:]))
-        alarm = next((e.pictures - _BEFORE for e in events if e.kind is EventKind.ALARM), np.inf)
-        named = next((e.moved for e in events if e.kind is EventKind.NAMED), None)
-        worse = any(e.kind is EventKind.PICTURES_WORSE for e in events)
-        found.append(Outcome(what, np.nan if watched.alarmed else alarm, named, worse))
+    for mm, deg in _MOVES:
+        known, views = simulate(cell, _BEFORE + _AFTER, mm, deg)
+        found.append(next((n - _BEFORE for n in _alarmed(known, views, _BEFORE)), np.inf))
     return found
 
 
-def _run_null(cell: Cell) -> tuple[int, bool]:
-    model, pictures = simulate(cell, _NULL, None)
-    monitor = MovementMonitor(model)
-    events = list(monitor.add(pictures))
-    begun = next(e.pictures for e in events if e.kind is EventKind.TESTING)
-    ended = next((e.pictures for e in events if e.kind is EventKind.ALARM), _NULL)
-    return ended - begun, monitor.alarmed
+def _alarms(cell: Cell) -> int:
+    return len(list(_alarmed(*simulate(cell, _NULL), EARLIER)))
+
+
+def _alarmed(known: KnownCell, views: ViewSet, begin: int) -> Iterator[int]:
+    """Yield the numbers of pictures after which an alarm is given, looked at after each.
+
+    The earlier pictures are solved again after every ten.
+    """
+    for count in range(begin, len(views)):
+        if count % 10 == begin % 10:
+            last = max(EARLIER, count - 20)
+            earlier = EarlierPictures.of(views.select(list(range(max(0, last - MOST_EARLIER), last))), known)
+        newest = list(range(max(last, count + 1 - NEWEST[-1]), count + 1))
+        if len(newest) >= NEWEST[0] and not earlier.test(views.select(newest)).passed:
+            yield count + 1
 
 
 # --- the cell ---
@@ -210,7 +111,7 @@ def _run_null(cell: Cell) -> tuple[int, bool]:
 class _Still:
     """A cell in which nothing happens, and everything in it that is random."""
 
-    model: CellModel
+    known: KnownCell
     seen_by: Callable[[Array], Array]
     arm: RobotModel
     joints: Array
@@ -223,28 +124,28 @@ class _Still:
     blur_px: Array
 
 
-def simulate(cell: Cell, count: int, what: Happening | None) -> tuple[CellModel, list[Picture]]:
-    """Simulate a cell's facts for the monitor, and its pictures; all are the same until something happens."""
+def simulate(cell: Cell, count: int, mm: float = 0.0, deg: float = 0.0) -> tuple[KnownCell, ViewSet]:
+    """Simulate what a calibration left known of a cell, and its pictures, in which the camera may move."""
     still = _still(cell, count)
-    later = (np.arange(count) >= _BEFORE) & (what is not None)
-    X, P, joints, noise_px = still.X.copy(), still.P.copy(), still.true_joints.copy(), still.noise_px.copy()
-    if what is not None:
-        move = np.concatenate([still.ways[0] * what.mm * 1e-3, still.ways[1] * np.radians(what.deg)])
-        if what.part == "camera":
-            X[later] = perturb(X[later], move)
-        elif what.part == "tag":
-            P[later] = perturb(P[later], move)
-        elif what.part == "noise":
-            noise_px[later] *= what.mm
-        else:
-            joints[later, int(what.part[-1]) - 1] += np.radians(what.deg) * np.sign(still.ways[0, 0])
-    F = forward(still.arm, joints)
-    C = inverse(F @ X) @ P if cell.mount == "eye-in-hand" else inverse(X) @ F @ P
-    pixels = still.seen_by(transform_points(C, still.tag)) + noise_px + still.blur_px
+    later, X = np.arange(count) >= _BEFORE, still.X.copy()
+    move = np.concatenate([still.ways[0] * mm * 1e-3, still.ways[1] * np.radians(deg)])
+    X[later] = perturb(X[later], move)
+    F = forward(still.arm, still.true_joints)
+    C = inverse(F @ X) @ still.P if cell.mount == "eye-in-hand" else inverse(X) @ F @ still.P
+    pixels = still.seen_by(transform_points(C, still.tag)) + still.noise_px + still.blur_px
     recorded = forward(_ARM, still.joints)
-    return still.model, [
-        Picture(str(i), recorded[i], still.joints[i], (0, 1, 2, 3), _TAG, pixels[i]) for i in range(count)
-    ]
+    views = (BoardView(i, str(i), recorded[i], _TAG, pixels[i], still.joints[i]) for i in range(count))
+    return still.known, solve_pnp(ViewSet(cell.mount, tuple(views), still.known.mean.camera))
+
+
+def _known(lens: CameraModel, X: Array, sigma: Array) -> KnownCell:
+    """What a calibration leaves: X, a lens and a tag within their usual tolerances, links within 0.3 mm."""
+    chain = chain_of(with_near_axes(_ARM))
+    links = np.full(len(chain.link_errors), 0.3e-3)
+    state = CellState(X, np.eye(4), np.zeros((0, 4, 4)), lens, np.zeros(5), np.zeros(len(links)))
+    each = [*sigma, *LensPrior.given(lens).sigma, *BoardTolerance().sigma, *links]
+    scales = Scales(np.array([1e-4, 2e-4]), 0.2, 0.2, 0.2, SHARE_COUNTS / SHARE_COUNTS.sum())
+    return KnownCell(state, np.diag(each) ** 2, scales, 69.0, extent_of(_TAG), chain, None)
 
 
 @lru_cache(maxsize=1)
@@ -260,10 +161,9 @@ def _still(cell: Cell, count: int) -> _Still:
     ways = rng.normal(size=(2, 3))
     blurred = (rng.random(count) < _BLURRED)[:, None, None]
     spread_px = rng.normal(size=(count, 4, 2)) * rng.uniform(0.5, 3, size=(count, 1, 1))
-    known = perturb(X, np.r_[rng.normal(size=3) * 0.15e-3, rng.normal(size=3) * np.radians(0.02)])
-    covariance = np.diag(np.repeat([0.15e-3, np.radians(0.02)], 3) ** 2)
+    sigma = np.repeat([0.15e-3, np.radians(0.02)], 3)
     return _Still(
-        CellModel(cell.mount, lens, known, covariance, _ARM),
+        _known(lens, perturb(X, rng.normal(size=6) * sigma), sigma),
         seen_by,
         arm,
         joints,
@@ -314,7 +214,7 @@ def _postures(
     rng: np.random.Generator, lens: CameraModel, X: Array, P: Array, cell: Cell, count: int
 ) -> Array:
     """Joints (count, 6) from which the whole tag is seen."""
-    tilt, roll = (5.0, 10.0) if cell.narrow else (40.0, 180.0)
+    tilt, roll = 40.0, 180.0
     wanted = 8 * count + 400
     away = rng.uniform(0.4, 0.8, wanted)
     about = rng.uniform(0, 2 * np.pi, wanted)

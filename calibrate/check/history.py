@@ -1,0 +1,74 @@
+"""History of the drift checks, one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from calibrate.errors import InstallError
+from calibrate.files.folders import calibrations_folder
+from calibrate.files.lines import append_line, read_lines
+from recordings.files import MAIN_CAMERA
+
+FILE = "checks.jsonl"
+
+
+class Trend(msgspec.Struct, frozen=True):
+    """Camera shift that grows with time, over the checks of one installed version."""
+
+    shift_mm: float
+    shift_deg: float
+    days: float
+    checks: int
+
+    @property
+    def text(self) -> str:
+        return (
+            f"Drift trend: {self.shift_mm:.2f} mm, {self.shift_deg:.3f}° in {_duration(self.days)} "
+            f"({self.checks} checks). Inspect the bracket and calibrate again."
+        )
+
+
+class CheckEntry(msgspec.Struct, frozen=True, omit_defaults=True):
+    wall_s: float
+    generation: int
+    recording: str
+    passed: bool
+    shift: tuple[float, ...]
+    """δt (m), δφ (rad)"""
+    statistic: float
+    threshold: float
+    trend: Trend | None = None
+    """Over the checks up to this one; None where chance explains them."""
+    right: tuple[float, ...] = ()
+    information_lower: tuple[float, ...] = ()
+    """`DriftCheck.evidence`: its right side, and the lower triangle of its information, row by row."""
+
+
+def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN_CAMERA) -> None:
+    """Append a drift check to the history. Raises InstallError when the state folder cannot be written."""
+    folder = calibrations_folder(root, camera)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        append_line(folder / FILE, entry)
+    except OSError as problem:
+        why = f"the drift check cannot be logged ({problem.strerror})"
+        raise InstallError("state-folder", path=folder, why=why) from None
+
+
+def read_checks(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
+    """Read the history of drift checks, oldest first; empty when there is none."""
+    return read_lines(calibrations_folder(root, camera) / FILE, CheckEntry)
+
+
+def earlier_results(history: Sequence[CheckEntry], generation: int) -> list[bool]:
+    """List whether each check of this installed version passed, oldest first; one failure may be chance."""
+    return [entry.passed for entry in history if entry.generation == generation]
+
+
+def _duration(days: float) -> str:
+    if days >= 2:
+        return f"{days:.0f} days"
+    return f"{days * 24:.0f} hours" if days * 24 >= 2 else f"{max(days * 1440, 1):.0f} min"

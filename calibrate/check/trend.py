@@ -1,0 +1,74 @@
+"""The trend of the drift checks of one installed version: the camera moves along a straight line in time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import special
+
+from calibrate.check.drift import DriftCheck
+from calibrate.check.history import CheckEntry, Trend
+from calibrate.handeye.cell_state import Quadratic
+from calibrate.handeye.posterior import KnownCell
+from calibrate.handeye.uncertainty import inverse_of
+
+FEWEST_FOR_TREND = 5
+"""Fewest drift checks from which a trend is estimated."""
+_TREND_P = 0.01
+
+
+def entry_of(check: DriftCheck, wall_s: float, generation: int, recording: str) -> CheckEntry:
+    """Make the line of a check."""
+    evidence = check.evidence or Quadratic(np.zeros((0, 0)), np.zeros(0))
+    return CheckEntry(
+        wall_s,
+        generation,
+        recording,
+        check.passed,
+        tuple(check.shift.tolist()),
+        check.statistic,
+        check.threshold,
+        right=tuple(evidence.right.tolist()),
+        information_lower=tuple(evidence.N[np.tril_indices(len(evidence.N))].tolist()),
+    )
+
+
+def _evidence(entry: CheckEntry) -> Quadratic:
+    size = len(entry.right)
+    N = np.zeros((size, size))
+    N[np.tril_indices(size)] = entry.information_lower
+    return Quadratic(N + np.tril(N, -1).T, np.array(entry.right))
+
+
+def find_trend(history: Sequence[CheckEntry], generation: int, known: KnownCell) -> Trend | None:
+    """Look for a trend in the checks of this installed version; None where chance explains it.
+
+    The checks are solved together: lens, board and arm are the same in all, the camera's pose moves along a
+    straight line of six slopes. These are tested by χ² with 6 degrees of freedom at 1 %.
+    """
+    size = len(known.covariance)
+    entries = [e for e in history if e.generation == generation and len(e.right) == size]
+    if len(entries) < FEWEST_FOR_TREND:
+        return None
+    days = np.array([entry.wall_s for entry in entries]) / 86400
+    span = float(np.ptp(days))
+    if span <= 0:
+        return None
+    # [X ⊕ δ at the middle, slope, the rest]; only what is known of the rest is a prior.
+    N, right = np.zeros((size + 6, size + 6)), np.zeros(size + 6)
+    N[12:, 12:] = known.prior(camera_may_have_moved=True).information[6:, 6:]
+    for entry, day in zip(entries, days - days.mean(), strict=True):
+        at = np.zeros((size, size + 6))
+        at[:6, :6], at[:6, 6:12], at[6:, 12:] = np.eye(6), day * np.eye(6), np.eye(size - 6)
+        evidence = _evidence(entry)
+        N += at.T @ evidence.N @ at
+        right += at.T @ evidence.right
+    covariance = inverse_of(N)
+    slope = (covariance @ right)[6:12]
+    statistic = float(slope @ np.linalg.solve(covariance[6:12, 6:12], slope))
+    if special.chdtrc(6, statistic) > _TREND_P:
+        return None
+    millimetres = float(np.linalg.norm(slope[:3]) * 1e3 * span)
+    degrees = float(np.degrees(np.linalg.norm(slope[3:])) * span)
+    return Trend(millimetres, degrees, span, len(entries))

@@ -1,0 +1,162 @@
+"""What a fit leaves known of a cell, as the calibration file keeps it and later views begin with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calibrate.chain import Chain
+from calibrate.geometry import Array
+from calibrate.handeye.arm import flex_motion, gravity_in_flange, recorded_joints
+from calibrate.handeye.axxb.pairs import mount_poses
+from calibrate.handeye.cell_state import CellState, Layout
+from calibrate.handeye.estimate import CellFit
+from calibrate.handeye.noise_scales import Scales
+from calibrate.handeye.pose_fit import central_pose
+from calibrate.handeye.priors import BoardTolerance, KnownBefore
+from calibrate.handeye.uncertainty import inverse_of
+from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
+from calibrate.results import SHAPE, LearnedArm, Posterior
+from calibrate.views import Observations, ViewSet, observe_views
+from recordings.schema.messages import CameraModel
+
+
+def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
+    """Keep of a fit what later views need; None where no corners were recorded.
+
+    stated_arm_error: (6, 6) covariance of X by it, zeros where none is stated.
+
+    Errors of an arm whose joints were not recorded stay inside the covariance of X: other postures have
+    others.
+    """
+    if not fit.observed.has_pixels:
+        return None
+    found, state, at = fit.estimate, fit.estimate.state, Layout.of(fit.estimate.state)
+    chain = fit.arm.chain if fit.arm is not None and fit.arm.recorded else None
+    by_arm = 0 if fit.arm is None else len(fit.arm.chain.link_errors)
+    errors = np.arange(0 if chain is not None else by_arm, len(state.table))
+    kept = np.concatenate([at.all_but_board[: -len(state.table) or None], at.table.start + errors])
+    lower = found.covariance[np.ix_(kept, kept)][np.tril_indices(len(kept))]
+    scales = found.scales
+    learned, gravity = None, None
+    if chain is not None:
+        learned = LearnedArm(
+            _rows(chain.axes), _rows(chain.points), chain.posture_rad.tolist(), _rows(chain.flange)
+        )
+    if len(state.table):
+        gravity = tuple(gravity_in_flange(fit.views.base_from_flange).mean(axis=0).tolist())
+    return Posterior(
+        X=_rows(state.X),
+        lens=intrinsics_vector(state.camera).tolist(),
+        shape=state.shape.tolist(),
+        errors=state.table[errors].tolist(),
+        covariance_lower=lower.tolist(),
+        robot_noise=tuple(scales.robot.tolist()),
+        corner_noise_px=(scales.tau_px, scales.lambda_px, scales.sigma_px),
+        class_shares=scales.shares.tolist(),
+        freedom=found.freedom,
+        board_extent_m=_rows(fit.observed.extent),
+        arm=learned,
+        stated_arm_error=_rows(stated_arm_error) if stated_arm_error.any() else None,
+        gravity=gravity,
+    )
+
+
+def _rows(matrix: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class KnownCell:
+    """A posterior as arrays: mean and covariance of [X, lens, board shape, errors of arm and bracket]."""
+
+    mean: CellState
+    """Its Y and C mean nothing."""
+    covariance: Array
+    """(g, g)"""
+    scales: Scales
+    freedom: float
+    extent: Array
+    """(2, 2) as `Observations.extent`."""
+    chain: Chain | None
+    gravity: Array | None
+    stated_arm_error: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    """(6, 6) as `Posterior.stated_arm_error`."""
+
+    @property
+    def knows_arm(self) -> bool:
+        """Whether errors of the arm are told from a shift of the camera."""
+        return self.chain is not None or bool(self.stated_arm_error.any())
+
+    @classmethod
+    def of(cls, posterior: Posterior, camera: CameraModel) -> KnownCell:
+        """Unpack; `camera` gives the lens's model and the size of its images."""
+        lens, shape, errors = (np.array(part) for part in (posterior.lens, posterior.shape, posterior.errors))
+        size = 6 + len(lens) + len(shape) + len(errors)
+        covariance = np.zeros((size, size))
+        covariance[np.tril_indices(size)] = posterior.covariance_lower
+        covariance += np.tril(covariance, -1).T
+        arm = posterior.arm
+        tau, lambda_, sigma = posterior.corner_noise_px
+        return cls(
+            CellState(
+                np.array(posterior.X),
+                np.eye(4),
+                np.zeros((0, 4, 4)),
+                with_intrinsics_vector(camera, lens),
+                shape,
+                errors,
+            ),
+            covariance,
+            Scales(np.array(posterior.robot_noise), tau, lambda_, sigma, np.array(posterior.class_shares)),
+            posterior.freedom,
+            np.array(posterior.board_extent_m),
+            None
+            if arm is None
+            else Chain(*(np.array(part) for part in (arm.axes, arm.points, arm.posture_rad, arm.flange))),
+            None if posterior.gravity is None else np.array(posterior.gravity),
+            np.zeros((6, 6)) if posterior.stated_arm_error is None else np.array(posterior.stated_arm_error),
+        )
+
+    def with_board(self, tolerance: BoardTolerance) -> KnownCell:
+        """Return what is known when another board is looked at."""
+        shape = slice(6 + len(intrinsics_names(self.mean.camera)), -len(self.mean.table) or None)
+        covariance = self.covariance.copy()
+        covariance[shape], covariance[:, shape] = 0.0, 0.0
+        covariance[shape, shape] = np.diag(tolerance.sigma**2)
+        return replace(self, mean=replace(self.mean, shape=np.zeros(len(SHAPE))), covariance=covariance)
+
+    def prior(self, camera_may_have_moved: bool) -> KnownBefore:
+        """Take this as what is known before new views; X not, where the camera may have moved since."""
+        if not camera_may_have_moved:
+            return KnownBefore(self.mean, inverse_of(self.covariance))
+        information = np.zeros_like(self.covariance)
+        information[6:, 6:] = inverse_of(self.covariance[6:, 6:])
+        return KnownBefore(self.mean, information)
+
+    def beside(self, views: ViewSet) -> KnownCell:
+        """Return what is known beside these views: not the arm's errors where their joints are not known."""
+        joints = recorded_joints(views)
+        if self.chain is None or (joints is not None and joints.shape[1] == len(self.chain.axes)):
+            return self
+        rest = slice(0, len(self.covariance) - len(self.mean.table))
+        mean, covariance = replace(self.mean, table=np.zeros(0)), self.covariance[rest, rest]
+        return replace(self, mean=mean, covariance=covariance, chain=None, gravity=None)
+
+    def observe(self, views: ViewSet) -> Observations:
+        """Observe new views with the errors of this arm and bracket; see `beside`."""
+        observed = replace(observe_views(views), extent=self.extent)
+        columns = np.zeros((len(views), 6, 0))
+        if self.chain is not None:
+            columns = self.chain.by_links(np.array([view.joints_rad for view in views]))
+        if self.gravity is not None:
+            flange = views.base_from_flange
+            held = self.mean.X if views.mount == "eye-in-hand" else self.start(views).Y
+            columns = np.concatenate([columns, flex_motion(views.mount, flange, held, self.gravity)], axis=2)
+        return replace(observed, table=columns)
+
+    def start(self, views: ViewSet) -> CellState:
+        """Begin new views with this mean, and the board where most of them see it."""
+        seen = mount_poses(views.base_from_flange, views.mount) @ self.mean.X @ views.camera_from_board
+        return replace(self.mean, Y=central_pose(seen), C=views.camera_from_board)

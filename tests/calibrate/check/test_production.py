@@ -1,0 +1,138 @@
+"""Production pictures of one fixed tag: a camera that moved is noticed, one that did not is left alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from calibrate.boards.model import board_points
+from calibrate.check.production import EARLIER, EarlierPictures, check_production
+from calibrate.cli import main
+from calibrate.errors import TooFewViewsError
+from calibrate.files.install import install
+from calibrate.files.loader import load_installed
+from calibrate.files.validity import ValidityState
+from calibrate.geometry import Array, inverse, perturb, pose, quaternion_from_matrix, rotation_exp
+from calibrate.handeye.posterior import KnownCell
+from calibrate.handeye.priors import BoardTolerance
+from calibrate.handeye.solution import SolveOptions
+from calibrate.handeye.solve import solve_views
+from calibrate.projection import project_at
+from calibrate.views import ViewSet
+from recordings.schema.messages import BoardKind, BoardSpec
+from tests.calibrate.calling import raises_code
+from tests.calibrate.chains import ArmCell, arm_cell, later_views
+from tests.calibrate.sessions import looking
+from tests.command_line import call
+
+TAG = BoardSpec(BoardKind.APRIL_TAG, square_m=0.05)
+TAG_PLACE = pose(rotation_exp([np.pi, 0.1, 0.2]), [0.6, 0.0, 0.05])
+STILL = np.zeros(6)
+
+
+@pytest.fixture(scope="module", params=["eye-in-hand", "eye-to-hand"])
+def cell(request: pytest.FixtureRequest) -> ArmCell:
+    return arm_cell("seven joints", request.param, 0.2, 31)
+
+
+def four_corners(views: ViewSet) -> ViewSet:
+    """The same pictures of a tag: only the outermost corners of the board."""
+    few = [0, 8, 54, 62]
+    small = (replace(v, board_points=v.board_points[few], pixels=v.pixels[few]) for v in views)
+    return replace(views, views=tuple(small))
+
+
+def test_a_shift_is_noticed_within_ten_pictures_and_nothing_else(cell: ArmCell) -> None:
+    solution = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
+    assert solution.posterior is not None
+    known = KnownCell.of(solution.posterior, solution.camera).with_board(BoardTolerance())
+    before = four_corners(later_views(cell, STILL, 1, EARLIER))
+    earlier = EarlierPictures.of(before, known)
+    after = four_corners(later_views(cell, STILL, 2, 30))
+    assert all(earlier.test(after.select(list(range(n)))).passed for n in range(3, 31, 3))
+    moved = four_corners(later_views(cell, np.r_[1.5e-3, np.zeros(5)], 2, 10))
+    found = earlier.test(moved)
+    assert not found.passed and found.shift_mm == pytest.approx(1.5, abs=0.4)
+    blurred = [replace(v, pixels=v.pixels + np.array([2.0, -1.0]) * (i == 1)) for i, v in enumerate(after)]
+    assert earlier.test(replace(after, views=tuple(blurred[:3]))).passed  # one of three is no move
+    with raises_code(TooFewViewsError, "too-few-views", views=EARLIER - 1):
+        check_production(before.select(list(range(EARLIER - 1))), known)
+
+
+class Production:
+    """A folder of pictures of one tag that a program adds to; the camera may move."""
+
+    def __init__(self, folder: Path, root: Path) -> None:
+        found = load_installed(root)
+        self.folder, self.lens, self.X = folder, found.intrinsics.model, found.transform.matrix
+        self.rng = np.random.default_rng(7)
+        self.count = 0
+        seen = [looking(TAG, self.rng, roll_rad=2.0) for _ in range(6)]
+        self.flanges = [TAG_PLACE @ inverse(C) @ inverse(self.X) for C in seen]
+        folder.mkdir()
+        stated = {
+            "mount": "eye-in-hand",
+            "board": {"kind": "april-tag", "square_m": 0.05, "id": 0},
+            "camera": {"width": self.lens.width, "height": self.lens.height},
+        }
+        (folder / "dataset.yaml").write_text(yaml.safe_dump(stated))
+        (folder / "poses.csv").write_text("image,x,y,z,qx,qy,qz,qw\n")
+
+    def take(self, pictures: int, tag: bool = True) -> None:
+        for _ in range(pictures):
+            F = self.flanges[self.count % len(self.flanges)]
+            true = perturb(F, self.rng.normal(size=6) * np.repeat([2e-5, 2e-5], 3))
+            name = f"{self.count:04}.png"
+            cv2.imwrite(str(self.folder / name), self._drawn(inverse(true @ self.X) @ TAG_PLACE, tag))
+            numbers = [*F[:3, 3], *quaternion_from_matrix(F[:3, :3])]
+            with (self.folder / "poses.csv").open("a") as file:
+                file.write(",".join([name, *(repr(float(x)) for x in numbers)]) + "\n")
+            self.count += 1
+
+    def _drawn(self, C: Array, tag: bool) -> Any:
+        cell_px = 20
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+        marker = cv2.aruco.generateImageMarker(dictionary, 0, 8 * cell_px)
+        sheet = np.full((10 * cell_px, 10 * cell_px), 230, np.uint8)
+        if tag:
+            sheet[cell_px:-cell_px, cell_px:-cell_px] = marker
+        near, far = cell_px - 0.5, 9 * cell_px - 0.5
+        corners = np.array([[near, near], [far, near], [near, far], [far, far]], np.float32)
+        H = cv2.getPerspectiveTransform(
+            corners, project_at(self.lens, C, board_points(TAG)).astype(np.float32)
+        )
+        size = (2 * self.lens.width, 2 * self.lens.height)
+        finer = np.array([[2.0, 0, 0.5], [0, 2.0, 0.5], [0, 0, 1]])
+        drawn = cv2.warpPerspective(sheet, finer @ H, size, flags=cv2.INTER_LINEAR, borderValue=230)
+        small = cv2.resize(drawn, (self.lens.width, self.lens.height), interpolation=cv2.INTER_AREA)
+        return np.clip(small + self.rng.normal(size=small.shape) * 2, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def root(make_file: Callable[..., Path], tmp_path: Path) -> Path:
+    install(make_file(), tmp_path / "s")
+    return tmp_path / "s"
+
+
+def test_a_folder_that_grows_puts_a_moved_camera_in_doubt(root: Path, tmp_path: Path) -> None:
+    production = Production(tmp_path / "pictures", root)
+    production.take(EARLIER + 5)
+    still = call(main, "drift-check", production.folder, "--root", root, "--json")
+    assert still.returncode == 0 and json.loads(still.stdout)["validity"] is None
+    assert load_installed(root).validity.state is ValidityState.VALID
+    production.X = perturb(production.X, np.array([0.002, -0.001, 0, 0, 0, 0.002]))
+    production.take(10)
+    moved = call(main, "drift-check", production.folder, "--root", root, "--json")
+    told = json.loads(moved.stdout)
+    assert moved.returncode == 4 and not told["passed"] and told["views"] <= 10
+    few = Production(tmp_path / "few", root)
+    few.take(4)
+    assert call(main, "drift-check", few.folder, "--root", root).returncode == 1

@@ -1,4 +1,4 @@
-"""Simulated cells: that of the paper, and random ones by seed.
+"""Simulated cells: those of the paper and the blog, and random ones by seed.
 
 Seed 0 is the cell as published. Other seeds draw the camera's orientation (anywhere on SO(3)), the board's
 pose, lens and noise, such that 25 different poses can see the board.
@@ -11,10 +11,10 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from calibrate.geometry import pose, project_to_rotation, random_rotation, rotation_exp
+from calibrate.geometry import Array, pose, project_to_rotation, random_rotation, rotation_exp
 from calibrate.kinematics import MODELS, forward
-from recordings.schema.messages import CameraModel, Matrix4, Mount, Vector6
-from station.cell.config import PAPER_BOARD, PoseGuess, StationConfig, matrix4, vector6
+from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
+from station.cell.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig, matrix4, vector6
 from station.cell.layout import guess_from
 from station.simulation.placement import (
     Placement,
@@ -42,6 +42,28 @@ PAPER_LENS = CameraModel(
     matrix=((_FOCAL_PX + 3.1, 0.0, 646.2), (0.0, _FOCAL_PX + 2.7, 505.8), (0.0, 0.0, 1.0)),
     distortion=(-0.092, 0.118, 0.0004, -0.0003, 0.0),
 )
+_BLOG_FOCAL_PX = float(360.0 / np.tan(np.deg2rad(31.0482) / 2))
+BLOG_LENS = CameraModel(
+    width=960,
+    height=720,
+    matrix=((_BLOG_FOCAL_PX, 0.0, 480.0), (0.0, _BLOG_FOCAL_PX, 360.0), (0.0, 0.0, 1.0)),
+)
+BLOG_X = pose(rotation_exp([0.0, np.deg2rad(-15.0), 0.0]), [0.1, 0.0, 0.0])
+"""The blog's `Hand-Eye` frame, whose z is taken as the optical axis: RPY(0, -15, 0)° at (0.1, 0, 0) m."""
+
+
+class _PublishedCell(NamedTuple):
+    board: BoardSpec
+    lens: CameraModel
+    X: Array
+    """flange_from_camera"""
+
+
+_PUBLISHED = {
+    "paper": _PublishedCell(PAPER_BOARD, PAPER_LENS, PAPER_X),
+    "blog": _PublishedCell(BLOG_BOARD, BLOG_LENS, BLOG_X),
+    "paper-binned": _PublishedCell(PAPER_BOARD, scaled(PAPER_LENS, 0.5), PAPER_X),
+}
 _START_DEG = (0.0, -94.0, -90.0, -86.0, 90.0, 0.0)
 """Start joints: the flange points straight down, half a metre above the table."""
 _GUESS_M, _GUESS_RAD = 0.004, 0.02
@@ -72,15 +94,15 @@ def make_cell(
 ) -> CellTruth:
     """Make the truth of a cell; equal arguments give the same cell."""
     rng = np.random.default_rng([2026, seed])
-    published = PAPER_LENS if scene == "paper" else scaled(PAPER_LENS, 0.5)
-    camera = published if seed == 0 else _other_lens(published, rng)
-    placed = _place(camera, seed, mount, rng)
+    published = _PUBLISHED[scene]
+    camera = published.lens if seed == 0 else _other_lens(published.lens, rng)
+    placed = _place(published, camera, seed, mount, rng)
     truth = CellTruth(
         scene=scene,
         seed=seed,
         mount=mount,
         robot_model="UR10",
-        board=PAPER_BOARD,
+        board=published.board,
         camera=camera,
         camera_mount=matrix4(placed.camera_mount),
         board_place=matrix4(placed.board_place),
@@ -89,17 +111,19 @@ def make_cell(
     return _with_noise(truth, _NOISE[noise], rng)
 
 
-def _place(camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator) -> Placement:
+def _place(
+    published: _PublishedCell, camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator
+) -> Placement:
     if mount == "eye-to-hand":
-        return place_fixed_camera(PAPER_BOARD, camera, rng)
+        return place_fixed_camera(published.board, camera, rng)
     if seed != 0:
-        return place_moving_camera(PAPER_BOARD, camera, random_rotation(rng), rng)
+        return place_moving_camera(published.board, camera, random_rotation(rng), rng)
     start = np.deg2rad(_START_DEG)
-    base_from_camera = forward(MODELS["UR10"], start) @ PAPER_X
+    base_from_camera = forward(MODELS["UR10"], start) @ published.X
     axis = base_from_camera[:3, 2]
     middle = base_from_camera[:3, 3] - axis * base_from_camera[2, 3] / axis[2]
     level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    return Placement(PAPER_X, pose(level, middle - level @ board_centre(PAPER_BOARD)), start)
+    return Placement(published.X, pose(level, middle - level @ board_centre(published.board)), start)
 
 
 def _other_lens(camera: CameraModel, rng: np.random.Generator) -> CameraModel:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from station.cell import limits
+from station.cell import limits, status
 from station.devices import news, ur_child, ur_control, ur_moves, ur_script
-from station.session import lease, supervisor
+from station.session import motion, supervisor
 
 PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
 
@@ -32,8 +32,8 @@ PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
         (ur_moves.SLIDER_ZERO_S, 10.0, "after 10 s the move is given up"),
         (ur_child.STOP_DECELERATION, 4.0, "the joints brake with 4 rad/s²"),
         (ur_script.STOP_RAD_S2, 4.0, "the joints brake with 4 rad/s²"),
-        (lease.APPROVAL_LIFETIME_S, 120.0, "It is for one use"),
-        (lease.START_TOLERANCE_RAD, 0.005, "from where the arm stood"),
+        (status.APPROVAL_LIFETIME_S, 120.0, "It is for one use"),
+        (motion.START_TOLERANCE_RAD, 0.005, "from where the arm stood"),
     ],
 )
 def test_a_limit_is_the_one_that_is_promised(figure: float, most: float, promised: str) -> None:

@@ -35,7 +35,7 @@ CELLS = [
     ("paper", "eye-in-hand", 0),
     ("paper", "eye-in-hand", 3),
     ("paper", "eye-to-hand", 1),
-    ("paper-binned", "eye-in-hand", 0),
+    ("blog", "eye-in-hand", 0),
 ]
 
 

@@ -25,7 +25,6 @@ RECORDINGS = LazyGroup(
                 "recordings export session.mcap --to folder -o images  # edit, then import",
                 "recordings export session.mcap --to excerpt -o small.mcap",
             ),
-            gone={"ros2": "Export folder or csv: both are read without ROS."},
         ),
         "recover": LazyCommand(
             "recordings.cli.commands:recover_command",

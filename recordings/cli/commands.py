@@ -45,12 +45,12 @@ def export_command(
         Target,
         typer.Option(
             "--to",
-            help="folder: images and poses, for `import`; csv: tables; excerpt: an .mcap file.",
+            help="folder: images and poses, for `import`; csv: tables; ros2: a bag; excerpt: an .mcap file.",
         ),
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Write images and poses, CSV tables, or a smaller recording.
+    """Write images and poses, CSV tables, a ROS 2 bag, or a smaller recording.
 
     An excerpt solves like the whole: its images are lossless PNG, its robot states those around the images.
     """

@@ -1,6 +1,6 @@
-"""Recordings for other people's programs: folders, tables, smaller recordings."""
+"""Recordings for other people's programs: folders and tables, ROS 2 bags, smaller recordings."""
 
 from typing import Literal
 
-Target = Literal["folder", "csv", "excerpt"]
+Target = Literal["folder", "csv", "ros2", "excerpt"]
 """Kind of output of `recordings export`."""

@@ -1,4 +1,4 @@
-"""A recording as a folder that `import` reads, CSV tables, or an excerpt."""
+"""A recording as a folder that `import` reads, CSV tables, a ROS 2 bag, or an excerpt."""
 
 from __future__ import annotations
 
@@ -33,7 +33,12 @@ def export_recording(recording: Recording, output: Path, target: Target) -> Path
     if target == "excerpt":
         return write_excerpt(recording, output)
     with _new_folder(output) as folder:
-        (_write_folder if target == "folder" else _write_tables)(recording, folder)
+        if target == "ros2":
+            from recordings.exporters.ros2 import write_ros2
+
+            write_ros2(recording, folder)
+        else:
+            (_write_folder if target == "folder" else _write_tables)(recording, folder)
     return output
 
 

@@ -1,0 +1,190 @@
+"""A recording as a ROS 2 bag that can be played: written by `rosbags` (the extra `ros`), no ROS needed.
+
+An image, its CameraInfo and the flange's frame carry one stamp: that of mid-exposure, where the image
+belongs to a view. In between the flange's frame follows at 100 Hz, the joints at their full rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from heapq import merge
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from recordings.errors import RecordingError
+from recordings.images import mosaic_encoding, raw_encoding
+from recordings.importers.messages import ros_types
+from recordings.reader import Recording
+from recordings.schema.definitions import PictureFacts
+from recordings.schema.messages import CameraModel, Matrix4, View
+from recordings.schema.topics import Topic
+from recordings.schema.viewing import (
+    CAMERA_FRAME,
+    JOINT_NAMES,
+    base_from_flange,
+    quaternion_xyzw,
+)
+from recordings.segment import RecordingSegment
+
+FRAME_PERIOD_NS = 10_000_000
+_NS = 1_000_000_000
+_LAST_S = 2**31 - 1
+"""That builtin_interfaces/Time can hold."""
+_BAG_VERSION: Literal[8] = 8
+_DISTORTION_COUNT = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
+
+
+class _Entry(NamedTuple):
+    time_ns: int
+    topic: str
+    message: Any
+
+
+def write_ros2(recording: Recording, folder: Path) -> None:
+    """Fills the folder with `NAME.mcap` and `metadata.yaml`. Wall time is the bag's time. RecordingError."""
+    messages = _Messages()
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    inner = folder / recording.info.name
+    with Writer(inner, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for segment in recording.segments:
+            for entry in _entries(messages, recording, segment):
+                kind = entry.message.__msgtype__
+                if entry.topic not in connections:
+                    connections[entry.topic] = writer.add_connection(
+                        entry.topic,
+                        kind,
+                        typestore=messages.store,
+                    )
+                data = messages.store.serialize_cdr(entry.message, kind)
+                writer.write(connections[entry.topic], entry.time_ns, data)
+    for path in inner.iterdir():
+        path.rename(folder / path.name)
+    inner.rmdir()
+
+
+def _entries(messages: _Messages, recording: Recording, segment: RecordingSegment) -> Iterator[_Entry]:
+    """List the entries in time order."""
+    counted = {view.picture_sequence: view for view in recording.views() if view.part == segment.info.part}
+    stored = {message.sequence: message.log_time for message in segment.stored(Topic.PICTURE_FACTS)}
+    facts = {facts.sequence: facts for facts in segment.image_facts()}
+    times = {
+        number: _mid_exposure_ns(counted.get(number), facts[number], time_ns)
+        for number, time_ns in stored.items()
+    }
+    return merge(
+        _arm(messages, segment),
+        _images(messages, segment, times, facts, counted),
+        key=lambda entry: entry.time_ns,
+    )
+
+
+def _mid_exposure_ns(view: View | None, facts: PictureFacts, recorded_ns: int) -> int:
+    """By the view, else by the frame's own time; when it was recorded where there is neither."""
+    if view is not None and view.stamps.host_wall_ns:
+        return view.stamps.host_wall_ns
+    stamps = facts.stamps
+    if facts.time is None or not stamps.host_wall_ns:
+        return recorded_ns
+    return stamps.host_wall_ns + facts.time.host_monotonic_ns - stamps.host_monotonic_ns
+
+
+def _arm(messages: _Messages, segment: RecordingSegment) -> Iterator[_Entry]:
+    shown_ns = -FRAME_PERIOD_NS
+    for stored, state in zip(segment.stored(Topic.ROBOT_STATE), segment.robot_states(), strict=True):
+        time_ns = stored.log_time
+        joints = messages.make(
+            "sensor_msgs/msg/JointState",
+            messages.header(time_ns, ""),
+            JOINT_NAMES,
+            np.array(state.joints_rad),
+            np.array(state.joint_speeds_rad_s),
+            np.empty(0),
+        )
+        yield _Entry(time_ns, "/joint_states", joints)
+        if not 0 <= time_ns - shown_ns < FRAME_PERIOD_NS and np.isfinite(state.tcp_pose).all():
+            shown_ns = time_ns
+            T = base_from_flange(state.tcp_pose, segment.info.robot.tcp_offset)
+            yield _Entry(time_ns, "/tf", messages.frames("base", "flange", T, time_ns))
+
+
+def _images(
+    messages: _Messages,
+    segment: RecordingSegment,
+    times: dict[int, int],
+    facts: dict[int, PictureFacts],
+    counted: dict[int, View],
+) -> Iterator[_Entry]:
+    for sequence, time_ns in sorted(times.items(), key=lambda item: item[1]):
+        if view := counted.get(sequence):
+            yield _Entry(time_ns, "/tf", messages.frames("base", "flange", view.base_from_flange, time_ns))
+        yield _Entry(time_ns, "/camera/camera_info", messages.camera_info(segment.info.camera, time_ns))
+        yield _image(messages, segment, sequence, facts[sequence].pixel_format, time_ns)
+
+
+def _image(
+    messages: _Messages, segment: RecordingSegment, sequence: int, pixel_format: str, time_ns: int
+) -> _Entry:
+    header = messages.header(time_ns, CAMERA_FRAME)
+    stored = segment.stored_image(sequence)
+    if stored is not None:
+        file_format, file = stored[0], np.frombuffer(stored[1], np.uint8)
+        if mosaic := mosaic_encoding(pixel_format):
+            file_format = f"{mosaic}; {file_format} compressed"  # as image_transport says it
+        message = messages.make("sensor_msgs/msg/CompressedImage", header, file_format, file)
+        return _Entry(time_ns, "/camera/image_raw/compressed", message)
+    image = segment.image(sequence)
+    height, width = image.pixels.shape[:2]
+    data = np.ascontiguousarray(image.pixels).view(np.uint8).ravel()
+    encoding = raw_encoding(image.pixels, pixel_format)
+    message = messages.make(
+        "sensor_msgs/msg/Image", header, height, width, encoding, 0, len(data) // height, data
+    )
+    return _Entry(time_ns, "/camera/image_raw", message)
+
+
+class _Messages:
+    """ROS 2's messages, made by the names of their types."""
+
+    def __init__(self) -> None:
+        self.store = ros_types()
+
+    def make(self, kind: str, *fields: Any) -> Any:
+        return self.store.types[kind](*fields)
+
+    def header(self, time_ns: int, frame: str) -> Any:
+        seconds, nanoseconds = divmod(time_ns, _NS)
+        if seconds > _LAST_S:
+            raise RecordingError("stamp-too-late", stamp_s=seconds, limit_s=_LAST_S)
+        stamp = self.make("builtin_interfaces/msg/Time", seconds, nanoseconds)
+        return self.make("std_msgs/msg/Header", stamp, frame)
+
+    def frames(self, parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
+        at = self.make("geometry_msgs/msg/Vector3", *(float(row[3]) for row in T[:3]))
+        turn = self.make("geometry_msgs/msg/Quaternion", *quaternion_xyzw(T))
+        placed = self.make("geometry_msgs/msg/Transform", at, turn)
+        header = self.header(time_ns, parent)
+        stamped = self.make("geometry_msgs/msg/TransformStamped", header, child, placed)
+        return self.make("tf2_msgs/msg/TFMessage", [stamped])
+
+    def camera_info(self, camera: CameraModel, time_ns: int) -> Any:
+        K = np.array(camera.matrix or np.zeros((3, 3)), float)
+        count = max(_DISTORTION_COUNT[camera.distortion_model], len(camera.distortion))
+        D = [*camera.distortion, *[0.0] * count][:count] if camera.matrix else []
+        return self.make(
+            "sensor_msgs/msg/CameraInfo",
+            self.header(time_ns, CAMERA_FRAME),
+            camera.height,
+            camera.width,
+            camera.distortion_model,
+            np.array(D, float),
+            K.ravel(),
+            np.eye(3).ravel(),
+            np.column_stack([K, np.zeros(3)]).ravel(),
+            0,
+            0,
+            self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False),
+        )

@@ -21,6 +21,7 @@ from station.cell.arm_acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
 from station.devices.base import fresh, ready
+from station.devices.news import RESTING_S
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import arm_held, control_ended, foreign_program
@@ -121,6 +122,10 @@ class UrRobot(UrLink):
             if tcp is not None and self._tool is not None:
                 self._tool.agree((tcp[0], tcp[1], tcp[2], tcp[3], tcp[4], tcp[5]))
             await self._heard(child)
+            # Older news are of an arm without a program: no move may be judged by them.
+            await self.state_after(time.monotonic(), RESTING_S)
+            if self._why_stopped():
+                raise _stopped()
         except BaseException as error:
             await self.end_control()
             if (why := self._why_stopped()) and isinstance(error, RobotError):

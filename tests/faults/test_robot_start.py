@@ -12,6 +12,7 @@ import pytest
 
 from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
+from station.devices.ur_state import StateReader
 from tests.codes import raises
 from tests.faults.conftest import Cell, MakeCell
 from tests.patience import PATIENCE_S, until
@@ -52,6 +53,18 @@ async def test_a_move_right_after_the_start_is_taken(cell: MakeCell) -> None:
         await c.robot.start_control()
         await c.robot.move(c.near(), 0.5, 1.0)
         await c.robot.end_control()
+
+
+async def test_a_move_is_not_judged_by_news_from_before_the_start(
+    cell: MakeCell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A busy computer takes states 80 ms after they arrived: current, but of an arm without a program."""
+    c = await cell(control=False)
+    take, loop = StateReader._take, asyncio.get_running_loop()
+    monkeypatch.setattr(StateReader, "_take", lambda *state: loop.call_later(0.08, take, *state))
+    await asyncio.sleep(0.2)
+    await c.robot.start_control()
+    await c.robot.move(c.near(), 0.5, 1.0)
 
 
 async def test_a_move_waits_for_a_session_that_was_busy_for_a_moment(cell: MakeCell) -> None:

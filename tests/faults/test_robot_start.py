@@ -129,9 +129,11 @@ async def test_before_the_first_heartbeat(cell: MakeCell, name: str) -> None:
     if code in ("protective-stop", "program-ended", "local-control"):
         await c.told()
     c.beating = beats
-    with raises(code):
+    with pytest.raises(RobotError) as ended:
         async with asyncio.timeout(PATIENCE_S):
             await starting
+    # On a busy computer the simulated controller is truly late, and that comes before an ended program.
+    assert ended.value.code in (code, *(["controller-late"] if code == "program-ended" else []))
     if name == "cable pulled":
         # Nobody could tell the controller: its program waits, moves nothing, and is not silently replaced.
         await c.robot.idle()

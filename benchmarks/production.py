@@ -35,7 +35,7 @@ _ARM = MODELS["UR10"]
 _BLURRED = 0.05
 """Share of blurred pictures."""
 _MOUNTS: tuple[Mount, Mount] = ("eye-in-hand", "eye-to-hand")
-_BEFORE, _AFTER, _NULL = 600, 150, 1200
+_BEFORE, _AFTER, _NULL, _CREEP_MM = 600, 150, 1200, 0.1  # creep of the camera in a day
 _MOVES = ((0.5, 0.0), (0.0, 0.05), (1.0, 0.0), (0.0, 0.1))
 """Shifts, mm, and turns, degrees, of the camera after `_BEFORE` pictures."""
 
@@ -46,8 +46,6 @@ class Cell:
     mount: Mount
     repeated: bool
     """Few postures that come again and again in any order; else every posture is another."""
-    creep_mm: float = 0.1
-    """By which the camera creeps a day, from the first picture on."""
 
 
 def run() -> str:
@@ -168,7 +166,7 @@ def _still(cell: Cell, count: int) -> _Still:
         arm,
         joints,
         joints + _repeating(rng, joints),
-        _with_day(rng, X, days, 0.05, cell.creep_mm),
+        _with_day(rng, X, days, 0.05, _CREEP_MM),
         _with_day(rng, P, days, 0.02, 0.0),
         _TAG * (1 + 0.003 * rng.normal()),
         ways / np.linalg.norm(ways, axis=1, keepdims=True),

@@ -14,7 +14,6 @@ from calibrate.chain import Chain, LearnedChain, learn_chain, read_otherwise, wr
 from calibrate.geometry import Array, difference, skew
 from calibrate.kinematics import MODELS, RobotModel, inverse_many, link_frames, table_of_axes, with_near_axes
 from calibrate.views import ViewSet
-from recordings.schema.messages import Mount
 
 FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")
 """Names of a bracket's compliance, radians: turn about `row` for gravity along `column` of the flange."""
@@ -92,7 +91,7 @@ def gravity_in_flange(flange: Array) -> Array:
     return np.asarray(-flange[:, 2, :3])
 
 
-def flex_motion(mount: Mount, flange: Array, held: Array, level: Array | None = None) -> Array:
+def flex_motion(flange: Array, held: Array, level: Array | None = None) -> Array:
     """Compute the motion (n, 6, 9) of the flange, in base, by each entry of a bracket's compliance (3, 3).
 
     The bracket carries the camera (eye-in-hand) or the board at `held` (4, 4) in the flange. It bends by the

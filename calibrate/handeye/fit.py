@@ -57,7 +57,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     arm, joints_note = arm_postures(views) if with_table else (None, "")
     if with_table and len(views) >= FEWEST_FOR_TABLE:
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
-        flex = flex_motion(views.mount, views.base_from_flange, held)
+        flex = flex_motion(views.base_from_flange, held)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
         modelled = replace(observed, table=np.concatenate([links, flex], axis=2))
         try:

@@ -153,7 +153,7 @@ class KnownCell:
         if self.gravity is not None:
             flange = views.base_from_flange
             held = self.mean.X if views.mount == "eye-in-hand" else self.start(views).Y
-            columns = np.concatenate([columns, flex_motion(views.mount, flange, held, self.gravity)], axis=2)
+            columns = np.concatenate([columns, flex_motion(flange, held, self.gravity)], axis=2)
         return replace(observed, table=columns)
 
     def start(self, views: ViewSet) -> CellState:

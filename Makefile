@@ -62,7 +62,7 @@ $(FOREIGN)/.ready: $(READY) tests/foreign/requirements.txt
 foreign: $(FOREIGN)/.ready  ## our files judged by other people's programs, and theirs read by ours
 	$(BIN)/python -m pytest -n 2 --dist loadfile tests/foreign
 
-bench: $(READY)  ## the benchmarks; tables go to benchmarks/README.md
+bench: $(READY)  ## the benchmarks; tables go to docs/contributor/benchmarks.md
 	$(BIN)/python -m benchmarks
 
 pages: $(READY)  ## the pages of docs/ that are made from the sources

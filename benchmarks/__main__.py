@@ -1,4 +1,4 @@
-"""`python -m benchmarks [name …]`: run benchmarks, write results/NAME.md and the page README.md.
+"""`python -m benchmarks [name …]`: run benchmarks, write results/NAME.md and the page in docs.
 
 Every module here with a `run() -> str` is one. BENCH_SHARE=0.05 runs a twentieth of the trials,
 BENCH_SETS=six-views,denso-long only these recordings (real, mistakes). `--page` writes the page alone.
@@ -18,11 +18,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 HERE = Path(__file__).parent
-README = HERE / "README.md"
+PAGE = HERE.parent / "docs/contributor/benchmarks.md"
 RESULTS = HERE / "results"
 HEAD = """# Benchmarks
-Made by `python -m benchmarks`; do not edit. Each table shows the rows that say most. `results/NAME.md` has
-all of them, how they were measured, on what computer and with how many trials. `python -m benchmarks NAME`
+Made by `python -m benchmarks`; do not edit. Each table shows the rows that say most. All of them, how they
+were measured, on what computer, how many trials: `benchmarks/results/NAME.md`. `python -m benchmarks NAME`
 measures anew. Robot and camera are simulated unless said otherwise.
 """
 SHOWN: dict[str, str] = {
@@ -45,7 +45,7 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 def main() -> int:
     if sys.argv[1:] == ["--page"]:
-        _replace(README, page())
+        _replace(PAGE, page())
         return 0
     names = sys.argv[1:] or sorted(_benchmarks())
     unknown = set(names) - set(_benchmarks())
@@ -65,7 +65,7 @@ def main() -> int:
         took_s = time.perf_counter() - start
         _write(name, f"{text}\n\n{_where()}; took {took_s:.0f} s.")
         print(text, flush=True)
-    _replace(README, page())
+    _replace(PAGE, page())
     return 0
 
 

@@ -64,7 +64,7 @@ def test_the_schemas_are_fresh() -> None:
 
 def test_the_page_of_benchmarks_is_fresh_and_short() -> None:
     """`python -m benchmarks --page` makes it anew from the results."""
-    page = (ROOT / "benchmarks/README.md").read_text()
+    page = (ROOT / "docs/contributor/benchmarks.md").read_text()
     assert page == import_module("benchmarks.__main__").page()
     assert len(page.split()) < 3500
 

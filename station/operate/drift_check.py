@@ -14,7 +14,7 @@ from station.protocol.verbs import GetPlan, LoadPlan, MakePlan, Prepare, Purpose
 
 POSES = 8
 """Default number of poses. Eight detect a shift of 0.5 mm in 96 % of cases at mid noise, five in 88 %
-(benchmarks/README.md)."""
+(docs/contributor/benchmarks.md)."""
 SEED = 0
 
 

@@ -64,6 +64,7 @@ def test_the_wheel_reads_moves_and_asks(controller: Start, model: str, rate: int
         receive = rtde_receive.RTDEReceiveInterface(host)
         control = rtde_control.RTDEControlInterface(host)
         result["start"] = receive.getActualQ()
+        until(lambda: receive.getRuntimeState() == 2)  # its script plays before the next state tells so
         result["modes"] = [receive.getRobotMode(), receive.getSafetyMode(), receive.getRuntimeState()]
         result["steady"] = control.isSteady()
         result["moveJ"] = control.moveJ(NEAR, 1.0, 2.0)

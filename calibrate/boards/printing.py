@@ -74,6 +74,29 @@ class Sheet:
             figure.savefig(content, format=file_format, metadata={date: None})
         return content.getvalue()
 
+    def pixels(self, px_mm: float) -> NDArray[np.uint8]:
+        """Draw the shapes without text, black 0 on white 255, (height, width); edges fall between pixels."""
+        image = np.full((round(self.height_mm * px_mm), round(self.width_mm * px_mm)), 255, np.uint8)
+        edges = np.round(np.cumsum(self.rectangles.reshape(-1, 2, 2), axis=1) * px_mm).astype(int)
+        for (left, top), (right, bottom) in edges:
+            image[top:bottom, left:right] = 0
+        sixteenths = np.round(16 * (self.circles * px_mm - [0.5, 0.5, 0])).astype(int)
+        for x, y, radius in sixteenths.tolist():
+            cv2.circle(image, (x, y), radius, 0, cv2.FILLED, cv2.LINE_AA, shift=4)
+        return image
+
+
+def board_texture(spec: BoardSpec, square_px: int) -> NDArray[np.uint8]:
+    """Draw the board as the texture of a simulated one: `square_px` pixels a square, white border of one.
+
+    Raises BoardError for an impossible board.
+    """
+    check_board(spec)
+    squares, circles, width, height = draw_pattern(spec)
+    side = spec.square_m * 1000
+    shapes = _moved(squares, side, side), _moved(circles, side, side)
+    return Sheet(width + 2 * side, height + 2 * side, *shapes).pixels(square_px / side)
+
 
 def board_sheet(spec: BoardSpec, paper: str | None = None) -> Sheet:
     """Lay out the board with ruler and text, centred on `paper` (A4 … A0) or on a sheet as large as needed.

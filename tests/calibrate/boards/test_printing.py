@@ -11,7 +11,7 @@ import yaml
 
 from calibrate.boards.detect import detect
 from calibrate.boards.model import BoardError, board_points
-from calibrate.boards.printing import Sheet, board_sheet
+from calibrate.boards.printing import Sheet, board_sheet, board_texture
 from recordings.schema.messages import BoardKind, BoardSpec
 
 PX_MM = 4.0
@@ -39,17 +39,8 @@ BOARDS = [
 
 
 def printed(sheet: Sheet) -> np.ndarray:
-    """The sheet's shapes, black on white at PX_MM, four times oversampled."""
-    fine = 4 * PX_MM
-    canvas = np.full((round(fine * sheet.height_mm), round(fine * sheet.width_mm)), 235, np.uint8)
-    for x, y, width, height in (
-        np.round(16 * (sheet.rectangles * fine - [0.5, 0.5, 0, 0])).astype(int).tolist()
-    ):
-        corners = np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])
-        cv2.fillPoly(canvas, [corners.astype(np.int32)], 20, shift=4)
-    for x, y, radius in np.round(16 * (sheet.circles * fine - [0.5, 0.5, 0])).astype(int).tolist():
-        cv2.circle(canvas, (x, y), radius, 20, -1, shift=4)
-    return cv2.resize(canvas, None, fx=1 / 4, fy=1 / 4, interpolation=cv2.INTER_AREA)
+    """The sheet's shapes at PX_MM, four times oversampled."""
+    return cv2.resize(sheet.pixels(4 * PX_MM), None, fx=1 / 4, fy=1 / 4, interpolation=cv2.INTER_AREA)
 
 
 def page_mm(content: bytes) -> tuple[float, float]:
@@ -90,6 +81,21 @@ def test_every_printed_board_is_found_whole_and_to_scale(spec: BoardSpec) -> Non
     span = np.ptp(plane, axis=0).max()
     assert np.abs(scale - 1).max() * span < 0.1
     assert np.linalg.det(H[:, :2]) > 0, "the board's frame is mirrored"
+
+
+@pytest.mark.parametrize("spec", BOARDS, ids=lambda s: f"{s.kind.value}-{s.columns}x{s.rows}")
+def test_a_texture_has_whole_pixels_a_square_and_a_white_border(spec: BoardSpec) -> None:
+    texture = board_texture(spec, 60)
+    found = detect(texture, spec)
+    assert found.corners == len(board_points(spec)), found.reason
+    offsets = found.pixels - board_points(spec)[found.indices][:, :2] * 60 / spec.square_m
+    assert np.ptp(offsets, axis=0).max() < 0.5
+    border = np.ones_like(texture, bool)
+    border[60:-60, 60:-60] = False
+    assert (texture[border] == 255).all()
+    if spec.kind is BoardKind.CHESSBOARD:
+        assert texture.shape == (60 * (spec.rows + 3), 60 * (spec.columns + 3))
+        assert set(np.unique(texture)) == {0, 255}
 
 
 def test_pdf_and_svg_are_pages_of_their_true_size() -> None:

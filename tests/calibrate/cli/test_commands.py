@@ -192,7 +192,9 @@ def test_the_board_prints(tmp_path: Path) -> None:
     assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF-")
     warned = run("board", "-o", "b.svg", "--columns", 11, "--rows", 9, cwd=tmp_path)
     assert warned.stderr, "it looks the same when turned by 180°"
-    refused(run("board", "-o", "b.png", cwd=tmp_path), 2, "board-format")
+    assert run("board", "-o", "b.ppm", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "b.ppm").read_bytes().startswith(b"P6\n1000 900\n255\n")
+    refused(run("board", "-o", "b.bmp", cwd=tmp_path), 2, "board-format")
 
 
 def test_batch_solves_the_rest_and_goes_on_where_it_was(session_file: Path, tmp_path: Path) -> None:

@@ -163,7 +163,7 @@ async def test_the_link_comes_back_by_itself_but_control_does_not(cell: MakeCell
     await until(lambda: c.robot.age_s() < 0.05)
     await c.stays_at_rest()
     await c.robot.start_control()
-    await c.robot.move(c.near(), 0.5, 1.0)
+    await c.arrives(c.near())
 
 
 CHANGES: dict[str, tuple[Any, Any]] = {

@@ -190,7 +190,7 @@ async def test_at_a_slow_slider_the_move_arrives(cell: MakeCell) -> None:
     c = await cell()
     await c.ask("slider", fraction=0.2)
     goal = c.near()
-    move = asyncio.create_task(c.robot.move(goal, 0.8, 1.0))
+    move = asyncio.create_task(c.arrives(goal, 0.8))
     await until(lambda: c.robot.notice == "speed slider at 20 %")
     await move
     assert max(abs(a - b) for a, b in zip(await c.joints_rad(), goal, strict=True)) < 1e-3

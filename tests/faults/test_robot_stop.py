@@ -117,7 +117,7 @@ async def test_a_new_approval_right_after_a_stop(cell: MakeCell) -> None:
             await move
         await c.robot.start_control()  # waits for the old control to be gone
     assert c.robot.control
-    await c.robot.move(c.near(), 0.5, 1.0)
+    await c.arrives(c.near())
 
 
 async def test_a_cancelled_move_stops_the_arm(cell: MakeCell) -> None:

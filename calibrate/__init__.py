@@ -12,6 +12,12 @@
     print(calibration.validity.state, calibration.validity.since)
     flange_from_camera = calibration.transform.matrix  # (4, 4), metres
 
+In a notebook, from pictures and poses as arrays (`board` is a `recordings.BoardSpec`):
+
+    solved = calibrate.solve(images, base_from_flange, board, "eye-in-hand")
+    print(solved.X, solved.covariance(), [gate.text for gate in solved.gates if not gate.passed])
+    solved.plot()
+
 Errors are `CalibrationError`s with `code`, `values` and `remedy`. Names are loaded at their first use. The
 solver without files is `calibrate.handeye`. Everything else is private.
 """
@@ -38,6 +44,8 @@ if TYPE_CHECKING:
     from calibrate.geometry import Transform as Transform
     from calibrate.job import JobOptions as JobOptions
     from calibrate.job import SolvedRecording as SolvedRecording
+    from calibrate.pictures import SolvedPictures as SolvedPictures
+    from calibrate.pictures import solve as solve
     from calibrate.pipeline import solve_recording as solve_recording
     from calibrate.quality.gates import GateLimits as GateLimits
     from calibrate.results import Gate as Gate
@@ -51,6 +59,7 @@ _MODULES = {
     "files.validity": "Validity ValidityReason ValidityState",
     "geometry": "Transform",
     "job": "JobOptions SolvedRecording",
+    "pictures": "SolvedPictures solve",
     "pipeline": "solve_recording",
     "quality.gates": "GateLimits",
     "results": "Gate",

@@ -21,7 +21,7 @@ from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Solution, SolveOptions, Verification
 from calibrate.handeye.solve import solve_views
 from calibrate.job import JobOptions, PreparedViews, SolvedRecording
-from calibrate.lens.intrinsics import calibrate_intrinsics
+from calibrate.lens.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
 from calibrate.projection import intrinsics_names
 from calibrate.quality.gates import GateInputs, judge
@@ -81,15 +81,26 @@ def prepare_views(
     if options.without:
         loaded = without_views(loaded, options.without, fewest)
     watch.lap("detect")
-    views, intrinsics = loaded.views, None
-    if views.camera.matrix is None:
-        intrinsics = calibrate_intrinsics(views, options.lens_model)
-        views = replace(views, camera=intrinsics.camera)
-    watch.lap("intrinsics")
-    views = solve_pnp(views, loaded.board)
-    _check_lens_fits(views)
-    watch.lap("board poses")
+    views, intrinsics = with_board_poses(loaded.views, loaded.board, options.lens_model)
+    watch.lap("lens and board poses")
     return PreparedViews(recording, loaded, views, intrinsics, watch.stage_ms)
+
+
+def with_board_poses(
+    views: ViewSet, board: BoardSpec, model: LensModel = "plumb_bob"
+) -> tuple[ViewSet, Intrinsics | None]:
+    """Add `camera_from_board`, through the lens found from these views where the camera has none.
+
+    Raises CalibrationError where no lens explains the corners, or the given one does not.
+    """
+    intrinsics = calibrate_intrinsics(views, model) if views.camera.matrix is None else None
+    if intrinsics is not None:
+        views = replace(views, camera=intrinsics.camera)
+    views = solve_pnp(views, board)
+    median = float(np.median([view_rms_px(v, views.camera, v.camera_from_board) for v in views]))  # type: ignore[arg-type]
+    if not median <= _WORST_VIEW_PX:
+        raise BadViewsError("lens-misfit", median_px=median, limit_px=_WORST_VIEW_PX)
+    return views, intrinsics
 
 
 def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions:
@@ -184,12 +195,6 @@ def picture_coverage(views: ViewSet) -> float:
         outline = cv2.convexHull((view.pixels * scale).astype(np.float32)).round().astype(np.int32)
         cv2.fillConvexPoly(seen, outline, 1)
     return float(seen.mean())
-
-
-def _check_lens_fits(views: ViewSet) -> None:
-    median = float(np.median([view_rms_px(v, views.camera, v.camera_from_board) for v in views]))  # type: ignore[arg-type]
-    if not median <= _WORST_VIEW_PX:
-        raise BadViewsError("lens-misfit", median_px=median, limit_px=_WORST_VIEW_PX)
 
 
 def _clock_bound_s(recording: Recording, solution: Solution) -> float | None:

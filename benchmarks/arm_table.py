@@ -18,6 +18,7 @@ import numpy as np
 from benchmarks.imperfect_cells import BOARD, LENSES, _look
 from benchmarks.scene import grid
 from benchmarks.trials import in_processes, rms, share_spread, table, trials
+from calibrate.gates import GateInputs, GateLimits, judge
 from calibrate.geometry import (
     Array,
     difference,
@@ -38,7 +39,6 @@ from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import MODELS, forward, inverse_many
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import intrinsics_names, intrinsics_vector, project_pixels, with_intrinsics_vector
-from calibrate.quality.gates import GateInputs, GateLimits, judge
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import Mount
 from station.cell.pose_plan import Criterion

@@ -15,12 +15,12 @@ import numpy as np
 from benchmarks.imperfect_cells import Imperfection, Known, imperfect_cell
 from benchmarks.trials import in_processes, rms, table, trials
 from calibrate.errors import CalibrationError
+from calibrate.gates import GateInputs, judge
 from calibrate.geometry import difference
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import LensModel
 from calibrate.pipeline import picture_coverage, single_threaded_opencv
-from calibrate.quality.gates import GateInputs, judge
 from recordings.schema.messages import Mount
 
 TRIALS = 200

@@ -12,12 +12,12 @@ from benchmarks.imperfect_cells import BOARD, ImperfectCell, Known, imperfect_ce
 from benchmarks.scene import MID
 from benchmarks.trials import in_processes, rms, table, trials
 from calibrate.errors import CalibrationError
+from calibrate.gates import GateInputs, judge
 from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.handeye.solution import Reading, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import single_threaded_opencv
-from calibrate.quality.gates import GateInputs, judge
 from calibrate.views import BoardView, Places, ViewSet
 from recordings.schema.messages import Mount
 

@@ -156,7 +156,8 @@ def x_error(cell: RandomCell, flange: Array, rng: np.random.Generator) -> Array:
         np.broadcast_to(POINTS, (n, k, 3)),
         np.zeros((n, k, 2)),
         np.ones((n, k)),
-        extent=extent_of(POINTS),
+        np.zeros((n, 6, 0)),
+        extent_of(POINTS),
     )
     board = bent_points(observed, rng.normal(size=len(SHAPE)) * _PRIORS.board_sigma)
     points = np.einsum("nij,nkj->nki", C[:, :3, :3], board) + C[:, None, :3, 3]

@@ -41,13 +41,13 @@ if TYPE_CHECKING:
     from calibrate.files.validity import Validity as Validity
     from calibrate.files.validity import ValidityReason as ValidityReason
     from calibrate.files.validity import ValidityState as ValidityState
+    from calibrate.gates import GateLimits as GateLimits
     from calibrate.geometry import Transform as Transform
     from calibrate.job import JobOptions as JobOptions
     from calibrate.job import SolvedRecording as SolvedRecording
     from calibrate.pictures import SolvedPictures as SolvedPictures
     from calibrate.pictures import solve as solve
     from calibrate.pipeline import solve_recording as solve_recording
-    from calibrate.quality.gates import GateLimits as GateLimits
     from calibrate.results import Gate as Gate
 
 _MODULES = {
@@ -61,7 +61,7 @@ _MODULES = {
     "job": "JobOptions SolvedRecording",
     "pictures": "SolvedPictures solve",
     "pipeline": "solve_recording",
-    "quality.gates": "GateLimits",
+    "gates": "GateLimits",
     "results": "Gate",
 }
 """Module → names that it gives."""

@@ -9,9 +9,9 @@ import msgspec
 
 from calibrate.errors import require_choice
 from calibrate.files.calibration import Calibration
+from calibrate.gates import GateLimits
 from calibrate.handeye.solution import Profile, Solution, Verification
 from calibrate.lens.intrinsics import Intrinsics, LensModel
-from calibrate.quality.gates import GateLimits
 from calibrate.recorded_views import LoadedViews
 from calibrate.results import Gate
 from calibrate.views import ViewSet

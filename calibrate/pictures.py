@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points, check_board
 from calibrate.errors import BadViewsError, TooFewViewsError, require_choice
+from calibrate.gates import GateInputs, judge
 from calibrate.geometry import Array
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
@@ -23,7 +24,6 @@ from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.pipeline import picture_coverage, single_threaded_opencv, with_board_poses
 from calibrate.projection import project_at
-from calibrate.quality.gates import GateInputs, judge
 from calibrate.results import SHAPE, Gate
 from calibrate.views import BoardView, ViewSet, array_of, board_in_camera, observe_views
 from recordings.files import usable_cores

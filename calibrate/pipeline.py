@@ -15,6 +15,7 @@ import numpy as np
 from calibrate.boards.model import check_board
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
+from calibrate.gates import GateInputs, judge
 from calibrate.handeye.arm_result import verify_elsewhere
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
@@ -24,7 +25,6 @@ from calibrate.job import JobOptions, PreparedViews, SolvedRecording
 from calibrate.lens.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp, view_rms_px
 from calibrate.projection import intrinsics_names
-from calibrate.quality.gates import GateInputs, judge
 from calibrate.recorded_views import Progress, load_views, without_views
 from calibrate.views import ViewSet
 from recordings.reader import Recording, open_recording

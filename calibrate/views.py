@@ -162,8 +162,8 @@ class Observations:
     """(n, k, 2)"""
     present: Array
     """(n, k) 1 for a corner, 0 for padding."""
-    table: Array | None = None
-    """(n, 6, q) motion of the flange, in base, by each error of the kinematic table; None without joints."""
+    by_arm_errors: Array
+    """(n, 6, q) motion of the flange, in base, by each modelled error of arm and bracket."""
     extent: Array = field(default_factory=lambda: np.array([[0.0, 0.0], [1.0, 1.0]]))
     """(2, 2) middle and half size of all corners seen, metres: what the board's bends refer to."""
 
@@ -182,12 +182,12 @@ class Observations:
             points=self.points[places],
             pixels=self.pixels[places],
             present=self.present[places],
-            table=None if self.table is None else self.table[places],
+            by_arm_errors=self.by_arm_errors[places],
         )
 
 
 def observe_views(views: ViewSet) -> Observations:
-    """Pad the views' corners to one array."""
+    """Pad the views' corners to one array, without errors of the arm."""
     count = max(1, max(len(view.pixels) for view in views))
     n = len(views)
     points, pixels, present = np.zeros((n, count, 3)), np.zeros((n, count, 2)), np.zeros((n, count))
@@ -195,7 +195,8 @@ def observe_views(views: ViewSet) -> Observations:
         k = len(view.pixels)
         points[i, :k], pixels[i, :k], present[i, :k] = view.board_points, view.pixels, 1.0
     extent = extent_of(points[present > 0]) if present.any() else np.array([[0.0, 0.0], [1.0, 1.0]])
-    return Observations(views.mount, views.base_from_flange, points, pixels, present, extent=extent)
+    by_none = np.zeros((n, 6, 0))
+    return Observations(views.mount, views.base_from_flange, points, pixels, present, by_none, extent)
 
 
 def extent_of(points: Array) -> Array:

@@ -19,8 +19,8 @@ from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.output import AsJson, err, out
 from calibrate.cli.solve_options import GatesFile, MemoryLimit, ProfileName, Seed, TimeLimit
 from calibrate.errors import UsageError
+from calibrate.gates import GateLimits, read_limits
 from calibrate.job import JobOptions
-from calibrate.quality.gates import GateLimits, read_limits
 from calibrate.recorded_views import Progress as LoadProgress
 from recordings.cli.console import progress_bar
 

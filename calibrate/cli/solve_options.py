@@ -14,10 +14,10 @@ import typer
 
 from calibrate.cli.files import read_board, read_camera
 from calibrate.errors import UsageError
+from calibrate.gates import GateLimits, read_limits
 from calibrate.handeye.solution import Profile
 from calibrate.job import JobOptions
 from calibrate.lens.intrinsics import LensModel
-from calibrate.quality.gates import GateLimits, read_limits
 
 ProfileName = Annotated[Profile, typer.Option(help="robust: the station's; paper: the published method")]
 Seed = Annotated[int, typer.Option(min=0, help="Random seed")]

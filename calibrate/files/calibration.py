@@ -131,7 +131,7 @@ class SessionReading(msgspec.Struct, frozen=True):
     text: str
 
 
-class TableError(msgspec.Struct, frozen=True):
+class ArmErrorValue(msgspec.Struct, frozen=True):
     """One error of the arm's kinematic table, true minus nominal, metres or radians."""
 
     parameter: str
@@ -144,7 +144,7 @@ class Arm(msgspec.Struct, frozen=True):
     """True when the evidence for systematic errors of the arm is clear."""
     log_bayes: float
     size_mm: float
-    table: list[TableError]
+    table: list[ArmErrorValue]
 
 
 class DhTable(msgspec.Struct, frozen=True):

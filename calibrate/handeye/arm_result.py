@@ -37,8 +37,8 @@ def arm_results(
     """
     found, state, chain, table = fit.estimate, fit.estimate.state, arm.chain, arm.table
     count = len(chain.link_errors)
-    errors = state.table[:count]
-    places = np.append(np.arange(6), Layout.of(state).table.start + np.arange(count))
+    errors = state.arm_errors[:count]
+    places = np.append(np.arange(6), Layout.of(state).arm_errors.start + np.arange(count))
     covariance = found.covariance[np.ix_(places, places)]
     joints = sample_range(arm.joints_rad) if table is None else sample_workspace(table, arm.joints_rad)
 

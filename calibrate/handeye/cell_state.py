@@ -1,8 +1,8 @@
 """The unknowns of a cell, and the residual of the flange that they imply against the recorded one.
 
-Unknown: the camera's pose X, the board's pose Y, the lens, the board's shape, errors of the arm's kinematic
-table, and every camera_from_board C_i. Observed: the corners and the recorded flange poses F_i. The true
-flange is Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand). The robot's noise is modelled in base.
+Unknown: the camera's pose X, the board's pose Y, the lens, the board's shape, the systematic errors of
+arm and bracket, and every camera_from_board C_i. Observed: the corners and the recorded flange poses F_i. The
+true flange is Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand). The robot's noise is modelled in base.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class CellState:
     camera: CameraModel
     shape: Array
     """(5,) as in `SHAPE`."""
-    table: Array
-    """(q,) errors of the kinematic table, empty where they are not modelled."""
+    arm_errors: Array
+    """(q,) errors of the arm's links and of a bracket that bends (`handeye.arm`); empty: not modelled."""
 
     def with_boards(self, C: Array) -> CellState:
         """Return a copy with the board poses (m, 4, 4) in place of its own."""
@@ -49,7 +49,7 @@ class CellState:
             C=perturb(self.C, by_view),
             camera=camera,
             shape=self.shape + step[at.shape],
-            table=self.table + step[at.table],
+            arm_errors=self.arm_errors + step[at.arm_errors],
         )
 
 
@@ -61,22 +61,22 @@ class Layout:
     Y: slice
     lens: slice
     shape: slice
-    table: slice
+    arm_errors: slice
     size: int
 
     @property
     def all_but_board(self) -> Places:
         """Positions of all but the board's pose, which a later view does not share."""
-        return np.concatenate([_places(part) for part in (self.X, self.lens, self.shape, self.table)])
+        return np.concatenate([_places(part) for part in (self.X, self.lens, self.shape, self.arm_errors)])
 
     @classmethod
     def of(cls, state: CellState) -> Layout:
         """Lay out the unknowns of `state` one after the other."""
-        sizes = (6, 6, len(intrinsics_names(state.camera)), len(SHAPE), len(state.table))
+        sizes = (6, 6, len(intrinsics_names(state.camera)), len(SHAPE), len(state.arm_errors))
         ends = np.cumsum(sizes).tolist()
         slices = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
-        X, Y, lens, shape, table = slices
-        return cls(X, Y, lens, shape, table, ends[-1])
+        X, Y, lens, shape, arm_errors = slices
+        return cls(X, Y, lens, shape, arm_errors, ends[-1])
 
 
 def _places(part: slice) -> Places:
@@ -84,16 +84,16 @@ def _places(part: slice) -> Places:
 
 
 def flange_residuals(observed: Observations, state: CellState) -> Array:
-    """Compute [δt, δφ] (n, 6) in base, implied minus recorded flange, without errors of the arm's table."""
+    """Compute [δt, δφ] (n, 6) in base, implied minus recorded flange, without the arm's errors."""
     miss = difference(implied_flange(observed.mount, state.X, state.Y, state.C), observed.flange)
-    return miss if observed.table is None or not len(state.table) else miss - observed.table @ state.table
+    return np.asarray(miss - observed.by_arm_errors @ state.arm_errors)
 
 
 def flange_derivatives(mount: Mount, X: Array, Y: Array, C: Array, miss: Array) -> tuple[Array, Array, Array]:
     """Compute ∂residual/∂X, ∂Y, ∂C (n, 6, 6) for deltas of `geometry.perturb`.
 
     X and Y: (4, 4), or (n, 4, 4) where they differ from view to view; C (n, 4, 4); miss: (n, 6), the residual
-    without errors of the kinematic table.
+    without the arm's errors.
     """
     eye_in_hand = mount == "eye-in-hand"
     F = implied_flange(mount, X, Y, C)

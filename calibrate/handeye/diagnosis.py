@@ -68,13 +68,13 @@ def error_shares(fit: CellFit, common: Array) -> dict[str, float]:
     """Split X's variance by source into shares that sum to 1, mean over directions.
 
     The share of the lens is the variance that would vanish if it were known exactly, that of the board what
-    would vanish besides if it were known, too, then that of the arm's table. What is left is the noise of
+    would vanish besides if it were known, too, then that of the arm's errors. What is left is the noise of
     corners, robot translation and robot rotation.
     """
     covariance, at = fit.estimate.covariance, Layout.of(fit.estimate.state)
     whiten = np.linalg.inv(covariance[:6, :6] + common)
     shares = {}
-    for name, part in (("intrinsics", at.lens), ("board", at.shape), ("kinematics", at.table)):
+    for name, part in (("intrinsics", at.lens), ("board", at.shape), ("kinematics", at.arm_errors)):
         known = covariance[:, part] @ np.linalg.pinv(covariance[part, part], hermitian=True)
         taken = known @ covariance[part]
         shares[name] = float(np.trace(whiten @ taken[:6, :6])) / 6
@@ -167,7 +167,7 @@ def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
 def held_out_elsewhere(fit: CellFit, joints_rad: Array) -> Array | None:
     """Predict each view from views taken elsewhere: error (2, n) of the board's middle, metres.
 
-    First row without, second with the errors of the arm's table; NaN for views that do not count fully.
+    First row without, second with the arm's errors; NaN for views that do not count fully.
     joints_rad: (n, 6), split into FOLDS along their principal axis. None where a fold determines nothing.
     """
     full = np.flatnonzero(fit.estimate.chances[:, 0] > FULL)
@@ -177,8 +177,8 @@ def held_out_elsewhere(fit: CellFit, joints_rad: Array) -> Array | None:
     order = full[np.argsort(spread @ np.linalg.svd(spread)[2][0], kind="stable")]
     bare = replace(
         fit,
-        estimate=replace(fit.plain, scales=replace(fit.estimate.scales, table=np.zeros(0))),
-        observed=replace(fit.observed, table=None),
+        estimate=replace(fit.plain, scales=replace(fit.estimate.scales, arm_error_sigma=np.zeros(0))),
+        observed=replace(fit.observed, by_arm_errors=fit.observed.by_arm_errors[..., :0]),
     )
     missed = np.full((2, len(fit.views)), np.nan)
     for way, one in enumerate((bare, fit)):

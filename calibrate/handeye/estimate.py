@@ -120,13 +120,13 @@ def estimate(
     try:
         while steps < MAX_STEPS and not converged:
             steps += 1
-            solved = linear.solve(priors.linearise(state, scales.table), scales, fit)
+            solved = linear.solve(priors.linearise(state, scales.arm_error_sigma), scales, fit)
             scales = solved.scales
             state = state.moved(solved.step, linear.board_step(solved))
             weights = corner_weights(observed, state, scales.sigma_px)
             converged = is_settled(solved.step, solved.precision)
             linear = Linear.at(observed, state, weights)
-        solved = linear.solve(priors.linearise(state, scales.table), scales, "nothing")
+        solved = linear.solve(priors.linearise(state, scales.arm_error_sigma), scales, "nothing")
         covariance = linear.covariance(solved)
     except np.linalg.LinAlgError as problem:
         raise BadViewsError("pose-open", reason=str(problem)) from None
@@ -174,7 +174,7 @@ class CellFit:
     log_bayes: float | None
     """Log evidence of systematic errors of arm and bracket; None where they were not modelled."""
     arm: ArmPostures | None
-    """None where errors of the arm's kinematic table are not among them."""
+    """None where errors of the arm's links are not among them."""
     plain: Estimate
     """The estimate without systematic errors of arm and bracket."""
     pairs: Pairs

@@ -30,7 +30,7 @@ from calibrate.handeye.uncertainty import inverse_of
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, Observations, Places, ViewSet, observe_views
 
-FEWEST_FOR_TABLE = 8
+FEWEST_FOR_ARM_ERRORS = 8
 """Fewest views from which errors of the arm can be told from noise."""
 FEWEST_USED = 3
 """Fewest views that must not be rejected: two motions need three views."""
@@ -41,7 +41,7 @@ MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
 """Above this robot noise (1σ per axis, metres and radians) the poses are refused."""
 
 
-def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True) -> CellFit:
+def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) -> CellFit:
     """Estimate all unknowns of a cell. Raises BadViewsError or DegenerateMotionError: X is not determined."""
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = all_pairs(H, C)
@@ -54,14 +54,14 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
     log_bayes, plain, failure = None, found, ""
-    arm, joints_note = arm_postures(views) if with_table else (None, "")
-    if with_table and len(views) >= FEWEST_FOR_TABLE:
+    arm, joints_note = arm_postures(views) if model_arm else (None, "")
+    if model_arm and len(views) >= FEWEST_FOR_ARM_ERRORS:
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
         flex = flex_motion(views.base_from_flange, held)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
-        modelled = replace(observed, table=np.concatenate([links, flex], axis=2))
+        modelled = replace(observed, by_arm_errors=np.concatenate([links, flex], axis=2))
         try:
-            found, log_bayes = allow_for_table(modelled, found, priors, links.shape[2])
+            found, log_bayes = estimate_with_arm_errors(modelled, found, priors, links.shape[2])
             observed = modelled
         except np.linalg.LinAlgError as problem:
             failure = str(problem)
@@ -85,7 +85,7 @@ _WORTH_SOLVING = 1e-3
 """Probability below which a pair of sizes is dropped after the first step."""
 
 
-def allow_for_table(
+def estimate_with_arm_errors(
     observed: Observations, plain: Estimate, priors: Priors, link_errors: int
 ) -> tuple[Estimate, float]:
     """Estimate again with systematic errors of arm and bracket, starting from the estimate without them.
@@ -97,13 +97,13 @@ def allow_for_table(
     The second value is the log evidence of errors of any size against none; above 3 they are worth saying.
     Raises LinAlgError where it fails.
     """
-    columns = np.asarray(observed.table).shape[2]
+    columns = observed.by_arm_errors.shape[2]
     by_links = _SIZES if link_errors else [_NONE]
     # The first pair, no errors at all, has probability 0 and is for comparison only.
     pairs = np.array([(_NONE, _NONE), *itertools.product(by_links, _BENDS)])
     sigma = np.repeat(pairs, [link_errors, columns - link_errors], axis=1)
     beforehand = np.append(0.0, np.tile(_BENDS_BEFOREHAND, len(by_links)) / len(by_links))
-    state = replace(plain.state, table=np.zeros(columns))
+    state = replace(plain.state, arm_errors=np.zeros(columns))
     scales, weights = plain.scales, plain.corner_weights
     chances, log_bayes = beforehand, 0.0
     kept = np.arange(len(chances))
@@ -133,10 +133,10 @@ def allow_for_table(
             log_bayes = float(log_all - log_evidence[0])
         converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
     best = solutions[int(chances.argmax())]
-    with_table = replace(
+    with_errors = replace(
         plain,
         state=state,
-        scales=replace(best.scales, table=chances @ sigma[kept]),
+        scales=replace(best.scales, arm_error_sigma=chances @ sigma[kept]),
         chances=np.einsum("s,snk->nk", chances, [s.chances for s in solutions]),
         covariance=covariance,
         robot=linear.m + linear.J @ step,
@@ -150,7 +150,7 @@ def allow_for_table(
         converged=converged,
         mean_of=MeanParts(chances, _against(spread[:, :6, :6], covariance[:6, :6])),
     )
-    return with_table, log_bayes
+    return with_errors, log_bayes
 
 
 def _against(spread: Array, mean: Array) -> Array:

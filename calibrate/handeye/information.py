@@ -52,12 +52,12 @@ def view_information(
     Y: ArrayLike,
     board_points: ArrayLike,
     noise: MeasurementNoise,
-    table: Array | None = None,
+    by_arm_errors: Array | None = None,
 ) -> Array:
     """Compute each view's information (n, p, p), the whole board (k, 3) seen from flange poses (n, 4, 4).
 
-    The view's own robot error is marginalised, so views simply add. `table`: (n, 6, q) motion of the flange
-    by each error of the arm's table.
+    The view's own robot error is marginalised, so views simply add. `by_arm_errors`: (n, 6, q) motion of the
+    flange by each error of the arm's links.
     """
     require_mount(mount)
     flange = array_of(base_from_flange, (-1, 4, 4), "base_from_flange")
@@ -65,17 +65,17 @@ def view_information(
     X, Y = array_of(X, (4, 4), "X"), array_of(Y, (4, 4), "Y")
     n, k = len(flange), len(points)
     C = board_in_camera(mount, flange, X, Y)
+    errors = np.zeros((n, 6, 0)) if by_arm_errors is None else by_arm_errors
     observed = Observations(
         mount,
         flange,
         np.broadcast_to(points, (n, k, 3)),
         np.zeros((n, k, 2)),
         np.ones((n, k)),
-        table,
+        errors,
         extent_of(points),
     )
-    errors = np.zeros(0 if table is None else table.shape[2])
-    state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), errors)
+    state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), np.zeros(errors.shape[2]))
     linear = Linear.at(observed, state, observed.present, information=1.0)
     robot = np.repeat([noise.robot_m, noise.robot_rad], 3) ** 2
     W = np.linalg.inv(noise.pixel_px**2 * linear.B + np.diag(robot))
@@ -91,18 +91,18 @@ def prior_information(
     camera: CameraModel,
     lens_known: bool,
     board: BoardTolerance,
-    table_mm: float = 0.0,
+    arm_error_mm: float = 0.0,
     lens: LensPrior | None = None,
 ) -> Array:
     """Compute the prior information (p, p), before any view, of lens and board tolerance.
 
-    `table_mm`: 1σ, mm and mrad, of errors of the arm's table; 0: none are modelled. `lens`: what is known of
-    the lens; None: the defaults for a known or an unknown one.
+    `arm_error_mm`: 1σ, mm and mrad, of errors of the arm's links; 0: none are modelled. `lens`: what is
+    known of the lens; None: the defaults for a known or an unknown one.
     """
-    errors = np.zeros(_LINK_ERRORS if table_mm else 0)
+    errors = np.zeros(_LINK_ERRORS if arm_error_mm else 0)
     state = CellState(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), errors)
     lens = lens or (LensPrior.given(camera) if lens_known else LensPrior.unknown(camera))
-    N = Priors(lens, board).linearise(state, table_mm).N
+    N = Priors(lens, board).linearise(state, arm_error_mm).N
     at = Layout.of(state)
     N[np.arange(12), np.arange(12)] += np.tile(_POSE_PRECISION, 2)
     N[at.lens.start, at.lens.start] += (_FOCAL_SHARE * camera_matrix(camera)[0, 0]) ** -2.0

@@ -79,12 +79,11 @@ class Linear:
         """
         at, n = Layout.of(state), len(observed)
         m = flange_residuals(observed, state)
-        bare = m if observed.table is None or not len(state.table) else m + observed.table @ state.table
+        bare = m + observed.by_arm_errors @ state.arm_errors
         by_X, by_Y, A = flange_derivatives(observed.mount, state.X, state.Y, state.C, bare)
         J = np.zeros((n, 6, at.size))
         J[..., at.X], J[..., at.Y] = by_X, by_Y
-        if observed.table is not None and len(state.table):
-            J[..., at.table] = -observed.table
+        J[..., at.arm_errors] = -observed.by_arm_errors
         if not observed.has_pixels:
             return cls(np.zeros((n, 6, 6)), A, m, J)
         blocks = linearise_corners(observed, state.camera, state.C, information * weights, True, state.shape)

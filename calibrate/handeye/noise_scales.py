@@ -33,7 +33,7 @@ class Scales:
     sigma_px: float
     shares: Array
     """(K,) prior probability of each class."""
-    table: Array = field(default_factory=lambda: np.zeros(0))
+    arm_error_sigma: Array = field(default_factory=lambda: np.zeros(0))
     """(q,) prior 1σ of each systematic error, mm and mrad."""
 
     @property

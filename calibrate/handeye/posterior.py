@@ -35,8 +35,8 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
     found, state, at = fit.estimate, fit.estimate.state, Layout.of(fit.estimate.state)
     chain = fit.arm.chain if fit.arm is not None and fit.arm.recorded else None
     by_arm = 0 if fit.arm is None else len(fit.arm.chain.link_errors)
-    errors = np.arange(0 if chain is not None else by_arm, len(state.table))
-    kept = np.concatenate([at.all_but_board[: -len(state.table) or None], at.table.start + errors])
+    errors = np.arange(0 if chain is not None else by_arm, len(state.arm_errors))
+    kept = np.concatenate([at.all_but_board[: -len(state.arm_errors) or None], at.arm_errors.start + errors])
     lower = found.covariance[np.ix_(kept, kept)][np.tril_indices(len(kept))]
     scales = found.scales
     learned, gravity = None, None
@@ -44,13 +44,13 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
         learned = LearnedArm(
             _rows(chain.axes), _rows(chain.points), chain.posture_rad.tolist(), _rows(chain.flange)
         )
-    if len(state.table):
+    if len(state.arm_errors):
         gravity = tuple(gravity_in_flange(fit.views.base_from_flange).mean(axis=0).tolist())
     return Posterior(
         X=_rows(state.X),
         lens=intrinsics_vector(state.camera).tolist(),
         shape=state.shape.tolist(),
-        errors=state.table[errors].tolist(),
+        errors=state.arm_errors[errors].tolist(),
         covariance_lower=lower.tolist(),
         robot_noise=tuple(scales.robot.tolist()),
         corner_noise_px=(scales.tau_px, scales.lambda_px, scales.sigma_px),
@@ -121,7 +121,7 @@ class KnownCell:
 
     def with_board(self, tolerance: BoardTolerance) -> KnownCell:
         """Return what is known when another board is looked at."""
-        shape = slice(6 + len(intrinsics_names(self.mean.camera)), -len(self.mean.table) or None)
+        shape = slice(6 + len(intrinsics_names(self.mean.camera)), -len(self.mean.arm_errors) or None)
         covariance = self.covariance.copy()
         covariance[shape], covariance[:, shape] = 0.0, 0.0
         covariance[shape, shape] = np.diag(tolerance.sigma**2)
@@ -140,8 +140,8 @@ class KnownCell:
         joints = recorded_joints(views)
         if self.chain is None or (joints is not None and joints.shape[1] == len(self.chain.axes)):
             return self
-        rest = slice(0, len(self.covariance) - len(self.mean.table))
-        mean, covariance = replace(self.mean, table=np.zeros(0)), self.covariance[rest, rest]
+        rest = slice(0, len(self.covariance) - len(self.mean.arm_errors))
+        mean, covariance = replace(self.mean, arm_errors=np.zeros(0)), self.covariance[rest, rest]
         return replace(self, mean=mean, covariance=covariance, chain=None, gravity=None)
 
     def observe(self, views: ViewSet) -> Observations:
@@ -154,7 +154,7 @@ class KnownCell:
             flange = views.base_from_flange
             held = self.mean.X if views.mount == "eye-in-hand" else self.start(views).Y
             columns = np.concatenate([columns, flex_motion(flange, held, self.gravity)], axis=2)
-        return replace(observed, table=columns)
+        return replace(observed, by_arm_errors=columns)
 
     def start(self, views: ViewSet) -> CellState:
         """Begin new views with this mean, and the board where most of them see it."""

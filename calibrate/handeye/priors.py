@@ -21,8 +21,8 @@ _KNOWN_SHARE = 0.002
 _UNKNOWN = {"k1": 1.0, "k2": 3.0, "k3": 10.0, "k4": 1.0, "k5": 3.0, "k6": 10.0, "p1": 0.02, "p2": 0.02}
 """1σ of an unknown lens's distortion, about 0; its centre is the middle of the image ± `_UNKNOWN_CENTRE`."""
 _UNKNOWN_CENTRE = 0.2
-TABLE_UNIT = 1e-3
-"""Errors of the arm's table are in mm and mrad: at a reach of 1 m both move the flange alike."""
+ARM_ERROR_UNIT = 1e-3
+"""Errors of arm and bracket are in mm and mrad: at a reach of 1 m both move the flange alike."""
 
 
 @dataclass(frozen=True)
@@ -90,15 +90,16 @@ class Priors:
     lens: LensPrior
     board: BoardTolerance = field(default_factory=BoardTolerance)
 
-    def linearise(self, state: CellState, table: Array | float) -> Quadratic:
-        """Linearise around `state`. table: 1σ of the systematic errors, (q,) or one for all, mm and mrad."""
+    def linearise(self, state: CellState, arm_error_sigma: Array | float) -> Quadratic:
+        """Linearise around `state`. arm_error_sigma: (q,) or one for all, mm and mrad."""
         at = Layout.of(state)
         N, right = np.zeros((at.size, at.size)), np.zeros(at.size)
         vector = intrinsics_vector(state.camera)
-        table_sigma = np.broadcast_to(TABLE_UNIT * np.asarray(table), (len(state.table),))
-        sigma = np.concatenate([self.lens.sigma, self.board_sigma, table_sigma])
-        value = np.concatenate([vector - self.lens.mean, state.shape, state.table])
-        places = np.arange(at.lens.start, at.table.stop)
+        errors = state.arm_errors
+        errors_sigma = np.broadcast_to(ARM_ERROR_UNIT * np.asarray(arm_error_sigma), errors.shape)
+        sigma = np.concatenate([self.lens.sigma, self.board_sigma, errors_sigma])
+        value = np.concatenate([vector - self.lens.mean, state.shape, errors])
+        places = np.arange(at.lens.start, at.arm_errors.stop)
         N[places, places] = sigma**-2.0
         right[places] = -value / sigma**2
         fx, fy = at.lens.start, at.lens.start + 1
@@ -106,8 +107,8 @@ class Priors:
         miss = (np.log(vector[1] / vector[0]) - self.lens.log_aspect) / ASPECT_SIGMA
         N[fx : fy + 1, fx : fy + 1] += np.outer(slope, slope)
         right[fx : fy + 1] -= slope * miss
-        # Constants are left out, except what differs between sizes of the table's errors.
-        log = -0.5 * float(((state.table / table_sigma) ** 2).sum()) - float(np.log(table_sigma).sum())
+        # Constants are left out, except what differs between sizes of the arm's errors.
+        log = -0.5 * float(((errors / errors_sigma) ** 2).sum()) - float(np.log(errors_sigma).sum())
         return Quadratic(N, right, log)
 
     @property
@@ -130,10 +131,10 @@ class KnownBefore:
             difference(state.X, self.mean.X),
             intrinsics_vector(state.camera) - intrinsics_vector(self.mean.camera),
             state.shape - self.mean.shape,
-            state.table - self.mean.table,
+            state.arm_errors - self.mean.arm_errors,
         ])  # fmt: skip
 
-    def linearise(self, state: CellState, table: Array | float) -> Quadratic:
+    def linearise(self, state: CellState, arm_error_sigma: Array | float) -> Quadratic:
         """Linearise around `state`."""
         at = Layout.of(state)
         N, right, places = np.zeros((at.size, at.size)), np.zeros(at.size), at.all_but_board

@@ -160,7 +160,7 @@ class UncorrectedArm:
 
 
 @dataclass(frozen=True)
-class ArmTable:
+class ArmErrors:
     """Systematic errors of the robot: of the arm's kinematics, and of a bracket that bends."""
 
     log_bayes: float
@@ -259,12 +259,12 @@ class Solution:
     board_finding: Finding | None = None
     noise: NoiseScales | None = None
     error_shares: dict[str, float] = field(default_factory=dict)
-    arm: ArmTable | None = None
+    arm: ArmErrors | None = None
     without_arm: bool = False
     """The stated error is without the arm's own: it is neither modelled nor stated."""
     predicted_error_m: float | None = None
     """1σ (root of the mean squared length) of a point at the working distance on the camera's axis; where
-    errors of the arm are detected, that of `ArmTable.installed`."""
+    errors of the arm are detected, that of `ArmErrors.installed`."""
     working_distance_m: float | None = None
     board_spread_m: float | None = None
     """Root mean square distance of the board's origin in base (or flange), view by view, from its mean."""

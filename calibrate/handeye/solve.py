@@ -47,7 +47,7 @@ from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.readings import explain_recording, explain_text
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.handeye.solution import (
-    ArmTable,
+    ArmErrors,
     Explanation,
     NoiseScales,
     Reading,
@@ -129,7 +129,7 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
     distance = options.working_distance_m or median_distance_m(C[used])
     common = _common_error(views, state.X, options) if fit.arm is None else np.zeros((6, 6))
     covariance = found.covariance[:6, :6] + common
-    arm = _arm(fit, found.covariance[at.table, at.table], options, distance)
+    arm = _arm(fit, found.covariance[at.arm_errors, at.arm_errors], options, distance)
     installed = None if arm is None else arm.installed
     pairs, certified = fit.pairs, fit.certified
     apart = distance_in_sigmas(certified.X, state.X, pair_covariance(certified.objective, pairs, certified.X))
@@ -218,15 +218,15 @@ def _board(fit: CellFit, covariance: Array) -> BoardShape:
     return BoardShape(scale, anisotropy, tuple(bend), tuple(np.sqrt(np.diag(covariance)).tolist()))
 
 
-def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: float) -> ArmTable | None:
+def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: float) -> ArmErrors | None:
     if fit.log_bayes is None:
         return None
     names = FLEX if fit.arm is None else (*fit.arm.chain.link_errors, *FLEX)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     errors = dict(
-        zip(names, zip(fit.estimate.state.table.tolist(), sigma.tolist(), strict=True), strict=True)
+        zip(names, zip(fit.estimate.state.arm_errors.tolist(), sigma.tolist(), strict=True), strict=True)
     )
-    found = ArmTable(fit.log_bayes, float(fit.estimate.scales.table[0]), errors)
+    found = ArmErrors(fit.log_bayes, float(fit.estimate.scales.arm_error_sigma[0]), errors)
     if fit.arm is None:
         return found
     missed = held_out_elsewhere(fit, fit.arm.joints_rad) if found.detected and options.folds else None

@@ -60,11 +60,11 @@ def _branch(model: RobotModel, joints_rad: Array) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """Derivatives of points in base by X and by the errors of the table."""
+    """Derivatives of points in base by X and by the errors of the arm's links."""
 
     by_camera: Array
     """(m, 6) by X"""
-    by_table: Array
+    by_arm_errors: Array
     """(m, q)"""
     by_rigid: Array
     """(m, 6) the motion that counts as no error."""
@@ -113,24 +113,24 @@ class Workspace:
         return Workspace(
             *(
                 np.concatenate([getattr(self, name), ratio * getattr(other, name)])
-                for name in ("by_camera", "by_table", "by_rigid")
+                for name in ("by_camera", "by_arm_errors", "by_rigid")
             )
         )
 
     def for_uncorrected(self) -> Array:
         """Matrix (6, q): times the arm's errors, the change of X that is best for the uncorrected arm."""
         J = np.concatenate([self.by_camera, self.by_rigid], axis=1)
-        return np.asarray(np.linalg.lstsq(J, self.by_table, rcond=None)[0][:6])
+        return np.asarray(np.linalg.lstsq(J, self.by_arm_errors, rcond=None)[0][:6])
 
     def quadratic(self) -> Array:
         """Matrix K (6 + q, 6 + q): a point's mean squared error is trace(K C), C that of [X, errors]."""
-        J = self._beside_rigid(np.concatenate([self.by_camera, self.by_table], axis=1))
+        J = self._beside_rigid(np.concatenate([self.by_camera, self.by_arm_errors], axis=1))
         return np.asarray(3 * J.T @ J / len(J))
 
     def among(self, size: int) -> Array:
-        """Embed `quadratic` into (size, size), in `handeye.information`'s order: X first, the table last."""
+        """Embed `quadratic` into (size, size), in `handeye.information`'s order: X first, the links last."""
         K = np.zeros((size, size))
-        places = np.concatenate([np.arange(6), np.arange(size - self.by_table.shape[1], size)])
+        places = np.concatenate([np.arange(6), np.arange(size - self.by_arm_errors.shape[1], size)])
         K[np.ix_(places, places)] = self.quadratic()
         return K
 
@@ -140,7 +140,7 @@ class Workspace:
 
     def error_m(self, shift: Array, errors: Array) -> float:
         """Compute a point's rms error, metres, for X wrong by `shift` (6,) and errors (q,) ignored."""
-        off = self._beside_rigid(self.by_camera @ shift - self.by_table @ errors)
+        off = self._beside_rigid(self.by_camera @ shift - self.by_arm_errors @ errors)
         return float(np.sqrt(3 * (off**2).mean()))
 
     def _beside_rigid(self, J: Array) -> Array:

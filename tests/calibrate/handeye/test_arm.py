@@ -77,7 +77,9 @@ def test_the_region_of_an_average_holds_95_percent_of_it():
     """Of normal distributions of several widths: more lies far out than of one with their mean variance."""
     views = worn_cell(np.random.default_rng(2), 0.3).views
     found = fit_cell(views, Priors(LensPrior.given(views.camera)), 0)
-    assert found.estimate.scales.table[0] > 0.2 > found.estimate.scales.table[-1], "the bracket is rigid"
+    assert found.estimate.scales.arm_error_sigma[0] > 0.2 > found.estimate.scales.arm_error_sigma[-1], (
+        "the bracket is rigid"
+    )
     chances, widths = np.array([0.5, 0.3, 0.2]), np.array([0.2, 0.8, 3.3])
     average = replace(found.estimate, mean_of=MeanParts(chances, widths))
     rng, n = np.random.default_rng(0), 200_000
@@ -101,7 +103,7 @@ def test_an_arm_that_cannot_be_fitted_is_said(monkeypatch):
     def fails(*_):
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(fit_module, "allow_for_table", fails)
+    monkeypatch.setattr(fit_module, "estimate_with_arm_errors", fails)
     found = solve_views(worn_cell(np.random.default_rng(2), 0.4).views, QUICK)
     assert found.arm is None
     assert "arm-not-fitted" in {remark.code for remark in found.warnings}

@@ -165,7 +165,7 @@ def test_workspace_derivatives_are_those_of_the_points(mount: str) -> None:
     else:
         held = Y[:, 3]
         off = (said @ held - wrong @ inverse(X) @ true @ held)[:, :3]
-    linear = room.by_camera @ shift - room.by_table @ errors
+    linear = room.by_camera @ shift - room.by_arm_errors @ errors
     np.testing.assert_allclose(linear.reshape(-1, 3), off, atol=3e-9)
 
 

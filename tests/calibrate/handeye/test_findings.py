@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.gates import GateInputs, judge
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Finding, Reading
 from calibrate.handeye.solve import solve_views
-from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import (
     LENSES,
     LOW,

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from calibrate.gates import GateInputs, judge
 from calibrate.geometry import pose, rotation_exp, transform_points
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import SolveOptions, solve_views
-from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import MID, MOUNTS, QUICK, changed, inside, make_cell, slipped
 
 OPTIONS = SolveOptions(holdout=True, folds=True)

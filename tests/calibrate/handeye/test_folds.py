@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibrate.gates import GateInputs, judge
 from calibrate.geometry import perturb
 from calibrate.handeye import diagnosis
 from calibrate.handeye import solve as profile_robust
@@ -14,7 +15,6 @@ from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.metrics import HELD_OUT
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import SolveOptions, solve_views
-from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import LOW, MID, MOUNTS, make_cell, nudged
 
 VIEWS = 20

@@ -18,7 +18,7 @@ ONE_CLASS = np.array([1.0, 1e-300, 1e-300, 1e-300])
 VIEWS = 5
 
 
-def setting(mount, with_table):
+def setting(mount, with_arm_errors):
     """A state a little off its optimum; one view has fewer corners than the others."""
     rng = np.random.default_rng(3)
     camera = LENSES["plumb_bob"]
@@ -33,10 +33,10 @@ def setting(mount, with_table):
         perturb(views.camera_from_board, 1e-4 * rng.normal(size=(VIEWS, 6))),
         camera,
         1e-4 * rng.normal(size=5),
-        1e-4 * rng.normal(size=3 * with_table),
+        1e-4 * rng.normal(size=3 * with_arm_errors),
     )
-    if with_table:
-        observed = replace(observed, table=rng.normal(size=(VIEWS, 6, 3)))
+    if with_arm_errors:
+        observed = replace(observed, by_arm_errors=rng.normal(size=(VIEWS, 6, 3)))
     return observed, state
 
 
@@ -58,9 +58,9 @@ def differences(observed, state):
 
 
 @MOUNTS
-@pytest.mark.parametrize("with_table", [False, True])
-def test_elimination_equals_the_dense_solution(mount, with_table):
-    observed, state = setting(mount, with_table)
+@pytest.mark.parametrize("with_arm_errors", [False, True])
+def test_elimination_equals_the_dense_solution(mount, with_arm_errors):
+    observed, state = setting(mount, with_arm_errors)
     rng = np.random.default_rng(0)
     weights = rng.uniform(0.3, 1.0, observed.present.shape) * observed.present
     scales = Scales(np.array([3e-4, 5e-4]), 0.5, 0.2, 0.1, ONE_CLASS)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibrate.errors import PosesDisagreeError
+from calibrate.gates import GateInputs, judge
 from calibrate.geometry import (
     inverse,
     matrix_from_quaternion,
@@ -19,7 +20,6 @@ from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.projection import project_pixels
-from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import (
     HIGH,
     LOW,

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from calibrate.errors import UsageError
+from calibrate.gates import GateInputs, GateLimits, judge, read_limits
 from calibrate.handeye.solution import (
     Explanation,
     Finding,
@@ -19,7 +20,6 @@ from calibrate.handeye.solution import (
     Solution,
 )
 from calibrate.job import SolvedRecording
-from calibrate.quality.gates import GateInputs, GateLimits, judge, read_limits
 from calibrate.results import CrossValidation, Gate, HoldoutScore, Remark
 from tests.calibrate.calling import raises_code
 
@@ -167,7 +167,7 @@ def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) ->
 
 
 def test_the_documented_defaults_are_those_in_force() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "integrator" / "calibration-file.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "integrator" / "calibration-file.md").read_text()
     table = text[text.index("## Gates") : text.index("Installing asks one more")]
     documented: dict[str, str] = {}
     for row in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", table, re.MULTILINE):

@@ -72,7 +72,7 @@ pages: $(READY)  ## the pages of docs/ that are made from the sources
 	$(BIN)/python docs/schemas.py
 
 docs: $(READY)  ## the books as a site in site/, to be read without a server
-	$(BIN)/mkdocs build --strict -d site && echo site/index.html
+	$(BIN)/mkdocs build --strict -d site && echo "site/index.html; with its search: python3 -m http.server --bind 127.0.0.1 -d site"
 
 soak: $(READY)  ## the long runs that CI shortens
 	$(BIN)/python -m pytest -m soak --timeout 3600

@@ -48,12 +48,24 @@ def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str
     return shown
 
 
-def error_text(calibration: Calibration) -> str:
-    """Write the error and its limit as a sentence."""
-    figure = figures(calibration)["error"]
-    gates = [gate for gate in calibration.quality.gates if gate.name == "predicted_error_m"]
-    limit = f" The limit is {gates[0].shown(gates[0].limit)}." if gates and figure.about else ""
-    return f"{f'{figure.label} {figure.about}'.strip().capitalize()}: {figure.value}.{limit}"
+def accuracy_text(calibration: Calibration) -> str:
+    """Write how right the result is, and the limit, as a sentence."""
+    figure, quality = figures(calibration)["error"], calibration.quality
+    of = "The camera's position"
+    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
+        of = f"A point {quality.working_distance_m:.2f} m from the camera"
+    without = ", without the arm's own error" * ("without" in figure.about)
+    gates = [gate for gate in quality.gates if gate.name == "predicted_error_m"]
+    limit = f" The limit is {gates[0].shown(gates[0].limit)}." if gates else ""
+    return f"{of} is right to {figure.value}{without}.{limit}"
+
+
+def use_text(calibration: Calibration) -> str:
+    """Say in a sentence whether to use it, and why."""
+    if failed := calibration.quality.failed:
+        return f"Do not use it: {failed[0].text.partition(' FAIL')[0]}."
+    practice, text = calibration.source in ("simulated", "playback"), accuracy_text(calibration)
+    return f"{'For practice only' if practice else 'Use it'}: {text[0].lower()}{text[1:]}"
 
 
 def noise_text(calibration: Calibration) -> str:
@@ -63,10 +75,10 @@ def noise_text(calibration: Calibration) -> str:
     return f"Measurement noise (1σ): corners {noise['corner_px']:.3g} px, {robot}." if noise else ""
 
 
-def shares_text(calibration: Calibration) -> str:
-    """List the sources of the error of X with their shares, the largest first."""
+def error_shares(calibration: Calibration) -> dict[str, float]:
+    """The sources of the error of X with their shares of its variance, the largest first."""
     shares = sorted(calibration.quality.error_shares.items(), key=lambda item: -item[1])
-    return ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares if share > 0.005)
+    return {name.replace("_", " "): share for name, share in shares if share > 0.005}
 
 
 def verdict_text(calibration: Calibration) -> str:
@@ -133,8 +145,8 @@ def _result_table(calibration: Calibration) -> Table:
     fy, cy = lens.matrix[1][1], lens.matrix[1][2]
     rms = "" if lens.rms_px is None else f"  RMS {lens.rms_px:.3f} px"
     table.add_row("intrinsics", f"f {fx:.1f} {fy:.1f}  c {cx:.1f} {cy:.1f} px{rms}  ({lens.found})")
-    if text := shares_text(calibration):
-        table.add_row("error comes from", text)
+    if shares := error_shares(calibration):
+        table.add_row("error comes from", ", ".join(f"{name} {share:.0%}" for name, share in shares.items()))
     table.add_row("board", describe_board(calibration.board))
     robot, camera = calibration.robot, calibration.camera
     table.add_row(
@@ -162,8 +174,8 @@ _REMEDIES = {
     "board": "measure the board and state its tolerance (square_tolerance, flatness_m)",
     "kinematics": "have the arm calibrated",
     "corners": "take better or more images",
-    "robot_translation": "take more poses",
-    "robot_rotation": "take more poses",
+    "robot translation": "take more poses",
+    "robot rotation": "take more poses",
 }
 
 
@@ -173,14 +185,12 @@ def cell_sentences(calibration: Calibration) -> list[str]:
     sentences: list[str] = []
     if quality.board is not None:
         sentences += _board(quality.board, calibration.board.square_m * 1e3)
-    shares = sorted(quality.error_shares.items(), key=lambda item: -item[1])
-    if shares and shares[0][1] > _COSTLY and (name := shares[0][0]) in _REMEDIES:
-        label, remedy, arm = name.replace("_", " "), _REMEDIES[name], calibration.arm_table
+    name, share = next(iter(error_shares(calibration).items()), ("", 0.0))
+    if share > _COSTLY and name in _REMEDIES:
+        remedy, arm = _REMEDIES[name], calibration.arm_table
         if name == "kinematics" and arm is not None and arm.offered:
             remedy = "use the corrected table"
-        sentences.append(
-            f"Largest error source: {label}, {shares[0][1]:.0%} of the variance. To lower it, {remedy}."
-        )
+        sentences.append(f"Largest error source: {name}, {share:.0%} of the variance. To lower it, {remedy}.")
     return sentences
 
 

@@ -38,29 +38,27 @@ def folded(title: str, parts: Iterable[str], *, printed: bool = False) -> str:
     return f"<details{kind}><summary>{escape(title)}</summary>\n{inside}</details>"
 
 
-def cards(facts: Iterable[tuple[str, str]]) -> str:
-    """Figures side by side, each with what it is."""
-    return (
-        '<div class="cards">'
-        + "".join(
-            f"<div><strong>{escape(figure)}</strong><span>{escape(what)}</span></div>"
-            for figure, what in facts
-        )
-        + "</div>"
-    )
+def side_by_side(kind: str, parts: Iterable[str]) -> str:
+    """Parts beside each other, below each other on a narrow screen; `kind`: class of the style sheet."""
+    return f'<div class="{kind}">' + "\n".join(f"<div>{part}</div>" for part in parts if part) + "</div>"
 
 
 def paragraph(text: str, kind: str = "") -> str:
     return f'<p class="{kind}">{escape(text)}</p>' if text else ""
 
 
+def listed(items: Iterable[tuple[str, Literal["", "pass", "fail"]]]) -> str:
+    """A list of texts, with ✓ or ✗ before those that passed or failed."""
+    return "<ul>" + "".join(f'<li class="{kind}">{escape(text)}</li>' for text, kind in items) + "</ul>"
+
+
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """Cells are escaped; `numbers` are the columns to align right. A cell '✓' or '✗' is coloured."""
+    """Cells are escaped; `numbers` are the columns to align right."""
+
+    mark = ' class="n"'
 
     def cell(tag: str, column: int, text: str) -> str:
-        kinds = [*(["n"] if column in numbers else []), *({"✓": ["pass"], "✗": ["fail"]}.get(text, []))]
-        mark = f' class="{" ".join(kinds)}"' if kinds else ""
-        return f"<{tag}{mark}>{escape(text)}</{tag}>"
+        return f"<{tag}{mark * (column in numbers)}>{escape(text)}</{tag}>"
 
     lines = (
         ["<tr>" + "".join(cell("th", k, text) for k, text in enumerate(head)) + "</tr>"] if any(head) else []
@@ -69,8 +67,10 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[
     return "<table>" + "\n".join(lines) + "</table>"
 
 
-def figure(svg: str, caption: str) -> str:
-    return f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
+def figure(drawn: str, caption: str, question: str = "") -> str:
+    """A plot or picture: the question that it answers above, the answer below."""
+    above = f"<h2>{escape(question)}</h2>" if question else ""
+    return f"<figure>{above}{drawn}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def picture(jpeg: bytes, alt: str) -> str:

@@ -5,36 +5,44 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime
+from itertools import pairwise
 
 import cv2
 import numpy as np
 
-from calibrate.annotate import MAGNIFIED
 from calibrate.boards.corners import to_grey
-from calibrate.boards.model import describe_board
+from calibrate.boards.model import board_from_turned, board_points, describe_board, looks_same_turns
 from calibrate.files.calibration import source_stamp
 from calibrate.files.formatting import (
     arm_sentences,
     cell_sentences,
+    error_shares,
     figures,
     noise_text,
     pose_text,
-    shares_text,
+    use_text,
     verdict_text,
 )
 from calibrate.geometry import Array, difference
 from calibrate.handeye.reprojection import bent_points
 from calibrate.job import SolvedRecording
 from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import intrinsics_names, intrinsics_vector, project_at
+from calibrate.projection import intrinsics_names, intrinsics_vector, project_at, project_pixels
 from calibrate.report import html, plots
 from calibrate.results import SHAPE
-from calibrate.views import observe_views
-from recordings.images import Pixels, viewable
+from calibrate.views import board_in_camera, observe_views
+from recordings import strict_yaml
+from recordings.images import viewable
+from recordings.schema.messages import CameraModel, View
 
-_PICTURES_LIMIT = 60
-_WIDTHS_PX = ((12, 480), (30, 320), (_PICTURES_LIMIT, 240))
-"""Up to so many views, their pictures are so wide: a page stays below a megabyte."""
+_FIRST_WIDTH_PX, _OTHER_WIDTH_PX, _PICTURES_LIMIT = 720, 320, 12
+"""A page stays below a megabyte."""
+_REMEDIES_SHOWN = 3
+_DRAWN_IN = (255, 140, 20)
+"""Colour of what the calibration predicts: blue, green, red."""
+_AHEAD_PX = 1e6
+"""Rejected and suspect views stand before all others, however far off those are."""
 
 
 def report_page(job: SolvedRecording) -> str:
@@ -44,32 +52,116 @@ def report_page(job: SolvedRecording) -> str:
         f"Calibration of {job.recording.info.name}",
         [
             *_verdict(job),
-            html.folded("Gates", _gates(job), printed=True),
+            html.side_by_side("first", (_picture(job), _first_facts(job))),
+            html.side_by_side("plots", _plots(job, modelled)),
             html.folded("Camera pose", _result(job), printed=True),
-            html.folded("Residuals", _residuals(job, modelled), printed=True),
+            html.folded("Gates", _gates(job), printed=True),
             html.folded("Error sources", _error(job)),
-            html.folded("Arm", _arm(job)),
             html.folded("Intrinsics", _lens(job)),
-            html.folded("Views", _views(job, modelled)),
-            html.folded("Provenance", _provenance(job), printed=True),
+            html.folded("Views", _views(job)),
+            html.folded("Provenance", _provenance(job)),
         ],
     )
 
 
 def _verdict(job: SolvedRecording) -> Iterator[str]:
-    """All that one screen holds: the verdict, and the figures it stands on."""
     calibration = job.calibration
-    quality = calibration.quality
     if stamp := source_stamp(calibration.source):
         yield html.stamp(f"{stamp}. It is not installed on a real cell.")
     yield html.paragraph(rehearsal_text(job))
-    failed = " ".join(gate.text for gate in quality.failed)
-    yield html.verdict("good" if job.passed else "bad", verdict_text(calibration), failed)
-    told = figures(calibration)
-    del told["gates"]  # the verdict counts them
-    yield html.cards([(figure.value, f"{figure.label} {figure.about}") for figure in told.values()])
-    for warning in quality.warnings:
-        yield html.paragraph(warning, "warning")
+    yield html.verdict("good" if job.passed else "bad", use_text(calibration), verdict_text(calibration))
+
+
+def _first_facts(job: SolvedRecording) -> str:
+    """The one figure, what was calibrated and when, and what could be better."""
+    calibration, info = job.calibration, job.recording.info
+    figure = figures(calibration)["error"]
+    cell = strict_yaml.load_plain(job.recording.attachments().get("config.yaml", b"{}"))
+    wall_s = info.created_wall_ns / 1e9
+    rows = {
+        "recorded": datetime.fromtimestamp(wall_s, UTC).strftime("%d %B %Y, %H:%M UTC") if wall_s else "",
+        "cell": str(cell.get("name", "")) if isinstance(cell, dict) else "",
+        "robot": f"{calibration.robot.model} {calibration.robot.serial}",
+        "camera": f"{calibration.camera.vendor} {calibration.camera.model} {calibration.camera.serial}",
+        "mounting": f"{calibration.mount}, {describe_board(calibration.board)}",
+        "views": f"{len(calibration.views.used)} used, {len(calibration.views.rejected)} rejected",
+        "installed": "not when this page was written",
+    }
+    return "\n".join(
+        (
+            f'<p class="big">{html.escape(figure.value)}</p>',
+            html.paragraph(f"{figure.label} {figure.about}", "note"),
+            html.table(("", ""), [(name, text.strip()) for name, text in rows.items() if text.strip()]),
+            "<h2>What could be better?</h2>",
+            html.listed((text, "") for text in _could_be_better(job)[:_REMEDIES_SHOWN]),
+        )
+    )
+
+
+def _could_be_better(job: SolvedRecording) -> list[str]:
+    """Remedies, most important first: of gates, of views, of the largest error; then other findings."""
+    calibration = job.calibration
+    quality, rejected = calibration.quality, calibration.views.rejected
+    told = [gate.remedy for gate in sorted(quality.gates, key=lambda gate: gate.passed) if gate.remedy]
+    if rejected:
+        told.append(f"Retake the rejected views: {', '.join(str(view.index + 1) for view in rejected)}.")
+    told += [*reversed(cell_sentences(calibration)), *quality.warnings]
+    return told or ["Nothing stands out."]
+
+
+def _picture(job: SolvedRecording) -> str:
+    """The used view that fits worst, with the board drawn in."""
+    robot = job.solution.residual_robot
+    used = [view for view in job.recording.views() if view.index in robot]
+    if not used:
+        return ""
+    view = max(used, key=lambda view: robot[view.index][0])
+    picture, off_px = _drawn_in(job, view, _FIRST_WIDTH_PX)
+    return html.figure(
+        picture,
+        f"Blue: the board where this calibration and the robot's pose place it. In pose {view.index + 1}, "
+        f"where the arm was off most, that is {off_px:.2f} px beside the board in the image.",
+    )
+
+
+def _drawn_in(job: SolvedRecording, view: View, width_px: int) -> tuple[str, float]:
+    """A view with the board where robot pose, camera pose and board pose place it; how far off it is, px rms.
+
+    A board that is small in the image is shown with its surroundings only.
+    """
+    calibration, board = job.calibration, board_points(job.calibration.board)
+    image, seen = job.recording.image(view), job.loaded.detections[view.index]
+    X, B = calibration.transform.matrix, calibration.board_place.transform.matrix
+    placed = board_in_camera(calibration.mount, np.array(view.base_from_flange), X, B)
+    low, high = board.min(axis=0), board.max(axis=0)
+    corners = np.array([low, [high[0], low[1], 0], high, [low[0], high[1], 0], low])
+    outline = np.concatenate([np.linspace(a, b, 20) for a, b in pairwise(corners)])  # a lens bends them
+
+    def shown_at(points: Array, C: Array = placed) -> Array:
+        at = project_pixels(calibration.intrinsics.model, points @ C[:3, :3].T + C[:3, 3])
+        return np.nan_to_num(at)
+
+    turns = (board_from_turned(calibration.board, q) for q in (0, *looks_same_turns(calibration.board)))
+    orders = [shown_at(board[seen.indices], placed @ turned) for turned in turns]
+    pixels = to_grey(viewable(image.pixels, image.pixel_format))
+    size = np.array(pixels.shape[::-1])
+    span = size * min(1.0, 2.4 * float(np.ptp(seen.pixels, axis=0).max()) / size.max())
+    corner = np.clip(np.median(seen.pixels, axis=0) - span / 2, 0, size - span).astype(int)
+    (left, top), (right, bottom) = corner, np.ceil(corner + span).astype(int)
+    scale = width_px / (right - left)
+    small = cv2.resize(pixels[top:bottom, left:right], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    bright = np.clip(small * (245.0 / max(float(np.percentile(small, 99.5)), 1.0)), 0, 255).astype(np.uint8)
+    canvas = cv2.cvtColor(bright, cv2.COLOR_GRAY2BGR)
+    sixteenths = [
+        np.rint(16 * ((at - corner + 0.5) * scale - 0.5)).astype(np.int32)
+        for at in (shown_at(outline), shown_at(board))
+    ]
+    cv2.polylines(canvas, sixteenths[:1], False, _DRAWN_IN, 2, cv2.LINE_AA, 4)
+    for dot in sixteenths[1].tolist():
+        cv2.circle(canvas, dot, width_px // 11, _DRAWN_IN, 2, cv2.LINE_AA, 4)
+    jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 65])[1].tobytes()
+    shown = html.picture(jpeg, f"pose {view.index + 1} with the board drawn in")
+    return shown, min(float(np.sqrt(np.square(at - seen.pixels).sum(axis=1).mean())) for at in orders)
 
 
 def rehearsal_text(job: SolvedRecording) -> str:
@@ -107,19 +199,19 @@ def _result(job: SolvedRecording) -> Iterator[str]:
 
 
 def _gates(job: SolvedRecording) -> Iterator[str]:
-    yield html.table(
-        ("", "gate", "result"), [("✓" if gate.passed else "✗", gate.name, gate.text) for gate in job.gates]
-    )
+    yield html.listed((gate.text, "pass" if gate.passed else "fail") for gate in job.gates)
 
 
 def _error(job: SolvedRecording) -> Iterator[str]:
     quality = job.calibration.quality
-    if quality.error_shares:
-        yield html.paragraph(f"Shares of the variance of X: {shares_text(job.calibration)}.")
     yield html.paragraph(noise_text(job.calibration))
+    if quality.holdout is not None:
+        held = figures(job.calibration)["held_out"]
+        yield html.paragraph(f"{held.label.capitalize()}: {held.value} {held.about}.")
     yield html.paragraph(f"Least known: {quality.weakest}." if quality.weakest else "")
-    for sentence in cell_sentences(job.calibration):
-        yield html.paragraph(sentence)
+    yield from map(
+        html.paragraph, (*_could_be_better(job)[_REMEDIES_SHOWN:], *arm_sentences(job.calibration))
+    )
 
 
 ModelledPixels = dict[int, tuple[Array, Array]]
@@ -145,28 +237,40 @@ def _modelled_pixels(job: SolvedRecording) -> ModelledPixels:
     }
 
 
-def _residuals(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
+def _plots(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
     solution = job.solution
-    if solution.residual_px:
-        robot_mm = {index: metres * 1000 for index, (metres, _) in solution.residual_robot.items()}
+    if px := solution.residual_px:
         limit = next((gate.limit for gate in job.gates if gate.name == "view_rms_px"), None)
-        yield html.figure(
-            plots.residuals_by_view(solution.residual_px, robot_mm, limit),
-            "Per pose: reprojection error of the corners, and modelled against recorded flange.",
+        worst = max(px, key=lambda index: px[index])
+        answer = f"Most: pose {worst + 1}, {px[worst]:.2f} px" + f" (limit {limit:g} px)." * (
+            limit is not None
         )
-    pairs = [both for index, both in modelled.items() if index in set(solution.used)]
-    if pairs:
+        yield html.figure(plots.by_view(px, "px", limit), answer, "Does a picture stand out?")
+    if robot_mm := {index: metres * 1000 for index, (metres, _) in solution.residual_robot.items()}:
+        worst = max(robot_mm, key=lambda index: robot_mm[index])
+        answer = f"Most: pose {worst + 1}, {robot_mm[worst]:.2f} mm from where the picture says."
+        yield html.figure(plots.by_view(robot_mm, "mm"), answer, "Was the arm where it said?")
+    if shares := error_shares(job.calibration):
+        answer = "Shares of the variance of the camera pose."
+        yield html.figure(plots.shares(shares), answer, "Where does the error come from?")
+    if pairs := [both for index, both in modelled.items() if index in set(solution.used)]:
         pixels = np.concatenate([found for found, _ in pairs])
         misses = np.concatenate([found - shown for found, shown in pairs])
-        yield html.figure(
-            plots.residual_scatter(misses, pixels, job.solution.camera),
-            "Found corners against the lens and each image's own board pose. Left: circles at 1, 2, 3 σ. "
-            "Right: over the image; a pattern of arrows means that the lens model does not fit.",
+        middles, means = _mean_by_field(pixels, misses, solution.camera)
+        answer = (
+            f"Mean of the corners in a field: at most {np.linalg.norm(means, axis=1).max():.2f} px off. "
+            "Long arrows side by side: it does not fit."
         )
+        drawn = plots.field_misses(middles, means, solution.camera)
+        yield html.figure(drawn, answer, "Does the lens model fit everywhere?")
 
 
-def _arm(job: SolvedRecording) -> Iterator[str]:
-    yield from map(html.paragraph, arm_sentences(job.calibration))
+def _mean_by_field(pixels: Array, misses: Array, camera: CameraModel) -> tuple[Array, Array]:
+    """Middles (n, 2) of the image's fields that hold corners, and the mean miss (n, 2) in each; px."""
+    size = np.array([camera.width, camera.height]) / plots.FIELDS
+    fields, owner = np.unique(pixels // size, axis=0, return_inverse=True)
+    means = [misses[owner.ravel() == place].mean(axis=0) for place in range(len(fields))]
+    return (fields + 0.5) * size, np.array(means)
 
 
 def _lens(job: SolvedRecording) -> Iterator[str]:
@@ -183,7 +287,8 @@ def _lens(job: SolvedRecording) -> Iterator[str]:
     yield html.paragraph(f"Image coverage by corners: {job.coverage:.0%}.")
 
 
-def _views(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
+def _views(job: SolvedRecording) -> Iterator[str]:
+    """Rejected views and why, then pictures: of those, of suspect ones and of those that fit worst."""
     rejected = {view.index: view.reason for view in job.calibration.views.rejected}
     if rejected:
         names = {view.index: view.name for view in job.recording.views()}
@@ -191,33 +296,23 @@ def _views(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
             ("pose", "name", "reason"),
             [(str(index + 1), names.get(index, ""), reason) for index, reason in rejected.items()],
         )
-    cells = []
-    shown = job.recording.views()[:_PICTURES_LIMIT]
-    width_px = next(width for most, width in _WIDTHS_PX if len(shown) <= most)
-    for view in shown:
-        detection = job.loaded.detections.get(view.index)
-        if detection is None:  # its picture cannot be decoded: the table above says so
+    figures, suspects = dict[float, str](), job.solution.suspects
+    for view in job.recording.views():
+        seen = job.loaded.detections.get(view.index)
+        if seen is None or not seen.found:  # the table above says why
             continue
-        found = detection.pixels
-        ours = modelled.get(view.index, (found, None))[1]
-        image = job.recording.image(view)
-        jpeg = _drawn_view(viewable(image.pixels, image.pixel_format), found, ours, width_px)
-        px = job.solution.residual_px.get(view.index)
-        name = "" if view.name == str(view.index) else f": {view.name}"
-        caption = f"pose {view.index + 1}{name}" + (f", {px:.2f} px" if px is not None else "")
+        picture, off_px = _drawn_in(job, view, _OTHER_WIDTH_PX)
+        caption = f"pose {view.index + 1}: {off_px:.2f} px"
         if view.index in rejected:
             caption += ", rejected"
-        elif view.index in job.solution.suspects:
-            caption += f", suspect: P(outlier) {job.solution.suspects[view.index]:.0%}"
-        mark = "out" if view.index in rejected else "in"
-        cells.append(f'<div class="{mark}">{html.figure(html.picture(jpeg, caption), caption)}</div>')
-    yield html.paragraph(
-        f"Lines lead to the corners by board pose and intrinsics, {MAGNIFIED:.0f} times as long.",
-        "note",
-    )
-    yield '<div class="views">' + "\n".join(cells) + "</div>"
-    if len(job.recording.views()) > _PICTURES_LIMIT:
-        yield html.paragraph(f"The first {_PICTURES_LIMIT} are shown.", "note")
+        elif view.index in suspects:
+            caption += f", suspect: P(outlier) {suspects[view.index]:.0%}"
+        rank = (view.index in rejected) + suspects.get(view.index, 0.0)
+        figures[rank * _AHEAD_PX + off_px] = html.figure(picture, caption)
+    worst = sorted(figures, reverse=True)[:_PICTURES_LIMIT]
+    yield html.side_by_side("views", (figures[rank] for rank in worst))
+    if len(figures) > len(worst):
+        yield html.paragraph(f"The {len(worst)} worst of {len(figures)} views are shown.", "note")
 
 
 def _provenance(job: SolvedRecording) -> Iterator[str]:
@@ -235,21 +330,3 @@ def _provenance(job: SolvedRecording) -> Iterator[str]:
         ("solved", calibration.created),
     ]
     yield html.table(("", ""), rows)
-
-
-def _drawn_view(image: Pixels, found: Array, modelled: Array | None, width_px: int) -> bytes:
-    """JPEG of the image, brightened, with the found corners and lines towards the modelled ones."""
-    grey = to_grey(image)
-    scale = width_px / grey.shape[1]
-    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    bright = np.clip(small * (245.0 / max(float(np.percentile(small, 99.5)), 1.0)), 0, 255).astype(np.uint8)
-    canvas = cv2.cvtColor(bright, cv2.COLOR_GRAY2BGR)
-    misses = np.zeros(found.shape) if modelled is None else np.nan_to_num(modelled - found)
-    corners = (found + 0.5) * scale - 0.5
-    ends = corners + np.clip(MAGNIFIED * scale * misses, -width_px, width_px)
-    for corner, end in zip(
-        *(np.rint(16 * ways).astype(int).tolist() for ways in (corners, ends)), strict=True
-    ):
-        cv2.circle(canvas, corner, 16 * width_px // 80, (51, 230, 26), 1, cv2.LINE_AA, 4)
-        cv2.line(canvas, corner, end, (26, 204, 255), 2, cv2.LINE_AA, 4)
-    return cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 65])[1].tobytes()

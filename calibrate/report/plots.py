@@ -15,8 +15,8 @@ from calibrate.geometry import Array
 from recordings.schema.messages import CameraModel
 
 _BLUE, _RED, _GREY, _ORANGE = "#0969da", "#b42318", "#8c959f", "#bc4c00"
-_DPI = 120
-"""Resolution of clouds of points, which would be most of the page as lines."""
+FIELDS = (8, 6)
+"""Columns and rows of fields into which the image is divided."""
 STYLE: Any = {
     "svg.hashsalt": "report",
     "svg.fonttype": "none",
@@ -31,23 +31,21 @@ STYLE: Any = {
 
 
 Axes: TypeAlias = Any
-"""Matplotlib's Axes, or an array of them."""
+"""Matplotlib's Axes."""
 P = ParamSpec("P")
 
 
-def drawn(
-    width: float, height: float, columns: int = 1, *, grid: bool = True
-) -> Callable[[Callable[Concatenate[Axes, P], None]], Callable[P, str]]:
+def drawn(width: float, height: float) -> Callable[[Callable[Concatenate[Axes, P], None]], Callable[P, str]]:
     """Make a function that fills axes one that returns them as SVG; sizes in inches."""
 
     def decorate(fill: Callable[Concatenate[Axes, P], None]) -> Callable[P, str]:
         @wraps(fill)
         def svg(*args: P.args, **named: P.kwargs) -> str:
             buffer = io.StringIO()
-            with matplotlib.rc_context(STYLE | {"axes.grid": grid}):
+            with matplotlib.rc_context(STYLE):
                 figure = Figure(figsize=(width, height), layout="constrained")
-                fill(figure.subplots(1, columns), *args, **named)
-                figure.savefig(buffer, format="svg", dpi=_DPI, metadata={"Date": None, "Creator": None})
+                fill(figure.subplots(), *args, **named)
+                figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
             text = buffer.getvalue()
             return text[text.index("<svg") :]
 
@@ -56,44 +54,43 @@ def drawn(
     return decorate
 
 
-@drawn(10, 2.6, 2)
-def residuals_by_view(
-    axes: Axes, residual_px: Mapping[int, float], robot_mm: Mapping[int, float], limit_px: float | None
-) -> None:
-    """Bars per pose: RMS of the corners, and pose residual of the robot."""
-    for axis, values, unit in (
-        (axes[0], residual_px, "corners, px rms"),
-        (axes[1], robot_mm, "robot, mm"),
-    ):
-        axis.bar([str(k + 1) for k in values], list(values.values()), color=_BLUE)
-        axis.set_xlabel("pose")
-        axis.set_ylabel(unit)
-        axis.tick_params(axis="x", labelsize=7)
-    if limit_px is not None and residual_px and max(residual_px.values()) > 0.3 * limit_px:
-        axes[0].axhline(limit_px, color=_RED, linewidth=1)
-
-
-@drawn(10, 3.6, 2)
-def residual_scatter(axes: Axes, misses: Array, pixels: Array, camera: CameraModel) -> None:
-    """Residuals of the corners (n, 2) px: round zero, and over the image as arrows."""
-    reach = float(np.abs(misses).max(initial=1e-3)) * 1.05
-    axes[0].scatter(misses[:, 0], misses[:, 1], s=3, color=_BLUE, alpha=0.5, linewidths=0, rasterized=True)
-    axes[0].set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x miss, px", ylabel="y miss, px")
-    axes[0].set_aspect("equal")
-    sigma = float(np.sqrt(np.square(misses).mean()))
-    angle = np.linspace(0, 2 * np.pi, 100)
-    for k in (1, 2, 3):
-        axes[0].plot(k * sigma * np.cos(angle), k * sigma * np.sin(angle), color=_RED, linewidth=1)
-    keep = np.linspace(0, len(pixels) - 1, min(len(pixels), 1500)).astype(int)
-    axes[1].quiver(
-        pixels[keep, 0],
-        pixels[keep, 1],
-        misses[keep, 0],
-        misses[keep, 1],
-        angles="xy",
-        color=_BLUE,
-        width=0.0015,
-        rasterized=True,
+@drawn(4.6, 1.9)
+def by_view(axes: Axes, values: Mapping[int, float], unit: str, limit: float | None = None) -> None:
+    """A bar for each pose, the largest marked; the limit where it is near."""
+    largest = max(values, key=lambda index: values[index])
+    axes.bar(
+        [index + 1 for index in values],
+        list(values.values()),
+        color=[_ORANGE if index == largest else _BLUE for index in values],
     )
-    axes[1].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
-    axes[1].set_aspect("equal")
+    axes.set(xlabel="pose", ylabel=unit)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    if limit is not None and values[largest] > 0.3 * limit:
+        axes.axhline(limit, color=_RED, linewidth=1.5)
+
+
+@drawn(4.6, 1.9)
+def shares(axes: Axes, values: Mapping[str, float]) -> None:
+    """A bar for each source with its share, the largest above."""
+    bars = axes.barh(list(values), [100 * share for share in values.values()], color=_BLUE)
+    axes.bar_label(bars, fmt="%.0f %%", padding=3)
+    axes.set(xlim=(0, 118 * max(values.values())), xticks=[])
+    axes.invert_yaxis()
+    axes.grid(False)
+
+
+@drawn(4.6, 1.9)
+def field_misses(axes: Axes, middles: Array, misses: Array, camera: CameraModel) -> None:
+    """An arrow for each field of the image: mean miss (n, 2) px at `middles` (n, 2).
+
+    A quarter of a pixel, or the largest where that is more, is as long as a field.
+    """
+    longest = max(0.25, float(np.linalg.norm(misses, axis=1).max(initial=0.0)))
+    scale = longest * FIELDS[0] / camera.width
+    axes.scatter(*middles.T, s=6, color=_GREY)
+    axes.quiver(*middles.T, *misses.T, angles="xy", scale_units="xy", scale=scale, color=_ORANGE, width=0.006)
+    axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), xticks=[], yticks=[])
+    axes.set_aspect("equal")
+    axes.grid(False)
+    for spine in axes.spines.values():
+        spine.set_visible(True)

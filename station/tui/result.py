@@ -16,7 +16,7 @@ from textual.content import Content
 from textual.widgets import DataTable, Static
 
 from calibrate.files.calibration import Calibration
-from calibrate.files.formatting import arm_sentences, error_text, figures, noise_text
+from calibrate.files.formatting import accuracy_text, arm_sentences, figures, noise_text, use_text
 from calibrate.files.install import change_text
 from calibrate.files.touch import LIMIT_SIGMAS, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import ValidityState, validity_text
@@ -51,7 +51,9 @@ def verdict_lines(result: Result) -> Content:
         state = result.state.held
     elif before:
         state = "installed before"
-    said = failed[0].text.partition(" FAIL")[0] if failed else error_text(calibration)
+    said = use_text(calibration)
+    if result.verdict == "PASS WITH A REASON" and not failed:
+        said = accuracy_text(calibration)
     rows = [Content.styled(f"{SIGNS[result.verdict]} {result.verdict}, {state}\n{said}", "bold")]
     if result.installed and (validity := result.state.validity) is not None:
         doubted = validity.state is not ValidityState.VALID

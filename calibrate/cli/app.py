@@ -61,18 +61,23 @@ COMMANDS = {
         ("calibrate rollback --reason 'camera was knocked'", "calibrate rollback 3"),
         gone=_ONE_KIND,
     ),
-    "withdraw": LazyCommand(f"{_FILES}:withdraw", ("calibrate withdraw 'a pallet hit the camera'",)),
+    "withdraw": LazyCommand(
+        f"{_FILES}:withdraw", ("calibrate withdraw 'a pallet hit the camera'",), rare=True
+    ),
     "metrics": LazyCommand(
         "calibrate.cli.metrics:metrics",
         ("calibrate metrics", "calibrate metrics -o /var/lib/node_exporter/calibration.prom"),
+        rare=True,
     ),
-    "follow": LazyCommand("calibrate.cli.follow:follow", ("calibrate follow --camera overhead",)),
+    "follow": LazyCommand("calibrate.cli.follow:follow", ("calibrate follow --camera overhead",), rare=True),
     "drift-check": LazyCommand(
         "calibrate.cli.drift_check:drift_check",
         ("calibrate drift-check later.mcap", "calibrate drift-check production-pictures --board tag.yaml"),
     ),
     "annotate": LazyCommand(
-        "calibrate.cli.annotate:annotate", ("calibrate annotate session.mcap calibration.yaml -o seen.mcap",)
+        "calibrate.cli.annotate:annotate",
+        ("calibrate annotate session.mcap calibration.yaml -o seen.mcap",),
+        rare=True,
     ),
     "board": LazyCommand(
         "calibrate.cli.board:board",
@@ -95,15 +100,13 @@ COMMANDS = {
                 "Name it in Dask's configuration: distributed.comm.tls.",
             ),
         },
+        rare=True,
     ),
 }
 CALIBRATE = LazyGroup(
     COMMANDS,
-    help="From a recording to a calibration that can be trusted, installed and undone.\n\n"
-    "First: calibrate solve REC -o cell.yaml --report cell.html, then calibrate install cell.yaml. Your own "
-    "images become a recording by: recordings import FOLDER -o REC.",
-    epilog="Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 done with loss, 4 a gate or a "
-    "drift check failed.",
+    help="From a recording to a calibration that can be trusted, installed and undone.",
+    epilog="Exit codes: 0 good, 1 failed, 2 usage, 3 done with loss, 4 gate failed.",
     gone={
         "check": "Use drift-check.",
         "diff": "`calibrate show` shows each; `calibrate install` tells how far it is from the one before.",

@@ -48,7 +48,7 @@ def named_or_installed(
 def show(
     file: Named = None, root: Root = None, camera: CameraName = MAIN_CAMERA, as_json: AsJson = False
 ) -> None:
-    """Show a calibration: verdict, result, gates; of the installed one whether it still holds."""
+    """Show a calibration: verdict, result, gates, validity."""
     calibration, validity = named_or_installed(file, root, camera)
     if as_json:
         plain = msgspec.to_builtins(calibration)

@@ -57,4 +57,5 @@ def detection_progress() -> Iterator[LoadProgress | None]:
 def _progress_line(done: int, total: int, name: str) -> None:
     if done == total or done % 5 == 0:
         sys.stderr.write(f"finding the board: {done} of {total}\n")
+        sys.stderr.write("computing: some seconds, more for many images\n" * (done == total))
         sys.stderr.flush()

@@ -50,7 +50,7 @@ def export_command(
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Write images and poses, CSV tables, a ROS 2 bag, or a smaller recording.
+    """Write images and poses, tables, a ROS 2 bag, or an excerpt.
 
     An excerpt solves like the whole: its images are lossless PNG, its robot states those around the images.
     """

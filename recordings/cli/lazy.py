@@ -31,6 +31,9 @@ _EXTRAS = {
 """Packages that only some commands need, and the extra that brings each."""
 
 
+ALL = "`COMMAND -h`: its options. `--all`: every command. `--version`."
+
+
 class GoneError(CodedError):
     """A command or an option of an earlier release is asked for."""
 
@@ -47,6 +50,8 @@ class LazyCommand(NamedTuple):
     """Command lines as a person types them, a remark behind `#`."""
     gone: Mapping[str, str] = {}
     """Options that are no more, and what to do instead."""
+    rare: bool = False
+    """Listed by `--all` only."""
 
     def first_line(self) -> str:
         """First line of the function's docstring, by its source: importing it may take a second."""
@@ -85,7 +90,7 @@ class LazyGroup(TyperGroup):
         super().__init__(
             commands={name: TyperCommand(name) for name in commands},
             help=help,
-            epilog=epilog,
+            epilog=f"{ALL}\n\n{epilog}",
             no_args_is_help=True,
             rich_markup_mode="markdown",
             context_settings=_HELP_KEYS,
@@ -99,6 +104,19 @@ class LazyGroup(TyperGroup):
         if stub is not None and stub.help is None:
             stub.help = self._lazy[cmd_name].first_line()
         return stub
+
+    def get_help_option(self, ctx: Any) -> Any:
+        """Known to all, so not listed."""
+        option = super().get_help_option(ctx)
+        if option is not None:
+            option.hidden = True
+        return option
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """The commands that people use; with `--all` every one."""
+        for name, command in self._lazy.items():
+            self.commands[name].hidden = command.rare and not ctx.params.get("every")
+        super().format_help(ctx, formatter)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The loaded command in place of its line in the group's help."""
@@ -120,19 +138,32 @@ def _print_version(asked: bool) -> None:
         raise typer.Exit
 
 
+def _print_all(ctx: typer.Context, asked: bool) -> None:
+    if asked:
+        ctx.params["every"] = True
+        print(ctx.get_help())
+        raise typer.Exit
+
+
 def _options(
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+    ] = False,
+    every: Annotated[
+        bool, typer.Option("--all", is_eager=True, callback=_print_all, help="Show every command.")
     ] = False,
 ) -> None:
     pass
 
 
 def _group_options() -> list[Any]:
-    """`--version`, and the options that install a shell's completion."""
+    """`--version`, `--all` and a shell's completion, which no help lists: it fits on one screen."""
     app = typer.Typer()
     app.callback()(_options)
-    return list(get_command(app).params)
+    options: list[Any] = list(get_command(app).params)
+    for option in options:
+        option.hidden = True
+    return options
 
 
 def _refuse_gone(word: str, gone: Mapping[str, str]) -> None:

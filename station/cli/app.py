@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from recordings.cli.lazy import LazyCommand, LazyGroup, examples
+from recordings.cli.lazy import LazyCommand, LazyGroup
 
 _APPROVED = {"--go": "Use --approve."}
 _PLAN_DRAWN = "Plan (2) on the screen draws the plan and turns it."
@@ -55,14 +55,18 @@ STATION = LazyGroup(
             "station.cli.control:status_command", ("station status", "station status --json")
         ),
         "stop": LazyCommand("station.cli.control:stop_command", ("station stop",)),
-        "acknowledge": LazyCommand("station.cli.control:acknowledge_command", ("station acknowledge",)),
-        "pause": LazyCommand("station.cli.control:pause_command", ("station pause",)),
-        "resume": LazyCommand("station.cli.session:resume_command", ("station resume",), _APPROVED),
-        "finish": LazyCommand("station.cli.control:finish_command", ("station finish",)),
-        "retake": LazyCommand(
-            "station.cli.control:retake_command", ("station retake 7  # then: station resume",)
+        "acknowledge": LazyCommand(
+            "station.cli.control:acknowledge_command", ("station acknowledge",), rare=True
         ),
-        "skip": LazyCommand("station.cli.control:skip_command", ("station skip 7",)),
+        "pause": LazyCommand("station.cli.control:pause_command", ("station pause",), rare=True),
+        "resume": LazyCommand(
+            "station.cli.session:resume_command", ("station resume",), _APPROVED, rare=True
+        ),
+        "finish": LazyCommand("station.cli.control:finish_command", ("station finish",), rare=True),
+        "retake": LazyCommand(
+            "station.cli.control:retake_command", ("station retake 7  # then: station resume",), rare=True
+        ),
+        "skip": LazyCommand("station.cli.control:skip_command", ("station skip 7",), rare=True),
         "drift-check": LazyCommand(
             "station.cli.session:drift_check_command",
             ("station drift-check", "station drift-check --poses 12"),
@@ -71,6 +75,7 @@ STATION = LazyGroup(
         "accept": LazyCommand(
             "station.cli.accept:accept_command",
             ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.25"),
+            rare=True,
         ),
         "new": LazyCommand("station.cli.new:new_command", ("station new", "station new -o station.yaml")),
         "doctor": LazyCommand(
@@ -88,14 +93,6 @@ STATION = LazyGroup(
         "watch": "`calibrate drift-check FOLDER` tests production pictures; run it from a timer.",
         "trace": "The simulated controller's limits are in the docs: The simulator.",
     },
-    help="A calibration station for a robot cell. Without a command: the operator screen.",
-    epilog=examples(
-        "station demo  # first time: everything, with no hardware",
-        "station new  # a cell: its configuration, and a rehearsal of it",
-        "station  # the screen of the cell",
-        "station plan --config station.yaml -o plan.yaml  # without a screen",
-        "station capture --plan plan.yaml  # then: calibrate solve RECORDING",
-    )
-    + "\n\nExit codes: 0 good, 1 failed or stopped, 2 wrong usage or configuration, 3 done with loss, 4 a "
-    "gate failed or the drift check failed.",
+    help="A calibration station for a robot cell. Alone: the operator's screen.",
+    epilog="Exit codes: 0 good, 1 failed, 2 usage, 3 done with loss, 4 gate failed.",
 )

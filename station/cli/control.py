@@ -142,7 +142,7 @@ def doctor_command(
     config: Annotated[Path | None, typer.Option(help="Only check this configuration; no daemon.")] = None,
     example: Annotated[bool, typer.Option("--example", help="Print a configuration to start from.")] = False,
 ) -> None:
-    """Check everything a capture needs; say how to mend what is missing.
+    """Check what a capture needs; say how to mend what is missing.
 
     Nothing moves. Without options it asks the daemon. For a new cell: print an example, write the cell into
     it, check it, then `station serve --config station.yaml`.

@@ -82,7 +82,7 @@ def demo_command(
     as_json: AsJson = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
 ) -> None:
-    """Run the whole job on a simulated cell and compare with the truth.
+    """Run the whole job on a simulated cell: no hardware needed.
 
     Takes about a minute and ends with the paths of recording, calibration and report (open it in a browser).
     The same cell to play with: `station`.

@@ -32,7 +32,7 @@ def capture_command(
     socket: Socket = None,
     as_json: AsJson = False,
 ) -> None:
-    """Capture all poses of a plan into a recording. Ctrl-C stops the arm.
+    """Capture the poses of a plan. Ctrl-C stops the arm.
 
     Shows what would move and asks. Next: `calibrate solve RECORDING`. With nobody there a real arm needs
     `--headless --approve HASH`: the hash that `station plan --json` prints, given as a user that the
@@ -65,7 +65,7 @@ def drift_check_command(
     approve: Approve = "",
     socket: Socket = None,
 ) -> None:
-    """Check on a few new poses whether the installed calibration holds.
+    """Check by a few new poses that the calibration holds.
 
     The board may lie elsewhere by now. Eight poses detect a shift of 0.5 mm or 0.1° on a usual cell, five on
     a quiet one; where they do not, it says how many more would. Ctrl-C stops the arm.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 import subprocess
 import sys
 from typing import Any
@@ -9,6 +11,7 @@ from typing import Any
 import pytest
 import typer
 
+from recordings.cli.lazy import LazyGroup
 from station.cli.app import STATION
 
 
@@ -40,3 +43,19 @@ def test_a_command_loads_what_it_needs_alone(argument: str, foreign: tuple[str, 
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
+
+
+@pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
+def test_help_fits_on_a_small_terminal_and_all_lists_every_command(program: str) -> None:
+    def told(option: str) -> list[str]:
+        command = [sys.executable, "-m", f"{program}.cli", option]
+        small = {**os.environ, "COLUMNS": "80"}
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=small)
+        return done.stdout.splitlines()
+
+    group: LazyGroup = getattr(importlib.import_module(f"{program}.cli.app"), program.upper())
+    common = {name for name, command in group._lazy.items() if not command.rare}
+    for option, names in (("--help", common), ("--all", set(group.commands))):
+        assert {line.split()[1] for line in told(option) if line.startswith("│")} >= names
+    assert len(told("--help")) < 24
+    assert not any(f"│ {name} " in line for name in set(group.commands) - common for line in told("--help"))

@@ -24,6 +24,7 @@ from station.devices.discovery import discover, discover_usb
 from station.devices.ur_dashboard import STOP, DashboardError
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import identify, open_dashboard, unsupported_model
+from station.devices.webcam import WebcamCamera, discover_webcams
 from station.operate.draft import ArmReader, CameraChoice, CameraReader
 
 
@@ -44,12 +45,15 @@ class GuidedArm(UrLink):
                 err.print(str(problem))
 
 
-class GenicamReader:
-    """`draft.CameraReader` over the GenICam driver."""
+_DRIVERS: dict[str, type[AravisCamera | WebcamCamera]] = {"aravis": AravisCamera, "webcam": WebcamCamera}
 
-    def __init__(self, device: str) -> None:
-        self._config = CameraConfig(device=device)
-        self._camera = AravisCamera(self._config)
+
+class OpenCamera:
+    """`draft.CameraReader` over a driver."""
+
+    def __init__(self, found: CameraChoice) -> None:
+        self._config = CameraConfig(driver=found.driver, device=found.device)  # type: ignore[arg-type]
+        self._camera = _DRIVERS[found.driver](self._config)
         self._changing = asyncio.Lock()
 
     @property
@@ -69,7 +73,7 @@ class GenicamReader:
         async with self._changing:
             await self._camera.close()
             self._config = msgspec.structs.replace(self._config, exposure_us=round(exposure_us, 1))
-            self._camera = AravisCamera(self._config)
+            self._camera = type(self._camera)(self._config)
             await self._camera.open()
 
     async def close(self) -> None:
@@ -96,11 +100,13 @@ class RealHardware:
 
     async def cameras(self) -> tuple[CameraChoice, ...]:
         network, usb = await asyncio.to_thread(lambda: (discover(), discover_usb()))
-        found = [(c.model, c.serial) for c in network] + [(c.model, c.serial) for c in usb]
-        return tuple(CameraChoice("aravis", serial, f"{model} {serial}") for model, serial in found)
+        known = [(c.model, c.serial) for c in network] + [(c.model, c.serial) for c in usb]
+        genicam = [CameraChoice("aravis", serial, f"{model} {serial}") for model, serial in known]
+        webcams = [CameraChoice("webcam", node, f"{name}, webcam") for node, name in discover_webcams()]
+        return (*genicam, *webcams)
 
     async def camera(self, found: CameraChoice) -> CameraReader:
-        reader = GenicamReader(found.device)
+        reader = OpenCamera(found)
         await reader.open()
         return reader
 

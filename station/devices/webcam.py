@@ -234,6 +234,16 @@ def _readable(video: cv2.VideoCapture) -> dict[str, float]:
     return {name: value for name, value in known.items() if value > 0 and not (automatic and name != "focus")}
 
 
+def discover_webcams(system: Path = _SYSTEM) -> list[tuple[str, str]]:
+    """List device file and name of each camera of the kernel, without its further nodes for metadata."""
+    nodes = sorted(system.glob("video*"), key=lambda node: int(node.name.removeprefix("video")))
+    return [
+        (f"/dev/{node.name}", kernel_text(node / "name") or node.name)
+        for node in nodes
+        if kernel_text(node / "index") in ("", "0")
+    ]
+
+
 def _identity(device: str) -> CameraIdentity:
     """Make the identity from the kernel's data; without a serial number, from the path."""
     node = f"video{device}" if device.isdecimal() else Path(device).resolve().name

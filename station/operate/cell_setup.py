@@ -9,7 +9,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from calibrate.boards.corners import to_grey
 from calibrate.boards.detect import Detection, detect
+from calibrate.boards.grids import seen_size
 from calibrate.geometry import Array
 from recordings.schema.messages import BoardSpec, Image, Mount, RobotState
 from station.cell.errors import RobotError, StationError
@@ -49,6 +51,8 @@ class CellSetup:
         self._moved_s = time.monotonic()
         self.seen: tuple[float, Detection] | None = None
         """Time at which the newest image was requested, and the board in it."""
+        self.counts: tuple[int, int] | None = None
+        """Inner corners of a chessboard in the image, counted while no board is known."""
         self.trouble = ""
         """What is wrong with the newest image; empty: nothing."""
 
@@ -129,6 +133,8 @@ class CellSetup:
     def look(self, begun_s: float, image: Image, step: CellStep) -> Detection | None:
         """Look for the board; None in steps that do not ask for it. A tenth of a second, in any thread."""
         board = self.draft.board
+        if board is None and step is CellStep.BOARD and self.counts is None:
+            self.counts = seen_size(to_grey(image.pixels))
         if board is None or step not in _LOOKED_FOR:
             return None
         found = detect(image.pixels, board, step is CellStep.BOARD and self.seen is None)
@@ -157,14 +163,26 @@ class CellSetup:
     def drop_view(self) -> None:
         self.change(views=self.draft.views[:-1], written="")
 
+    def correct_mount(self) -> bool:
+        """Take the other mounting where the views fit it far better; tell whether they did."""
+        if self.found is None or not self.found.other_fits:
+            return False
+        self.mount = "eye-to-hand" if self.mount == "eye-in-hand" else "eye-in-hand"
+        self.set_mount()
+        return True
+
     def set_mount(self) -> None:
         """Save the selected mounting."""
         if self.draft.mount != self.mount:
             self.change(mount=self.mount, written="")
 
     def set_board(self, board: BoardSpec) -> None:
-        self.seen = None
-        self.keep(self.draft.without_views(board=board))
+        """Save the board; views stay when only its sizes are others."""
+        self.seen, before = None, self.draft.board
+        sizes = {"square_m": board.square_m, "marker_m": board.marker_m}
+        self._found(
+            before is not None and msgspec.structs.replace(before, **sizes) == board, board=board, written=""
+        )
 
     async def stop(self) -> None:
         if self.arm is not None:

@@ -118,7 +118,7 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
 
     def without_views(self, **changes: object) -> Draft:
         """Return the draft with changes, and without the views, which they invalidate."""
-        return msgspec.structs.replace(self, views=(), written="", **changes)
+        return msgspec.structs.replace(self, **{"views": (), "written": "", **changes})
 
 
 def load_draft(root: Path) -> Draft:

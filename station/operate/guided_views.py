@@ -160,8 +160,8 @@ class FoundCell:
             return "These views fit the other drawing (step 3): the camera is mounted the other way."
         if self.cause == "square-size":
             return (
-                f"By the arm's travel the squares are {self.scale:.2f} times as large as stated (step 4). "
-                "Measure one square."
+                f"By the arm's travel the squares are {self.scale:.2f} times as large as stated. "
+                "Measure one: step 4 (PgUp) holds the corrected size, and the views stay."
             )
         if self.cause == "moved":
             return (

@@ -7,6 +7,7 @@ that the person can interrupt and continue later.
 from __future__ import annotations
 
 import re
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,8 @@ def read_board(text: str) -> BoardSpec:
     Other kinds are named first; marker size (charuco) or gap (april-grid) and dictionary come last, unless
     the defaults: 'charuco 8x6 30 22 DICT_5X5_100'. Raises ConfigError, BoardError.
     """
-    words = re.sub(r"(?<=\d) *mm|,", " ", text.replace("×", "x")).split()
+    in_mm = re.sub(r"(\d+(?:\.\d+)?) *cm\b", lambda cm: f"{10 * float(cm[1]):g}", text.replace("×", "x"))
+    words = re.sub(r"(?<=\d) *mm|,", " ", in_mm).split()
     try:
         kind = BoardKind.CHESSBOARD if words[0][0].isdigit() else BoardKind(words.pop(0).lower())
         columns, rows = (int(part) for part in words[0].lower().split("x"))
@@ -110,6 +112,16 @@ def read_board(text: str) -> BoardSpec:
     board = BoardSpec(kind, columns, rows, size_m, marker[0] if marker else usual_m, dictionary or usual)
     check_board(board)
     return board
+
+
+def check_address(text: str) -> None:
+    """ConfigError for an address in numbers that is none; names are left to the network."""
+    address = text.partition(" ")[0]
+    if re.fullmatch(r"[\d.]+", address):
+        try:
+            IPv4Address(address)
+        except ValueError:
+            raise ConfigError("no-address-typed", typed=address) from None
 
 
 def board_words(board: BoardSpec) -> str:

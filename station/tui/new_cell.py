@@ -150,7 +150,12 @@ class NewCell(ThemedApp[Ending]):
         image = await self.setup.camera.glimpse()
         if image is None:
             return
+        counted = self.setup.counts
         found = await asyncio.to_thread(self.setup.look, begun_s, image, step)
+        line = self.query_one("#typed", Input)
+        if step is self.step is CellStep.BOARD and self.setup.counts != counted and not line.value:
+            line.value = typed(self.setup, step)
+            line.cursor_position = len(line.value)
         pane = self.query_one(PreviewPane)
         if pane.display:
             self._pictures += 1
@@ -163,6 +168,8 @@ class NewCell(ThemedApp[Ending]):
     def _add_view(self) -> None:
         self.setup.take_view()
         self.bell()
+        if self.setup.correct_mount():
+            self.notify("The views fit the other drawing: step 3 is corrected.")
         self._tell_found()
         if enough(self.setup.draft):
             self.step = flow.next_step(self.setup.draft)
@@ -280,7 +287,10 @@ class NewCell(ThemedApp[Ending]):
         bar.append(dim("  Your hand moves the arm, never this wizard."))
         self._say("#bar", fitting(bar, width))
         self._say("#rail", rail_line(self._rail(), self.step, width))
-        self._say("#next", next_line(next_of(setup, self.step), width))
+        self._say(
+            "#next",
+            next_line(next_of(setup, self.step, self.query_one("#typed", Input).value.strip()), width),
+        )
         self._say("#live-lines", "\n".join(live_lines(setup, self.step)))
 
     def _rail(self) -> tuple[Step, ...]:

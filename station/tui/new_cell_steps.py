@@ -6,6 +6,8 @@ import asyncio
 import math
 from dataclasses import dataclass
 
+import msgspec
+
 from calibrate.boards.model import describe_board
 from recordings.errors import CodedError
 from recordings.schema.messages import Mount
@@ -72,6 +74,8 @@ REMOTE_OFF = (
     "The station can drive the arm only in Remote Control: ☰ → Settings → System → Remote Control → Enable, "
     "then the icon top right → Remote Control."
 )
+_TINY_M = 0.005
+"""Squares below this size are rare: the number may be one of centimetres."""
 WRITTEN = "Written. F9 rehearses the whole job in simulation, Enter opens the cell."
 
 
@@ -87,16 +91,23 @@ def about(setup: CellSetup, step: CellStep) -> str:
 
 def typed(setup: CellSetup, step: CellStep) -> str:
     """Return the text that the input line begins with."""
-    if step is CellStep.BOARD and setup.draft.board is not None:
-        return flow.board_words(setup.draft.board)
+    if step is CellStep.BOARD and (board := setup.draft.board) is not None:
+        if (found := setup.found) is not None and found.cause == "square-size":
+            board = msgspec.structs.replace(board, square_m=round(board.square_m * found.scale, 4))
+        return flow.board_words(board)
+    if step is CellStep.BOARD and setup.counts is not None:
+        return "{}x{} ".format(*setup.counts)
     return setup.draft.host if step is CellStep.ROBOT else ""
 
 
-def next_of(setup: CellSetup, step: CellStep) -> Action:
+def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
+    """Choose the next action; `text`: what is typed, as it is understood so far."""
     draft = setup.draft
     match step:
         case CellStep.ROBOT if setup.arm is None:
-            return Action("", "Type the address", "then Enter.")
+            wrong = any(part.isdecimal() and int(part) > 255 for part in text.split(".")[:4])
+            why = "Numbers of an address go up to 255." if wrong else "then Enter."
+            return Action("", "Type the address", why, look=wrong)
         case CellStep.ROBOT:
             return Action("Enter", "On to the camera", "The arm is read.")
         case CellStep.CAMERA if setup.camera is None:
@@ -105,8 +116,8 @@ def next_of(setup: CellSetup, step: CellStep) -> Action:
             return Action("Enter", "This camera", "")
         case CellStep.MOUNTING:
             return Action("Enter", DRAWINGS[setup.mount][0][3:], "Left and Right mark the other drawing.")
-        case CellStep.BOARD if draft.board is None:
-            return Action("", "Type the board", "then Enter.")
+        case CellStep.BOARD if draft.board is None or text != flow.board_words(draft.board):
+            return _board_typed(setup, text)
         case CellStep.BOARD:
             return Action("Enter", "This board", "Lay it so that the camera sees it.")
         case CellStep.VIEWS:
@@ -117,6 +128,18 @@ def next_of(setup: CellSetup, step: CellStep) -> Action:
         case _ if not draft.written:
             return Action("Enter", "Write the file", "")
     return Action("Enter", "Open this cell", "Or F9: rehearse it first; nothing real moves.")
+
+
+def _board_typed(setup: CellSetup, text: str) -> Action:
+    try:
+        board = flow.read_board(text)
+    except CodedError:
+        if setup.counts is not None and text == typed(setup, CellStep.BOARD).strip():
+            return Action("", "Type the size of a square in mm", "The corners were counted in the image.")
+        return Action("", "Type the board", "then Enter.")
+    tiny = board.square_m < _TINY_M
+    why = "So small? Centimetres are typed as 2.3cm." if tiny else "Measure one square."
+    return Action("Enter", describe_board(board), why, look=tiny)
 
 
 def live_lines(setup: CellSetup, step: CellStep) -> list[str]:
@@ -169,6 +192,7 @@ async def accept(setup: CellSetup, step: CellStep, text: str) -> bool:
     match step:
         case CellStep.ROBOT:
             if text and (setup.arm is None or text != draft.host):
+                flow.check_address(text)
                 await setup.connect(text)
             return setup.arm is not None
         case CellStep.CAMERA:
@@ -177,7 +201,7 @@ async def accept(setup: CellSetup, step: CellStep, text: str) -> bool:
             setup.set_mount()
             return True
         case CellStep.BOARD:
-            if text and text != typed(setup, step):
+            if text and (draft.board is None or text != flow.board_words(draft.board)):
                 setup.set_board(flow.read_board(text))  # the next Enter goes on
                 return False
             return draft.board is not None

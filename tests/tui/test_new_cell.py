@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from textual.pilot import Pilot
-from textual.widgets import Static
+from textual.widgets import Input, Static
 
 from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec
@@ -93,7 +93,11 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
             await person.until_step(CellStep.MOUNTING)
             await person.press("enter")
             await person.until_step(CellStep.BOARD)
-            await person.type("8x5 23")
+            await until(pilot, lambda: app.setup.counts == (8, 5), "the corners were not counted")
+            await until(
+                pilot, lambda: app.query_one("#typed", Input).value == "8x5 ", "nothing was filled in"
+            )
+            await person.type("2.3cm")
             await person.press("enter")
             await until(
                 pilot, lambda: app.setup.seen is not None and app.setup.seen[1].found, "the board is not seen"

@@ -11,7 +11,7 @@ import pytest
 
 from station.cell.config import CameraConfig, CaptureConfig
 from station.devices import webcam
-from station.devices.webcam import WebcamCamera
+from station.devices.webcam import WebcamCamera, discover_webcams
 from tests.codes import raises
 
 SIZE = (240, 320)
@@ -153,3 +153,16 @@ async def test_a_webcam_of_this_machine() -> None:
     first, second = await camera.capture(), await camera.capture()
     assert second.sequence == first.sequence + 1 and first.pixels.size
     await camera.close()
+
+
+def test_the_kernels_cameras_are_listed_without_their_nodes_for_metadata(tmp_path: Path) -> None:
+    for node, name, index in (
+        ("video10", "Late cam", "0"),
+        ("video2", "HD cam", "0"),
+        ("video3", "HD cam", "1"),
+    ):
+        (tmp_path / node).mkdir()
+        (tmp_path / node / "name").write_text(f"{name}\n")
+        (tmp_path / node / "index").write_text(f"{index}\n")
+    assert discover_webcams(tmp_path) == [("/dev/video2", "HD cam"), ("/dev/video10", "Late cam")]
+    assert discover_webcams(tmp_path / "none") == []

@@ -19,7 +19,8 @@ from station.cell.layout import layout_of
 from station.operate import draft as drafts
 from station.operate import guided_views
 from station.operate import new_cell as flow
-from station.operate.draft import CellStep, Draft
+from station.operate.cell_setup import CellSetup
+from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep, Draft
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.cells import make_cell
 from station.simulation.renderer import Light, render
@@ -107,6 +108,7 @@ def test_a_board_is_typed_as_people_write_it() -> None:
     assert (board.columns, board.rows, board.square_m) == (8, 5, 0.03)
     charuco = flow.read_board("ChArUco 8x6 30 20 dict_5x5_100")
     assert (charuco.kind, charuco.marker_m, charuco.dictionary) == (BoardKind.CHARUCO, 0.02, "DICT_5X5_100")
+    assert flow.read_board("8x5 2.3cm") == flow.read_board("8x5 2.3 cm") == flow.read_board("8x5 23")
     for wrong in (
         "",
         "8x5",
@@ -121,6 +123,53 @@ def test_a_board_is_typed_as_people_write_it() -> None:
             flow.read_board(wrong)
     with raises("board-marker"):
         flow.read_board("charuco 8x6 30 40")
+
+
+class NoHardware:
+    """`draft.Hardware` where nothing is asked for."""
+
+    async def arm(self, host: str) -> ArmReader:
+        raise NotImplementedError
+
+    async def cameras(self) -> tuple[CameraChoice, ...]:
+        raise NotImplementedError
+
+    async def camera(self, found: CameraChoice) -> CameraReader:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("wrong", ["192.168.1.300", "192.168.1", "1.2.3.4.5", "192.168..1"])
+def test_an_address_that_is_none_is_refused_before_it_is_asked(wrong: str) -> None:
+    for right in ("192.168.1.30", "192.168.1.30 UR10", "robot.local"):
+        flow.check_address(right)
+    with raises("no-address-typed"):
+        flow.check_address(wrong)
+
+
+def test_a_corrected_square_keeps_the_views_and_another_board_does_not(
+    done: tuple[Draft, object], tmp_path: Path
+) -> None:
+    setup = CellSetup(NoHardware(), tmp_path, tmp_path / "station.yaml")
+    setup.keep(done[0])
+    board = done[0].board
+    assert board is not None
+    setup.set_board(msgspec.structs.replace(board, square_m=1.05 * board.square_m))
+    assert setup.draft.views == done[0].views and not setup.draft.written
+    setup.set_board(msgspec.structs.replace(board, columns=board.columns + 1))
+    assert not setup.draft.views
+
+
+def test_views_that_fit_the_other_drawing_correct_the_mounting(
+    done: tuple[Draft, object], tmp_path: Path
+) -> None:
+    setup = CellSetup(NoHardware(), tmp_path, tmp_path / "station.yaml")
+    setup.keep(done[0])
+    setup.mount = done[0].mount or "eye-in-hand"
+    assert not setup.correct_mount()
+    setup.mount = "eye-to-hand" if done[0].mount == "eye-in-hand" else "eye-in-hand"
+    setup.set_mount()
+    assert setup.correct_mount() and setup.draft.mount == done[0].mount
+    assert setup.found is not None and setup.found.good
 
 
 BOARDS = ("8x5 23", "charuco 8x6 23", "circles 7x6 23", "asymmetric-circles 4x11 15", "april-grid 5x4 30 9")

@@ -120,7 +120,7 @@ class Session:
         if self.store.state is StationState.STOPPED:
             await self.context.cell.robot.stop(f"STOP by {who}")
             return
-        await self._halt(StationState.STOPPED, f"STOP by {who}. Look at the cell, then acknowledge.", "stop")
+        await self._halt(StationState.STOPPED, f"STOP by {who}.", "stop")
 
     async def lease_lost(self, client_id: int, how: str = "The connection of {} was lost.") -> None:
         """Stop the arm as the client in control is gone; going on needs a new approval."""

@@ -22,6 +22,7 @@ from station.protocol.client import ANSWER_S, Client
 from station.protocol.verbs import Verb
 from station.tui.task import Known
 from station.tui.themes import ThemedApp
+from station.tui.words import duration
 
 R = TypeVar("R")
 LISTEN_S = 0.5
@@ -133,13 +134,21 @@ class Desk:
         words = busy_words(verb)
         if words and self.known.busy:
             raise RefusedError("screen-busy", work=self.known.busy)
-        if words:
-            self.app.known = replace(self.known, busy=words)
+        if not words:
+            yield
+            return
+        begun_s = time.monotonic()
+
+        def tell() -> None:
+            self.app.known = replace(self.known, busy=f"{words} {duration(time.monotonic() - begun_s)}")
+
+        tell()
+        timer = self.app.set_interval(1.0, tell)
         try:
             yield
         finally:
-            if words:
-                self.app.known = replace(self.known, busy="")
+            timer.stop()
+            self.app.known = replace(self.known, busy="")
 
     async def attempt(self, work: Awaitable[R]) -> R | None:
         """Its result, or None after a notice that says why not."""

@@ -98,8 +98,7 @@ class Frame(Horizontal):
         yield StopBlock(id="stop")
 
     def _next(self, known: Known, width: int) -> Content:
-        action = self.question or next_action(known).on(self._mode)
-        return next_line(action, width - self.query_one(StopBlock).size.width)
+        return next_line(self.question or next_action(known).on(self._mode), width)
 
     def show(self, known: Known) -> None:
         for line in self.query(Line):

@@ -17,7 +17,7 @@ from station.tui.task import Known
 from station.tui.words import UNKNOWN, facts, mark, size
 
 NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
-COLUMNS = ("session", "what became of it", "verdict", "predicted", "held-out", "views", "size")
+COLUMNS = ("session", "what became of it", "verdict", "predicted error", "views", "size")
 
 
 class SessionsScreen(StationScreen):
@@ -85,12 +85,11 @@ class SessionsScreen(StationScreen):
 
 def _row(kept: Kept) -> tuple[Content, ...]:
     session, found, check = kept.session, kept.calibration, kept.check
-    predicted = held = UNKNOWN
+    predicted = UNKNOWN
     became, verdict = kept.word, mark("todo", "not solved")
     if found is not None:
         quality = found.quality
         predicted = UNKNOWN if quality.predicted_error_mm is None else f"± {quality.predicted_error_mm:.2f}"
-        held = UNKNOWN if quality.holdout is None else f"{1000 * quality.holdout.e_t_m:.2f}"
         verdict = mark("failed" if found.verdict == "FAIL" else "done", found.verdict)
         became = became or "solved, not installed"
     elif check is not None:
@@ -105,7 +104,6 @@ def _row(kept: Kept) -> tuple[Content, ...]:
         Content.styled(("● " if now else "") + became, style),
         verdict,
         facts(("", f"{predicted:>6}", "mm")),
-        facts(("", f"{held:>5}", "mm")),
         Content.styled(f"{session.views:>4}", "$foreground"),
         Content.styled(size(session.bytes), "$foreground"),
     )

@@ -48,9 +48,11 @@ def stopped_text(status: StationStatus) -> Content:
     )
     pendant = mark("look", held) if (held := robot.condition.held) else mark("done", "nothing to clear there")
     safety = Content.assemble(("safety ", "$dim"), (robot.condition.safety or UNKNOWN, "bold $strong"))
-    told = "The arm was told to stop. " if status.cause == "stop" else ""
+    rests = ""
+    if robot.connected and status.cause in ("stop", *STOPPED_BY):  # else its news may be old
+        rests = " The arm stands still." if robot.still else " The arm is told to stop."
     return lines(
-        Content.styled(STOPPED_BY.get(status.cause, told + status.reason), "bold $strong"),
+        Content.styled(f"{STOPPED_BY.get(status.cause, status.reason)}{rests}", "bold $strong"),
         Content(""),
         Content(saved),
         Content(""),

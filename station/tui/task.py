@@ -139,9 +139,7 @@ def _plan(status: StationStatus) -> Step:
     poses = status.session.poses
     if not poses:
         return Step("plan", "todo", "no plan yet")
-    end_mm = poses[-1].predicted_sigma_mm
-    expected = "" if end_mm is None else f", ± {end_mm:.2f} mm"
-    return Step("plan", "done", f"{many(len(poses), 'pose')}{expected}", str(len(poses)))
+    return Step("plan", "done", many(len(poses), "pose"), str(len(poses)))
 
 
 def _capture(status: StationStatus) -> Step:
@@ -209,9 +207,8 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     """Choose the action where the arm works or is held; None at rest."""
     state, held = status.state, status.robot.condition.held
     if state in LATCHED:
-        return Action(
-            "F8", "Acknowledge", status.reason or "Look at the cell first; nothing moves.", look=True
-        )
+        why = f"{status.reason} Look at the cell first; F8 moves nothing.".strip()
+        return Action("F8", "Acknowledge", why, look=True)
     if state is StationState.DISCONNECTED:
         why = status.reason or "The robot does not answer."
         return Action("1", "See what is missing", why, look=True)
@@ -243,8 +240,8 @@ def _at_rest(known: Known, status: StationStatus) -> Action:
     if missing is not None:
         return Action("1", f"Mend: {missing.name}", missing.remedy or missing.text, look=True)
     if session.poses and not session.recording:
-        asks = f"{many(len(session.poses), 'pose')}: F5 shows the motion and asks before the arm moves."
-        return Action("F5", "Start the capture", f"{status.reason} {asks}".strip())
+        asks = f"{status.reason} It shows the motion and asks before the arm moves.".strip()
+        return Action("F5", "Start the capture", asks)
     if result is not None:
         return _with_result(result, status)
     if not session.poses:

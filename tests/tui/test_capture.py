@@ -78,13 +78,19 @@ async def test_the_pose_under_way_is_told_by_its_number(link: FakeLink) -> None:
         await until(pilot, lambda: pilot.app.screen.query_one("#progress").border_title == "Pose 5 of 7")
 
 
-@pytest.mark.parametrize(
-    ("cause", "told"), [("stop", True), ("protective-stop", False), ("stale-state", False)]
-)
-def test_only_who_pressed_stop_told_the_arm_to_stop(cause: str, told: bool) -> None:
-    status = msgspec.structs.replace(idle(StationState.STOPPED, "why it stands"), cause=cause)
-    said = stopped_text(status).plain.splitlines()[0]
-    assert ("told to stop" in said) is told and ("why it stands" in said) is (cause != "protective-stop")
+@pytest.mark.parametrize("cause", ["stop", "protective-stop", "stale-state"])
+def test_the_card_says_that_the_arm_stands_only_where_it_is_known(cause: str) -> None:
+    status = msgspec.structs.replace(idle(StationState.STOPPED, "why it stopped"), cause=cause)
+
+    def said(**robot: object) -> str:
+        shown = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, **robot))
+        return stopped_text(shown).plain.splitlines()[0]
+
+    assert status.robot.connected
+    rests = said(still=True)
+    assert ("why it stopped" in rests) is (cause != "protective-stop")
+    assert (said(still=False) == rests) is (cause == "stale-state")
+    assert (said(still=True, state=None) == rests) is (cause == "stale-state")
 
 
 def test_the_error_falls_towards_its_goal() -> None:

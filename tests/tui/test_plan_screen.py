@@ -11,7 +11,6 @@ from station.cell.status import PoseStatus
 from station.protocol import verbs
 from station.tui.desk import busy_words
 from station.tui.plan_screen import facts_line
-from station.tui.task import Known, steps
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 
@@ -77,4 +76,3 @@ def test_the_error_at_the_end_is_that_of_the_last_pose_alone() -> None:
         session = msgspec.structs.replace(status.session, poses=tuple(poses))
         changed = msgspec.structs.replace(status, session=session)
         assert ("±" in facts_line(changed).plain) is shown
-        assert ("±" in steps(Known(changed))[1].text) is shown

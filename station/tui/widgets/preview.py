@@ -44,7 +44,9 @@ OLD = "OLD IMAGE"
 SMALLEST = (16, 16)
 """Pixels to ask for while no image is drawn: the daemon still looks for the board."""
 FEW_SHADES = " ░▒▓█"
-"""Shades of a console with 16 colours, whose backgrounds have no greys: one a cell."""
+"""Shades of a console with 16 colours, whose backgrounds have no greys: one a cell, dithered."""
+_BAYER = (np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]]) + 0.5) / 16
+"""Thresholds of ordered dithering. True greys are not dithered: each cell would need a style of its own."""
 
 
 def sharp_widget() -> Any:
@@ -191,7 +193,9 @@ class PreviewPane(Widget):
         if self.app.current_theme.ansi:
             # White on black, so that light is light on a white terminal too.
             few = Style() if self.app.no_color else Style(color="white", bgcolor="black")
-        cells = (shades[:, 0] * LEVELS + shades[:, 1] if few is None else shades.sum(axis=1)).tolist()
+        dark = np.tile(_BAYER, (rows // 8 + 1, columns // 4 + 1))[: rows // 2, :columns]
+        dithered = small.reshape(shades.shape).mean(axis=1) / 255 * (len(FEW_SHADES) - 1) + dark
+        cells = (shades[:, 0] * LEVELS + shades[:, 1] if few is None else dithered.astype(int)).tolist()
         for x, y in self._corners:
             row, column = int(y * rows) // 2, int(x * columns)
             if 0 <= row < rows // 2 and 0 <= column < columns:
@@ -209,7 +213,7 @@ def _runs(line: list[int], few: Style | None) -> list[Segment]:
         if cell == _CORNER:
             runs += [CORNER] * count
         elif few is not None:
-            runs.append(Segment(FEW_SHADES[cell * len(FEW_SHADES) // (2 * LEVELS - 1)] * count, few))
+            runs.append(Segment(FEW_SHADES[cell] * count, few))
         else:
             runs.append(Segment("▀" * count, _style(cell)))
     return runs

@@ -11,8 +11,10 @@ import pytest
 from recordings.schema.messages import ClockReading
 from station.devices.frame_time import DeviceClock, by_clock
 from station.simulation.camera import RenderedCamera
+from tests.faults.conftest import LOOP
 
 
+@LOOP
 @pytest.mark.process
 async def test_24_an_ntp_step_of_an_hour_moves_no_mid_exposure(
     camera: RenderedCamera, monkeypatch: pytest.MonkeyPatch
@@ -29,6 +31,7 @@ async def test_24_an_ntp_step_of_an_hour_moves_no_mid_exposure(
     assert 3600 < stepped_s < 3630, "the wall clock is recorded as it was"
 
 
+@LOOP
 @pytest.mark.process
 async def test_25_a_stamp_that_cannot_be_is_replaced_by_the_arrival_and_counted(
     camera: RenderedCamera,

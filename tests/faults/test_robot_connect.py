@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,9 @@ from recordings.errors import ErrorData
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError
 from station.devices.ur import UrRobot
-from station.simulation.launch import SimulatedController
+from station.simulation.launch import SimulatedController, start_controller
 from tests.codes import raises
+from tests.conftest import check_allow_list
 from tests.faults.conftest import MakeCell
 from tests.patience import PATIENCE_S, until
 
@@ -24,7 +25,14 @@ pytestmark = pytest.mark.process
 
 OTHERS = ["input_int_register_0", "input_int_register_24"]
 """Registers that another client owns: the first of each control path."""
-Start = Callable[..., SimulatedController]
+
+
+@pytest.fixture(scope="module")
+def arm() -> Iterator[SimulatedController]:
+    """One for all tests that only connect."""
+    with start_controller() as running:
+        yield running
+        check_allow_list(running.host)
 
 
 def robot_at(host: str, folder: Path, **config: Any) -> UrRobot:
@@ -61,12 +69,11 @@ async def test_nobody_is_there(tmp_path: Path) -> None:
     ],
 )
 async def test_a_silent_controller_does_not_hang_the_station(
-    controller: Start, tmp_path: Path, fault: dict[str, Any], code: str
+    arm: SimulatedController, tmp_path: Path, fault: dict[str, Any], code: str
 ) -> None:
-    running = await asyncio.to_thread(controller)
-    with running.admin() as admin:
+    with arm.admin() as admin:
         admin.ask(**fault)
-        robot = robot_at(running.host, tmp_path)
+        robot = robot_at(arm.host, tmp_path)
         with raises(code):
             async with asyncio.timeout(PATIENCE_S):
                 await robot.connect()
@@ -75,15 +82,13 @@ async def test_a_silent_controller_does_not_hang_the_station(
         await robot.close()
 
 
-async def test_another_robot_than_configured_is_refused(controller: Start, tmp_path: Path) -> None:
-    running = await asyncio.to_thread(controller)
+async def test_another_robot_than_configured_is_refused(arm: SimulatedController, tmp_path: Path) -> None:
     with raises("other-robot"):
-        await robot_at(running.host, tmp_path, serial="1").connect()
+        await robot_at(arm.host, tmp_path, serial="1").connect()
 
 
-async def test_one_owner(controller: Start, tmp_path: Path) -> None:
-    running = await asyncio.to_thread(controller)
-    first, second = robot_at(running.host, tmp_path), robot_at(running.host, tmp_path)
+async def test_one_owner(arm: SimulatedController, tmp_path: Path) -> None:
+    first, second = robot_at(arm.host, tmp_path), robot_at(arm.host, tmp_path)
     await first.connect()
     with raises("robot-owned"):
         await second.connect()
@@ -216,22 +221,21 @@ async def test_safety_stop_between_moves_ends_control(cell: MakeCell) -> None:
         c.robot.check()
 
 
-async def test_a_daemon_that_died_leaves_no_lock(controller: Start, tmp_path: Path) -> None:
-    running = await asyncio.to_thread(controller)
+async def test_a_daemon_that_died_leaves_no_lock(arm: SimulatedController, tmp_path: Path) -> None:
     program = (
         "import os, sys; from station.devices.ur_probe import RobotLock\n"
         "if os.getuid() == 0: os.setgid(65534); os.setuid(65534)  # another user's, where that can be tried\n"
         "lock = RobotLock(sys.argv[1]); print('held', flush=True); sys.stdin.read()"
     )
     holder = subprocess.Popen(
-        [sys.executable, "-c", program, running.host],
+        [sys.executable, "-c", program, arm.host],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
     assert holder.stdout is not None and holder.stdin is not None
     with holder:
         assert holder.stdout.readline() == b"held\n"
-        robot = robot_at(running.host, tmp_path)
+        robot = robot_at(arm.host, tmp_path)
         with pytest.raises(RobotError, match=f"pid {holder.pid}"):
             await robot.connect()
         holder.kill()

@@ -81,8 +81,8 @@ async def run_cycles(c: Cell, count: int) -> None:
     assert growth_mb < 5 + 0.01 * count, f"grew by {growth_mb:.1f} MB in {count} cycles"
 
 
-async def test_twenty_cycles(cell: MakeCell) -> None:
-    await run_cycles(await cell(control=False), 20)
+async def test_twelve_cycles(cell: MakeCell) -> None:
+    await run_cycles(await cell(control=False), 12)
 
 
 @pytest.mark.soak

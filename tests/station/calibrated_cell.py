@@ -15,7 +15,7 @@ from calibrate.files.calibration import (
     Sigma,
     Views,
 )
-from calibrate.geometry import Array, Transform, inverse, perturb, transform_points
+from calibrate.geometry import Array, Transform, inverse, perturb
 from calibrate.projection import project_at
 from calibrate.results import Certificate
 from calibrate.views import BoardView
@@ -88,9 +88,3 @@ def seen_from(
     if rng is not None:
         pixels = pixels + rng.normal(0, CORNER_PX, pixels.shape)
     return BoardView(0, "now", base_from_flange if told is None else told, points, pixels)
-
-
-def board_from_tip(base_from_board: Array, base_from_flange: Array, pointer: PointerConfig) -> Array:
-    """The tip (3,) in `board`, metres."""
-    tip = transform_points(base_from_flange, np.array(pointer.tip_m))
-    return transform_points(inverse(base_from_board), tip)

@@ -23,19 +23,17 @@ from tests.station.session_rig import ArmInMemory, CameraInMemory, WorkerInThisP
 
 
 @pytest.fixture
-def thawed() -> Iterator[None]:
-    yield
+def daemon(tmp_path: Path) -> Iterator[Daemon]:
+    """Not yet running; it serves on the socket `s`."""
+    cell = Cell(memory_config(), ArmInMemory(), CameraInMemory(), "simulated")
+    made = Daemon(cell, tmp_path / "root", tmp_path / "s")
+    made.session.context.workers = WorkerInThisProcess()  # type: ignore[assignment]
+    yield made
     gc.unfreeze()
 
 
-async def test_what_was_loaded_is_not_searched_for_garbage_beside_a_moving_arm(
-    thawed: None, tmp_path: Path
-) -> None:
+async def test_what_was_loaded_is_not_searched_for_garbage_beside_a_moving_arm(daemon: Daemon) -> None:
     """All modules of a daemon are some 90 000 objects: 0.05 to 0.1 s, as long as a heartbeat may be old."""
-    daemon = Daemon(
-        Cell(memory_config(), ArmInMemory(), CameraInMemory(), "simulated"), tmp_path / "root", tmp_path / "s"
-    )
-    daemon.session.context.workers = WorkerInThisProcess()  # type: ignore[assignment]
     left: list[int] = []
 
     def ready() -> None:
@@ -63,7 +61,7 @@ def _watch_files(event: str, arguments: tuple[object, ...]) -> None:
 
 
 async def test_the_loop_of_the_heartbeat_touches_no_file(
-    thawed: None, tmp_path: Path, small_plan: Plan, monkeypatch: pytest.MonkeyPatch
+    daemon: Daemon, tmp_path: Path, small_plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk or a file server may answer late or never: everything else goes on."""
     sys.addaudithook(_watch_files)  # for ever, but it looks at watched threads only
@@ -75,9 +73,6 @@ async def test_the_loop_of_the_heartbeat_touches_no_file(
             return real(*args, **named)
 
         monkeypatch.setattr(os, name, told)
-    cell = Cell(memory_config(), ArmInMemory(), CameraInMemory(), "simulated")
-    daemon = Daemon(cell, tmp_path / "root", tmp_path / "s")
-    daemon.session.context.workers = WorkerInThisProcess()  # type: ignore[assignment]
     ready = asyncio.Event()
     running = asyncio.create_task(daemon.run(ready.set))
     await ready.wait()

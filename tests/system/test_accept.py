@@ -60,7 +60,6 @@ async def begun(
     )
 
 
-@both_paths
 async def test_a_sound_arm_passes_and_every_move_was_approved_by_itself(rig: SystemRig) -> None:
     ways = (StopWay.CONTROL, StopWay.FROZEN)
     client, tester, test = await begun(rig, *ways)

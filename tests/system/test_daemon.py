@@ -17,7 +17,6 @@ from tests.system.conftest import SystemRig, both_paths, go, status_when
 pytestmark = pytest.mark.process
 
 
-@both_paths
 async def test_a_killed_operator_stops_the_arm_and_stop_from_a_watcher_is_latched(
     rig: SystemRig, short_plan: Plan
 ) -> None:

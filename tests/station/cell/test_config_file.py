@@ -30,14 +30,6 @@ CENTRE_IN_MM = "[[1667, 0, 3.2], [0, 1667, -2.1], [0, 0, 1]]"
 PLACE = "translation_m: [0, 0, 0.1], rotation_xyzw: [0, 0, 0, 1]"
 
 
-def test_a_good_file_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "station.yaml"
-    path.write_text(GOOD)
-    config, content = load_config(path)
-    assert config.limits.speed_m_s == 0.2
-    assert content == GOOD.encode()
-
-
 def test_a_key_that_is_gone_is_told_once_and_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -124,17 +116,6 @@ def test_equal_limits_of_a_joint_hold_it_and_open_sides_of_the_box_are_fine(tmp_
     for more in (held, box, "joints_min_rad: [1, 1, 1, 1, 1, 1]", "workspace_max_m: [-1, -1, -1]"):
         path.write_text(GOOD.replace("speed_m_s: 0.2", more))
         load_config(path)
-
-
-def test_the_configuration_is_read_once(tmp_path: Path) -> None:
-    path = tmp_path / "station.yaml"
-    path.write_text(GOOD)
-    cell = configured_cell(*load_config(path), tmp_path)
-    before = cell.config_sha256
-    path.write_text(GOOD.replace("0.2\n", "0.1\n"))
-    assert cell.config_sha256 == before
-    assert cell.config_yaml == GOOD.encode()
-    assert cell.config.limits.speed_m_s == 0.2
 
 
 def test_pictures_that_are_not_real_never_stand_beside_a_real_arm(tmp_path: Path) -> None:

@@ -31,26 +31,6 @@ def plan_of(*joints, robot="UR10", **extra):
     return Plan(robot=robot, mount="eye-in-hand", poses=poses, **extra)
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_no_modelled_point_is_faster_than_the_cap_when_the_move_is_driven_as_allowed(seed):
-    """Drives the trapezoid in 2 ms steps and measures the speed of every point by itself."""
-    rng = np.random.default_rng(seed)
-    start, target = REST, REST + rng.uniform(-0.8, 0.8, 6)
-    move = check_path(FREE, start, target)
-    step = np.abs(target - start).max()
-    speed, acceleration = move.joint_speed_rad_s, move.joint_acceleration_rad_s2
-    time = np.arange(0, move.duration_s, 0.002)
-    ramp = min(speed, np.sqrt(step * acceleration)) / acceleration
-    rate = np.clip(np.minimum(time, move.duration_s - time) / ramp, 0, 1) * ramp * acceleration
-    share = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * 0.002)]) / step
-    assert share[-1] == pytest.approx(1.0, abs=0.01)
-    points = moving_points(FREE, start + share[:, None] * (target - start))
-    fastest = np.linalg.norm(np.diff(points, axis=0), axis=-1).max() / 0.002
-    assert fastest <= SPEED_CAP_M_S
-    assert fastest <= move.top_speed_m_s * 1.03
-    assert move.top_speed_m_s <= SPEED_CAP_M_S
-
-
 def test_no_configuration_raises_the_caps():
     wild = LimitsConfig(speed_m_s=5.0, joint_speed_rad_s=9.0, joint_acceleration_rad_s2=99.0)
     geometry = CellGeometry(MODELS["UR10"], wild)
@@ -112,12 +92,6 @@ def test_a_plate_of_several_rods_is_one_problem():
     )
     [told] = [p.text for p in check_path(cell, down, down).problems if p.what == "board against table"]
     assert told.startswith(f"board against table, {-1000 * (worst_m - SPACING_M / 2):.0f} mm too close")
-
-
-def test_samples_lie_as_dense_as_promised():
-    samples = sample_path(FREE, REST, REST + np.array([1.5, 0.3, -0.4, 0.5, 1.0, 2.5]), 0.01)
-    travel = np.linalg.norm(np.diff(moving_points(FREE, samples), axis=0), axis=-1)
-    assert travel.max() <= 0.01
 
 
 @pytest.mark.parametrize("turn", [1.0, LimitsConfig().joint_step_rad, 2 * np.pi])

@@ -14,28 +14,15 @@ from station.cell.config import StillnessConfig
 from station.cell.errors import StaleStateError
 from station.cell.stillness import NotStillError, StillnessMonitor
 from tests.codes import raises
+from tests.station.devices.test_ur_moves import STATE
 
 HOME = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
-REST = RobotState(
-    stamps=Stamps(),
-    joints_rad=HOME,
-    joint_speeds_rad_s=(0.0,) * 6,
-    target_joints_rad=HOME,
-    tcp_pose=(0.0,) * 6,
-    robot_mode=7,
-    safety_mode=1,
-    safety_status_bits=1,
-    runtime_state=2,
-    robot_status_bits=3,
-    speed_scaling=1.0,
-    target_speed_fraction=1.0,
-)
 
 
 def state(at_s: float, joint_rad: float = 0.0, speed_rad_s: float = 0.0) -> RobotState:
     """Joint 2 displaced and moving."""
     return msgspec.structs.replace(
-        REST,
+        STATE,
         stamps=Stamps(controller_s=at_s),
         joints_rad=(HOME[0], HOME[1] + joint_rad, *HOME[2:]),
         joint_speeds_rad_s=(0.0, speed_rad_s, 0.0, 0.0, 0.0, 0.0),

@@ -22,12 +22,12 @@ from tests.recordings.small_recording import shown
 @pytest.mark.timeout(900)
 def test_the_demo_finds_the_truth(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "station.cli", "demo", "--headless", "--json", "--seed", "4"]
-    command += ["--out", str(tmp_path), "--poses", "12", "--time-scale", "2"]
+    command += ["--out", str(tmp_path), "--poses", "9", "--time-scale", "4"]
     done = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)
-    assert done.returncode in (0, 4), done.stderr  # 12 poses may be too few for a gate
+    assert done.returncode in (0, 4), done.stderr  # 9 poses may be too few for a gate
     result = json.loads(done.stdout)
     assert msgspec.json.encode(msgspec.convert(result, DemoJson, strict=True)).decode() == done.stdout.strip()
-    assert result["poses"] == {"planned": 12, "captured": 12}
+    assert result["poses"] == {"planned": 9, "captured": 9}
     assert result["truth_error"]["translation_mm"] <= 0.5
     assert result["truth_error"]["rotation_deg"] <= 0.05
     for name in ("recording", "calibration", "report"):

@@ -154,18 +154,6 @@ async def test_nonsense_is_answered_and_others_are_served(server: Served, line: 
         assert await client.request("doctor")
 
 
-async def test_an_endless_line_costs_no_memory(server: Served) -> None:
-    _, path = server
-    _, writer = await asyncio.open_unix_connection(str(path))
-    sent = 0
-    with pytest.raises(OSError):
-        while sent < 1_000_000_000:
-            writer.write(b"x" * 65536)
-            await asyncio.wait_for(writer.drain(), PATIENCE_S)
-            sent += 65536
-    assert sent < 10_000_000
-
-
 async def test_of_too_many_questions_at_once_the_last_are_turned_away_but_never_a_stop(
     server: Served, handler: RecordingHandler
 ) -> None:

@@ -39,7 +39,7 @@ from station.protocol.stop_client import (
 )
 from station.server import stop_server
 from station.server.control import ControlServer
-from station.server.stop_server import BATCH, Peer, StopServer
+from station.server.stop_server import Peer, StopServer
 from tests.patience import PATIENCE_S, until
 from tests.station.server.test_control import RecordingHandler, raw
 
@@ -151,22 +151,6 @@ async def test_a_stop_after_an_acknowledgement_is_carried_out_however_soon_it_co
     station.latched = False
     assert send_stop(station.control)
     await until(lambda: len(station.heard) == 2)
-
-
-async def test_one_waking_reads_a_bounded_number(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert station.server._link is not None
-
-    class Endless:
-        reads = 0
-
-        def recvmsg(self, *_: int) -> tuple[bytes, list[object], int, None]:
-            Endless.reads += 1
-            return b"x", [], 0, None
-
-    with monkeypatch.context() as patch:
-        patch.setattr(station.server, "_link", Endless())
-        station.server._read()
-    assert Endless.reads == BATCH
 
 
 async def test_a_daemon_that_hangs_is_not_believed(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import socket
 import struct
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from itertools import islice
 from typing import Any
 
@@ -32,28 +33,14 @@ from tests.patience import PATIENCE_S
 @pytest.fixture
 def controller() -> Iterator[Callable[..., SimulatedController]]:
     """Starts controllers: `controller("UR10", time_scale=…)`; all end with the test."""
-    running: list[SimulatedController] = []
-
-    def start(model: str = "UR10", **options: Any) -> SimulatedController:
-        running.append(start_controller(model, **options))
-        return running[-1]
-
-    yield start
-    for child in running:
-        child.stop()
+    with ExitStack() as ends:
+        yield lambda model="UR10", **options: ends.enter_context(start_controller(model, **options))
 
 
 @pytest.fixture
 def admin() -> Iterator[Callable[[SimulatedController], AdminClient]]:
-    clients: list[AdminClient] = []
-
-    def connect(running: SimulatedController) -> AdminClient:
-        clients.append(running.admin())
-        return clients[-1]
-
-    yield connect
-    for client in clients:
-        client.close()
+    with ExitStack() as ends:
+        yield lambda running: ends.enter_context(running.admin())
 
 
 class RtdeClient:
@@ -112,15 +99,8 @@ class RtdeClient:
 @pytest.fixture
 def rtde() -> Iterator[Callable[..., RtdeClient]]:
     """Opens raw RTDE connections."""
-    clients: list[RtdeClient] = []
-
-    def connect(running: SimulatedController, timeout_s: float = PATIENCE_S) -> RtdeClient:
-        clients.append(RtdeClient(running.host, timeout_s))
-        return clients[-1]
-
-    yield connect
-    for client in clients:
-        client.close()
+    with ExitStack() as ends:
+        yield lambda running, **how: ends.enter_context(closing(RtdeClient(running.host, **how)))
 
 
 class SteppedRobot:

@@ -43,21 +43,7 @@ def test_a_child_that_is_not_ready_in_time_is_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_it_dies_with_its_parent(number: int) -> None:
-    code = (
-        "import time; from station.simulation.launch import start_controller; c = start_controller('UR10');"
-        "print(c.process.pid, flush=True); time.sleep(60)"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
-    assert parent.stdout is not None
-    child = int(parent.stdout.readline())
-    os.kill(parent.pid, number)
-    parent.wait()
-    parent.stdout.close()
-    wait_until(lambda: gone(child))
-
-
-def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe() -> None:
+def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe(number: signal.Signals) -> None:
     code = (
         "import os, time\n"
         "from station.simulation.launch import start_controller\n"
@@ -70,7 +56,7 @@ def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe() -> None:
     assert parent.stdout is not None
     child, sibling = map(int, parent.stdout.readline().split())
     try:
-        parent.kill()
+        parent.send_signal(number)
         parent.wait()
         wait_until(lambda: gone(child))
     finally:

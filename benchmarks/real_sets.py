@@ -43,10 +43,10 @@ def real_sets(names: tuple[str, ...] = ()) -> Iterator[RealSet]:
     folders = sorted(path.parent for path in DATASETS.glob("*/dataset.yaml"))
     for folder in folders:
         if not names or folder.name in names:
-            yield _read(folder)
+            yield read_set(folder)
 
 
-def _read(folder: Path) -> RealSet:
+def read_set(folder: Path) -> RealSet:
     with tempfile.TemporaryDirectory() as temporary, single_threaded_opencv():
         recording = Path(temporary) / "recording.mcap"
         import_folder(folder, recording)

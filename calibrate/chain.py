@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize
 
 from calibrate.geometry import (
     Array,
@@ -29,6 +28,8 @@ from calibrate.geometry import (
     rotation_log,
     skew,
 )
+from calibrate.kinematics import RobotModel, link_frames
+from calibrate.results import LearnedArm
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,18 @@ class Chain:
     """(n,) joints at which axes, points and flange are given."""
     flange: Array
     """(4, 4) base_from_flange."""
+
+    @classmethod
+    def of(cls, arm: LearnedArm) -> Chain:
+        return cls(*(np.array(part) for part in (arm.axes, arm.points, arm.posture_rad, arm.flange)))
+
+    @property
+    def plain(self) -> LearnedArm:
+        """The same as a calibration file keeps it."""
+        axes, points, flange = (
+            tuple(map(tuple, part.tolist())) for part in (self.axes, self.points, self.flange)
+        )
+        return LearnedArm(axes, points, tuple(self.posture_rad.tolist()), flange)
 
     def motions(self, joints_rad: Array) -> Array:
         """Compute the motion (m, n + 1, 4, 4), in base, of what joints 0 … n carry since the posture."""
@@ -119,6 +132,12 @@ class Chain:
                 along = axis @ (at - point)
             at = point + along * axis
             yield at
+
+
+def chain_of(model: RobotModel) -> Chain:
+    """Describe a table by its axes with all joints at 0."""
+    frames = link_frames(model, np.zeros(6))
+    return Chain(frames[:6, :3, 2], frames[:6, :3, 3], np.zeros(6), frames[6])
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +236,8 @@ def _fit_rotations(joints_rad: Array, R: Array, at: int) -> tuple[Array, float]:
     Linear start: small turns of the joints add up as vectors, so views count by how near they are. Axes of
     free length first, then of unit length.
     """
+    from scipy import optimize  # programs that only move along a chain need not wait for it
+
     away, turned = joints_rad - joints_rad[at], R @ R[at].T
     square = (away**2).sum(axis=1)
     near = np.sort(square)[min(joints_rad.shape[1] + 1, len(square) - 1)]

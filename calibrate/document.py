@@ -30,8 +30,9 @@ from calibrate.files.calibration import (
     Views,
     ViewWeight,
 )
-from calibrate.geometry import Transform
-from calibrate.handeye.solution import Solution, TableResult, Verification
+from calibrate.geometry import Array, Transform
+from calibrate.handeye.solution import ArmResult, Solution
+from calibrate.kinematics import table_of_axes
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.projection import intrinsics_names
@@ -52,7 +53,6 @@ def make_calibration(
     solution: Solution,
     gates: tuple[Gate, ...],
     options: dict[str, Any],
-    verified: Verification | None = None,
 ) -> Calibration:
     """`options`: the choices that differ from the defaults."""
     info = recording.info
@@ -93,36 +93,40 @@ def make_calibration(
             recorded_wall_ns=info.created_wall_ns,
             plan_sha256=info.plan_sha256,
         ),
-        arm_table=None if arm is None else _arm_table(solution, arm, verified),
+        arm_table=None if arm is None else _arm_table(solution, arm),
         posterior=solution.posterior,
     )
 
 
-def _arm_table(solution: Solution, arm: TableResult, verified: Verification | None) -> CorrectedArm:
+def _arm_table(solution: Solution, arm: ArmResult) -> CorrectedArm:
     assert solution.arm is not None and solution.arm.uncorrected is not None
-    X, held_out = solution.parent_from_child, None
-    if arm.held_out_m is not None:
-        without, with_table = 1e3 * np.sqrt(np.nanmean(arm.held_out_m**2, axis=1))
-        seen = int(np.isfinite(arm.held_out_m[0]).sum())
-        held_out = HeldOutViews(float(without), float(with_table), seen)
-    own, later = Transform(f"corrected_{X.parent}", X.child, X.matrix), None
-    if verified is not None:
-        without_m, with_m = verified.rms_m
-        later = HeldOutViews(1e3 * without_m, 1e3 * with_m, len(verified.flange_m), verified.recording)
+    X = solution.parent_from_child
+    own = Transform(f"corrected_{X.parent}", X.child, X.matrix)
+    table, chain, offered = arm.table, arm.corrected, arm.offered
+    true = None if table is None else table_of_axes(table, chain.axes, chain.points, chain.flange)
     return CorrectedArm(
-        offered=arm.offered,
-        model=arm.nominal.name,
-        nominal=DhTable.of(arm.nominal),
-        nominal_source="factory" if arm.factory else "published",
+        offered=offered,
+        model="" if table is None else table.name,
+        nominal_source="learned" if table is None else "factory" if arm.factory else "published",
         covariance=tuple(tuple(row) for row in arm.covariance.tolist()),
-        with_table_mm=1e3 * arm.with_table_m,
+        with_table_mm=1e3 * arm.error_m,
         without_table_mm=1e3 * solution.arm.uncorrected.error_m,
-        held_out=held_out,
-        verified=later,
+        joints_rad=[(low, high) for low, high in arm.joints_rad.T.tolist()],
+        held_out=None if arm.held_out_m is None else _held_out(arm.held_out_m),
+        verified=None if arm.verified_m is None else _held_out(arm.verified_m, arm.verified_by),
         refused=arm.refused or "",
-        corrected=DhTable.of(arm.corrected) if arm.offered else None,
-        result=FramePose.of(own) if arm.offered else None,
+        nominal=None if table is None else DhTable.of(table),
+        learned=arm.nominal.plain if table is None else None,
+        corrected=DhTable.of(true) if true is not None and offered else None,
+        corrected_chain=chain.plain if true is None and offered else None,
+        result=FramePose.of(own) if offered else None,
     )
+
+
+def _held_out(missed_m: Array, recording: str = "") -> HeldOutViews:
+    """Sum up errors (2, n), NaN: none, of the arm as it is and of the corrected one."""
+    as_it_is, corrected = (1e3 * np.sqrt(np.nanmean(missed_m**2, axis=1))).tolist()
+    return HeldOutViews(as_it_is, corrected, int(np.isfinite(missed_m[0]).sum()), recording)
 
 
 @cache

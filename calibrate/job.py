@@ -10,7 +10,7 @@ import msgspec
 from calibrate.errors import require_choice
 from calibrate.files.calibration import Calibration
 from calibrate.gates import GateLimits
-from calibrate.handeye.solution import Profile, Solution, Verification
+from calibrate.handeye.solution import Profile, Solution
 from calibrate.lens.intrinsics import Intrinsics, LensModel
 from calibrate.recorded_views import LoadedViews
 from calibrate.results import Gate
@@ -79,7 +79,6 @@ class SolvedRecording(PreparedViews):
     coverage: float
     gates: tuple[Gate, ...]
     calibration: Calibration
-    verified: Verification | None = None
 
     @property
     def passed(self) -> bool:

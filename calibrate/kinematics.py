@@ -8,7 +8,7 @@ for calculations of kinematics and dynamics". Needs NumPy only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -177,19 +177,6 @@ def _turn_z(angle: float) -> Array:
 def forward(model: RobotModel, joints_rad: ArrayLike) -> Array:
     """Compute base_from_flange (..., 4, 4) of joints (..., 6)."""
     return np.asarray(link_frames(model, joints_rad)[..., 6, :, :])
-
-
-TABLE_COLUMNS = ("a_m", "d_m", "alpha_rad", "theta_rad", "beta_rad")
-
-
-def base_from_flange(table: Mapping[str, Sequence[float]], joints_rad: ArrayLike) -> Array:
-    """Compute the flange (..., 4, 4) of joints (..., 6) by a calibration file's `arm_table.corrected`.
-
-    table: a_m, d_m, alpha_rad, theta_rad, beta_rad of six numbers each. The result maps
-    `corrected_flange` into `corrected_base`: it belongs to `arm_table.result` alone, never to another X.
-    """
-    a, d, alpha, theta, beta = (tuple(table[name]) for name in TABLE_COLUMNS)
-    return forward(RobotModel("corrected", a, d, alpha, theta, beta), joints_rad)
 
 
 def jacobian(model: RobotModel, joints_rad: ArrayLike) -> Array:

@@ -19,7 +19,7 @@ from calibrate.gates import GateInputs, judge
 from calibrate.handeye.arm_result import verify_elsewhere
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.handeye.solution import Solution, SolveOptions, Verification
+from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.job import JobOptions, PreparedViews, SolvedRecording
 from calibrate.lens.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
@@ -125,7 +125,7 @@ def solve_recording(
 ) -> SolvedRecording:
     """Solve and judge a recording. Raises RecordingError or CalibrationError; each says what to do next.
 
-    `verify`: a recording of the same camera and board at other poses, which judges the arm's table.
+    `verify`: a recording of the same camera and board at other poses, which judges the corrected arm.
     """
     options = options or JobOptions()
     prepared = prepare_views(path, options, progress)
@@ -133,13 +133,11 @@ def solve_recording(
     watch = _Stopwatch()
     solution = solve_views(views, solver_options(options, prepared))
     watch.lap("solve")
-    verified = None
     if verify is not None:
         same = replace(options, board=loaded.board, square_m=None, camera=solution.camera, without=())
         same = replace(same, find_intrinsics=False)
         elsewhere = prepare_views(verify, same, progress, 1)
-        verified = verify_elsewhere(solution, elsewhere.views, verify.name)
-        solution = _judged_by(verified, solution)
+        solution = verify_elsewhere(solution, elsewhere.views, verify.name)
         watch.lap("verify")
     used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
     coverage = picture_coverage(used)
@@ -148,7 +146,7 @@ def solve_recording(
     )
     gates = judge(solution, inputs, options.limits)
     calibration = make_calibration(
-        recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen, verified
+        recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen
     )
     watch.lap("judge")
     made = vars(prepared) | {"stage_ms": prepared.stage_ms | watch.stage_ms}
@@ -158,16 +156,7 @@ def solve_recording(
         coverage=coverage,
         gates=gates,
         calibration=calibration,
-        verified=verified,
     )
-
-
-def _judged_by(verified: Verification, solution: Solution) -> Solution:
-    """Take the table's offer back where it does not help at the poses of a verification."""
-    arm = solution.arm
-    if verified.better or arm is None or arm.result is None or not arm.result.offered:
-        return solution
-    return replace(solution, arm=replace(arm, result=replace(arm.result, refused="not-better")))
 
 
 def _lens_sigma(options: JobOptions, camera: CameraModel) -> tuple[float, ...] | None:

@@ -32,7 +32,7 @@ class Followed(msgspec.Struct, frozen=True):
     mount: Mount | None = None
     validity: Validity | None = None
     result: FramePose | None = None
-    """For the arm as it is, not for its corrected table."""
+    """For the arm as it is, not for the corrected arm."""
     intrinsics: Lens | None = None
 
 

@@ -20,6 +20,7 @@ from calibrate.files.calibration import Calibration, read_calibration, write_out
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.folders import cameras, current_validity, readable_folder
 from calibrate.files.formatting import override_text, pose_text, summary, verdict_text
+from calibrate.files.proof import read_bounded
 from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.files.versions import InstalledVersion, installed_versions
 from recordings.files import MAIN_CAMERA, state_root
@@ -70,9 +71,9 @@ def export(
     camera: Annotated[
         str, typer.Option("--of", help="Name of the camera, in a cell with several")
     ] = MAIN_CAMERA,
-    with_table: Annotated[
-        bool, typer.Option("--with-table", help="The camera pose that belongs to the arm's corrected table")
-    ] = False,
+    arm: Annotated[
+        Path | None, typer.Option("--arm", help="urdf: your arm's URDF, to be written as the corrected arm")
+    ] = None,
     root: Root = None,
 ) -> None:
     """Write a calibration in another program's format.
@@ -81,8 +82,9 @@ def export(
     """
     calibration, validity = named_or_installed(file, root, camera)
     names = FrameNames.of_camera(camera if file is None else calibration.camera_name)
-    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity, with_table)
-    content = exports.export(calibration, str(to.value), frames)
+    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity)
+    given = None if arm is None else read_bounded(arm)
+    content = exports.export(calibration, str(to.value), frames, given)
     if validity is not None and validity.state is not ValidityState.VALID:
         err.print(f"Warning: the calibration is {validity_text(validity)}", style="yellow")
     if output is None:

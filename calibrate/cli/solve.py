@@ -28,7 +28,7 @@ from calibrate.results import PeerResult
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
 Verify = Annotated[
     Path | None,
-    typer.Option(help="A recording at other poses, same board: judges the arm's corrected table"),
+    typer.Option(help="A recording at other poses, same board: judges the corrected arm"),
 ]
 GATE_FAILED = 4
 

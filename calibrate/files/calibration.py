@@ -15,21 +15,24 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
+from calibrate.chain import Chain, chain_of
 from calibrate.errors import CalibrationFileError
 from calibrate.files.proof import check_result, content_sha256, proven_plain, read_bounded
 from calibrate.files.touch import Touch
-from calibrate.geometry import Transform
-from calibrate.kinematics import RobotModel, base_from_flange
+from calibrate.geometry import Array, Transform
+from calibrate.kinematics import RobotModel
 from calibrate.results import (
     BoardShape,
     Certificate,
     CrossValidation,
     Gate,
     HoldoutScore,
+    LearnedArm,
     Posterior,
     RejectedView,
     Remark,
 )
+from calibrate.views import array_of
 from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
 from recordings.schema.messages import (
     BoardSpec,
@@ -172,49 +175,95 @@ class HeldOutViews(msgspec.Struct, frozen=True):
 
 
 class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
-    """X and the arm's corrected table as one result. `corrected` and `result` are given only where offered.
+    """X and the arm's corrected kinematics as one result, given only where offered.
 
-    This X is valid with this table only: its frames are `corrected_base` and `corrected_flange`, which chain
-    with `base_from_flange` here and with nothing else. The file's own `result` is for the arm as it is.
+    This X is valid with these kinematics only: its frames are `corrected_base` and `corrected_flange`, which
+    chain with `base_from_flange` here and with nothing else. The file's own `result` is for the arm as it is.
+    The arm is a table, or a chain of axes that was learned from the recorded joints.
     """
 
     offered: bool
     model: str
-    nominal: DhTable
-    """Table that the recorded flanges follow."""
-    nominal_source: Literal["published", "factory"]
+    nominal_source: Literal["published", "factory", "learned"]
     covariance: tuple[tuple[float, ...], ...]
     """Of X's [δt, δφ] and of the errors of the arm's links, as in `quality.arm.table`; metres, radians."""
     with_table_mm: float
-    """1σ of a point at the working distance, averaged over the arm's workspace."""
+    """1σ of a point at the working distance with the corrected arm, averaged over the arm's workspace, or
+    over `joints_rad`."""
     without_table_mm: float
     """The same for the uncorrected arm with `result` of the file."""
+    nominal: DhTable | None = None
+    """Table that the recorded flanges follow."""
+    learned: LearnedArm | None = None
+    """Chain that the recorded flanges follow, where they follow no table."""
+    joints_rad: list[tuple[float, float]] = []
+    """Least and greatest of each joint in the recording; a learned chain is not asked beyond."""
     held_out: HeldOutViews | None = None
     verified: HeldOutViews | None = None
     """Verification by another recording: distance of the board's middle from its mean position."""
     refused: str = ""
     """Reason why it is not offered: no-evidence, no-joints, not-nominal, not-better; empty: offered."""
     corrected: DhTable | None = None
+    corrected_chain: LearnedArm | None = None
+    """The corrected arm as a chain, where `learned` is one."""
     result: FramePose | None = None
     """corrected_flange_from_camera (eye-in-hand) or corrected_base_from_camera."""
 
     def __post_init__(self) -> None:
         frames = ("", "") if self.result is None else (self.result.parent_frame, self.result.child_frame)
         known = frames in (("corrected_flange", "camera"), ("corrected_base", "camera"))
-        if not (self.offered == known == (self.corrected is not None) == (self.result is not None)):
-            raise ValueError("the arm's table and its X do not belong together")
+        nominal, corrected = (self.nominal, self.learned), (self.corrected, self.corrected_chain)
+        kinds = [[arm is not None for arm in arms] for arms in (nominal, corrected)]
+        if not (self.offered == known == (self.result is not None)) or sum(kinds[0]) != 1:
+            raise ValueError("the corrected arm and its X do not belong together")
+        if kinds[1] != (kinds[0] if self.offered else [False, False]):
+            raise ValueError("the corrected arm is of another kind than the nominal one")
 
     def base_from_flange(self, joints_rad: ArrayLike) -> Transform:
-        """Compute corrected_base_from_corrected_flange of joints (6,). Raises as `installable`."""
-        table, _ = self.installable()
-        flange = base_from_flange(msgspec.structs.asdict(table), joints_rad)
+        """Compute corrected_base_from_corrected_flange of joints (n,).
+
+        Raises as `installable`; CalibrationFileError (`joints-beyond`) where a learned chain was not seen.
+        """
+        flange = self.chain.forward(self._within(joints_rad)[None])[0]
         return Transform("corrected_base", "corrected_flange", flange)
 
-    def installable(self) -> tuple[DhTable, Transform]:
-        """Return the table and the X that belongs to it. CalibrationFileError if not offered."""
-        if not self.offered or self.corrected is None or self.result is None:
+    def covariance_of_flange(self, joints_rad: ArrayLike) -> Array:
+        """Compute the covariance (6, 6) of `base_from_flange`, δt (m) and δφ (rad) in base. Raises as it."""
+        J = self.chain.by_links(self._within(joints_rad)[None])[0]
+        return np.asarray(J @ np.array(self.covariance)[6:, 6:] @ J.T)
+
+    @property
+    def chain(self) -> Chain:
+        """The corrected arm. Raises as `installable`."""
+        self.installable()
+        return _chain(self.corrected, self.corrected_chain)
+
+    @property
+    def nominal_chain(self) -> Chain:
+        """The arm as its controller computes it."""
+        return _chain(self.nominal, self.learned)
+
+    def installable(self) -> tuple[DhTable | None, Transform]:
+        """Return the table, if it is one, and the X that belongs to it. CalibrationFileError if refused."""
+        if self.result is None:
             raise CalibrationFileError("table-not-offered", reason=self.refused)
         return self.corrected, self.result.transform
+
+    def _within(self, joints_rad: ArrayLike) -> Array:
+        q = array_of(joints_rad, self.nominal_chain.posture_rad.shape, "joints_rad")
+        for joint, (low, high) in enumerate(self.joints_rad if self.learned else (), start=1):
+            if not low <= (at := float(q[joint - 1])) <= high:
+                low_deg, at_deg, high_deg = (math.degrees(v) for v in (low, at, high))
+                raise CalibrationFileError(
+                    "joints-beyond", joint=joint, at_deg=at_deg, low_deg=low_deg, high_deg=high_deg
+                )
+        return q
+
+
+def _chain(table: DhTable | None, chain: LearnedArm | None) -> Chain:
+    if chain is not None:
+        return Chain.of(chain)
+    return chain_of(RobotModel("", **msgspec.structs.asdict(table)))  # type: ignore[arg-type]
 
 
 class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -243,6 +292,11 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     def remarks(self) -> list[Remark]:
         """The warnings with their codes."""
         return [Remark(code, text) for code, text in zip(self.warning_codes, self.warnings, strict=True)]
+
+    @property
+    def without_arm(self) -> bool:
+        """Whether the stated error is without the arm's own, by the gate `arm`."""
+        return any(gate.name == "arm" and gate.remedy for gate in self.gates)
 
     @property
     def failed(self) -> list[Gate]:
@@ -292,7 +346,7 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     verification: list[Touch] = []
     """Touch tests, oldest first; see `touch`."""
     arm_table: CorrectedArm | None = None
-    """The arm's corrected table, where its model is known; `result` does not depend on it."""
+    """The arm's corrected kinematics, where they are known; `result` does not depend on them."""
     posterior: Posterior | None = None
     """What later checks begin with; None in files of the first version."""
 

@@ -30,7 +30,7 @@ class ShownFigure:
 def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str, ShownFigure]:
     """Collect the figures that a calibration is judged by, most important first, without unknown ones."""
     quality, gates, views = calibration.quality, calibration.quality.gates, calibration.views
-    without = "without the arm's own" * any(gate.name == "arm" and gate.remedy for gate in gates)
+    without = "without the arm's own" * quality.without_arm
     position = f"± {calibration.sigma.translation_mm:.3g} mm (1σ)"
     shown = {"error": ShownFigure("camera position", position, without)}
     if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
@@ -189,29 +189,30 @@ def cell_sentences(calibration: Calibration) -> list[str]:
     if share > _COSTLY and name in _REMEDIES:
         remedy, arm = _REMEDIES[name], calibration.arm_table
         if name == "kinematics" and arm is not None and arm.offered:
-            remedy = "use the corrected table"
+            remedy = "use the corrected arm"
         sentences.append(f"Largest error source: {name}, {share:.0%} of the variance. To lower it, {remedy}.")
     return sentences
 
 
 _REFUSED = {
     "no-joints": "the joints were not recorded",
-    "not-nominal": "the recorded flanges do not follow the nominal table: let the station reach port "
-    "30001 of the controller, which states the factory calibration",
+    "not-nominal": "the recorded flanges do not follow the nominal arm: let the station reach port "
+    "30001 of a UR controller, which states the factory calibration",
     "not-better": "it does not help on poses elsewhere",
 }
 
 
 def arm_sentences(calibration: Calibration) -> Iterator[str]:
-    """Yield sentences on the accuracy with and without the arm's corrected table, and on what limits it."""
+    """Yield sentences on the accuracy by the corrected arm and as it is, and on what limits it."""
     arm = calibration.arm_table
     if arm is None or arm.refused == "no-evidence":
         return
     distance_mm = 1e3 * (calibration.quality.working_distance_m or 0.0)
     point = f"a point {distance_mm:.0f} mm ahead" if calibration.mount == "eye-in-hand" else "the tool"
+    learned = arm.learned is not None
     yield (
-        f"Over the arm's workspace {point} is placed to {arm.with_table_mm:.2f} mm (1σ) with the arm's "
-        f"corrected table, to {arm.without_table_mm:.2f} mm without it."
+        f"Over the {'range of the joints' if learned else 'workspace'} {point} is placed to "
+        f"{arm.with_table_mm:.2f} mm (1σ) by the corrected arm, to {arm.without_table_mm:.2f} mm as it is."
     )
     for seen, poses in (
         (arm.held_out, "Views predicted from poses elsewhere"),
@@ -219,17 +220,18 @@ def arm_sentences(calibration: Calibration) -> Iterator[str]:
     ):
         if seen is not None:
             yield (
-                f"{poses}: {seen.with_table_mm:.2f} mm with the table, {seen.without_table_mm:.2f} mm "
-                f"without ({seen.views} views)."
+                f"{poses}: {seen.with_table_mm:.2f} mm by the corrected arm, {seen.without_table_mm:.2f} mm "
+                f"as it is ({seen.views} views)."
             )
     if arm.offered:
+        how = "--to urdf --arm ROBOT.urdf" if learned else "--to ur-kinematics"
         yield (
-            "Where points far from the board count, give the robot program the corrected table (calibrate "
-            "export --to ur-kinematics). The installed camera pose is the best for the arm as it is. "
+            "Where points far from the board count, give the robot program the corrected arm (calibrate "
+            f"export {how}). The installed camera pose is the best for the arm as it is. "
             "More poses would lower the error further: station plan --for arm."
         )
     else:
-        yield f"The arm's table is not offered: {_REFUSED.get(arm.refused, arm.refused)}."
+        yield f"The corrected arm is not offered: {_REFUSED.get(arm.refused, arm.refused)}."
 
 
 def _board(board: BoardShape, square_mm: float) -> Iterator[str]:

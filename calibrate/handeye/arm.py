@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.chain import Chain, LearnedChain, learn_chain, read_otherwise, wrong_row
+from calibrate.chain import Chain, LearnedChain, chain_of, learn_chain, read_otherwise, wrong_row
 from calibrate.geometry import Array, difference, skew
-from calibrate.kinematics import MODELS, RobotModel, inverse_many, link_frames, table_of_axes, with_near_axes
+from calibrate.kinematics import MODELS, RobotModel, inverse_many, with_near_axes
 from calibrate.views import ViewSet
 
 FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")
@@ -55,18 +55,6 @@ def arm_postures(views: ViewSet) -> tuple[ArmPostures | None, str]:
         return None, note
     found = _joints_of_one_branch(published, flanges)
     return (None if found is None else ArmPostures(chain_of(model), found, False, model)), note
-
-
-def chain_of(model: RobotModel) -> Chain:
-    """Describe a table by its axes with all joints at 0."""
-    frames = link_frames(model, np.zeros(6))
-    return Chain(frames[:6, :3, 2], frames[:6, :3, 3], np.zeros(6), frames[6])
-
-
-def corrected_model(nominal: RobotModel, errors: Array) -> RobotModel:
-    """Restate as a table the arm whose links have these errors (30,)."""
-    true = chain_of(nominal).with_errors(errors)
-    return table_of_axes(nominal, true.axes, true.points, true.flange)
 
 
 def _learned(joints: Array, views: ViewSet) -> tuple[LearnedChain, Array, str]:

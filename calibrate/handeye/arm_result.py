@@ -1,39 +1,33 @@
-"""The arm's fitted kinematic table as a result: whether it is offered, its accuracy, its verification."""
+"""The corrected arm as a result: whether it is offered, its accuracy, its verification."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb
-from calibrate.handeye.arm import ArmPostures, corrected_model
+from calibrate.handeye.arm import ArmPostures
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.handeye.estimate import CellFit
-from calibrate.handeye.solution import (
-    Solution,
-    TableRefusal,
-    TableResult,
-    UncorrectedArm,
-    Verification,
-)
+from calibrate.handeye.solution import ArmRefusal, ArmResult, Solution, UncorrectedArm
 from calibrate.handeye.workspace import SPREAD, Workspace, sample_range, sample_workspace
-from calibrate.kinematics import forward
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, ViewSet, observe_views
 
 _NOMINAL_M = 1e-4
-"""Above this rms distance (m) the recorded flanges were not computed with the nominal table."""
+"""Above this rms distance (m) the recorded flanges were not computed with the nominal arm."""
 
 
 def arm_results(
     fit: CellFit, arm: ArmPostures, detected: bool, distance_m: float, missed: Array | None
-) -> tuple[UncorrectedArm, TableResult | None]:
-    """Derive from a fit the X for the arm as it is, and the corrected table where it follows a known one.
+) -> tuple[UncorrectedArm, ArmResult]:
+    """Derive from a fit the X for the arm as it is, and the corrected arm.
 
-    missed: (2, n), as `TableResult.held_out_m`.
+    missed: (2, n), as `ArmResult.held_out_m`.
     """
     found, state, chain, table = fit.estimate, fit.estimate.state, arm.chain, arm.table
     count = len(chain.link_errors)
@@ -55,14 +49,14 @@ def arm_results(
     uncorrected = UncorrectedArm(
         perturb(state.X, by_errors @ errors), both @ covariance @ both.T, float(np.hypot(corrected_m, left_m))
     )
-    if table is None:
-        return uncorrected, None
-    return uncorrected, TableResult(
-        nominal=table,
+    return uncorrected, ArmResult(
+        nominal=chain,
+        corrected=chain.with_errors(errors),
+        table=table,
         factory=fit.views.arm is not None,
-        corrected=corrected_model(table, errors),
+        joints_rad=np.array([arm.joints_rad.min(axis=0), arm.joints_rad.max(axis=0)]),
         covariance=covariance,
-        with_table_m=corrected_m,
+        error_m=corrected_m,
         held_out_m=missed,
         refused=_refusal(fit, arm, detected, missed),
     )
@@ -73,8 +67,8 @@ _ELSEWHERE_RAD = 0.1
 _FEWEST_ELSEWHERE = 5
 
 
-def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") -> Verification:
-    """Verify X and the arm's table with views of the same board that took no part in the fit.
+def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") -> Solution:
+    """Verify X and the corrected arm with views of the same board that took no part in the fit.
 
     The board may lie anywhere but must not move: every view should place its middle at one point of base (or
     of the flange). Views from the postures of the fit are left out. Raises BadViewsError where too few are
@@ -97,12 +91,21 @@ def verify_elsewhere(solution: Solution, views: ViewSet, recording: str = "") ->
     missed = []
     for flange, X in (
         (views.base_from_flange, found.uncorrected.X),
-        (forward(arm.corrected, joints), solution.matrix),
+        (arm.corrected.forward(joints), solution.matrix),
     ):
         chain = flange @ X @ C if views.mount == "eye-in-hand" else inverse(flange) @ X @ C
         at = (chain @ middle)[:, :3]
         missed.append(np.linalg.norm(at - at.mean(axis=0), axis=1))
-    return Verification(recording, views.base_from_flange[:, :3, 3], np.array(missed))
+    missed_m = np.array(missed)
+    refused = arm.refused or (None if _helps(missed_m) else "not-better")
+    result = replace(arm, verified_by=recording, verified_m=missed_m, refused=refused)
+    return replace(solution, arm=replace(found, result=result))
+
+
+def _helps(missed_m: Array) -> bool:
+    """Tell whether the corrected arm misses less than the arm as it is; (2, n), NaN: unknown."""
+    as_it_is, corrected = np.nanmean(missed_m**2, axis=1)
+    return bool(corrected < as_it_is)
 
 
 def _stands_elsewhere(view: BoardView, fitted: Sequence[Array]) -> bool:
@@ -111,7 +114,7 @@ def _stands_elsewhere(view: BoardView, fitted: Sequence[Array]) -> bool:
     return all(np.abs(view.joints_rad - joints).max() > _ELSEWHERE_RAD for joints in fitted)
 
 
-def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | None) -> TableRefusal | None:
+def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | None) -> ArmRefusal | None:
     if not detected:
         return "no-evidence"
     if not arm.recorded:
@@ -119,6 +122,6 @@ def _refusal(fit: CellFit, arm: ArmPostures, detected: bool, missed: Array | Non
     off = difference(arm.chain.forward(arm.joints_rad), fit.views.base_from_flange)[:, :3]
     if np.sqrt(np.mean((off**2).sum(axis=1))) > max(_NOMINAL_M, 3 * float(fit.estimate.scales.robot[0])):
         return "not-nominal"
-    if missed is not None and not np.nanmean(missed[1] ** 2) < np.nanmean(missed[0] ** 2):
+    if missed is not None and not _helps(missed):
         return "not-better"
     return None

@@ -17,7 +17,7 @@ from calibrate.handeye.pose_fit import central_pose
 from calibrate.handeye.priors import BoardTolerance, KnownBefore
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
-from calibrate.results import SHAPE, LearnedArm, Posterior
+from calibrate.results import SHAPE, Posterior
 from calibrate.views import Observations, ViewSet, observe_views
 from recordings.schema.messages import CameraModel
 
@@ -41,9 +41,7 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
     scales = found.scales
     learned, gravity = None, None
     if chain is not None:
-        learned = LearnedArm(
-            _rows(chain.axes), _rows(chain.points), chain.posture_rad.tolist(), _rows(chain.flange)
-        )
+        learned = chain.plain
     if len(state.arm_errors):
         gravity = tuple(gravity_in_flange(fit.views.base_from_flange).mean(axis=0).tolist())
     return Posterior(
@@ -112,9 +110,7 @@ class KnownCell:
             Scales(np.array(posterior.robot_noise), tau, lambda_, sigma, np.array(posterior.class_shares)),
             posterior.freedom,
             np.array(posterior.board_extent_m),
-            None
-            if arm is None
-            else Chain(*(np.array(part) for part in (arm.axes, arm.points, arm.posture_rad, arm.flange))),
+            None if arm is None else Chain.of(arm),
             None if posterior.gravity is None else np.array(posterior.gravity),
             np.zeros((6, 6)) if posterior.stated_arm_error is None else np.array(posterior.stated_arm_error),
         )

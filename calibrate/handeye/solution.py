@@ -12,6 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from calibrate.chain import Chain
 from calibrate.errors import require_choice
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.metrics import Observability
@@ -100,51 +101,39 @@ class NoiseScales:
 
 
 @dataclass(frozen=True, eq=False)
-class TableResult:
-    """X and the arm's table as one result."""
+class ArmResult:
+    """X and the corrected arm as one result."""
 
-    nominal: RobotModel
-    """The table that the recorded flanges follow."""
+    nominal: Chain
+    """The arm as its controller computes it."""
+    corrected: Chain
+    table: RobotModel | None
+    """What `nominal` restates; None: it was learned."""
     factory: bool
-    """`nominal` is the maker's calibration of this arm, not the published table."""
-    corrected: RobotModel
+    """`table` is the maker's calibration of this arm, not the published one."""
+    joints_rad: Array
+    """(2, n) least and greatest of each joint in the views."""
     covariance: Array
-    """(36, 36) of X, as in `Solution.parent_from_child`, and of the links' errors, as in `Chain.by_links`."""
-    with_table_m: float
-    """1σ of a point over the workspace."""
+    """(6 + q, 6 + q) of X (as `Solution.parent_from_child`) and of the links' errors (`Chain.by_links`)."""
+    error_m: float
+    """1σ of a point over the workspace of a table, or over the range of the joints."""
     held_out_m: Array | None
-    """(2, n) error of views predicted from those taken elsewhere: without, with the table."""
-    refused: TableRefusal | None
-    """Reason why the table is not offered; None where it is."""
+    """(2, n) error of views predicted from those taken elsewhere: by the arm as it is, by the corrected."""
+    refused: ArmRefusal | None
+    """Reason why the corrected arm is not offered; None where it is."""
+    verified_by: str = ""
+    """File name of a second recording."""
+    verified_m: Array | None = None
+    """(2, n) distance of the board's middle from its mean place at poses of that recording, likewise."""
 
     @property
     def offered(self) -> bool:
         return self.refused is None
 
 
-@dataclass(frozen=True, eq=False)
-class Verification:
-    """The arm without and with its table at poses that took no part in the fit, n of them."""
-
-    recording: str
-    flange_m: Array
-    """(n, 3) where the flange stood."""
-    missed_m: Array
-    """(2, n) distance of the board's middle from its mean place: without, with the table."""
-
-    @property
-    def rms_m(self) -> tuple[float, float]:
-        without, with_table = np.sqrt(np.mean(self.missed_m**2, axis=1)).tolist()
-        return without, with_table
-
-    @property
-    def better(self) -> bool:
-        return self.rms_m[1] < self.rms_m[0]
-
-
-TableRefusal = Literal["no-evidence", "no-joints", "not-nominal", "not-better"]
-"""No clear evidence; joints by inverse kinematics; recorded flanges do not follow the nominal table; the
-table does not help on poses elsewhere."""
+ArmRefusal = Literal["no-evidence", "no-joints", "not-nominal", "not-better"]
+"""No clear evidence; joints by inverse kinematics; recorded flanges do not follow the nominal arm; the
+corrected one does not help on poses elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +160,8 @@ class ArmErrors:
     """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
     uncorrected: UncorrectedArm | None = None
     """None where the arm's kinematics are not known: only the bracket is modelled."""
-    result: TableResult | None = None
-    """None where the arm follows no known table."""
+    result: ArmResult | None = None
+    """None as `uncorrected`."""
 
     @property
     def detected(self) -> bool:

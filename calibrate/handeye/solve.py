@@ -230,8 +230,8 @@ def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: flo
     if fit.arm is None:
         return found
     missed = held_out_elsewhere(fit, fit.arm.joints_rad) if found.detected and options.folds else None
-    uncorrected, table = arm_results(fit, fit.arm, found.detected, distance_m, missed)
-    return replace(found, uncorrected=uncorrected, result=table)
+    uncorrected, result = arm_results(fit, fit.arm, found.detected, distance_m, missed)
+    return replace(found, uncorrected=uncorrected, result=result)
 
 
 def _holdout(fit: CellFit) -> HoldoutScore | None:
@@ -266,7 +266,7 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
     systematic = (
         f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm or mrad in the arm's "
         "kinematics, or a bracket that bends. "
-    ) + ("Use the corrected table." if offered else "Have the arm calibrated, and stiffen the bracket.")
+    ) + ("Use the corrected arm." if offered else "Have the arm calibrated, and stiffen the bracket.")
     as_recorded = session.reading is Reading.AS_RECORDED
     said = (
         (not as_recorded, session.reading.value, explain_text(session, fit.views)),

@@ -175,8 +175,7 @@ def rehearsal_text(job: SolvedRecording) -> str:
     about = json.loads(attachments["rehearsal.json"])
     true_X = np.array(json.loads(attachments["truth.json"])["camera_mount"])
     off = difference(job.calibration.transform.matrix, true_X)
-    distance_mm = 1000 * (quality.working_distance_m or 0.0)
-    reached = f"{quality.predicted_error_mm:.2f} mm at {distance_mm:.0f} mm (1σ)"
+    reached = f"{quality.predicted_error_mm:.2f} mm (1σ) {figures(job.calibration)['error'].about}"
     repeats = f"{about['robot_sigma_mm']:.2g} mm and {about['robot_sigma_deg']:.2g}° (1σ per axis)"
     off_deg = np.degrees(np.linalg.norm(off[3:]))
     return (

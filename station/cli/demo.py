@@ -141,7 +141,7 @@ def _show_demo(result: DemoJson, with_table: bool, duration_s: float) -> None:
     table = Table(title=f"SIMULATED cell, seed {result.seed}: {result.mount}, {result.scene} scene")
     for heading in ("", "translation", "rotation"):
         table.add_column(heading, justify="left" if not heading else "right")
-    on_table = ", with the arm's table" if with_table else ""
+    on_table = ", by the corrected arm" if with_table else ""
     for name, value in (
         (f"error against the truth{on_table}", result.truth_error),
         (f"standard uncertainty{on_table}", result.sigma),

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from calibrate.boards.model import board_points
+from calibrate.chain import chain_of
 from calibrate.geometry import Array
-from calibrate.handeye.arm import chain_of
 from calibrate.handeye.information import (
     USUAL_NOISE,
     MeasurementNoise,

@@ -85,11 +85,12 @@ class SessionsScreen(StationScreen):
 
 def _row(kept: Kept) -> tuple[Content, ...]:
     session, found, check = kept.session, kept.calibration, kept.check
-    predicted = UNKNOWN
+    predicted, unit = UNKNOWN, "mm"
     became, verdict = kept.word, mark("todo", "not solved")
     if found is not None:
         quality = found.quality
         predicted = UNKNOWN if quality.predicted_error_mm is None else f"± {quality.predicted_error_mm:.2f}"
+        unit = "mm + arm" if quality.without_arm else unit
         verdict = mark("failed" if found.verdict == "FAIL" else "done", found.verdict)
         became = became or "solved, not installed"
     elif check is not None:
@@ -103,7 +104,7 @@ def _row(kept: Kept) -> tuple[Content, ...]:
         Content.styled(session.name, "$foreground"),
         Content.styled(("● " if now else "") + became, style),
         verdict,
-        facts(("", f"{predicted:>6}", "mm")),
+        facts(("", f"{predicted:>6}", unit)),
         Content.styled(f"{session.views:>4}", "$foreground"),
         Content.styled(size(session.bytes), "$foreground"),
     )

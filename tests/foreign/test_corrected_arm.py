@@ -1,4 +1,4 @@
-"""The exported arm, chained by pytransform3d: the corrected arm to 1e-9 m, with its own camera."""
+"""The exported arm by other people's readers of URDF: the corrected arm to 1e-9 m, and its camera."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from calibrate.files.exports import export
 from calibrate.geometry import Array, Transform, pose, rotation_exp
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.simulation.cells import make_cell
+from tests.calibrate.files.test_arm_urdf import X, arm_of, urdf_of, within
 from tests.calibrate.files.test_exports import offered_arm
 from tests.foreign.judges import FOLDER, missing
 from tests.station.calibrated_cell import calibration_of
@@ -35,19 +36,15 @@ def calibration() -> Calibration:
     return msgspec.structs.replace(made, arm_table=arm)
 
 
-def by_pytransform3d(path: Path, parent: str, child: str) -> Array:
-    """(n, 4, 4) at `POSTURES`."""
-    library = FOLDER / "python"
-    if not (library / "pytransform3d").is_dir():
-        missing("pytransform3d")
-    script = Path(__file__).with_name("pytransform3d_urdf.py")
-    postures = [
-        {f"{name}_joint": q for name, q in zip(JOINTS, row, strict=True)} for row in POSTURES.tolist()
-    ]
+def chained(library: str, path: Path, parent: str, child: str, postures: list[dict[str, float]]) -> Array:
+    """parent_from_child (n, 4, 4) at the postures."""
+    installed = FOLDER / "python"
+    if not (installed / library).is_dir():
+        missing(library)
     ran = subprocess.run(
-        [sys.executable, str(script), str(path), parent, child],
+        [sys.executable, str(Path(__file__).with_name("urdf_frames.py")), library, str(path), parent, child],
         input=json.dumps(postures),
-        env={**os.environ, "PYTHONPATH": str(library)},
+        env={**os.environ, "PYTHONPATH": str(installed)},
         capture_output=True,
         text=True,
         check=True,
@@ -80,5 +77,25 @@ def test_the_driver_s_kinematics_file_in_the_joints_of_its_description(
         parent = child
     path = tmp_path / "ur.urdf"
     path.write_text("".join([*parts, "</robot>"]))
-    found = by_pytransform3d(path, "base_link_inertia", "wrist_3_link")
+    postures = [
+        {f"{name}_joint": q for name, q in zip(JOINTS, row, strict=True)} for row in POSTURES.tolist()
+    ]
+    found = chained("pytransform3d", path, "base_link_inertia", "wrist_3_link", postures)
     assert np.abs(found - own(calibration)).max() < 1e-9
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("library", ["pytransform3d", "yourdfpy"])
+def test_a_urdf_of_a_learned_arm_is_the_corrected_arm_with_its_camera(
+    calibration: Calibration, library: str, mount: str, tmp_path: Path
+) -> None:
+    arm = arm_of("seven joints", parent="flange" if mount == "eye-in-hand" else "base")
+    made = msgspec.structs.replace(calibration, mount=mount, arm_table=arm)
+    path = tmp_path / "arm.urdf"
+    path.write_bytes(export(made, "urdf", arm=urdf_of("seven joints")))
+    q = within(arm, 30)
+    postures = [{f"joint_{i}": angle for i, angle in enumerate(row)} for row in q.tolist()]
+    flange = np.array([arm.base_from_flange(row).matrix for row in q])
+    assert np.abs(chained(library, path, "world", "tool0", postures) - flange).max() < 1e-9
+    camera = flange @ X if mount == "eye-in-hand" else np.broadcast_to(X, flange.shape)
+    assert np.abs(chained(library, path, "world", "camera_optical_frame", postures) - camera).max() < 1e-9

@@ -17,10 +17,11 @@ from station.cell.status import StationState, StationStatus
 from station.operate.drift_check import POSES, SEED
 from station.protocol import verbs
 from station.tui import jobs
+from station.tui.app import StationApp
 from station.tui.desk import REMEDIES, busy_words
 from station.tui.dialogs import ConfirmMotion, JobScreen
 from station.tui.installed import read_installed
-from tests.tui.conftest import FakeLink, app_on, idle, in_session, said, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 from tests.tui.test_install import GOOD
 from tests.tui.test_plan_screen import SlowPlanner
 
@@ -55,8 +56,14 @@ def installed(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def check_session(root: Path, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:
-    folder = str(root / "root/sessions/s-2")
-    return in_session(idle(state), plan_sha256=CHECK_PLAN, folder=folder, recording=recording)
+    status = idle(state)
+    session = msgspec.structs.replace(
+        status.session,
+        plan_sha256=CHECK_PLAN,
+        folder=str(root / "root/sessions/s-2"),
+        recording=recording,
+    )
+    return msgspec.structs.replace(status, session=session)
 
 
 async def ask_for_it(pilot: Pilot[None]) -> None:
@@ -64,12 +71,16 @@ async def ask_for_it(pilot: Pilot[None]) -> None:
     await pilot.press("4", "d")
 
 
+def said(app: StationApp, words: str) -> bool:
+    return any(words in notice.message for notice in app._notifications)
+
+
 async def test_nothing_is_planned_where_nothing_is_installed(link: FakeLink, tmp_path: Path) -> None:
     link.root = tmp_path
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await ask_for_it(pilot)
-        await until(pilot, lambda: REMEDIES["nothing-installed"] in said(pilot))
+        await until(pilot, lambda: said(app, REMEDIES["nothing-installed"]))
         assert link.verbs == []
 
 

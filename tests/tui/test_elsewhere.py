@@ -12,10 +12,11 @@ from textual.widgets import DataTable
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install, rollback
 from calibrate.files.versions import note_installed, who
+from calibrate.results import Gate
 from station.tui import app as app_module
 from station.tui.app import StationApp
 from station.tui.installed import read_installed
-from tests.tui.conftest import FakeLink, app_on, idle, in_session, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 from tests.tui.test_install import GOOD, OFF
 
 
@@ -68,6 +69,19 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
         assert table.cursor_row == 2
 
 
+async def test_an_error_without_the_arm_s_own_is_marked_in_the_list(link: FakeLink, root: Path) -> None:
+    arm = Gate("arm", True, None, None, "Arm's own error WARN", remedy="Record joints.")
+    quality = msgspec.structs.replace(GOOD.quality, predicted_error_mm=0.25, gates=[arm])
+    unsure = msgspec.structs.replace(GOOD, created="2026-01-03", quality=quality)
+    write_calibration(unsure, root / "sessions" / "s-2" / "calibration.yaml")
+    app = app_on(link)
+    async with app.run_test(size=(80, 24)) as pilot:
+        table = await list_of_sessions(app, pilot)
+        await until(pilot, lambda: table.row_count == 2)
+        shown = {str(table.get_row_at(line)[0]): str(table.get_row_at(line)[3]) for line in range(2)}
+        assert "+ arm" in shown["s-2"] and "+ arm" not in shown["s-1"]
+
+
 async def test_the_result_says_when_it_is_the_installed_one(link: FakeLink, root: Path) -> None:
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
@@ -110,9 +124,11 @@ def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
 
 
 async def test_the_result_of_the_session_just_captured_needs_no_picking(link: FakeLink, root: Path) -> None:
-    app = app_on(link)
+    app, status = app_on(link), idle()
     path = str(root / "sessions" / "s-1" / "calibration.yaml")
-    link.show(in_session(idle(), calibration=path))
+    link.show(
+        msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, calibration=path))
+    )
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: app.known.status is not None and app.known.status.session.calibration)
         await pilot.press("4")

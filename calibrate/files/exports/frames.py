@@ -40,8 +40,6 @@ class FrameNames:
     body: str = "camera_link"
     validity: Validity | None = None
     """Validity of the installed calibration, for the comment; None: the export is of a file."""
-    with_table: bool = False
-    """True: export the camera pose that belongs to the arm's corrected table."""
 
     @classmethod
     def of_camera(cls, name: str) -> FrameNames:
@@ -58,7 +56,7 @@ class FrameNames:
         return name if name[:1].isalpha() else f"camera{name}"
 
 
-def comment(calibration: Calibration, frames: FrameNames) -> str:
+def comment(calibration: Calibration, frames: FrameNames, corrected: bool = False) -> str:
     """Make the comment on the origin of an export, with a warning for a calibration of no real cell.
 
     Always one line: a line break in a name must not become a line of a launch file or a script.
@@ -66,13 +64,10 @@ def comment(calibration: Calibration, frames: FrameNames) -> str:
     stamp = source_stamp(calibration.source)
     origin = f"{calibration.provenance.session}, solved {calibration.created}"
     held = "" if frames.validity is None else validity_text(frames.validity)
-    two = calibration.arm_table is not None and calibration.arm_table.offered
-    table = "" if not two else _WITH_TABLE if frames.with_table else _AS_IT_IS
-    return " ".join(". ".join(filter(None, (stamp, origin, table, held))).split())
-
-
-_WITH_TABLE = "Camera pose for the corrected table (ur-kinematics) alone, not for the arm as it is"
-_AS_IT_IS = "Camera pose for the arm as it is, not for its corrected table"
+    two = ("the corrected arm", "the arm as it is")[:: 1 if corrected else -1]
+    offered = calibration.arm_table is not None and calibration.arm_table.offered
+    arm = f"Camera pose for {two[0]}, not for {two[1]}" if offered else ""
+    return " ".join(". ".join(filter(None, (stamp, origin, arm, held))).split())
 
 
 def commented_yaml(calibration: Calibration, frames: FrameNames, plain: dict[str, Any], **layout: Any) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -29,17 +28,19 @@ def urdf(calibration: Calibration, frames: FrameNames) -> str:
     parent = frames.parent(calibration)
     name = quoteattr(f"{frames.node}_calibrated")
     return (
-        f"{_commented(comment(calibration, frames))}<robot name={name}>\n<link name={quoteattr(parent)}/>\n"
-        f"{_camera(calibration.transform.matrix, parent, frames)}</robot>\n"
+        f"{commented(comment(calibration, frames))}<robot name={name}>\n<link name={quoteattr(parent)}/>\n"
+        f"{camera(calibration.transform.matrix, parent, frames)}</robot>\n"
     )
 
 
-def _commented(note: str) -> str:
+def commented(note: str) -> str:
+    """Make a comment of XML."""
     safe = re.sub("-(?=-)", "- ", note)  # no -- inside a comment of XML
     return f"<!-- {safe} -->\n"
 
 
-def _camera(parent_from_optical: Array, parent: str, frames: FrameNames) -> str:
+def camera(parent_from_optical: Array, parent: str, frames: FrameNames) -> str:
+    """Make links and joints of the camera's body and its optical frame, carried by the link `parent`."""
     return (
         f"<link name={quoteattr(frames.body)}/>\n<link name={quoteattr(frames.camera)}/>\n"
         + _joint(parent, frames.body, parent_from_optical @ inverse(BODY_FROM_OPTICAL))
@@ -47,7 +48,8 @@ def _camera(parent_from_optical: Array, parent: str, frames: FrameNames) -> str:
     )
 
 
-def _numbers(values: ArrayLike) -> str:
+def numbers(values: ArrayLike) -> str:
+    """Write numbers so that they read back exactly."""
     return " ".join(repr(v) for v in np.asarray(values, float).tolist())
 
 
@@ -61,7 +63,7 @@ def _joint(parent: str, child: str, matrix: Array) -> str:
 
 def _origin(matrix: Array) -> str:
     rpy = roll_pitch_yaw(matrix[:3, :3])
-    return f'<origin xyz="{_numbers(matrix[:3, 3])}" rpy="{_numbers(rpy)}"/>'
+    return f'<origin xyz="{numbers(matrix[:3, 3])}" rpy="{numbers(rpy)}"/>'
 
 
 _LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -76,17 +78,13 @@ def link_origins(table: DhTable) -> Array:
     model, after = RobotModel("corrected", a, d, alpha, theta, beta), [a[5], alpha[5], beta[5]]
     if np.abs(after).max() > 1e-12:
         raise ExportError("table-behind-joint-6")
-    frames, behind, found = link_frames(model, np.zeros(6)), np.eye(4), []
-    for i in range(6):
-        step = inverse(frames[i]) @ frames[i + 1]
-        turned = pose(rotation_exp([0.0, 0.0, theta[i]]), [0.0, 0.0, d[i]])
-        found.append(behind @ turned)
-        behind = inverse(turned) @ step
-    return np.array(found)
+    axis = np.eye(3)[2]
+    links = link_frames(model, np.zeros(6))[:6] @ pose(rotation_exp(np.outer(theta, axis)), np.outer(d, axis))
+    return np.asarray(inverse(np.stack([np.eye(4), *links[:-1]])) @ links)
 
 
 def table_of(calibration: Calibration) -> CorrectedArm:
-    """Return the arm's table, offered or not. Raises ExportError where there is none."""
+    """Return the corrected arm, offered or not. Raises ExportError where there is none."""
     if calibration.arm_table is None:
         raise ExportError("no-arm-table")
     return calibration.arm_table
@@ -96,9 +94,11 @@ def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
     """Make the `kinematics_params_file` of ROS 2's ur_description: x y z, roll pitch yaw of each link."""
     arm = table_of(calibration)
     table, X = arm.installable()
-    values = _numbers([*X.translation_m, *X.quaternion_xyzw])
+    if table is None:
+        raise ExportError("no-ur-table")
+    values = numbers([*X.translation_m, *X.quaternion_xyzw])
     note = (
-        f"{comment(calibration, replace(frames, with_table=True))}\n"
+        f"{comment(calibration, frames, corrected=True)}\n"
         f"{arm.model}: use it only with this camera pose, and this one only with it:\n"
         f"{frames.parent(calibration)} {frames.camera} (x y z, qx qy qz qw) {values}"
     )

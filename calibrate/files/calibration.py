@@ -212,11 +212,11 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     def __post_init__(self) -> None:
         frames = ("", "") if self.result is None else (self.result.parent_frame, self.result.child_frame)
         known = frames in (("corrected_flange", "camera"), ("corrected_base", "camera"))
-        nominal, corrected = (self.nominal, self.learned), (self.corrected, self.corrected_chain)
-        kinds = [[arm is not None for arm in arms] for arms in (nominal, corrected)]
-        if not (self.offered == known == (self.result is not None)) or sum(kinds[0]) != 1:
+        kinds = [arm is not None for arm in (self.nominal, self.learned)]
+        given = [arm is not None for arm in (self.corrected, self.corrected_chain)]
+        if not (self.offered == known == (self.result is not None)) or sum(kinds) != 1:
             raise ValueError("the corrected arm and its X do not belong together")
-        if kinds[1] != (kinds[0] if self.offered else [False, False]):
+        if given != (kinds if self.offered else [False, False]):
             raise ValueError("the corrected arm is of another kind than the nominal one")
 
     def base_from_flange(self, joints_rad: ArrayLike) -> Transform:

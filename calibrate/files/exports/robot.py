@@ -218,11 +218,12 @@ def _recognise(paths: list[_Path], arm: CorrectedArm) -> tuple[_Path, Array, Arr
     told, least_m = nominal.forward(q), np.inf
     for signs in sorted(product((1.0, -1.0), repeat=n), key=lambda signs: -sum(signs)):
         tried = [replace(path, axes=np.array(signs)[:, None] * path.axes) for path in paths]
-        places = [path.chain.forward(q) for path in tried]
-        turned, own = (rotation_angle((inverse(F[:1]) @ F)[:, :3, :3]) for F in (told, places[0]))
+        pairs = [(path, path.chain.forward(q)) for path in tried]
+        pairs.sort(key=lambda pair: float(np.linalg.norm((pair[1] - told)[0, :3, 3])))  # the least tool first
+        turned, own = (rotation_angle((inverse(F[:1]) @ F)[:, :3, :3]) for F in (told, pairs[0][1]))
         if np.isfinite(least_m) and np.sqrt(np.mean((turned - own) ** 2)) > _MAX_OFF_RAD:
             continue  # whatever base and tool are
-        for way, (path, place) in product(range(3), zip(tried, places, strict=True)):
+        for way, (path, place) in product(range(3), pairs):
             B, T = eye, eye if way == 0 else mean_pose(inverse(place) @ told)
             if way == 2:
                 T = inverse(solve_global(all_pairs(told, inverse(place))).X)

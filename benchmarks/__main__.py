@@ -35,7 +35,6 @@ SHOWN: dict[str, str] = {
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
     "drift": r"^\| (ur|seven joints) ",
-    "production": r"^\| (repeated|any) .* of ",
     "late_news": r"^\| all",
     "stop_latency": r"^\| both \| (first|bytes).* 200 \||no heartbeat \| rest",
 }

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from itertools import islice
-
 import numpy as np
 
-from benchmarks.trials import in_processes, rms, table, trials
+from benchmarks.trials import Miss, rms, rows_of, table, trials
 from calibrate.geometry import Array, difference, rotation_log
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
@@ -27,18 +25,7 @@ _AHEAD_M = 0.5
 def run() -> str:
     count = trials(TRIALS)
     cases = [(arm, mount, size) for arm in ARMS for mount in MOUNTS for size in SIZES_MM]
-    results = in_processes(measure, [(*case, seed) for case in cases for seed in range(count)])
-    rows = []
-    for arm, mount, size in cases:
-        found = np.array(list(islice(results, count)))
-        inside, square, error, claimed, plain_inside, plain_error, installed, said = found.T
-        rows.append([
-            arm, mount, f"{size:g}", f"{100 * inside.mean():.1f}", f"{np.median(square) / 6:.2f}",
-            f"{rms(error):.3f}", f"{rms(claimed):.3f}", f"{100 * plain_inside.mean():.1f}",
-            f"{rms(plain_error):.3f}", f"{rms(installed):.3f}", f"{rms(said):.3f}",
-            f"{100 * (installed <= 2 * said).mean():.1f}",
-        ])  # fmt: skip
-        print(" | ".join(rows[-1]), flush=True)
+    rows = rows_of(measure, cases, count, line)
     text = (
         f"{count} cells a row (`tests/calibrate/chains.py`): 25 views, each link but the last off by so many "
         "mm and mrad (1σ) in each direction, corners 0.15 px, robot noise 0.02 mm and 0.02 mrad. Known: "
@@ -49,28 +36,30 @@ def run() -> str:
     return text + "\n\n" + table(HEADER, rows)
 
 
+def line(case: tuple[str, Mount, float], cells: list[tuple[float, ...]]) -> list[str]:
+    arm, mount, size = case
+    inside, square, error, claimed, plain_inside, plain_error, installed, said = np.array(cells).T
+    return [
+        arm, mount, f"{size:g}", f"{100 * inside.mean():.1f}", f"{np.median(square) / 6:.2f}",
+        f"{rms(error):.3f}", f"{rms(claimed):.3f}", f"{100 * plain_inside.mean():.1f}",
+        f"{rms(plain_error):.3f}", f"{rms(installed):.3f}", f"{rms(said):.3f}",
+        f"{100 * (installed <= 2 * said).mean():.1f}",
+    ]  # fmt: skip
+
+
 def measure(task: tuple[str, Mount, float, int]) -> tuple[float, ...]:
     cell = arm_cell(*task)
-    learned = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
-    plain = solve_views(cell.views, SolveOptions(holdout=False, folds=False, model_arm=False))
-    found = []
-    for solution in (learned, plain):
-        delta = difference(solution.matrix, cell.X)
-        square = float(delta @ np.linalg.solve(solution.covariance, delta))
-        found.append((float(square <= solution.confidence_threshold), square, delta, solution))
-    (inside, square, delta, _), (plain_inside, _, plain_delta, _) = found
+    learned, plain = (
+        solve_views(cell.views, SolveOptions(holdout=False, folds=False, model_arm=arm))
+        for arm in (True, False)
+    )
+    miss, plain_miss = (Miss.of(solution, cell.X) for solution in (learned, plain))
     assert learned.arm is not None and learned.arm.uncorrected is not None
     installed = learned.arm.uncorrected
-    return (
-        inside,
-        square,
-        1e3 * float(np.linalg.norm(delta[:3])),
-        1e3 * learned.sigma_translation_m,
-        plain_inside,
-        1e3 * float(np.linalg.norm(plain_delta[:3])),
-        1e3 * over_range(cell, installed.X),
-        1e3 * installed.error_m,
-    )
+    lengths_m = [miss.shift_m, learned.sigma_translation_m, plain_miss.shift_m]
+    lengths_m += [over_range(cell, installed.X), installed.error_m]
+    error, claimed, plain_error, over, said = (1e3 * length for length in lengths_m)
+    return miss.covered, miss.square, error, claimed, plain_miss.covered, plain_error, over, said
 
 
 def over_range(cell: ArmCell, X: Array) -> float:

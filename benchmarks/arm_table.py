@@ -15,9 +15,9 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.imperfect_cells import BOARD, LENSES, _look
+from benchmarks.imperfect_cells import BOARD, LENSES, look, mounted
 from benchmarks.scene import grid
-from benchmarks.trials import in_processes, rms, share_spread, table, trials
+from benchmarks.trials import Miss, in_processes, rms, share_spread, table, trials
 from calibrate.chain import chain_of
 from calibrate.gates import GateInputs, GateLimits, judge
 from calibrate.geometry import (
@@ -110,20 +110,15 @@ def draw_errors(rng: np.random.Generator, size: float) -> Array:
 def draw_cell(rng: np.random.Generator, mount: Mount, size: float, told: Tolerances) -> tuple[Truth, Array]:
     """A cell, and joints (POOL, 6) of one arm branch from where its camera sees the board."""
     while True:
-        held = pose(rotation_exp(0.3 * rng.normal(size=3)), 0.05 * rng.normal(size=3) + [0, 0, 0.1])
-        if mount == "eye-in-hand":
-            turn = rotation_exp([np.pi, 0, 0]) @ rotation_exp(0.1 * rng.normal(size=3))
-            X, Y = held, pose(turn, [0.1, -0.7, 0.1])
-        else:
-            towards = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-            X, Y = pose(towards @ rotation_exp(0.15 * rng.normal(size=3)), [1.15, 0.2, 0.6]), held
-        C = np.array([_look(rng, LENS, POINTS) for _ in range(POOL)])
+        X, Y = mounted(rng, mount)
+        C = np.array([look(rng, LENS, POINTS) for _ in range(POOL)])
         flange = Y @ inverse(C) @ inverse(X) if mount == "eye-in-hand" else X @ C @ inverse(Y)
         _, joints, branch = inverse_many(ARM, flange)
         joints = joints[branch == np.bincount(branch).argmax()]
         if len(joints) >= 0.5 * POOL:
             break
-    u, v = (2 * POINTS[:, :2].T - POINTS[:, :2].T.max(axis=1)[:, None]) / POINTS[:, :2].T.max(axis=1)[:, None]
+    half = POINTS[:, :2].max(axis=0) / 2
+    u, v = (POINTS[:, :2] / half - 1).T
     s, unequal = told.board * rng.normal(size=2)
     scale = 1.0 + s + np.array([unequal, -unequal]) / 2
     about = rng.uniform(0, np.pi)
@@ -175,8 +170,6 @@ class Judge:
 
     truth: Truth
     joints: Array
-    points: Array
-    """(m, 3) in the camera, or on the board (eye-to-hand)."""
 
     @classmethod
     def everywhere(cls, truth: Truth, like: Array, rng: np.random.Generator) -> Judge:
@@ -190,27 +183,20 @@ class Judge:
             R = np.array([random_rotation(rng) for _ in at])
             _, q, branch = inverse_many(ARM, pose(R, reach * at + [0, 0, ARM.d_m[0]]))
             joints = np.concatenate([joints, q[branch == own]])
-        return cls(truth, joints[:400], cls._points(truth))
-
-    @staticmethod
-    def _points(truth: Truth) -> Array:
-        if truth.mount == "eye-in-hand":
-            return np.array([[0.0, 0.0, _AHEAD_M]])
-        return np.asarray(POINTS.mean(axis=0)[None])
+        return cls(truth, joints[:400])
 
     @classmethod
     def near(cls, truth: Truth, pool: Array) -> Judge:
-        return cls(truth, pool[:200], cls._points(truth))
+        return cls(truth, pool[:200])
 
     def error_mm(self, X: Array, flange: Callable[[Array], Array]) -> float:
         """rms, one rigid motion of all points taken out."""
         true = self.truth.flange(self.joints)
         said = flange(self.joints)
         if self.truth.mount == "eye-in-hand":
-            at = (true @ self.truth.X @ np.append(self.points[0], 1.0))[:, :3]
-            told = (said @ X @ np.append(self.points[0], 1.0))[:, :3]
+            at, told = ((way @ [0.0, 0.0, _AHEAD_M, 1.0])[:, :3] for way in (true @ self.truth.X, said @ X))
             return float(1e3 * rms_fitted(told, at))
-        held = (self.truth.Y @ np.append(self.points[0], 1.0))[:3]
+        held = (self.truth.Y @ np.append(POINTS.mean(axis=0), 1.0))[:3]
         at = transform_points(X @ inverse(self.truth.X), true[:, :3, :3] @ held + true[:, :3, 3])
         # The point that the flange carries is free: at = said (R p + t).
         A, b = said[:, :3, :3].reshape(-1, 3), (at - said[:, :3, 3]).reshape(-1)
@@ -268,10 +254,8 @@ def measure(
     found["claimed"] = 1e3 * result.error_m
     found["claimed without"] = 1e3 * arm.uncorrected.error_m
     for way, solution in (("plain", plain), ("table", with_table)):
-        delta = difference(solution.matrix, truth.X)
-        found[f"X {way}"] = 1e3 * float(np.linalg.norm(delta[:3]))
-        square = delta @ np.linalg.solve(solution.covariance, delta)
-        found[f"inside {way}"] = float(square <= solution.confidence_threshold)
+        miss = Miss.of(solution, truth.X)
+        found |= {f"X {way}": 1e3 * miss.shift_m, f"inside {way}": float(miss.covered)}
     q = everywhere.joints[:100]
     delta = difference(corrected(q), truth.flange(q))
     S = (T := CHAIN.by_links(q)) @ result.covariance[6:, 6:] @ np.swapaxes(T, 1, 2)
@@ -294,16 +278,16 @@ class Row:
     cells: int = TRIALS
 
 
+PLACES: tuple[tuple[Mount, str], ...] = (("eye-in-hand", ""), ("eye-to-hand", ", to hand"))
 ROWS = (
     Row("0.3 mm, measured, 50 planned", "eye-in-hand", 0.3, GOOD, 50, planned=True),
     Row("0.3 mm, measured, 50 random", "eye-in-hand", 0.3, GOOD, 50),
     Row("0.3 mm, usual, 50 planned", "eye-in-hand", 0.3, LOOSE, 50, planned=True),
-    *(Row(f"{size:g} mm, usual, 25 random", "eye-in-hand", size, LOOSE, 25) for size in (0.0, 0.3)),
-    *(Row(f"{size:g} mm, usual, 25 random, to hand", "eye-to-hand", size, LOOSE, 25) for size in (0.0, 0.3)),
-    *(Row(f"{size:g} mm, usual, 25 random", "eye-in-hand", size, LOOSE, 25, cells=40) for size in (0.1, 0.5)),
     *(
-        Row(f"{size:g} mm, usual, 25 random, to hand", "eye-to-hand", size, LOOSE, 25, cells=40)
-        for size in (0.1, 0.5)
+        Row(f"{size:g} mm, usual, 25 random{place}", mount, size, LOOSE, 25, cells=cells)
+        for cells, sizes in ((TRIALS, (0.0, 0.3)), (40, (0.1, 0.5)))
+        for mount, place in PLACES
+        for size in sizes
     ),
 )
 

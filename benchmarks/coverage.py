@@ -8,15 +8,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 
 from benchmarks.imperfect_cells import Imperfection, Known, imperfect_cell
-from benchmarks.trials import in_processes, rms, table, trials
+from benchmarks.trials import Miss, rms, rows_of, table, trials
 from calibrate.errors import CalibrationError
 from calibrate.gates import GateInputs, judge
-from calibrate.geometry import difference
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import LensModel
@@ -45,11 +43,9 @@ class CoverageTrial:
 
     closed: tuple[str, ...]
     """Names of the closed gates; where nothing was solved: what was said instead."""
-    square: float | None = None
-    """δᵀ C⁻¹ δ; None where nothing was solved."""
-    covered: bool = False
+    miss: Miss | None = None
+    """None where nothing was solved."""
     beyond: bool = False
-    error_m: float = 0.0
     claimed_m: float = 0.0
 
 
@@ -81,11 +77,7 @@ HEADER = ("what is off", "mount", "coverage %", "covered or refused %", "X rms m
 def run() -> str:
     count = trials(TRIALS)
     cases = [(place, mount) for place in range(len(ROWS)) for mount in MOUNTS]
-    results = in_processes(measure, [(*case, k) for case in cases for k in range(count)])
-    rows = []
-    for place, mount in cases:
-        rows.append(line(ROWS[place], mount, list(islice(results, count))))
-        print(" | ".join(rows[-1]), flush=True)
+    rows = rows_of(measure, cases, count, line)
     text = (
         f"{count} cells per row, 25 views, 0.2 px, 0.3 mm, 0.03° (`imperfect_cells`); the lens from the same "
         "pictures unless given, the arm unknown unless said. Signs and directions of what is off are drawn "
@@ -106,46 +98,40 @@ def measure(task: tuple[int, Mount, int]) -> CoverageTrial:
             cell = imperfect_cell(rng, mount, row.wrong, row.known, row.model)
             solution = solve_views(cell.views, SolveOptions(intrinsics_from_same_pictures=not row.known.lens))
     except CalibrationError as problem:
-        return CoverageTrial((str(problem.values.get("hypothesis", type(problem).__name__)),))
+        return CoverageTrial((problem.hypothesis or type(problem).__name__,))
     used = set(solution.used)
     seen = picture_coverage(cell.views.select([k for k, v in enumerate(cell.views) if v.index in used]))
     gates = judge(solution, GateInputs(None if row.known.lens else seen))
-    delta = difference(solution.matrix, cell.X)
-    square = float(delta @ np.linalg.solve(solution.covariance, delta))
-    shift, turn = float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
-    beyond = shift > _BEYOND * solution.sigma_translation_m or turn > _BEYOND * solution.sigma_rotation_rad
+    miss = Miss.of(solution, cell.X)
+    beyond = (
+        miss.shift_m > _BEYOND * solution.sigma_translation_m
+        or miss.turn_rad > _BEYOND * solution.sigma_rotation_rad
+    )
     closed = tuple(
         f"session: {solution.session.reading.value}" if gate.name == "session" else gate.name
         for gate in gates
         if not gate.passed
     )
-    return CoverageTrial(
-        closed,
-        square,
-        square <= solution.confidence_threshold,
-        beyond,
-        shift,
-        solution.sigma_translation_m,
-    )
+    return CoverageTrial(closed, miss, beyond, solution.sigma_translation_m)
 
 
-def line(row: Row, mount: Mount, found: Sequence[CoverageTrial]) -> list[str]:
-    solved = [trial for trial in found if trial.square is not None]
-    squares = np.array([trial.square for trial in solved])
+def line(case: tuple[int, Mount], found: list[CoverageTrial]) -> list[str]:
+    solved = [(trial.miss, trial.claimed_m) for trial in found if trial.miss is not None]
+    misses = [miss for miss, _ in solved]
     closed = Counter(name for trial in found for name in trial.closed)
 
-    def percent(count: int, of: Sequence[CoverageTrial]) -> str:
+    def percent(count: int, of: Sequence[object] = found) -> str:
         return f"{100 * count / max(len(of), 1):.1f}"
 
     return [
-        row.name,
-        mount,
-        percent(sum(t.covered for t in solved), solved),
-        percent(sum(t.covered or bool(t.closed) for t in found), found),
-        f"{1e3 * rms(np.array([t.error_m for t in solved])):.3f}",
-        f"{1e3 * rms(np.array([t.claimed_m for t in solved])):.3f}",
-        f"{np.median(squares) / 6:.2f}",
-        percent(sum(not t.closed for t in found), found),
-        percent(sum(t.beyond and not t.closed for t in found), found),
-        ", ".join(f"{name} {100 * k / len(found):.1f}" for name, k in closed.most_common()),
+        ROWS[case[0]].name,
+        case[1],
+        percent(sum(miss.covered for miss in misses), misses),
+        percent(sum((t.miss is not None and t.miss.covered) or bool(t.closed) for t in found)),
+        f"{1e3 * rms(np.array([miss.shift_m for miss in misses])):.3f}",
+        f"{1e3 * rms(np.array([claimed_m for _, claimed_m in solved])):.3f}",
+        f"{np.median([miss.square for miss in misses]) / 6:.2f}",
+        percent(sum(not t.closed for t in found)),
+        percent(sum(t.beyond and not t.closed for t in found)),
+        ", ".join(f"{name} {percent(k)}" for name, k in closed.most_common()),
     ]

@@ -5,11 +5,9 @@ The arms are chains written for the tests; nobody described them to the solver.
 
 from __future__ import annotations
 
-from itertools import islice
-
 import numpy as np
 
-from benchmarks.trials import in_processes, share_spread, table, trials
+from benchmarks.trials import rows_of, share_spread, table, trials
 from calibrate.check.drift import SHIFT_M, find_shift
 from calibrate.check.trend import entry_of, find_trend
 from calibrate.handeye.posterior import KnownCell
@@ -28,13 +26,13 @@ HEADER = ("arm", "mount", "links mm", "false alarms %", "0.5 mm found %", "state
 def run() -> str:
     count = trials(TRIALS)
     arms = ("ur", "spherical wrist", "seven joints")
-    cases = [(arm, mount, size) for arm in arms for mount in MOUNTS for size in (0.0, 0.1, 0.3)]
-    results = in_processes(measure, [(*case, 50_000 + seed) for case in cases for seed in range(count)])
-    rows = []
-    for arm, mount, size in cases:
-        shares = 100 * np.array(list(islice(results, count))).mean(axis=0)
-        rows.append([arm, mount, f"{size:g}", *(f"{share:.1f}" for share in shares)])
-        print(" | ".join(rows[-1]), flush=True)
+    cases = [(arm, mount, size) for arm in arms for mount in MOUNTS for size in (0, 0.1, 0.3)]
+    rows = rows_of(
+        measure,
+        cases,
+        count,
+        lambda case, cells: [*map(str, case), *(f"{100 * share:.1f}" for share in np.mean(cells, axis=0))],
+    )
     text = (
         f"{count} cells a row (one standard error of 5 %: {100 * share_spread(0.05, count):.1f} %), each "
         "link but the last off by so many mm and mrad (1σ) each way, corners 0.15 px, robot noise 0.02 mm "
@@ -48,7 +46,8 @@ def run() -> str:
 
 def measure(task: tuple[str, Mount, float, int]) -> tuple[float, ...]:
     """False alarm, detection, stated power, a trend of none, a trend found."""
-    cell, seed = arm_cell(*task), task[3]
+    seed = 50_000 + task[3]
+    cell = arm_cell(*task[:3], seed)
     solution = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
     assert solution.posterior is not None
     known = KnownCell.of(solution.posterior, solution.camera)

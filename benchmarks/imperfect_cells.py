@@ -22,27 +22,17 @@ from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 
 BOARD = BoardSpec(BoardKind.CHESSBOARD, 9, 7, 0.025)
+
+
+def _lens(f: float, cx: float, cy: float, distortion: tuple[float, ...], model: LensModel) -> CameraModel:
+    return CameraModel(1280, 1024, ((f, 0.0, cx), (0.0, f, cy), (0.0, 0.0, 1.0)), distortion, model)
+
+
+_RATIONAL = (0.3, -0.1, 3e-4, -2e-4, 0.02, 0.55, -0.05, 0.03)
 LENSES: dict[LensModel, CameraModel] = {
-    "plumb_bob": CameraModel(
-        1280,
-        1024,
-        ((1200.0, 0.0, 639.5), (0.0, 1200.0, 511.5), (0.0, 0.0, 1.0)),
-        (-0.1, 0.08, 5e-4, -3e-4, 0.0),
-    ),
-    "rational_polynomial": CameraModel(
-        1280,
-        1024,
-        ((900.0, 0.0, 645.0), (0.0, 900.0, 508.0), (0.0, 0.0, 1.0)),
-        (0.3, -0.1, 3e-4, -2e-4, 0.02, 0.55, -0.05, 0.03),
-        "rational_polynomial",
-    ),
-    "equidistant": CameraModel(
-        1280,
-        1024,
-        ((700.0, 0.0, 645.0), (0.0, 700.0, 508.0), (0.0, 0.0, 1.0)),
-        (0.01, -0.02, 0.005, -0.001),
-        "equidistant",
-    ),
+    "plumb_bob": _lens(1200.0, 639.5, 511.5, (-0.1, 0.08, 5e-4, -3e-4, 0.0), "plumb_bob"),
+    "rational_polynomial": _lens(900.0, 645.0, 508.0, _RATIONAL, "rational_polynomial"),
+    "equidistant": _lens(700.0, 645.0, 508.0, (0.01, -0.02, 0.005, -0.001), "equidistant"),
 }
 _ARM = MODELS["UR10"]
 _HOME = {"eye-in-hand": (-1.7, -1.7, 2.0, -1.9, -1.57, 0.0), "eye-to-hand": (0.1, -1.6, 2.0, -0.4, 1.57, 0.0)}
@@ -94,17 +84,6 @@ class ImperfectCell:
     """The true one."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Poses:
-    flange: Array
-    """(n, 4, 4) as the arm says, without noise."""
-    joints: Array
-    """(n, 6)"""
-    X: Array
-    Y: Array
-    C: Array
-
-
 def imperfect_cell(
     rng: np.random.Generator,
     mount: Mount = "eye-in-hand",
@@ -117,38 +96,43 @@ def imperfect_cell(
     """One cell. CalibrationError where its lens cannot be found."""
     wrong, known = wrong or Imperfection(), known or Known()
     lens, stated = LENSES[model], grid(9, 7, 0.025)
-    placed = _poses(rng, mount, wrong, lens, stated, views)
+    told, joints, X, Y, C = _poses(rng, mount, wrong, lens, stated, views)
     real = _real_points(rng, wrong, stated)
-    pixels = project_pixels(lens, transform_points(placed.C, real))
+    pixels = project_pixels(lens, transform_points(C, real))
     pixels = pixels + noise.corner_px * rng.normal(size=pixels.shape) + _bias(rng, wrong, stated, views)
     sigma = np.repeat([noise.robot_m, noise.robot_rad], 3)
-    flange = perturb(placed.flange, sigma * rng.normal(size=(views, 6)))
+    flange = perturb(told, sigma * rng.normal(size=(views, 6)))
     seen = tuple(
-        BoardView(i, f"view {i}", flange[i], stated, pixels[i], placed.joints[i] if known.joints else None)
+        BoardView(i, f"view {i}", flange[i], stated, pixels[i], joints[i] if known.joints else None)
         for i in range(views)
     )
-    told = _told(rng, wrong, lens) if known.lens else CameraModel(lens.width, lens.height)
-    found = ViewSet(mount, seen, told, "UR10" if known.arm else "unknown")
+    given = _told(rng, wrong, lens) if known.lens else CameraModel(lens.width, lens.height)
+    found = ViewSet(mount, seen, given, "UR10" if known.arm else "unknown")
     if not known.lens:
         found = replace(found, camera=calibrate_intrinsics(found, model).camera)
-    return ImperfectCell(solve_pnp(found, BOARD), placed.X, placed.Y, placed.C, lens)
+    return ImperfectCell(solve_pnp(found, BOARD), X, Y, C, lens)
+
+
+def mounted(rng: np.random.Generator, mount: Mount) -> tuple[Array, Array]:
+    """X and the board's place: what the flange holds, and the other before a UR10."""
+    held = pose(rotation_exp(0.3 * rng.normal(size=3)), 0.05 * rng.normal(size=3) + [0, 0, 0.1])
+    if mount == "eye-in-hand":
+        turn = rotation_exp([np.pi, 0, 0]) @ rotation_exp(0.1 * rng.normal(size=3))
+        return held, pose(turn, [0.1, -0.7, 0.1])
+    towards = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    return pose(towards @ rotation_exp(0.15 * rng.normal(size=3)), [1.15, 0.2, 0.6]), held
 
 
 def _poses(
     rng: np.random.Generator, mount: Mount, wrong: Imperfection, lens: CameraModel, board: Array, views: int
-) -> _Poses:
-    in_hand = mount == "eye-in-hand"
-    held = pose(rotation_exp(0.3 * rng.normal(size=3)), 0.05 * rng.normal(size=3) + [0, 0, 0.1])
-    if in_hand:
-        turn = rotation_exp([np.pi, 0, 0]) @ rotation_exp(0.1 * rng.normal(size=3))
-        X, Y = held, pose(turn, [0.1, -0.7, 0.1])
-    else:
-        towards = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-        X, Y = pose(towards @ rotation_exp(0.15 * rng.normal(size=3)), [1.15, 0.2, 0.6]), held
+) -> tuple[Array, Array, Array, Array, Array]:
+    """base_from_flange as the arm says (n, 4, 4), joints (n, 6), X, Y, true camera_from_board (n, 4, 4)."""
+    X, Y = mounted(rng, mount)
+    held = X if (in_hand := mount == "eye-in-hand") else Y
     arm = _ARM.calibrated(*table_errors(rng, wrong.table))
     joints: list[Array] = []
     while len(joints) < views:
-        C = _look(rng, lens, board)
+        C = look(rng, lens, board)
         flange = Y @ inverse(C) @ inverse(X) if in_hand else X @ C @ inverse(Y)
         q = inverse_nearest(_ARM, flange, _HOME[mount])
         if q is not None:
@@ -161,10 +145,10 @@ def _poses(
     bent = pose(rotation_exp(sag), np.zeros((views, 3))) @ held
     C = inverse(true @ bent) @ Y if in_hand else inverse(X) @ true @ bent
     mean = pose(rotation_exp(sag.mean(axis=0)), np.zeros(3)) @ held
-    return _Poses(forward(_ARM, q), q, mean if in_hand else X, Y if in_hand else mean, C)
+    return forward(_ARM, q), q, mean if in_hand else X, Y if in_hand else mean, C
 
 
-def _look(rng: np.random.Generator, lens: CameraModel, board: Array) -> Array:
+def look(rng: np.random.Generator, lens: CameraModel, board: Array) -> Array:
     """camera_from_board (4, 4) that shows all of the board."""
     centre, K = board.mean(axis=0), np.array(lens.matrix)
     size = np.array([lens.width, lens.height])

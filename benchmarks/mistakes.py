@@ -57,6 +57,9 @@ class MadeSession:
     """Place to what happens to its picture."""
 
 
+Make = Callable[[MadeSession], MadeSession]
+
+
 @dataclass(frozen=True)
 class Said:
     """Answer of `calibrate solve`."""
@@ -76,7 +79,7 @@ class Said:
 @dataclass(frozen=True)
 class Mistake:
     name: str
-    make: Callable[[MadeSession], MadeSession]
+    make: Make
     causes: tuple[str, ...]
     """Codes that are true of it. Some mistakes are the same to the data: inverted poses and the other
     mounting; in eye-to-hand a board that slipped on the flange and a changed TCP."""
@@ -90,7 +93,7 @@ def what_is_said(folder: Path, output: Path) -> Said:
         import_folder(folder, output)
         job = solve_recording(output)
     except (CalibrationError, RecordingError) as error:
-        hypothesis = str(error.values.get("hypothesis", ""))
+        hypothesis = str(getattr(error, "hypothesis", "") or "")
         return Said(hypothesis or error.code, hypothesis, (), str(error), answered=False)
     answer = job.calibration.quality
     assert answer.session is not None
@@ -121,7 +124,7 @@ def _half(session: MadeSession) -> slice:
     return slice(len(session.poses) // 2, None)
 
 
-def _with_poses(change: Callable[[MadeSession, Array], None]) -> Callable[[MadeSession], MadeSession]:
+def _with_poses(change: Callable[[MadeSession, Array], None]) -> Make:
     """A mistake in the poses; `change` works on a copy of them."""
 
     def make(session: MadeSession) -> MadeSession:
@@ -159,20 +162,12 @@ def _move_board(session: MadeSession, poses: Array) -> None:
     poses[_half(session)] = _BOARD_MOVED @ part if in_hand else part @ _BOARD_MOVED
 
 
-def _shift(session: MadeSession) -> MadeSession:
-    return replace(session, names=session.names[1:], poses=session.poses[:-1])
-
-
-def _w_first(session: MadeSession) -> MadeSession:
-    return replace(session, quaternion_order=(3, 0, 1, 2))
-
-
 def _other_mount(session: MadeSession) -> MadeSession:
     other = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
     return replace(session, description=session.description | {"mount": other[session.description["mount"]]})
 
 
-def _size(factor: float) -> Callable[[MadeSession], MadeSession]:
+def _size(factor: float) -> Make:
     def make(session: MadeSession) -> MadeSession:
         board = dict(session.description["board"])
         for key in ("square_m", "marker_m"):
@@ -183,12 +178,11 @@ def _size(factor: float) -> Callable[[MadeSession], MadeSession]:
     return make
 
 
-def _mirror(session: MadeSession) -> MadeSession:
-    return replace(session, edit=dict.fromkeys(range(len(session.names)), lambda image: image[:, ::-1]))
-
-
-def _refocus(session: MadeSession) -> MadeSession:
-    return replace(session, edit=dict.fromkeys(range(len(session.names))[_half(session)], _zoomed_out))
+def _pictures(change: Callable[[Array], Array], which: Callable[[MadeSession], slice]) -> Make:
+    """A mistake in the pictures at these places."""
+    return lambda session: replace(
+        session, edit=dict.fromkeys(range(len(session.names))[which(session)], change)
+    )
 
 
 def _zoomed_out(image: Array) -> Array:
@@ -206,9 +200,13 @@ _FRAME = ("board-moved", "camera-moved")
 MISTAKES = (
     Mistake("none", lambda session: session, ()),
     Mistake("two poses swapped", _with_poses(_swap), (), rejected=_SWAPPED),
-    Mistake("poses shifted by one picture", _shift, ("shifted-pictures",)),
+    Mistake(
+        "poses shifted by one picture",
+        lambda s: replace(s, names=s.names[1:], poses=s.poses[:-1]),
+        ("shifted-pictures",),
+    ),
     Mistake("millimetres", _with_poses(_millimetres), ("not-metres",)),
-    Mistake("quaternion w first", _w_first, ("quaternion-order",)),
+    Mistake("quaternion w first", lambda s: replace(s, quaternion_order=(3, 0, 1, 2)), ("quaternion-order",)),
     Mistake("inverse poses", _with_poses(_invert), _CONVENTION),
     Mistake("other mounting", _other_mount, _CONVENTION),
     Mistake(
@@ -220,8 +218,12 @@ MISTAKES = (
     Mistake("square size - 4 %", _size(0.96), ("square-size",)),
     Mistake("square size × 2", _size(2.0), ("square-size",)),
     Mistake("square size × 0.5", _size(0.5), ("square-size",)),
-    Mistake("mirrored pictures", _mirror, ("mirrored-pictures", "mirrored")),
-    Mistake("refocused at half", _refocus, ("refocused",)),
+    Mistake(
+        "mirrored pictures",
+        _pictures(lambda image: image[:, ::-1], lambda _: slice(None)),
+        ("mirrored-pictures", "mirrored"),
+    ),
+    Mistake("refocused at half", _pictures(_zoomed_out, _half), ("refocused",)),
     Mistake("TCP changed at half", _with_poses(_change_tcp), ("camera-moved",)),
     Mistake("board moved at half", _with_poses(_move_board), ("board-moved",)),
 )

@@ -31,7 +31,7 @@ from recordings.schema.messages import (
 )
 from recordings.writer import RecordingWriter
 from station.simulation.cells import make_cell
-from station.simulation.renderer import Light, render, scaled
+from station.simulation.renderer import Light, render
 from station.simulation.truth import CellTruth
 
 REPEATS = 15
@@ -81,13 +81,10 @@ def run() -> str:
     return "\n".join(lines)
 
 
-def make_recording(path: Path, views: int = 25, factor: float = 1.0, seed: int = 0) -> Path:
-    """The paper's scene from random views that face the board; stored as the station stores pictures.
-
-    factor: of the picture's sides.
-    """
+def make_recording(path: Path) -> Path:
+    """The paper's scene from random views that face the board; stored as the station stores pictures."""
     truth: CellTruth = make_cell("paper", 1, "low", "eye-in-hand")
-    camera = scaled(truth.camera, factor)
+    camera = truth.camera
     X, P = np.array(truth.camera_mount), np.array(truth.board_place)
     info = SessionInfo(
         name=path.stem,
@@ -99,8 +96,8 @@ def make_recording(path: Path, views: int = 25, factor: float = 1.0, seed: int =
         camera_identity=CameraIdentity("rendered", "context"),
     )
     with RecordingWriter(path, info) as writer:
-        for k in range(views):
-            image, seen = _picture(truth.board, camera, 1000 * seed + k)
+        for k in range(25):
+            image, seen = _picture(truth.board, camera, k)
             stamps = Stamps(k * 10**9, 10**18 + k * 10**9)
             writer.image(Image(image, stamps, frame_id=k, sequence=k))
             flange = P @ np.linalg.inv(seen) @ np.linalg.inv(X)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 
 from benchmarks.imperfect_cells import BOARD, ImperfectCell, Known, imperfect_cell
 from benchmarks.scene import MID
-from benchmarks.trials import in_processes, rms, table, trials
+from benchmarks.trials import Miss, rows_of, table, trials
 from calibrate.errors import CalibrationError
 from calibrate.gates import GateInputs, judge
-from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.handeye.solution import Reading, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.pnp import solve_pnp
@@ -51,13 +50,11 @@ class OutlierTrial:
     passed: bool
     reading: str
     """Cause that was named; where nothing was solved, the error's own name."""
-    oracle: tuple[float, float]
-    """Error of the oracle, metres and radians."""
+    oracle: Miss
     truly: bool
     falsely: bool
-    ours: tuple[float, float] | None = None
+    ours: Miss | None = None
     """None where nothing was solved."""
-    covered: bool = False
 
 
 Spoil = Callable[[ImperfectCell, Places, np.random.Generator], Spoilt]
@@ -72,11 +69,7 @@ def run() -> str:
         for share in shares
         for mount in MOUNTS
     ]
-    results = in_processes(measure, [(*case, k) for case in cases for k in range(count)])
-    rows = []
-    for case in cases:
-        rows.append(line(*case, list(islice(results, count))))
-        print(" | ".join(rows[-1]), flush=True)
+    rows = rows_of(measure, cases, count, line)
     text = (
         f"{count} cells per row (`imperfect_cells`, the lens given, nothing else wrong), {_VIEWS} views. "
         "Shuffled: the poses of all bad views exchanged; turned: "
@@ -98,22 +91,17 @@ def measure(task: tuple[str, float, Mount, int]) -> OutlierTrial:
         bad = _bad_views(name, share, seed, rng)
         spoilt = (_VIEWS_WRONG | _CHANGED)[name](cell, bad, rng)
         X_oracle = spoilt.X if spoilt.X_oracle is None else spoilt.X_oracle
-        oracle = _error(solve_views(spoilt.views.select(spoilt.good), _ORACLE).matrix, X_oracle)
+        oracle = Miss.of(solve_views(spoilt.views.select(spoilt.good), _ORACLE), X_oracle)
         try:
             solution = solve_views(spoilt.views, _OPTIONS)
         except CalibrationError as problem:
-            named = str(problem.values.get("hypothesis", type(problem).__name__))
+            named = problem.hypothesis or type(problem).__name__
             truly = named == spoilt.reading.value
-            falsely = "hypothesis" in problem.values and not truly
-            return OutlierTrial(False, named, oracle, truly, falsely)
+            return OutlierTrial(False, named, oracle, truly, bool(problem.hypothesis) and not truly)
         reading = solution.session.reading
-    delta = difference(solution.matrix, spoilt.X)
-    square = float(delta @ np.linalg.solve(solution.covariance, delta))
     passed = all(gate.passed for gate in judge(solution, GateInputs()))
     truly, falsely = _named(solution, spoilt, set(bad.tolist()))
-    covered = square <= solution.confidence_threshold
-    ours = _error(solution.matrix, spoilt.X)
-    return OutlierTrial(passed, reading.value, oracle, truly, falsely, ours, covered)
+    return OutlierTrial(passed, reading.value, oracle, truly, falsely, Miss.of(solution, spoilt.X))
 
 
 def _bad_views(name: str, share: float, seed: int, rng: np.random.Generator) -> Places:
@@ -135,43 +123,44 @@ def _named(solution: Solution, spoilt: Spoilt, bad: set[int]) -> tuple[bool, boo
     return found == bad and not falsely, falsely
 
 
-def _error(X: Array, truth: Array) -> tuple[float, float]:
-    delta = difference(X, truth)
-    return float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
-
-
-def line(name: str, share: float, mount: Mount, found: Sequence[OutlierTrial]) -> list[str]:
+def line(case: tuple[str, float, Mount], found: list[OutlierTrial]) -> list[str]:
+    name, share, mount = case
     plain = Reading.AS_RECORDED.value
-    taken = [t for t in found if t.ours is not None and t.reading == plain]
+    taken = [(t.ours, t.oracle) for t in found if t.ours is not None and t.reading == plain]
 
-    def percent(count: int, of: Sequence[OutlierTrial]) -> str:
+    def percent(count: int, of: Sequence[object] = found) -> str:
         return f"{100 * count / len(of):.0f}" if of else "-"
 
-    ours = np.array([t.ours for t in taken]).reshape(-1, 2)
-    oracle = np.array([t.oracle for t in taken]).reshape(-1, 2)
     numbers = ["-"] * 4
     if taken:
-        a, b = ([rms(e[:, i]) for i in (0, 1)] for e in (ours, oracle))
-        numbers = [f"{1e3 * a[0]:.3f}", f"{1e3 * b[0]:.3f}", *(f"{a[i] / b[i]:.3f}" for i in (0, 1))]
+        errors = np.array([[(miss.shift_m, miss.turn_rad) for miss in both] for both in taken])
+        own, best = np.sqrt(np.mean(np.square(errors), axis=0))
+        numbers = [f"{1e3 * a[0]:.3f}" for a in (own, best)] + [f"{r:.3f}" for r in own / best]
     return [
         name,
         f"{100 * share:.0f} %",
         mount,
-        percent(sum(t.passed for t in found), found),
-        percent(sum(t.reading != plain for t in found), found),
+        percent(sum(t.passed for t in found)),
+        percent(sum(t.reading != plain for t in found)),
         *numbers,
-        percent(sum(t.covered for t in taken), taken),
-        percent(sum(t.truly for t in found), found),
-        percent(sum(t.falsely for t in found), found),
+        percent(sum(ours.covered for ours, _ in taken), taken),
+        percent(sum(t.truly for t in found)),
+        percent(sum(t.falsely for t in found)),
     ]
 
 
 def _views_wrong(cell: ImperfectCell, bad: Places, changed: Sequence[BoardView], kind: str) -> Spoilt:
-    views = list(cell.views.views)
-    for place, view in zip(bad, changed, strict=True):
-        views[place] = view
+    views = _with(cell.views, bad, changed)
     good = np.setdiff1d(np.arange(_VIEWS), bad).tolist()
-    return Spoilt(replace(cell.views, views=tuple(views)), cell.X, good, kind=kind)
+    return Spoilt(views, cell.X, good, kind=kind)
+
+
+def _with(views: ViewSet, places: Places, changed: Iterable[BoardView]) -> ViewSet:
+    """The views, those at these places replaced."""
+    found = list(views.views)
+    for place, view in zip(places, changed, strict=True):
+        found[place] = view
+    return replace(views, views=tuple(found))
 
 
 def _exchange(cell: ImperfectCell, bad: Places, other: Places) -> Spoilt:
@@ -214,21 +203,15 @@ def _longer(bad: Places) -> list[int]:
 
 def _move(cell: ImperfectCell, bad: Places, D: Array, in_base: bool, reading: Reading) -> Spoilt:
     """Flange poses of the bad views, all D (4, 4) off, in base or in the flange."""
-    views = list(cell.views.views)
-    for i in bad:
-        F = views[i].base_from_flange
-        views[i] = replace(views[i], base_from_flange=D @ F if in_base else F @ D)
+    flanges = (cell.views.views[i].base_from_flange for i in bad)
+    moved = (D @ F if in_base else F @ D for F in flanges)
+    changed = (replace(cell.views.views[i], base_from_flange=F) for i, F in zip(bad, moved, strict=True))
     camera = in_base == (cell.views.mount == "eye-to-hand")
     other = (D @ cell.X if in_base else inverse(D) @ cell.X) if camera else cell.X
     good = _longer(bad)
     X = {True: other, False: cell.X}
-    return Spoilt(
-        replace(cell.views, views=tuple(views)),
-        X[_VIEWS - 1 in bad],
-        good,
-        reading,
-        X_oracle=X[good[0] in bad],
-    )
+    views = _with(cell.views, bad, changed)
+    return Spoilt(views, X[_VIEWS - 1 in bad], good, reading, X_oracle=X[good[0] in bad])
 
 
 def _move_board(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
@@ -249,17 +232,11 @@ def _change_tcp(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> S
 def _refocus(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
     factor = 1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.06)
     centre = np.array(cell.lens.matrix)[:2, 2]
-    views = list(cell.views.views)
-    for i in bad:
-        views[i] = replace(views[i], pixels=centre + factor * (views[i].pixels - centre))
-    good = _longer(bad)
-    spoilt = solve_pnp(replace(cell.views, views=tuple(views)), BOARD)
-    return Spoilt(spoilt, cell.X, good, Reading.REFOCUSED)
+    views = (cell.views.views[i] for i in bad)
+    changed = (replace(view, pixels=centre + factor * (view.pixels - centre)) for view in views)
+    spoilt = solve_pnp(_with(cell.views, bad, changed), BOARD)
+    return Spoilt(spoilt, cell.X, _longer(bad), Reading.REFOCUSED)
 
 
 _VIEWS_WRONG: dict[str, Spoil] = {"shuffled": _shuffle, "turned": _turn, "far": _far}
-_CHANGED: dict[str, Spoil] = {
-    "board moved": _move_board,
-    "TCP changed": _change_tcp,
-    "refocused": _refocus,
-}
+_CHANGED: dict[str, Spoil] = {"board moved": _move_board, "TCP changed": _change_tcp, "refocused": _refocus}

@@ -158,9 +158,7 @@ def gaps(joints: Array, X: Array, Y: Array) -> tuple[Array, Array]:
     far = np.linalg.norm(local - np.clip(local, low, high), axis=-1) - radii[moving]
     board = far.min(axis=1)
     gap = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) - radii[:, None] - radii
-    apart = body[None, :] - body[:, None] >= np.where(
-        body[:, None] == 3, 3, np.where(body[:, None] == 1, 2, 2)
-    )
+    apart = body[None, :] - body[:, None] >= np.where(body[:, None] == 3, 3, 2)
     apart &= ~((body[:, None] == 4) & (body[None, :] == 6)) & ~((body[:, None] == 1) & (body[None, :] < 3))
     apart &= ~((body[:, None] == 0) & (body[None, :] == 2)) & ~(body[:, None] >= 5)
     itself = np.where(apart, gap, np.inf).min(axis=(1, 2))
@@ -175,20 +173,18 @@ def _spheres(joints: Array, X: Array) -> tuple[Array, Array, Array]:
     flange = frames[:, 6]
     lens = (flange @ X)[:, :3, 3]
     back = lens - 0.05 * (flange @ X)[:, :3, 2]
-    ends = [
-        (o[:, 0], o[:, 1]),
-        (o[:, 1], o[:, 1] + beside),
-        (o[:, 2] + beside, o[:, 1] + beside),
-        (o[:, 2] + along, o[:, 3] + along),
-        (o[:, 3] + along, o[:, 4]),
-        (o[:, 4], o[:, 5]),
-        (o[:, 5], o[:, 6]),
-        (lens, back),
+    parts = [
+        (o[:, 0], o[:, 1], 0.09, 4),
+        (o[:, 1], o[:, 1] + beside, 0.09, 6),
+        (o[:, 2] + beside, o[:, 1] + beside, 0.075, 14),
+        (o[:, 2] + along, o[:, 3] + along, 0.06, 14),
+        (o[:, 3] + along, o[:, 4], 0.05, 4),
+        (o[:, 4], o[:, 5], 0.05, 4),
+        (o[:, 5], o[:, 6], 0.045, 3),
+        (lens, back, 0.035, 3),
     ]
-    radius = (0.09, 0.09, 0.075, 0.06, 0.05, 0.05, 0.045, 0.035)
-    count = (4, 6, 14, 14, 4, 4, 3, 3)
     centres, radii, body = [], [], []
-    for number, ((a, b), r, k) in enumerate(zip(ends, radius, count, strict=True)):
+    for number, (a, b, r, k) in enumerate(parts):
         # The upper arm's root is the shoulder: it stays, so its last sphere is left out.
         for share in np.linspace(0, 0.9 if number == 2 else 1, k):
             centres.append(a + share * (b - a))

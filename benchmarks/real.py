@@ -5,20 +5,13 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from benchmarks import real_arms
-from benchmarks.real_methods import (
-    FAILURES,
-    Answer,
-    board_centre,
-    calibration_rs,
-    opencv,
-    ours,
-    predicted_centre,
-)
+from benchmarks.real_methods import FAILURES, Answer, calibration_rs, opencv, ours, predicted_centre
 from benchmarks.real_sets import DATASETS, RealSet, real_sets
 from benchmarks.trials import table
 from calibrate.geometry import Array, difference
@@ -99,35 +92,27 @@ def cross_validate(data: RealSet) -> dict[str, Array]:
     methods: tuple[Callable[[ViewSet], Mapping[str, Answer]], ...] = (
         lambda views: {OURS: ours(views, data.board)},
         lambda views: opencv(views, data.board),
-        lambda views: calibration_rs(views, data.board),
+        calibration_rs,
     )
     errors: dict[str, Array] = {OURS: np.full((FOLD_SEEDS, n), np.nan)}
     for seed in range(FOLD_SEEDS):
         for out in np.array_split(np.random.default_rng(seed).permutation(n), FOLDS):
             training = data.views.select(sorted(set(range(n)) - set(out.tolist())))
             for method in methods:
-                for name, answer in _answers(method, training).items():
+                answers: Mapping[str, Answer] = {}
+                with suppress(*FAILURES):
+                    answers = method(training)
+                for name, answer in answers.items():
                     row = errors.setdefault(name, np.full((FOLD_SEEDS, n), np.nan))
                     row[seed, out] = [left_out_error_m(data, k, answer) for k in out]
     return errors
 
 
-def _answers(method: Callable[[ViewSet], Mapping[str, Answer]], views: ViewSet) -> Mapping[str, Answer]:
-    try:
-        return method(views)
-    except FAILURES:
-        return {}
-
-
 def left_out_error_m(data: RealSet, place: int, answer: Answer) -> float:
     """Distance of the predicted board centre from the trained one in the view at this place, metres."""
-    centre = board_centre(data.board, data.views)
-    in_hand = data.views.mount == "eye-in-hand"
-    try:
-        found = predicted_centre(data.views.views[place], answer, in_hand, centre)
-    except FAILURES:
-        return float("nan")
-    return float(np.linalg.norm(found - answer.centre))
+    with suppress(*FAILURES):
+        return float(np.linalg.norm(predicted_centre(data.views, place, answer) - answer.centre))
+    return float("nan")
 
 
 def charge(errors: Array) -> Array | None:

@@ -63,7 +63,7 @@ def ours(views: ViewSet, board: BoardSpec) -> Answer:
     shape = _shape(views, solution)
     return Answer(
         X=solution.matrix,
-        centre=Y[:3, :3] @ shape(board_centre(board, views)[None])[0] + Y[:3, 3],
+        centre=Y[:3, :3] @ shape(board_centre(views)[None])[0] + Y[:3, 3],
         camera=solution.camera,
         shape=shape,
         covariance=solution.covariance,
@@ -102,7 +102,7 @@ def opencv(views: ViewSet, board: BoardSpec) -> dict[str, Answer]:
             except FAILURES:
                 continue
             if np.isfinite(X).all():
-                centres = (H @ X @ C) @ np.append(board_centre(board, views), 1.0)
+                centres = (H @ X @ C) @ np.append(board_centre(views), 1.0)
                 answers[name + label] = Answer(X, centres[:, :3].mean(axis=0), camera)
     return answers
 
@@ -120,7 +120,7 @@ def opencv_lens(views: ViewSet) -> CameraModel:
     return _camera(views, np.asarray(K, dtype=float), np.asarray(D, dtype=float).ravel()[:5])
 
 
-def calibration_rs(views: ViewSet, board: BoardSpec) -> dict[str, Answer]:
+def calibration_rs(views: ViewSet) -> dict[str, Answer]:
     """Bundle adjustment of lens, X, board place and robot poses by `vision-calibration`, its own defaults."""
     in_hand = views.mount == "eye-in-hand"
     data = rs.SingleCamHandeyeDataset([_observation(view) for view in views])
@@ -139,7 +139,7 @@ def calibration_rs(views: ViewSet, board: BoardSpec) -> dict[str, Answer]:
     if found is None or place is None:
         raise ValueError("calibration-rs returned no pose")
     X, Y = (np.asarray(pose_from_quaternion(p.translation_xyz, p.rotation_xyzw)) for p in (found, place))
-    centre = Y[:3, :3] @ board_centre(board, views) + Y[:3, 3]
+    centre = Y[:3, :3] @ board_centre(views) + Y[:3, 3]
     return {CALIBRATION_RS: Answer(X if in_hand else inverse(X), centre, camera)}
 
 
@@ -157,18 +157,17 @@ def _camera(views: ViewSet, K: Array, D: Array) -> CameraModel:
     return CameraModel(views.camera.width, views.camera.height, rows, distortion)  # type: ignore[arg-type]
 
 
-def board_centre(board: BoardSpec, views: ViewSet) -> Array:
+def board_centre(views: ViewSet) -> Array:
     """(3,) middle of the board's points in `board`."""
     points = np.concatenate([view.board_points for view in views])
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
-def predicted_centre(view: BoardView, answer: Answer, in_hand: bool, centre: Array) -> Array:
+def predicted_centre(views: ViewSet, place: int, answer: Answer) -> Array:
     """(3,) where X, the robot's pose and the view's own PnP put the board centre."""
-    C = view_pnp(view, answer)
-    F = view.base_from_flange
-    chain = (F if in_hand else inverse(F)) @ answer.X @ C
-    return np.asarray((chain @ np.append(answer.shape(centre[None])[0], 1.0))[:3])
+    view, centre = views.views[place], answer.shape(board_centre(views)[None])[0]
+    F = view.base_from_flange if views.mount == "eye-in-hand" else inverse(view.base_from_flange)
+    return np.asarray((F @ answer.X @ view_pnp(view, answer) @ np.append(centre, 1.0))[:3])
 
 
 def view_pnp(view: BoardView, answer: Answer) -> Array:

@@ -164,15 +164,8 @@ async def measure(
         rows += [(control, way, event, str(len(ms)), *_spread(ms)) for event, ms in times.items()]
     beating.cancel()
     await robot.close()
-    rows.append(
-        (
-            control,
-            "–",
-            "trials repeated: the machine held up the session before the STOP",
-            str(disturbed),
-            *"––––",
-        )
-    )
+    repeated = "trials repeated: the machine held up the session before the STOP"
+    rows.append((control, "–", repeated, str(disturbed), *"––––"))
     return rows
 
 
@@ -192,7 +185,3 @@ def run() -> str:
         for control in get_args(ControlPath):
             rows += asyncio.run(measure(controller.host, admin, Path(folder), trials(TRIALS), control))
     return table(("control", "path", "from the call until", "n", "p50 ms", "p90", "p99", "max"), rows)
-
-
-if __name__ == "__main__":
-    print(run())

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import get_context
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from calibrate.geometry import Array
+from calibrate.geometry import Array, difference
+from calibrate.handeye.solution import Solution
 
 _PROCESSES = 2
 Task = TypeVar("Task")
@@ -23,6 +26,21 @@ def in_processes(work: Callable[[Task], Result], tasks: Sequence[Task]) -> Itera
         yield from pool.map(work, tasks, chunksize=2)
 
 
+def rows_of(
+    work: Callable[[Any], Result],
+    cases: Sequence[tuple[Any, ...]],
+    count: int,
+    row: Callable[[Any, list[Result]], list[str]],
+) -> list[list[str]]:
+    """`row(case, results)` of each case, printed when known, of `work((*case, k))` for k < count."""
+    results = in_processes(work, [(*case, k) for case in cases for k in range(count)])
+    rows = []
+    for case in cases:
+        rows.append(row(case, list(islice(results, count))))
+        print(" | ".join(rows[-1]), flush=True)
+    return rows
+
+
 def trials(full: int) -> int:
     """`full`, or its share by the environment's BENCH_SHARE (0…1) for a quick look; at least 10."""
     return max(10, round(full * float(os.environ.get("BENCH_SHARE", "1"))))
@@ -32,6 +50,25 @@ def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     lines += ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]
     return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Miss:
+    """How far a solution is from the truth."""
+
+    square: float
+    """δᵀ C⁻¹ δ by the covariance C that is stated."""
+    covered: bool
+    """The stated 95 % region holds the truth."""
+    shift_m: float
+    turn_rad: float
+
+    @classmethod
+    def of(cls, solution: Solution, truth: Array) -> Miss:
+        delta = difference(solution.matrix, truth)
+        square = float(delta @ np.linalg.solve(solution.covariance, delta))
+        shift_m, turn_rad = (float(np.linalg.norm(part)) for part in (delta[:3], delta[3:]))
+        return cls(square, square <= solution.confidence_threshold, shift_m, turn_rad)
 
 
 def rms(values: Array) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from recordings.errors import CodedError
+from recordings.errors import CodedError, Value
 
 
 class CalibrationError(CodedError):
@@ -12,6 +12,8 @@ class CalibrationError(CodedError):
 
     package = "calibrate"
     code = "calibration"
+    hypothesis: str = ""
+    """The cause as a word for programs, where it is known."""
 
 
 class UsageError(CalibrationError):
@@ -37,13 +39,13 @@ class TooFewViewsError(CalibrationError):
 class SquaresCountedError(TooFewViewsError):
     """A chessboard was declared in squares, not in inner corners; values: `columns`, `rows` seen."""
 
-    code = "squares-counted"
+    code = hypothesis = "squares-counted"
 
 
 class MirroredImagesError(TooFewViewsError):
     """The board's markers can be read only in the mirror image."""
 
-    code = "mirrored"
+    code = hypothesis = "mirrored"
 
 
 class DegenerateMotionError(CalibrationError):
@@ -59,9 +61,13 @@ class BadViewsError(CalibrationError):
 
 
 class PosesDisagreeError(BadViewsError):
-    """Robot poses and images contradict each other; value `hypothesis`: the code of the reading that fits."""
+    """Robot poses and images contradict each other; `hypothesis` is the code of the reading that fits."""
 
     code = "poses-disagree"
+
+    def __init__(self, code: str = "", /, *, hypothesis: str = "", **values: Value) -> None:
+        super().__init__(code, **values)
+        self.hypothesis = hypothesis
 
 
 class CalibrationFileError(CalibrationError):

@@ -33,7 +33,7 @@ def test_equal_errors_give_a_ratio_of_one_and_better_ones_stay_below() -> None:
 def test_every_method_answers_in_our_frames_and_predicts_the_board(mount: Mount) -> None:
     cell = make_cell(np.random.default_rng(3), 14, CellNoise(0.02, 1e-5, 1e-5), mount=mount)
     board, views = BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025), cell.views
-    answers = {"ours": ours(views, board)} | opencv(views, board) | calibration_rs(views, board)
+    answers = {"ours": ours(views, board)} | opencv(views, board) | calibration_rs(views)
     assert len(answers) == 1 + 2 * 7 + 1, "the lens is given: OpenCV's seven twice"
     data = RealSet("simulated", views, board, frozenset(), None)
     for name, answer in answers.items():

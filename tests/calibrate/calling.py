@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from subprocess import CompletedProcess
-from typing import Any
 
 import pytest
 
@@ -44,13 +41,3 @@ def refused(done: Done, exit_code: int, code: str = "", *named: object) -> None:
     assert (done.error.code if done.error else "") == code, done.stderr
     for name in named:
         assert str(name) in " ".join(done.stderr.split())
-
-
-@contextmanager
-def raises_code(
-    kind: type[CodedError], code: str, **values: Any
-) -> Iterator[pytest.ExceptionInfo[CodedError]]:
-    with pytest.raises(kind) as caught:
-        yield caught
-    assert caught.value.code == code, caught.value
-    assert values.items() <= caught.value.values.items()

@@ -5,20 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 
-from calibrate.files.calibration import FramePose, write_calibration
-from calibrate.geometry import Transform, perturb
+from calibrate.files.calibration import write_calibration
 from calibrate.job import SolvedRecording
 from calibrate.pipeline import solve_recording
-from tests.calibrate.sessions import Scene, write_session
+from tests.calibrate.sessions import Scene, shifted, write_session
 
 
 @pytest.fixture(scope="session")
 def session_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ten rendered views, eye-in-hand, simulated, lens unknown."""
     return write_session(tmp_path_factory.mktemp("session") / "rendered.mcap")
+
+
+@pytest.fixture(scope="session")
+def small_session_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five views and a known lens: the least that is solved, for tests of who solves it and what stops it."""
+    path = tmp_path_factory.mktemp("small") / "small.mcap"
+    return write_session(path, Scene(views=5), known_lens=True)
 
 
 @pytest.fixture(scope="session")
@@ -54,12 +59,11 @@ def make_file(solved_real: SolvedRecording, tmp_path: Path):  # type: ignore[no-
     def make(shift_m: float = 0.0, **changes: object) -> Path:
         nonlocal count
         count += 1
-        base = solved_real.calibration
-        moved = perturb(base.transform.matrix, np.array([shift_m, 0, 0, 0, 0, 0.0]))
-        frames = ("base" if changes.get("mount") == "eye-to-hand" else "flange", "camera")
-        result = FramePose.of(Transform(*frames, moved))
+        moved = shifted(solved_real.calibration, shift_m)
+        if changes.get("mount") == "eye-to-hand":
+            changes["result"] = msgspec.structs.replace(moved.result, parent_frame="base")
         path = tmp_path / f"made-{count}.yaml"
-        write_calibration(msgspec.structs.replace(base, result=result, **changes), path)
+        write_calibration(msgspec.structs.replace(moved, **changes), path)
         return path
 
     return make

@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
+from calibrate.files.calibration import Calibration, FramePose
+from calibrate.geometry import Array, Transform, inverse, perturb, pose, rotation_exp
 from recordings.schema.messages import (
     BoardKind,
     BoardSpec,
@@ -110,3 +111,10 @@ def write_session(path: Path, scene: Scene | None = None, known_lens: bool = Fal
             matrix = tuple(tuple(row) for row in recorded[k].tolist())
             writer.view(View(k, f"pose-{k}", k, matrix, stamps=stamps, time_bound_s=0.001))
         return writer.finish()
+
+
+def shifted(calibration: Calibration, *delta: float) -> Calibration:
+    """The calibration with another X: moved and turned by up to six numbers, metres and radians."""
+    frames = (calibration.result.parent_frame, calibration.result.child_frame)
+    moved = perturb(calibration.transform.matrix, np.r_[delta, np.zeros(6 - len(delta))])
+    return msgspec.structs.replace(calibration, result=FramePose.of(Transform(*frames, moved)))

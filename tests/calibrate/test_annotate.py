@@ -10,9 +10,10 @@ import pytest
 
 from calibrate.annotate import AnnotateError, annotate
 from calibrate.cli import main
-from calibrate.files.calibration import Calibration, FramePose, read_calibration
+from calibrate.files.calibration import read_calibration
 from calibrate.results import RejectedView
 from recordings.reader import open_recording
+from tests.calibrate.sessions import shifted
 from tests.command_line import call
 from tests.recordings.small_recording import shown
 
@@ -61,17 +62,6 @@ def test_a_wrong_calibration_is_seen(tmp_path: Path, solved: Path) -> None:
     wrong = annotate(recording, shifted(good, 0.005), tmp_path / "wrong.mcap")
     assert max(view.rms_px for view in right if view.rms_px is not None) < 1.0
     assert min(view.rms_px for view in wrong if view.rms_px is not None) > 2.0
-
-
-def shifted(calibration: Calibration, by_m: float) -> Calibration:
-    x, y, z = calibration.result.translation_m
-    moved = calibration.transform.matrix.copy()
-    moved[0, 3] += by_m
-    result = msgspec.structs.replace(
-        calibration.result, translation_m=(x + by_m, y, z), matrix=tuple(map(tuple, moved.tolist()))
-    )
-    assert isinstance(result, FramePose)
-    return msgspec.structs.replace(calibration, result=result)
 
 
 def test_rejected_views_are_red_and_say_why(tmp_path: Path, solved: Path) -> None:

@@ -19,7 +19,7 @@ from calibrate.bounds import SolveLimitError, bounded
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import write_calibration
 from calibrate.job import SolvedRecording
-from tests.calibrate.calling import raises_code
+from tests.codes import raises
 from tests.patience import PATIENCE_S
 
 PROGRAM = (sys.executable, "-m", "calibrate.cli", "solve")
@@ -33,7 +33,7 @@ def old_file(solved_real: SolvedRecording, tmp_path: Path) -> Path:
 
 
 def test_what_takes_too_long_is_ended_with_a_name() -> None:
-    with raises_code(SolveLimitError, "time-limit", limit_s=0.1), bounded(0.1, 0):
+    with raises("time-limit", SolveLimitError, limit_s=0.1), bounded(0.1, 0):
         _work(PATIENCE_S)
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
@@ -79,7 +79,7 @@ def _timers() -> set[threading.Thread]:
 @pytest.mark.parametrize("eater", ["numpy", "opencv"])
 def test_what_needs_too_much_memory_is_ended_with_a_name(eater: str) -> None:
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    with raises_code(SolveLimitError, "memory-limit", limit_mib=6000), bounded(0, 6000):
+    with raises("memory-limit", SolveLimitError, limit_mib=6000), bounded(0, 6000):
         if eater == "numpy":
             np.ones((1000, 1000, 1000))
         else:

@@ -19,8 +19,7 @@ def any_arm(name: str, rng: np.random.Generator) -> DhArm:
     return DhArm(name, TILTED, TOOL, rng.uniform(-1, 1, len(ROWS[name])))
 
 
-@pytest.mark.parametrize("spread_rad", [0.3, 1.0])
-@pytest.mark.parametrize("views", [15, 25])
+@pytest.mark.parametrize(("views", "spread_rad"), [(15, 1.0), (25, 0.3)])
 @pytest.mark.parametrize("name", ROWS)
 def test_an_arm_is_learned_whole_however_it_is_mounted(name: str, views: int, spread_rad: float) -> None:
     rng = np.random.default_rng(views)
@@ -59,8 +58,15 @@ def with_coupling(q: Array) -> Array:
     return q
 
 
-@pytest.mark.parametrize("wrong", [np.degrees, exchanged, with_coupling])
-@pytest.mark.parametrize("name", ["ur", "spherical wrist", "seven joints"])
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("ur", np.degrees),
+        ("spherical wrist", exchanged),
+        ("ur", with_coupling),
+        ("seven joints", with_coupling),
+    ],
+)
 def test_wrong_joints_do_not_explain_the_flanges_and_are_read_otherwise(
     name: str, wrong: Callable[[Array], Array]
 ) -> None:

@@ -12,16 +12,10 @@ import pytest
 
 from calibrate.errors import UsageError
 from calibrate.gates import GateInputs, GateLimits, judge, read_limits
-from calibrate.handeye.solution import (
-    Explanation,
-    Finding,
-    NoiseScales,
-    Reading,
-    Solution,
-)
+from calibrate.handeye.solution import Explanation, Finding, NoiseScales, Reading, Solution
 from calibrate.job import SolvedRecording
 from calibrate.results import CrossValidation, Gate, HoldoutScore, Remark
-from tests.calibrate.calling import raises_code
+from tests.codes import raises
 
 GOOD = GateInputs(0.6, 0.001)
 NAMES = [
@@ -85,10 +79,7 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
         "robot_error_m": replace(solution, noise=NoiseScales(0.1, 0.01, 0.0)),
         "robot_error_deg": replace(solution, noise=NoiseScales(0.1, 0.0, 0.02)),
     }
-    evidence = {
-        "coverage": replace(GOOD, coverage=0.05),
-        "clock_bound_s": replace(GOOD, clock_bound_s=0.05),
-    }
+    evidence = {"coverage": replace(GOOD, coverage=0.05), "clock_bound_s": replace(GOOD, clock_bound_s=0.05)}
     return changed.get(name, solution), evidence.get(name, GOOD)
 
 
@@ -130,11 +121,6 @@ def test_a_statement_closes_its_gate_by_what_its_tolerance_leaves_unexplained(
         assert failed(judge(told, GOOD)) == [f"{name}_pull"] * closed
 
 
-def test_a_move_closes_the_session_gate(solution: Solution) -> None:
-    moved = replace(solution, session=Explanation(Reading.BOARD_MOVED, 90.0, 7))
-    assert failed(judge(moved, GOOD)) == ["session"]
-
-
 def test_the_certificate_informs_and_closes_nothing(solution: Solution) -> None:
     bad = replace(solution.certificate, certified=False, distance_sigma=40.0)
     assert failed(judge(replace(solution, certificate=bad), GOOD)) == []
@@ -160,9 +146,9 @@ def test_limits_come_from_a_file_and_null_switches_a_gate_off(solution: Solution
 def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) -> None:
     path = tmp_path / "gates.yaml"
     path.write_text(content)
-    with raises_code(UsageError, "gate-limits", path=str(path)):
+    with raises("gate-limits", UsageError, path=str(path)):
         read_limits(path)
-    with raises_code(UsageError, "gate-limits"):
+    with raises("gate-limits", UsageError):
         read_limits(tmp_path / "none.yaml")
 
 

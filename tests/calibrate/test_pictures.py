@@ -12,7 +12,7 @@ from calibrate.boards.detect import detect
 from calibrate.errors import CalibrationError
 from calibrate.job import SolvedRecording
 from recordings.schema.messages import CameraModel
-from tests.calibrate.calling import raises_code
+from tests.codes import raises
 
 
 @pytest.fixture(scope="module")
@@ -76,5 +76,5 @@ def test_corners_and_gaps_are_taken(given: dict[str, Any], solved: SolvedRecordi
     ],
 )
 def test_what_cannot_be_solved_is_named(given: dict[str, Any], changed: dict[str, Any], code: str) -> None:
-    with raises_code(CalibrationError, code):
+    with raises(code, CalibrationError):
         calibrate.solve(**given | {"joints_rad": None} | changed)

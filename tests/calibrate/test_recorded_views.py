@@ -24,7 +24,7 @@ from recordings.reader import Recording, open_recording
 from recordings.recover import recover_recording
 from recordings.schema.messages import RobotIdentity
 from recordings.writer import RecordingWriter
-from tests.calibrate.calling import raises_code
+from tests.codes import raises
 
 Damage = Callable[[bytes], bytes]
 
@@ -85,7 +85,7 @@ def test_a_wrong_kinematics_file_is_named(source: Recording, tmp_path: Path, rob
             writer.image(picture)
             writer.view(view)
         path = writer.finish()
-    with raises_code(BadViewsError, "arm-kinematics"):
+    with raises("arm-kinematics", BadViewsError):
         load_views(open_recording(path))
 
 
@@ -129,7 +129,7 @@ def test_a_board_declared_in_squares_is_named_with_its_inner_corners(
     board = source.info.board
     few = open_recording(copied(source, tmp_path / "a.mcap", range(4)))
     squares = msgspec.structs.replace(board, columns=board.columns + 1, rows=board.rows + 1)
-    with raises_code(SquaresCountedError, "squares-counted", columns=board.columns, rows=board.rows):
+    with raises("squares-counted", SquaresCountedError, columns=board.columns, rows=board.rows):
         load_views(few, squares)
 
 
@@ -148,7 +148,7 @@ def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recordi
         return message
 
     part.parsed_at = lying  # type: ignore[method-assign]
-    with raises_code(TooFewViewsError, "too-few-views", views=2, images=3):
+    with raises("too-few-views", TooFewViewsError, views=2, images=3):
         load_views(recording)
 
 
@@ -158,7 +158,7 @@ def test_a_sweep_of_an_earlier_version_is_refused_by_name(source: Recording, tmp
         for _, picture in source.images():
             writer.image(picture)
         path = writer.finish()
-    with raises_code(TooFewViewsError, "too-few-views", views=0) as refused:
+    with raises("too-few-views", TooFewViewsError, views=0) as refused:
         load_views(open_recording(path))
     assert "sweep" in refused.value.remedy
 

@@ -59,12 +59,7 @@ def recovered(folder: Path) -> Path:
     return recover_recording(path, folder / "saved.mcap")[0].path
 
 
-FILES = {
-    "fresh": fresh,
-    "sample": lambda folder: SAMPLE,
-    "excerpt": excerpt,
-    "recovered": recovered,
-}
+FILES = {"fresh": fresh, "sample": lambda folder: SAMPLE, "excerpt": excerpt, "recovered": recovered}
 
 
 @pytest.mark.parametrize("judge", JUDGES)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -26,6 +24,7 @@ from recordings.schema.messages import (
     View,
 )
 from recordings.writer import RecordingWriter
+from tests.codes import raises
 
 WIDTH, HEIGHT = 32, 24
 START_NS = 1_700_000_000_000_000_000
@@ -33,12 +32,8 @@ BOARD = BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025)
 TURNED = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.2), (0.0, 0.0, 1.0, 0.3), (0.0, 0.0, 0.0, 1.0))
 
 
-@contextmanager
-def refused(code: str, **values: object) -> Iterator[pytest.ExceptionInfo[RecordingError]]:
-    """A RecordingError with this code, and these among its values."""
-    with pytest.raises(RecordingError) as caught:
-        yield caught
-    assert (caught.value.code, caught.value.values) == (code, caught.value.values | values)
+refused = partial(raises, kind=RecordingError)
+"""A RecordingError with this code, and these among its values."""
 
 
 def shown(path: Path, topic: str) -> list[tuple[int, Any]]:

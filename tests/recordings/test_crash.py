@@ -97,7 +97,7 @@ def kill_at_a_random_moment(folder: Path, seed: int) -> int:
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_kill_9_loses_no_acknowledged_pose(tmp_path: Path, seed: int) -> None:
     kill_at_a_random_moment(tmp_path, seed)
 
@@ -121,13 +121,13 @@ def fill_the_disk(folder: Path, limit_bytes: int) -> None:
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("limit_bytes", [20_000, 45_678, 99_999])
+@pytest.mark.parametrize("limit_bytes", [20_000, 99_999])
 def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, limit_bytes: int) -> None:
     fill_the_disk(tmp_path, limit_bytes)
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("limit_bytes", [0, 100])
+@pytest.mark.parametrize("limit_bytes", [100])
 def test_a_disk_that_is_full_at_the_beginning_leaves_the_name_free(tmp_path: Path, limit_bytes: int) -> None:
     process = start(tmp_path / "a.mcap", limit_bytes)
     said = process.communicate(timeout=PATIENCE_S)[0]

@@ -14,7 +14,7 @@ from recordings.schema.messages import RobotState, View
 from recordings.schema.topics import Topic
 from tests.recordings.small_recording import make_state, make_view, write_small
 
-SAMPLED_EVERY = 101
+SAMPLED_EVERY = 307
 """Prime to 8, so that a sample meets every bit position. `make soak` takes every one."""
 
 
@@ -38,7 +38,7 @@ def check_every_flip(path: Path, every: int) -> int:
 
 
 def test_a_flipped_bit_is_never_silent(small: Path) -> None:
-    assert check_every_flip(small, SAMPLED_EVERY) > 1_500
+    assert check_every_flip(small, SAMPLED_EVERY) > 500
 
 
 @pytest.mark.soak
@@ -57,7 +57,7 @@ def check_every_cut(path: Path, every: int) -> None:
 
 
 def test_a_cut_file_is_refused_and_names_recover(small: Path) -> None:
-    check_every_cut(small, 23)
+    check_every_cut(small, 67)
 
 
 @pytest.mark.soak

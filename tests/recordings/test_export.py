@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from recordings.cli import main
 from recordings.exporters.excerpt import write_excerpt
-from recordings.exporters.export import export_recording
+from recordings.exporters.folder import export_recording
 from recordings.importers.folder import import_folder
 from recordings.mcap.output import OutputFile
 from recordings.reader import open_recording
-from recordings.schema.messages import Stamps
+from recordings.schema.messages import Stamps, matrix_from_quaternion
 from recordings.schema.topics import Topic
 from recordings.schema.viewing import DETECTED, Marks, quaternion_xyzw
 from recordings.writer import RecordingWriter
@@ -150,18 +150,15 @@ def test_the_command_line_writes_each_target(small: Path, tmp_path: Path, target
     assert (tmp_path / "out").is_dir()
 
 
-def test_quaternions_of_any_rotation_turn_back() -> None:
-    rotations = [
-        *Rotation.random(50, random_state=2),
-        Rotation.from_rotvec([np.pi, 0, 0]),
-        Rotation.identity(),
-    ]
-    for rotation in rotations:
-        T = np.eye(4)
-        T[:3, :3] = rotation.as_matrix()
-        q = quaternion_xyzw(tuple(map(tuple, T.tolist())))
+def test_quaternions_turn_as_scipy_says_and_back() -> None:
+    turns = [*Rotation.random(30, random_state=2), Rotation.from_rotvec([np.pi, 0, 0]), Rotation.identity()]
+    for turn in turns:
+        T = matrix_from_quaternion([1.0, 2.0, 3.0], turn.as_quat().tolist())
+        np.testing.assert_allclose(np.array(T)[:3, :3], turn.as_matrix(), atol=1e-12)
+        assert [row[3] for row in T[:3]] == [1, 2, 3]
+        q = quaternion_xyzw(T)
         assert q[3] >= 0
-        np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), T[:3, :3], atol=1e-12)
+        np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), turn.as_matrix(), atol=1e-12)
 
 
 @pytest.mark.parametrize("lossless_png", [False, True])

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
-from recordings.errors import CorruptRecordingError, RecordingError
+from recordings.errors import RecordingError
 from recordings.reader import open_recording
 from recordings.recover import recover_recording
 from recordings.schema.definitions import encode
@@ -64,8 +64,7 @@ UNUSUAL = {
     "private record": lambda: after_session(record(0x80, b"x")),
     "record of a later specification": lambda: after_session(record(0x42, b"x")),
     "field of a later specification": lambda: sealed(
-        SESSION + chunk(STATE_SCHEMA + record(Opcode.CHANNEL, STATE_CHANNEL[9:] + b"!") + STATE),
-        DECLARED,
+        SESSION + chunk(STATE_SCHEMA + record(Opcode.CHANNEL, STATE_CHANNEL[9:] + b"!") + STATE), DECLARED
     ),
 }
 """Allowed by the specification, and written by other programs."""
@@ -169,23 +168,14 @@ DAMAGED = {
 }
 """Files that break the format in one place."""
 UNUSABLE = {
-    "attachment named a path": (
-        sealed(SESSION + attachment("../../etc/x", b"")),
-        "contradiction",
-    ),
-    "attachment named NUL": (
-        sealed(SESSION + attachment("a\0b", b"")),
-        "contradiction",
-    ),
+    "attachment named a path": (sealed(SESSION + attachment("../../etc/x", b"")), "contradiction"),
+    "attachment named NUL": (sealed(SESSION + attachment("a\0b", b"")), "contradiction"),
     "a topic of ours with somebody else's content": (
         sealed(SESSION + chunk(schema(1, Topic.LOG) + STATE_CHANNEL + STATE)),
         "other-schema",
     ),
     "no session": (sealed(b""), "not-a-recording"),
-    "a format of the future": (
-        sealed(session_metadata(file_format="station-recording/3")),
-        "newer-format",
-    ),
+    "a format of the future": (sealed(session_metadata(file_format="station-recording/3")), "newer-format"),
     "a session changed without its checksum": (
         sealed(SESSION.replace(b"eye-in-hand", b"eye-to-hand")),
         "contradiction",
@@ -205,10 +195,13 @@ UNUSABLE = {
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_one_lie_is_enough(tmp_path: Path, name: str) -> None:
+def test_one_lie_is_enough_and_costs_no_memory(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path, DAMAGED[name])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with refused("damaged-recording") as caught:
-        open_recording(write(tmp_path, DAMAGED[name]))
+        open_recording(path)
     assert "recordings recover" in caught.value.remedy
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 8 * 1024
 
 
 @pytest.mark.parametrize("name", UNUSABLE)
@@ -244,16 +237,7 @@ def test_messages_that_are_wrong_in_themselves_name_their_place(tmp_path: Path) 
             list(recording.robot_states())
 
 
-@pytest.mark.parametrize("name", ["record length 2^63", "chunk size 2^62", "map too long"])
-def test_lies_about_size_cost_no_memory(tmp_path: Path, name: str) -> None:
-    path = write(tmp_path, DAMAGED[name])
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(CorruptRecordingError):
-        open_recording(path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 8 * 1024
-
-
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_any_bytes_give_a_recording_or_a_recording_error(small: Path, data: st.DataObject) -> None:
     """Random edits of a good file: cut, repeat, overwrite. Recovery keeps to the same contract."""

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from recordings.cli import main
-from recordings.exporters.export import export_recording
+from recordings.exporters.folder import export_recording
 from recordings.importers.dataset import read_poses
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
-from recordings.schema.messages import BoardKind, matrix_from_quaternion
+from recordings.schema.messages import BoardKind
 from tests.command_line import call
 from tests.recordings.small_recording import BOARD, HEIGHT, WIDTH, make_image, refused
 
@@ -255,17 +255,15 @@ def test_an_existing_output_is_not_touched(folder: Path, tmp_path: Path) -> None
     assert output.read_text() == "precious"
 
 
-def test_quaternions_turn_as_scipy_says() -> None:
-    from scipy.spatial.transform import Rotation
-
-    for q in Rotation.random(20, random_state=1).as_quat():
-        matrix = np.array(matrix_from_quaternion([1.0, 2.0, 3.0], q.tolist()))
-        np.testing.assert_allclose(matrix[:3, :3], Rotation.from_quat(q).as_matrix(), atol=1e-12)
-        assert matrix[:3, 3].tolist() == [1, 2, 3]
+SOLVED = {
+    "ur5-chessboard", "charuco-eye-to-hand", "denso-long", "six-views", "rendered-truth",
+    "rendered-truth-eye-to-hand",
+}  # fmt: skip
 
 
 def test_every_real_dataset_imports(datasets: Path, tmp_path: Path) -> None:
-    folders = sorted(path.parent for path in datasets.glob("*/dataset.yaml"))
+    """But for those that tests/calibrate/test_pipeline.py imports and solves."""
+    folders = {path.parent for path in datasets.glob("*/dataset.yaml") if path.parent.name not in SOLVED}
     assert folders
     for source in folders:
         done = import_folder(source, tmp_path / f"{source.name}.mcap")

@@ -7,6 +7,7 @@ import errno
 import os
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,8 +46,21 @@ class Gate:
         monkeypatch.setattr(RecordingWriter, "event", slow_event)
 
 
-def event(kind: str = "note") -> CaptureEvent:
-    return CaptureEvent(Stamps(), kind)
+def event() -> CaptureEvent:
+    return CaptureEvent(Stamps(), "note")
+
+
+@pytest.fixture
+def gate(monkeypatch: pytest.MonkeyPatch) -> Gate:
+    return Gate(monkeypatch)
+
+
+def held_up(gate: Gate, folder: Path, **options: Any) -> Recorder:
+    """A recorder whose writer waits at the gate."""
+    recorder = Recorder(folder / "a.mcap", make_info(), **options)
+    recorder.event(event())
+    assert gate.reached.wait(PATIENCE_S)
+    return recorder
 
 
 def test_a_session_from_several_threads_comes_back_complete(tmp_path: Path) -> None:
@@ -169,14 +183,9 @@ def test_nothing_is_acknowledged_after_a_regular_sync_failed(
     assert recorder.error is not None
 
 
-def test_a_slow_disk_costs_counted_pictures_and_never_a_view(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gate = Gate(monkeypatch)
+def test_a_slow_disk_costs_counted_pictures_and_never_a_view(gate: Gate, tmp_path: Path) -> None:
     size = make_picture(0).pixels.nbytes
-    recorder = Recorder(tmp_path / "a.mcap", make_info(), queue_limit_bytes=3 * size + 500)
-    recorder.event(event())
-    assert gate.reached.wait(PATIENCE_S)
+    recorder = held_up(gate, tmp_path, queue_limit_bytes=3 * size + 500)
     kept = [recorder.image(make_picture(sequence)) for sequence in range(5)]
     assert kept == [True, True, True, False, False]
     assert recorder.dropped == 2
@@ -189,11 +198,8 @@ def test_a_slow_disk_costs_counted_pictures_and_never_a_view(
     assert [view.index for view in recording.views()] == [0]
 
 
-def test_the_callers_never_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    gate = Gate(monkeypatch)
-    recorder = Recorder(tmp_path / "a.mcap", make_info())
-    recorder.event(event())
-    assert gate.reached.wait(PATIENCE_S)
+def test_the_callers_never_wait_for_the_disk(gate: Gate, tmp_path: Path) -> None:
+    recorder = held_up(gate, tmp_path)
     for count in range(recorder_module.QUEUE_LIMIT_MESSAGES + 7):  # returns although nothing is written
         recorder.robot_state(make_state(count))
     recorder.event(event())
@@ -239,12 +245,9 @@ def test_the_first_write_error_is_final_and_said_to_everyone(
 
 
 def test_waiting_syncs_fail_with_the_error_and_nobody_hangs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    gate: Gate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gate = Gate(monkeypatch)
-    recorder = Recorder(tmp_path / "a.mcap", make_info())
-    recorder.event(event())
-    assert gate.reached.wait(PATIENCE_S)
+    recorder = held_up(gate, tmp_path)
     recorder.image(make_picture(0))
     waiting = [recorder.sync() for _ in range(3)]
     finishing = recorder.finish()
@@ -274,12 +277,8 @@ def test_an_error_of_the_sync_itself_is_as_final(
     assert not (tmp_path / "a.mcap").exists()
 
 
-async def test_a_task_that_stops_waiting_does_not_harm_the_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gate = Gate(monkeypatch)
-    recorder = Recorder(tmp_path / "a.mcap", make_info())
-    recorder.event(event())
+async def test_a_task_that_stops_waiting_does_not_harm_the_recording(gate: Gate, tmp_path: Path) -> None:
+    recorder = held_up(gate, tmp_path)
     waiting = asyncio.wrap_future(recorder.sync())
     waiting.cancel()
     gate.opened.set()

@@ -23,6 +23,7 @@ from station.cell.config import PAPER_BOARD, PoseGuess
 from station.cell.status import (
     ArmCondition,
     CameraStatus,
+    LeaseStatus,
     MotionPreview,
     PoseStatus,
     RobotStatus,
@@ -76,11 +77,7 @@ class FakeLink(Client):
         self.own_id, self.root = 7, Path("/nowhere")
         self.asked: list[Verb[Any]] = []
         self.refuse: dict[str, Exception] = {}
-        self.answers: dict[str, Any] = {
-            "prepare": SUMMARY,
-            "preview": _image(),
-            "configuration": CELL,
-        }
+        self.answers: dict[str, Any] = {"prepare": SUMMARY, "preview": _image(), "configuration": CELL}
         self.silent = asyncio.Event()
         """While set nothing is answered, as by a daemon that hangs."""
         self.same_image, self._images = False, 0
@@ -139,6 +136,21 @@ def idle(state: StationState = StationState.IDLE, reason: str = "") -> StationSt
         camera=CameraStatus(CameraIdentity(model="MER-131-75GM")),
         session=SessionStatus(name="s-1", poses=poses, plan_sha256="ab" * 32),
     )
+
+
+def in_session(status: StationStatus, **changes: object) -> StationStatus:
+    """The status with fields of its session replaced."""
+    return msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, **changes))
+
+
+def commanded(state: StationState, client_id: int = 7) -> StationStatus:
+    """The screen of `FakeLink` is client 7."""
+    return msgspec.structs.replace(idle(state), lease=LeaseStatus("anna on tty1", client_id))
+
+
+def said(pilot: Pilot[None]) -> str:
+    """What the notices on the screen say."""
+    return " ".join(notice.message for notice in pilot.app._notifications)
 
 
 @pytest.fixture

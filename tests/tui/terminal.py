@@ -84,11 +84,7 @@ class ScreenProcess:
     """`station tui` in a terminal of its own; `command`: another one of `station`'s."""
 
     def __init__(
-        self,
-        socket: Path,
-        columns: int = 100,
-        rows: int = 34,
-        command: tuple[str, ...] = (),
+        self, socket: Path, columns: int = 100, rows: int = 34, command: tuple[str, ...] = ()
     ) -> None:
         self._master, slave = pty.openpty()
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))

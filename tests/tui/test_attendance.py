@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import msgspec
 import pytest
 from textual import events
 
-from station.cell.status import LeaseStatus, StationState, StationStatus
+from station.cell.status import StationState
 from station.protocol import verbs
 from station.tui import attendance
-from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
+from tests.tui.conftest import FakeLink, app_on, commanded, said, text_of, until
 
 LOST = verbs.Release(silent=True)
-
-
-def commanded(state: StationState, client_id: int = 7) -> StationStatus:
-    return msgspec.structs.replace(idle(state), lease=LeaseStatus("anna on pts/1", client_id))
 
 
 @pytest.mark.parametrize(
@@ -52,5 +47,5 @@ async def test_who_commands_a_moving_arm_is_asked_for(
             await app.attendance.look()
             await pilot.pause()
         assert (LOST in link.asked) is lost
-        assert any("control released" in said.message for said in app._notifications) is lost
+        assert ("control released" in said(pilot)) is lost
         assert len(asked) >= attendance.UNANSWERED or not lost

@@ -9,12 +9,7 @@ import pytest
 from calibrate.geometry import pose as pose_of
 from station.cell.config import matrix4
 from station.cell.layout import layout_of
-from station.cell.status import (
-    EstimateStatus,
-    PoseStatus,
-    StationState,
-    StationStatus,
-)
+from station.cell.status import EstimateStatus, PoseStatus, StationState
 from station.tui.capture_panels import coverage_lines, error_lines
 from station.tui.progress import chips, counted_line, pose_line
 from station.tui.stopped import stopped_text
@@ -22,31 +17,27 @@ from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
 from station.tui.widgets.cell_drawing import draw
 from tests.recordings.small_recording import make_state
-from tests.tui.conftest import CELL, FakeLink, idle, opened, until
-
-
-def session(status: StationStatus, **changes: object) -> StationStatus:
-    return msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, **changes))
+from tests.tui.conftest import CELL, FakeLink, idle, in_session, opened, until
 
 
 def test_what_comes_next_fits_what_was_recorded() -> None:
-    assert "F5" in counted_line(session(idle(), name="").session).plain
-    assert "F9" in counted_line(session(idle(), recording="/r").session).plain
-    assert "4 shows" in counted_line(session(idle(), recording="/r", calibration="/c").session).plain
-    check = counted_line(session(idle(), recording="/r", check=True).session).plain
+    assert "F5" in counted_line(in_session(idle(), name="").session).plain
+    assert "F9" in counted_line(in_session(idle(), recording="/r").session).plain
+    assert "4 shows" in counted_line(in_session(idle(), recording="/r", calibration="/c").session).plain
+    check = counted_line(in_session(idle(), recording="/r", check=True).session).plain
     assert "k on 5" in check and "F9" not in check
 
 
 def test_steps_of_a_pose_are_marked_one_after_the_other() -> None:
     first, *rest = idle().session.poses
-    moving = session(
+    moving = in_session(
         idle(StationState.SETTLING),
         poses=(msgspec.structs.replace(first, state="settling"), *rest),
         current=0,
     )
     assert pose_line(moving).plain == "✓ move ─  ▶ settle  ─ ○ capture ─ ○ save"
     failed = msgspec.structs.replace(first, state="failed", reason="the board is cut")
-    assert "the board is cut" in pose_line(session(idle(), poses=(failed, *rest), current=0)).plain
+    assert "the board is cut" in pose_line(in_session(idle(), poses=(failed, *rest), current=0)).plain
 
 
 @pytest.mark.parametrize(("count", "current"), [(25, None), (25, 24), (200, 0), (200, 199)])
@@ -58,7 +49,8 @@ def test_the_chip_of_the_pose_under_way_is_always_there(
     if current is not None:
         poses[current] = msgspec.structs.replace(poses[current], state="moving")
     shown = [
-        row.plain for row in chips(session(idle(), poses=tuple(poses), current=current).session, width, rows)
+        row.plain
+        for row in chips(in_session(idle(), poses=tuple(poses), current=current).session, width, rows)
     ]
     assert len(shown) <= rows
     assert max(map(len, shown)) <= width
@@ -70,7 +62,7 @@ async def test_the_pose_under_way_is_told_by_its_number(link: FakeLink) -> None:
     poses = tuple(
         PoseStatus(index=i, name=f"p{i + 1}", state="moving" if i == 4 else "planned") for i in range(7)
     )
-    moving = session(idle(StationState.MOVING), poses=poses, current=4)
+    moving = in_session(idle(StationState.MOVING), poses=poses, current=4)
     assert "▶ move" in pose_line(moving).plain
     assert "5▶" in "".join(row.plain for row in chips(moving.session, 60, 1))
     link.show(moving)
@@ -104,7 +96,7 @@ def test_the_error_falls_towards_its_goal() -> None:
         for i in range(25)
     )
     estimate = EstimateStatus(6, (1.0, 2.0, 3.0), 0.83, goal_mm=0.5)
-    status = msgspec.structs.replace(session(idle(), poses=poses), estimate=estimate)
+    status = msgspec.structs.replace(in_session(idle(), poses=poses), estimate=estimate)
     lines = error_lines(Known(status), 60, 14).plain.split("\n")
     assert "± 0.83 mm" in lines[0] and "goal ± 0.50" in lines[0] and "reached" not in lines[0]
     assert len(lines) == 14
@@ -136,7 +128,7 @@ def test_the_parts_of_the_image_without_the_board_are_counted() -> None:
 @pytest.mark.parametrize("term", ["xterm-256color", "linux"])
 def test_the_scene_shows_arm_board_and_table(term: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", term)
-    status = session(idle(), poses=(seeing(0.6, 0.0), seeing(0.5, 0.2)))
+    status = in_session(idle(), poses=(seeing(0.6, 0.0), seeing(0.5, 0.2)))
     standing = msgspec.structs.replace(make_state(0), joints_rad=(0.0, -1.6, -1.5, -1.6, 1.5, 0.0))
     status = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, state=standing))
     drawn = draw(layout_of(CELL), status, 0, 60, 24).plain

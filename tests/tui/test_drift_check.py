@@ -17,11 +17,10 @@ from station.cell.status import StationState, StationStatus
 from station.operate.drift_check import POSES, SEED
 from station.protocol import verbs
 from station.tui import jobs
-from station.tui.app import StationApp
 from station.tui.desk import REMEDIES, busy_words
 from station.tui.dialogs import ConfirmMotion, JobScreen
 from station.tui.installed import read_installed
-from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, in_session, said, text_of, until
 from tests.tui.test_install import GOOD
 from tests.tui.test_plan_screen import SlowPlanner
 
@@ -56,14 +55,8 @@ def installed(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def check_session(root: Path, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:
-    status = idle(state)
-    session = msgspec.structs.replace(
-        status.session,
-        plan_sha256=CHECK_PLAN,
-        folder=str(root / "root/sessions/s-2"),
-        recording=recording,
-    )
-    return msgspec.structs.replace(status, session=session)
+    folder = str(root / "root/sessions/s-2")
+    return in_session(idle(state), plan_sha256=CHECK_PLAN, folder=folder, recording=recording)
 
 
 async def ask_for_it(pilot: Pilot[None]) -> None:
@@ -71,16 +64,12 @@ async def ask_for_it(pilot: Pilot[None]) -> None:
     await pilot.press("4", "d")
 
 
-def said(app: StationApp, words: str) -> bool:
-    return any(words in notice.message for notice in app._notifications)
-
-
 async def test_nothing_is_planned_where_nothing_is_installed(link: FakeLink, tmp_path: Path) -> None:
     link.root = tmp_path
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await ask_for_it(pilot)
-        await until(pilot, lambda: said(app, REMEDIES["nothing-installed"]))
+        await until(pilot, lambda: REMEDIES["nothing-installed"] in said(pilot))
         assert link.verbs == []
 
 

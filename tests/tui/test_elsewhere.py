@@ -16,7 +16,7 @@ from calibrate.results import Gate
 from station.tui import app as app_module
 from station.tui.app import StationApp
 from station.tui.installed import read_installed
-from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, in_session, text_of, until
 from tests.tui.test_install import GOOD, OFF
 
 
@@ -124,11 +124,9 @@ def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
 
 
 async def test_the_result_of_the_session_just_captured_needs_no_picking(link: FakeLink, root: Path) -> None:
-    app, status = app_on(link), idle()
+    app = app_on(link)
     path = str(root / "sessions" / "s-1" / "calibration.yaml")
-    link.show(
-        msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, calibration=path))
-    )
+    link.show(in_session(idle(), calibration=path))
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: app.known.status is not None and app.known.status.session.calibration)
         await pilot.press("4")

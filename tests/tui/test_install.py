@@ -25,7 +25,7 @@ from station.tui.result import evidence, verdict_lines
 from station.tui.task import next_action
 from tests.station.calibrated_cell import calibration_of
 from tests.station.session_rig import TRUTH
-from tests.tui.conftest import FakeLink, app_on, opened, text_of, until
+from tests.tui.conftest import FakeLink, app_on, opened, said, text_of, until
 
 GOOD = calibration_of(
     TRUTH, RobotIdentity(serial="1", model="UR10"), CameraIdentity(serial="2", model="camera")
@@ -61,13 +61,13 @@ def test_there_is_one_verdict_in_three_states(result: Result, verdict: str) -> N
 
 
 def test_terminal_and_screen_say_the_same_figures() -> None:
-    said = io.StringIO()
-    Console(file=said, width=200).print(summary(DOUBTED))
+    printed = io.StringIO()
+    Console(file=printed, width=200).print(summary(DOUBTED))
     screen = verdict_lines(Result("", DOUBTED)).plain + evidence(Result("", DOUBTED), DOUBTED).plain
     told = figures(DOUBTED, DOUBTED.verification)
     assert {"error", "gates", "views", "touch"} <= set(told)
     for figure in told.values():
-        assert figure.value in said.getvalue()
+        assert figure.value in printed.getvalue()
         assert figure.value in screen
 
 
@@ -85,10 +85,6 @@ async def install_until_a_reason_is_asked_for(pilot: Pilot[None], calibration: P
     await pilot.press("tab", "enter")
     # Shown is not yet composed, on a busy computer.
     await until(pilot, lambda: isinstance(pilot.app.screen, Reason) and pilot.app.screen.query(Input))
-
-
-def said(pilot: Pilot[None]) -> str:
-    return " ".join(notice.message for notice in pilot.app._notifications)
 
 
 async def test_who_overrules_gives_a_reason(link: FakeLink, calibration: Path) -> None:
@@ -164,8 +160,8 @@ async def test_a_first_installation_is_undone_by_taking_it_out_of_use(
 def test_a_calibration_that_was_installed_all_the_same_says_by_whom_and_why() -> None:
     taken = Override("measured with the tape", "anna", ["corner 0 is off"])
     now = Installed(msgspec.structs.replace(DOUBTED, override=taken))
-    said = verdict_lines(Result("", DOUBTED, now)).plain
-    assert "Override by anna: “measured with the tape”" in said
+    told = verdict_lines(Result("", DOUBTED, now)).plain
+    assert "Override by anna: “measured with the tape”" in told
     assert "Override" not in verdict_lines(Result("", DOUBTED, Installed(DOUBTED))).plain
 
 

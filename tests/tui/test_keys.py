@@ -9,10 +9,10 @@ import pytest
 from textual.widgets import Static
 
 from station.cell.errors import RefusedError
-from station.cell.status import LeaseStatus, StationState, StationStatus
+from station.cell.status import StationState
 from station.protocol import verbs
 from station.tui.dialogs import Confirm, ConfirmMotion
-from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, opened, text_of, until
+from tests.tui.conftest import SUMMARY, FakeLink, app_on, commanded, idle, opened, said, text_of, until
 
 
 async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
@@ -44,18 +44,12 @@ async def test_a_refusal_is_said_and_nothing_moves(link: FakeLink) -> None:
     link.refuse["prepare"] = RefusedError("control-held", holder="anna on tty1")
     async with opened(link, notifications=True) as pilot:
         await pilot.press("f5")
-        await until(pilot, lambda: any("anna on tty1" in n.message for n in pilot.app._notifications))
+        await until(pilot, lambda: "anna on tty1" in said(pilot))
         assert link.verbs == ["prepare"]
 
 
 async def test_a_key_sends_its_wish_at_once(link: FakeLink) -> None:
-    wishes = {
-        "f6": ["pause"],
-        "f8": ["acknowledge"],
-        "f3": ["free_drive"],
-        "f2": ["record"],
-        "f12": ["stop"],
-    }
+    wishes = {"f6": ["pause"], "f8": ["acknowledge"], "f3": ["free_drive"], "f2": ["record"], "f12": ["stop"]}
     async with opened(link) as pilot:
         for key, wish in wishes.items():
             link.asked.clear()
@@ -103,11 +97,6 @@ async def test_the_palette_names_the_screen_s_own_keys_too_and_stop_works_in_it(
         await until(pilot, lambda: "stop" in link.verbs)
 
 
-def commanded(state: StationState, client_id: int) -> StationStatus:
-    """The screen of `FakeLink` is client 7."""
-    return msgspec.structs.replace(idle(state), lease=LeaseStatus("anna on tty1", client_id))
-
-
 @pytest.mark.parametrize("key", ["ctrl+q", "f4"])
 async def test_what_ends_control_asks_while_the_arm_works_by_it(link: FakeLink, key: str) -> None:
     async with opened(link) as pilot:
@@ -138,7 +127,7 @@ async def test_control_is_let_go_of_by_its_holder_alone(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(160, 24), notifications=True) as pilot:
         await until(pilot, lambda: "control: anna on tty1" in text_of(pilot.app, "#bar"))
         await pilot.press("f4")
-        await until(pilot, lambda: any("anna on tty1 does" in n.message for n in pilot.app._notifications))
+        await until(pilot, lambda: "anna on tty1 does" in said(pilot))
         assert link.verbs == []
         link.show(commanded(StationState.PAUSED, 7))
         await until(pilot, lambda: pilot.app.known.live.lease.client_id == 7)  # type: ignore[attr-defined]
@@ -148,7 +137,7 @@ async def test_control_is_let_go_of_by_its_holder_alone(link: FakeLink) -> None:
 
 async def test_many_resizes_leave_a_working_screen(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        for i in range(0, 100, 10):
+        for i in range(0, 100, 25):
             await pilot.resize_terminal(60 + i, 20 + i % 40)
         await pilot.resize_terminal(80, 24)
         await pilot.pause()

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 from textual.pilot import Pilot
-from textual.widgets import Input, Static
+from textual.widgets import Input
 
 from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec
@@ -24,10 +23,10 @@ from station.simulation.truth import CellTruth, write_truth
 from station.tui.new_cell import NewCell
 from tests.conftest import check_allow_list
 from tests.station.operate.guided_views import guided_joints
+from tests.tui.conftest import until
 from tests.tui.new_cell_rig import SimulatedHardware
 
 pytestmark = pytest.mark.process
-PATIENCE_S = 60.0
 
 
 def other_cell() -> CellTruth:
@@ -35,17 +34,6 @@ def other_cell() -> CellTruth:
     truth = make_cell("paper-binned", seed=11, noise="mid")
     board = BoardSpec(kind=BoardKind.CHESSBOARD, columns=8, rows=5, square_m=0.023)
     return msgspec.structs.replace(truth, board=board)
-
-
-async def until(pilot: Pilot[object], condition: Callable[[], object], what: str) -> None:
-    give_up_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        if time.monotonic() > give_up_s:
-            app = pilot.app
-            assert isinstance(app, NewCell)
-            said = [str(app.query_one(part, Static).render()) for part in ("#live-lines", "#problem", "#bar")]
-            pytest.fail("\n".join([what, *said]))
-        await pilot.pause(0.05)
 
 
 class Operator:
@@ -63,7 +51,7 @@ class Operator:
         await self.press(*("space" if c == " " else "full_stop" if c == "." else c for c in text))
 
     async def until_step(self, step: CellStep) -> None:
-        await until(self.pilot, lambda: self.app.step is step, f"{step} did not come, it is {self.app.step}")
+        await until(self.pilot, lambda: self.app.step is step)
 
     async def guide(self, joints: np.ndarray) -> None:
         """A hand leads the arm, by the simulator's side door."""
@@ -88,20 +76,16 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
             await person.type(controller.host)
             await person.press("enter")
             await person.until_step(CellStep.CAMERA)
-            await until(pilot, lambda: app.setup.camera is not None, "no camera was opened")
+            await until(pilot, lambda: app.setup.camera is not None)
             await person.press("enter")
             await person.until_step(CellStep.MOUNTING)
             await person.press("enter")
             await person.until_step(CellStep.BOARD)
-            await until(pilot, lambda: app.setup.counts == (8, 5), "the corners were not counted")
-            await until(
-                pilot, lambda: app.query_one("#typed", Input).value == "8x5 ", "nothing was filled in"
-            )
+            await until(pilot, lambda: app.setup.counts == (8, 5))
+            await until(pilot, lambda: app.query_one("#typed", Input).value == "8x5 ")
             await person.type("2.3cm")
             await person.press("enter")
-            await until(
-                pilot, lambda: app.setup.seen is not None and app.setup.seen[1].found, "the board is not seen"
-            )
+            await until(pilot, lambda: app.setup.seen is not None and app.setup.seen[1].found)
             await person.press("enter")
             await person.until_step(CellStep.VIEWS)
             for joints in guided_joints(truth)[1:]:  # it stands at the first one
@@ -114,11 +98,10 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
                     lambda before=before: (
                         len(app.setup.draft.views) > before or app.step is not CellStep.VIEWS
                     ),
-                    "no view was taken",
                 )
             await person.until_step(CellStep.SAVE)
             await person.press("enter")
-            await until(pilot, lambda: app.setup.draft.written, "nothing was written")
+            await until(pilot, lambda: app.setup.draft.written)
             await person.press("enter")
         assert app.return_value == "serve"
         check_allow_list(controller.host)

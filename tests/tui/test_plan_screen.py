@@ -11,7 +11,7 @@ from station.cell.status import PoseStatus
 from station.protocol import verbs
 from station.tui.desk import busy_words
 from station.tui.plan_screen import facts_line
-from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until
 
 
 class SlowPlanner(FakeLink):
@@ -34,22 +34,20 @@ async def test_it_says_that_it_plans_for_as_long_as_it_does() -> None:
         await pilot.press("2", "n")
         await until(pilot, lambda: busy_words(verbs.MakePlan(25)) in text_of(pilot.app, "#next"))
         await pilot.press("n")
-        await until(pilot, lambda: any("Busy" in n.message for n in pilot.app._notifications))
+        await until(pilot, lambda: "Busy" in said(pilot))
         assert link.verbs.count("make_plan") == 1
         link.made.set()
         await until(pilot, lambda: "Wait" not in text_of(pilot.app, "#next"))
 
 
 async def test_the_end_of_two_hundred_poses_is_told_as_the_start_is(link: FakeLink) -> None:
-    status = idle()
     poses = tuple(PoseStatus(index=i, name=f"p{i + 1:03d}", why=f"place {i + 1}") for i in range(200))
-    link.show(msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, poses=poses)))
+    link.show(in_session(idle(), poses=poses))
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "/200" in text_of(pilot.app, "#rail"))
         await pilot.press("2", "end")
         await until(pilot, lambda: "place 200" in text_of(pilot.app, "#plan-detail"))
-        fewer = msgspec.structs.replace(status.session, poses=poses[:-1])
-        link.show(msgspec.structs.replace(status, session=fewer))
+        link.show(in_session(idle(), poses=poses[:-1]))
         await until(pilot, lambda: "place 199" in text_of(pilot.app, "#plan-detail"))
 
 
@@ -59,8 +57,7 @@ async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> No
         await pilot.press("2")
         poses = list(status.session.poses)
         poses[7] = msgspec.structs.replace(poses[7], state="failed", reason="too dark")
-        session = msgspec.structs.replace(status.session, poses=tuple(poses))
-        link.show(msgspec.structs.replace(status, session=session))
+        link.show(in_session(status, poses=tuple(poses)))
         table = pilot.app.screen.query_one(DataTable)
         await until(
             pilot, lambda: table.row_count == 25 and str(table.get_row_at(7)[-2]) == "failed: too dark"
@@ -70,9 +67,7 @@ async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> No
 
 def test_the_error_at_the_end_is_that_of_the_last_pose_alone() -> None:
     poses = [PoseStatus(index=i, name=f"p{i}", predicted_sigma_mm=0.2 + i) for i in range(3)]
-    status = idle()
     for last_known, shown in ((True, True), (False, False)):
         poses[-1] = msgspec.structs.replace(poses[-1], predicted_sigma_mm=2.2 if last_known else None)
-        session = msgspec.structs.replace(status.session, poses=tuple(poses))
-        changed = msgspec.structs.replace(status, session=session)
+        changed = in_session(idle(), poses=tuple(poses))
         assert ("±" in facts_line(changed).plain) is shown

@@ -13,7 +13,7 @@ from station.tui.capture_screen import CaptureScreen
 from station.tui.desk import STOP_UNHEARD
 from station.tui.task import SILENT
 from station.tui.widgets.preview import OLD, PreviewPane
-from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until
 
 
 @pytest.fixture(autouse=True)
@@ -56,21 +56,20 @@ async def test_meanwhile_only_stop_is_sent_and_the_emergency_stop_is_named(link:
         await pilot.press("f12")
         await pilot.pause()
         assert link.verbs == ["stop"]
-        assert any(said.message == STOP_UNHEARD for said in pilot.app._notifications)
+        assert STOP_UNHEARD in said(pilot)
         link.silent.clear()
 
 
 async def test_without_a_daemon_what_it_said_last_stays_and_is_marked_old(link: FakeLink) -> None:
     """Also on a screen that was away meanwhile: not what it had shown itself when it was left."""
-    said = Event(1, "warning", "pose 3 did not come to rest")
+    warning = Event(1, "warning", "pose 3 did not come to rest")
     async with opened(link, size=(160, 48)) as pilot:
         await pilot.press("2")
         await until(pilot, lambda: pilot.app.screen.query(DataTable))
         table = pilot.app.screen.query_one(DataTable)
         await until(pilot, lambda: table.row_count == 25)
-        moving = idle(StationState.MOVING)
-        session = msgspec.structs.replace(moving.session, current=7)
-        link.show(msgspec.structs.replace(moving, session=session, events=(said,)))
+        moving = in_session(idle(StationState.MOVING), current=7)
+        link.show(msgspec.structs.replace(moving, events=(warning,)))
         await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
         link.show(None)
         await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
@@ -83,8 +82,8 @@ async def test_without_a_daemon_what_it_said_last_stays_and_is_marked_old(link: 
         assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose 8 of 25: OLD"
 
 
-@pytest.mark.parametrize(("heard", "said"), [(True, "without a connection"), (False, "nothing was sent")])
-async def test_without_a_connection_stop_is_sent_all_the_same(heard: bool, said: str) -> None:
+@pytest.mark.parametrize(("heard", "told"), [(True, "without a connection"), (False, "nothing was sent")])
+async def test_without_a_connection_stop_is_sent_all_the_same(heard: bool, told: str) -> None:
     class Nobody(FakeLink):
         async def open(self) -> Client:
             raise DaemonGoneError("16 clients of this user are connected already")
@@ -96,7 +95,7 @@ async def test_without_a_connection_stop_is_sent_all_the_same(heard: bool, said:
     sent: list[bool] = []
     async with app_on(Nobody()).run_test(size=(80, 24), notifications=True) as pilot:
         await pilot.press("f12")
-        await until(pilot, lambda: any(said in notice.message for notice in pilot.app._notifications))
+        await until(pilot, lambda: told in said(pilot))
     assert sent
 
 

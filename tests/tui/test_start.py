@@ -16,7 +16,7 @@ from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
 from station.tui.plan_screen import NO_PLAN
 from station.tui.themes import chosen_theme
-from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until
 
 MISSING = [Check("robot", "failed", "no answer", "switch it on")]
 THERE = [Check("robot", "ok", "UR10")]
@@ -63,8 +63,7 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink, tmp_path: Path
         ("4", "i", "There is no result"),
         ("5", "c", "No session is recorded yet"),
     ]
-    fresh = idle()
-    link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
+    link.show(in_session(idle(), poses=()))
     link.answers |= {"doctor": THERE}
     link.root = tmp_path
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
@@ -75,7 +74,7 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink, tmp_path: Path
             await pilot.pause()
             pilot.app.clear_notifications()
             await pilot.press(key)
-            await until(pilot, lambda w=words: any(w in said.message for said in pilot.app._notifications))  # type: ignore[misc]
+            await until(pilot, lambda w=words: w in said(pilot))  # type: ignore[misc]
         assert not {"go", "prepare", "finish"} & set(link.verbs)
 
 
@@ -99,13 +98,12 @@ async def test_the_highlighted_pose_is_told_in_full(link: FakeLink) -> None:
     poses = list(status.session.poses)
     reason = "no board in the picture: " + "look at the light " * 4
     poses[1] = msgspec.structs.replace(poses[1], state="failed", reason=reason, attempt=2)
-    session = msgspec.structs.replace(status.session, poses=tuple(poses))
-    link.show(msgspec.structs.replace(status, session=session))
+    link.show(in_session(status, poses=tuple(poses)))
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await pilot.pause()
         await pilot.press("2", "down")
         await until(pilot, lambda: reason in text_of(pilot.app, "#plan-detail"))
-        link.show(msgspec.structs.replace(status, session=msgspec.structs.replace(session, poses=())))
+        link.show(in_session(status, poses=()))
         await until(pilot, lambda: text_of(pilot.app, "#plan-detail") == NO_PLAN)
 
 

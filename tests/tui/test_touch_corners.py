@@ -15,7 +15,7 @@ from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install, installed_calibration
 from station.tui.touch_corners import TouchCorners
 from tests.station.operate.test_tip_offsets import Daemon
-from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
+from tests.tui.conftest import FakeLink, app_on, idle, said, text_of, until
 
 
 @pytest.fixture
@@ -41,12 +41,7 @@ async def begin(pilot: Pilot[None], link: FakeLink, calibration: Path, daemon: D
     await pilot.press("h")
 
 
-async def touch(
-    pilot: Pilot[None],
-    link: FakeLink,
-    daemon: Daemon,
-    beside_mm: tuple[float, ...],
-) -> None:
+async def touch(pilot: Pilot[None], link: FakeLink, daemon: Daemon, beside_mm: tuple[float, ...]) -> None:
     """The tip so far from the first corner, then Enter on it."""
     corner = outer_corners(daemon.truth.board)[0]
     place = board_points(daemon.truth.board)[corner] + np.array(beside_mm) / 1000
@@ -84,5 +79,5 @@ async def test_what_is_read_goes_into_the_file_and_the_installed_one(
 async def test_no_board_in_the_image_is_said(link: FakeLink, calibration: Path) -> None:
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await begin(pilot, link, calibration, Daemon(corners=(), pixels=()))
-        await until(pilot, lambda: any("board" in said.message for said in pilot.app._notifications))
+        await until(pilot, lambda: "board" in said(pilot))
         assert not isinstance(pilot.app.screen, TouchCorners)

@@ -16,10 +16,11 @@ import pytest
 
 from calibrate.batch.cluster import cluster_workers, dask_workers
 from calibrate.batch.run import BatchResult, run_batch
-from calibrate.batch.workers import BatchError, pool
+from calibrate.batch.workers import BatchError
 from calibrate.errors import UsageError
 from tests.calibrate.batch.test_run import Counted, in_this_process, read_results
-from tests.calibrate.calling import raises_code
+from tests.calibrate.batch.test_run import recordings as recordings
+from tests.codes import raises
 from tests.patience import PATIENCE_S, wait_until
 
 needs_distributed = pytest.mark.skipif(
@@ -56,17 +57,12 @@ def dask_cluster(folder: Path, workers: int, tls: list[str] | None = None) -> It
         yield address, [scheduler, *(start("worker", address, *alone, *common).pid for _ in range(workers))]
 
 
-@pytest.fixture
-def recordings(session_file: Path, tmp_path: Path) -> list[Path]:
-    return [Path(shutil.copy(session_file, tmp_path / f"cell-{k}.mcap")) for k in range(4)]
-
-
 @needs_distributed
 @pytest.mark.process
-def test_a_killed_worker_loses_nothing_and_the_bits_are_the_pools(
+def test_a_killed_worker_loses_nothing_and_the_bits_are_those_of_one_process(
     recordings: list[Path], tmp_path: Path
 ) -> None:
-    pooled = run_batch(recordings, tmp_path / "pool", workers=pool(2))
+    alone = run_batch(recordings, tmp_path / "alone", workers=in_this_process)
     with dask_cluster(tmp_path, workers=2) as (address, pids):
 
         def kill_one(done: int, total: int, result: BatchResult) -> None:
@@ -75,31 +71,10 @@ def test_a_killed_worker_loses_nothing_and_the_bits_are_the_pools(
 
         workers = cluster_workers(address)
         spread = run_batch(recordings, tmp_path / "dask", progress=kill_one, workers=workers)
-    assert [result.error for result in spread] == [""] * 4
-    assert [r.content_sha256 for r in spread] == [r.content_sha256 for r in pooled]
+    assert [result.error for result in spread] == [""] * 3
+    assert [r.content_sha256 for r in spread] == [r.content_sha256 for r in alone]
     for result in spread:
         assert (tmp_path / "dask" / result.calibration).is_file()
-
-
-@needs_distributed
-@pytest.mark.process
-def test_a_lost_scheduler_is_said_and_finished_results_are_kept(
-    recordings: list[Path], tmp_path: Path
-) -> None:
-    with dask_cluster(tmp_path, workers=1) as (address, pids):
-
-        def kill_scheduler(done: int, total: int, result: BatchResult) -> None:
-            os.kill(pids[0], signal.SIGKILL)
-
-        with raises_code(BatchError, "cluster-lost"):
-            workers = cluster_workers(address)
-            run_batch(recordings, tmp_path / "out", progress=kill_scheduler, workers=workers)
-    kept = [result.recording for result in read_results(tmp_path / "out") if result.solved]
-    assert kept
-    counted = Counted()
-    results = run_batch(recordings, tmp_path / "out", workers=counted)
-    assert all(result.solved for result in results)
-    assert not set(counted.asked) & set(kept)
 
 
 @needs_distributed
@@ -118,30 +93,37 @@ def test_over_tls_and_without_the_key_nobody_answers(recordings: list[Path], tmp
             solved = run_batch(recordings[:1], tmp_path / "tls", workers=cluster_workers(address))
         assert [result.error for result in solved] == [""]
         for nobody in (address, address.replace("tls", "tcp"), "somewhere", "http://a:1"):
-            with raises_code(BatchError, "cluster-silent"):
+            with raises("cluster-silent", BatchError):
                 run_batch(recordings[1:2], tmp_path / "plain", workers=cluster_workers(nobody))
 
 
 @needs_distributed
 @pytest.mark.process
-def test_a_client_that_is_there_is_used_and_stays_open(recordings: list[Path], tmp_path: Path) -> None:
-    """A client's process that is killed leaves the cluster idle."""
+def test_a_client_stays_open_and_a_lost_scheduler_is_said(recordings: list[Path], tmp_path: Path) -> None:
+    """A batch that is killed leaves the cluster idle; what was finished before a loss is kept."""
     distributed = pytest.importorskip("distributed")
-    with dask_cluster(tmp_path, workers=1) as (address, _), distributed.Client(address) as client:
-        workers = dask_workers(client)
-        assert run_batch(recordings[:1], tmp_path / "out", workers=workers)[0].solved
-        command = ["batch", *map(str, recordings), "-o", "killed", "--scheduler", address]
-        other = subprocess.Popen([sys.executable, "-m", "calibrate.cli", *command], cwd=tmp_path)
-        wait_until((tmp_path / "killed/results.jsonl").exists)
-        other.kill()
-        assert other.wait(PATIENCE_S) == -signal.SIGKILL
-        wait_until(lambda: not any(client.processing().values()))
-        assert client.status == "running"
+    out, asked = tmp_path / "out", Counted()
+    with dask_cluster(tmp_path, workers=1) as (address, pids):
+        with distributed.Client(address) as client:
+            assert run_batch(recordings[:1], tmp_path / "client", workers=dask_workers(client))[0].solved
+            command = ["batch", *map(str, recordings), "-o", "killed", "--scheduler", address]
+            other = subprocess.Popen([sys.executable, "-m", "calibrate.cli", *command], cwd=tmp_path)
+            wait_until((tmp_path / "killed/results.jsonl").exists)
+            other.kill()
+            assert other.wait(PATIENCE_S) == -signal.SIGKILL
+            wait_until(lambda: not any(client.processing().values()))
+            assert client.status == "running"
+        with raises("cluster-lost", BatchError):
+            workers = cluster_workers(address)
+            run_batch(recordings, out, progress=lambda *_: os.kill(pids[0], signal.SIGKILL), workers=workers)
+    kept = {result.recording for result in read_results(out) if result.solved}
+    assert kept and all(result.solved for result in run_batch(recordings, out, workers=asked))
+    assert not set(asked.asked) & kept
 
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with raises_code(UsageError, "package-missing"):
+    with raises("package-missing", UsageError):
         cluster_workers("tcp://127.0.0.1:8786")
 
 

@@ -28,9 +28,9 @@ from calibrate.handeye.solve import solve_views
 from calibrate.projection import project_at
 from calibrate.views import ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec
-from tests.calibrate.calling import raises_code
 from tests.calibrate.chains import ArmCell, arm_cell, later_views
 from tests.calibrate.sessions import looking
+from tests.codes import raises
 from tests.command_line import call
 
 TAG = BoardSpec(BoardKind.APRIL_TAG, square_m=0.05)
@@ -57,13 +57,13 @@ def test_a_shift_is_noticed_within_ten_pictures_and_nothing_else(cell: ArmCell) 
     before = four_corners(later_views(cell, STILL, 1, EARLIER))
     earlier = EarlierPictures.of(before, known)
     after = four_corners(later_views(cell, STILL, 2, 30))
-    assert all(earlier.test(after.select(list(range(n)))).passed for n in range(3, 31, 3))
+    assert all(earlier.test(after.select(list(range(n)))).passed for n in (3, 10, 30))
     moved = four_corners(later_views(cell, np.r_[1.5e-3, np.zeros(5)], 2, 10))
     found = earlier.test(moved)
     assert not found.passed and found.shift_mm == pytest.approx(1.5, abs=0.4)
     blurred = [replace(v, pixels=v.pixels + np.array([2.0, -1.0]) * (i == 1)) for i, v in enumerate(after)]
     assert earlier.test(replace(after, views=tuple(blurred[:3]))).passed  # one of three is no move
-    with raises_code(TooFewViewsError, "too-few-views", views=EARLIER - 1):
+    with raises("too-few-views", TooFewViewsError, views=EARLIER - 1):
         check_production(before.select(list(range(EARLIER - 1))), known)
 
 

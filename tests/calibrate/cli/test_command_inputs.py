@@ -16,7 +16,7 @@ from calibrate.cli.files import read_camera
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration, write_calibration
 from recordings.errors import UnfinishedRecordingError
-from recordings.exporters.export import export_recording
+from recordings.exporters.folder import export_recording
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel
@@ -42,36 +42,27 @@ def test_recordings_that_are_not_whole(session_file: Path, tmp_path: Path) -> No
 
 
 def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_path: Path) -> None:
-    (tmp_path / "precious.yaml").write_text("not: a calibration\n")
-    refused(
-        run("solve", session_file, "-o", "precious.yaml", cwd=tmp_path),
-        2,
-        "target-exists",
-        "precious.yaml",
-        "-o",
-    )
-    assert (tmp_path / "precious.yaml").read_text() == "not: a calibration\n"
-    refused(run("solve", session_file, "-o", "no/such/c.yaml", cwd=tmp_path), 2, "output", "no/such")
-    done = run("solve", session_file, "--report", "no/such/r.html", cwd=tmp_path)
-    refused(done, 2, "output", "no/such")
+    files = {
+        "precious.yaml": "not: a calibration\n",
+        "board.yaml": "kind: chesboard\ncolums: 7\nrows: 6\nsquare_m: 0.025\n",
+        "gates.yaml": "view: 20\n",
+        "camera.yaml": "image_width: 3\ncamera_matrix: {data: [1]}\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    for option, value, code, *named in (
+        ("-o", "precious.yaml", "target-exists", "precious.yaml", "-o"),
+        ("-o", "no/such/c.yaml", "output", "no/such"),
+        ("--report", "no/such/r.html", "output", "no/such"),
+        ("--board", "board.yaml", "input-file", "line 1", "kind", "line 2", "colums", "columns"),
+        ("--gates", "gates.yaml", "gate-limits", "gates.yaml", "view"),
+        ("--camera", "camera.yaml", "input-file", "camera_info"),
+        ("--square-mm", "-4", "board-square", "square_m"),
+        ("--profile", "nix", "", "robust"),
+    ):
+        refused(run("solve", session_file, option, value, cwd=tmp_path), 2, code, *named)
+    assert (tmp_path / "precious.yaml").read_text() == files["precious.yaml"]
     assert not list(tmp_path.glob("*.calibration.yaml")), "said before the solve, not after it"
-    (tmp_path / "board.yaml").write_text("kind: chesboard\ncolums: 7\nrows: 6\nsquare_m: 0.025\n")
-    named = ("line 1", "kind", "line 2", "colums", "columns")
-    refused(run("solve", session_file, "--board", "board.yaml", cwd=tmp_path), 2, "input-file", *named)
-    (tmp_path / "gates.yaml").write_text("view: 20\n")
-    refused(
-        run("solve", session_file, "--gates", "gates.yaml", cwd=tmp_path),
-        2,
-        "gate-limits",
-        "gates.yaml",
-        "view",
-    )
-    (tmp_path / "camera.yaml").write_text("image_width: 3\ncamera_matrix: {data: [1]}\n")
-    refused(
-        run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 2, "input-file", "camera_info"
-    )
-    assert run("solve", session_file, "--square-mm", "-4", cwd=tmp_path).returncode == 2
-    refused(run("solve", session_file, "--profile", "nix", cwd=tmp_path), 2, "", "robust")
     for option in ("--threads", "--time-limit-s", "--memory-limit-mib", "--seed", "--working-distance-mm"):
         refused(run("solve", session_file, option, "-3", cwd=tmp_path), 2, "", option)
         refused(run("solve", session_file, option, "1e300", cwd=tmp_path), 2, "", option)

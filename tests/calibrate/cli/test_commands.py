@@ -21,32 +21,18 @@ from calibrate.files.validity import ValidityState
 from recordings.exporters.excerpt import write_excerpt
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraIdentity, RobotIdentity
-from tests.calibrate.calling import raises_code, refused, run
-from tests.calibrate.sessions import Scene, write_session
+from tests.calibrate.calling import refused, run
+from tests.calibrate.sessions import Scene, shifted, write_session
+from tests.codes import raises
 
-GATE_KEYS = {"name", "passed", "value", "limit", "unit", "text", "remedy", "sense"}
 
-
-def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) -> None:
+def test_solve_json_says_what_the_file_holds(session_file: Path, tmp_path: Path) -> None:
     done = run("solve", session_file, "-o", tmp_path / "c.yaml", "--json", cwd=tmp_path)
     assert done.returncode in (0, 4), done.stderr
     assert done.stdout.count("\n") == 1
     answer = json.loads(done.stdout)
-    assert list(answer) == [
-        "mount", "result", "sigma", "covariance", "views", "intrinsics", "holdout", "certificate", "gates",
-        "verdict", "warnings", "cross_validation", "board", "session", "arm", "arm_table", "solve_ms",
-    ]  # fmt: skip
-    assert set(answer["result"]) == {
-        "parent_frame",
-        "child_frame",
-        "translation_m",
-        "rotation_xyzw",
-        "matrix",
-    }
     assert [view["index"] for view in answer["views"]["weights"]] == answer["views"]["used"]
-    assert all(set(gate) == GATE_KEYS for gate in answer["gates"])
     assert answer["verdict"] == ("pass" if all(gate["passed"] for gate in answer["gates"]) else "fail")
-    assert all(set(warning) == {"code", "text"} for warning in answer["warnings"])
     assert answer["session"]["hypothesis"] == "as-recorded"
     assert done.returncode == (0 if all(gate["passed"] for gate in answer["gates"]) else 4)
     written = read_calibration(tmp_path / "c.yaml")
@@ -71,19 +57,13 @@ def test_solve_install_check_rollback(real_session_file: Path, real_file: Path, 
     """The operator's round: two calibrations, a look at each, a check, and back."""
     second = tmp_path / "second.yaml"
     calibration = read_calibration(real_file)
-    moved = np.array(calibration.result.matrix)
-    moved[0, 3] += 0.02
-    result = msgspec.structs.replace(
-        calibration.result,
-        matrix=tuple(map(tuple, moved.tolist())),
-        translation_m=tuple(moved[:3, 3].tolist()),
-    )
+    moved = shifted(calibration, 0.02)
     assert calibration.posterior is not None
     arm_error = tuple(map(tuple, np.diag(np.full(6, 1e-10)).tolist()))  # stated, as by --robot-accuracy-mm
     posterior = msgspec.structs.replace(
-        calibration.posterior, X=tuple(map(tuple, moved.tolist())), stated_arm_error=arm_error
+        calibration.posterior, X=moved.result.matrix, stated_arm_error=arm_error
     )
-    write_calibration(msgspec.structs.replace(calibration, result=result, posterior=posterior), second)
+    write_calibration(msgspec.structs.replace(moved, posterior=posterior), second)
     first = run("install", real_file, cwd=tmp_path)
     assert first.returncode == 0 and "calibrate withdraw" in first.stdout
     excerpt = write_excerpt(open_recording(real_session_file), tmp_path / "excerpt.mcap")
@@ -119,7 +99,7 @@ def _everything_says_that_it_is_in_doubt(folder: Path) -> None:
     assert shown["reason"]["values"]["shift_mm"] == pytest.approx(20, abs=2)
     refused(run("export", "--to", "opencv", cwd=folder), 1, "calibration-in-doubt")
     assert 'calibration_validity{camera="main",state="in-doubt"} 1' in run("metrics", cwd=folder).stdout
-    with raises_code(InstallError, "calibration-in-doubt"):
+    with raises("calibration-in-doubt", InstallError):
         load_installed(folder / "state/calibration-station")
     withdrawn = run("withdraw", "a pallet hit the camera", "--json", cwd=folder)
     assert json.loads(withdrawn.stdout)["state"] == "withdrawn"

@@ -18,7 +18,7 @@ from calibrate.files.install import (
 )
 from calibrate.files.touch import Touch
 from calibrate.files.versions import installed_versions, note_installed
-from tests.calibrate.calling import raises_code
+from tests.codes import raises
 
 MakeFile = Callable[..., Path]
 HAND = Touch(0, (0.0, 0.0), (9.0, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01T00:00:00+00:00")
@@ -38,10 +38,10 @@ def test_a_reason_is_words_in_any_script_and_no_keypress(said: str, accepted: bo
 def test_who_overrules_or_takes_back_says_it_in_words(make_file: MakeFile, tmp_path: Path) -> None:
     install(make_file(), tmp_path)
     doubted = make_file(0.001, verification=[HAND])
-    with raises_code(InstallError, "reason-too-short"):
+    with raises("reason-too-short", InstallError):
         install(doubted, tmp_path, override="x")
     assert install(doubted, tmp_path, override="the board was bent").number == 2
-    with raises_code(InstallError, "reason-too-short"):
+    with raises("reason-too-short", InstallError):
         rollback(tmp_path, reason="x")
     assert [g.current for g in installed_versions(tmp_path)] == [False, True]
     rollback(tmp_path)  # nobody must say why he goes back
@@ -52,7 +52,7 @@ def test_going_back_passes_the_checks_by_hand_of_the_same_solve(make_file: MakeF
     first = make_file()
     install(first, tmp_path)
     note_installed(tmp_path, [HAND])
-    with raises_code(InstallError, "nothing-older"):
+    with raises("nothing-older", InstallError):
         rollback(tmp_path)
     install(make_file(0.001), tmp_path)
     note_installed(tmp_path, [HAND])

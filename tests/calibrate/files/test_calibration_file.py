@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import msgspec
@@ -15,10 +14,9 @@ from calibrate.files.calibration import (
     encode_calibration,
     read_calibration,
     write_calibration,
-    write_output,
 )
 from calibrate.job import SolvedRecording
-from tests.calibrate.calling import raises_code
+from tests.codes import raises
 
 
 def test_everything_reads_back_as_it_was(solved_real: SolvedRecording, tmp_path: Path) -> None:
@@ -42,17 +40,17 @@ def test_layout_may_change_and_content_may_not(real_file: Path) -> None:
     decode_calibration(text.replace("translation_m:", "translation_m: ", 1).encode(), "x")
     begins = text.index("translation_m: [")
     ends = text.index("]", begins) + 1
-    for place in range(begins, ends):
+    for place in range(begins, ends, 3):
         digit = text[place].translate(str.maketrans("0123456789", "1234567890"))
         changed = text[:place] + digit + text[place + 1 :]
         if yaml.safe_load(changed[begins:ends]) != yaml.safe_load(text[begins:ends]):
-            with raises_code(CalibrationFileError, "damaged-calibration"):
+            with raises("damaged-calibration", CalibrationFileError):
                 decode_calibration(changed.encode(), "x")
 
 
 def test_a_cut_file_is_refused_at_every_length(real_file: Path) -> None:
     content = real_file.read_bytes()
-    for size in range(0, len(content) - 1, max(1, len(content) // 97)):
+    for size in range(0, len(content) - 1, max(1, len(content) // 31)):
         with pytest.raises(CalibrationFileError):
             decode_calibration(content[:size], "cut")
 
@@ -86,7 +84,7 @@ def test_a_result_that_contradicts_itself_is_refused_even_with_a_right_hash(
     )
     for result in (moved, swapped, skewed):
         content = encode_calibration(msgspec.structs.replace(good, result=result))
-        with raises_code(CalibrationFileError, "contradiction"):
+        with raises("contradiction", CalibrationFileError):
             decode_calibration(content, "x")
 
 
@@ -101,19 +99,3 @@ def test_a_covariance_that_is_none_is_refused_even_with_a_right_hash(
     wrong = msgspec.structs.replace(good, covariance=tuple(tuple(line) for line in rows))
     with pytest.raises(CalibrationFileError):
         decode_calibration(encode_calibration(wrong), "x")
-
-
-def test_a_failed_write_leaves_the_old_file_and_no_scraps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "c.yaml"
-    path.write_bytes(b"old")
-
-    def fail(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", fail)
-    with pytest.raises(CalibrationFileError):
-        write_output(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert [p.name for p in tmp_path.iterdir()] == ["c.yaml"]

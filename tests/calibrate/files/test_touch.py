@@ -15,7 +15,7 @@ from calibrate.files.install import install, installed_calibration, rollback
 from calibrate.files.touch import Touch, agrees, touch_sigmas, touch_text
 from calibrate.files.versions import installed_versions, note_in_file, note_installed, read_log
 from calibrate.job import SolvedRecording
-from tests.calibrate.calling import raises_code
+from tests.codes import raises
 
 GOOD = Touch(
     0, (0.0, 0.0), (0.3, -0.2), (0.15, 0.15), "told by a person", "anna", "2026-11-21T12:00:00+00:00"
@@ -51,7 +51,7 @@ def test_entries_go_into_a_file_and_stay_when_it_is_installed(file: Path, tmp_pa
 
 def test_entries_for_the_installed_one_make_a_new_generation(file: Path, tmp_path: Path) -> None:
     root = tmp_path / "s"
-    with raises_code(InstallError, "nothing-installed"):
+    with raises("nothing-installed", InstallError):
         note_installed(root, [GOOD])
     install(file, root)
     note_installed(root, [GOOD])
@@ -64,7 +64,7 @@ def test_entries_for_the_installed_one_make_a_new_generation(file: Path, tmp_pat
 
 def test_hands_that_disagree_keep_it_from_being_installed(file: Path, tmp_path: Path) -> None:
     note_in_file(file, [GOOD, BAD])
-    with raises_code(InstallError, "objection", objections=1, gates=0):
+    with raises("objection", InstallError, objections=1, gates=0):
         install(file, tmp_path / "s")
     made = install(file, tmp_path / "s", override="the board was bent there")
     assert made.calibration is not None and made.calibration.override is not None

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate import load_installed, watch
@@ -23,7 +23,7 @@ from calibrate.files.proof import canonical_json
 from calibrate.files.touch import Touch
 from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState
 from calibrate.files.versions import installed_versions, note_installed
-from tests.calibrate.calling import raises_code
+from tests.codes import raises
 
 MakeFile = Callable[..., Path]
 V, U, D, W = ValidityState.VALID, ValidityState.UNVERIFIED, ValidityState.IN_DOUBT, ValidityState.WITHDRAWN
@@ -54,7 +54,7 @@ def test_what_is_installed_is_valid_until_a_check_contradicts_it_and_again_when_
     doubted = load_installed(root, require_valid=False)
     assert doubted.validity.reason == MOVED
     for require in (None, True):
-        with raises_code(InstallError, "calibration-in-doubt", version=1, reason="drift-check"):
+        with raises("calibration-in-doubt", InstallError, version=1, reason="drift-check"):
             load_installed(root, require_valid=require)
     assert check(root, passed=True).state is V
     assert load_installed(root).validity.verified > doubted.validity.verified
@@ -64,7 +64,7 @@ def test_a_pass_that_could_have_missed_the_shift_proves_nothing(root: Path) -> N
     check(root, passed=False)
     since = load_installed(root, require_valid=False).validity.since
     assert check(root, passed=True, proves=False, kind="touch-test").state is U
-    with raises_code(InstallError, "calibration-unverified", since=since):
+    with raises("calibration-unverified", InstallError, since=since):
         load_installed(root, require_valid=True)
     assert load_installed(root).validity.state is U
     assert check(root, passed=True).state is V
@@ -82,12 +82,12 @@ def test_what_a_person_withdrew_no_check_brings_back_and_no_rollback_finds(
 ) -> None:
     set_validity(root, W, KNOCKED)
     assert check(root, passed=True).state is W
-    with raises_code(InstallError, "calibration-withdrawn", reason="withdrawn") as refused:
+    with raises("calibration-withdrawn", InstallError, reason="withdrawn") as refused:
         load_installed(root)
     assert "drift-check" not in refused.value.remedy and "calibrate install" in refused.value.remedy
     install(make_file(0.001), root)
     assert load_installed(root).validity.state is V
-    with raises_code(InstallError, "nothing-older"):
+    with raises("nothing-older", InstallError):
         rollback(root)
     rollback(root, to=1)  # a person who names it means it
     assert load_installed(root).validity.state is U
@@ -133,7 +133,7 @@ def test_a_root_from_before_validity_was_recorded_is_unverified(root: Path) -> N
 def test_another_device_than_the_calibrated_one_is_a_doubt(root: Path, kind: str) -> None:
     serial = load_installed(root).plain[kind]["serial"]
     assert load_installed(root, **{f"{kind}_serial": serial}).validity.state is V
-    with raises_code(InstallError, "calibration-in-doubt", reason=f"{kind}-changed"):
+    with raises("calibration-in-doubt", InstallError, reason=f"{kind}-changed"):
         load_installed(root, **{f"{kind}_serial": "another"})
 
 
@@ -154,7 +154,7 @@ def test_the_cells_own_rule_puts_an_old_proof_in_doubt(make_file: MakeFile, tmp_
 
 def test_a_check_judges_the_version_that_it_was_made_on(root: Path, make_file: MakeFile) -> None:
     install(make_file(0.001), root)
-    with raises_code(InstallError, "other-version", version=2, judged=1):
+    with raises("other-version", InstallError, version=2, judged=1):
         set_validity(root, D, MOVED, version=1)
     assert load_installed(root).validity.state is V
 
@@ -163,12 +163,12 @@ def test_a_state_may_be_given_by_its_name_and_no_other_one(root: Path) -> None:
     set_validity(root, D, MOVED)
     assert set_validity(root, "valid", MOVED).state is V  # type: ignore[arg-type]
     assert load_installed(root).validity.verified != installed_calibration(root).created
-    with raises_code(UsageError, "choice", given="validd"):
+    with raises("choice", UsageError, given="validd"):
         set_validity(root, "validd", MOVED)  # type: ignore[arg-type]
 
 
 def test_nothing_is_made_where_nothing_is_installed(tmp_path: Path) -> None:
-    with raises_code(InstallError, "nothing-installed"):
+    with raises("nothing-installed", InstallError):
         set_validity(tmp_path, W, KNOCKED)
     assert list(tmp_path.iterdir()) == []
 
@@ -180,13 +180,13 @@ def test_each_camera_has_its_own(root: Path, make_file: MakeFile) -> None:
     assert cameras(root) == ["main", "wrist"]
     set_validity(root, D, MOVED, camera="wrist")
     assert load_installed(root).validity.state is V
-    with raises_code(InstallError, "calibration-in-doubt", camera="wrist"):
+    with raises("calibration-in-doubt", InstallError, camera="wrist"):
         load_installed(root, camera="wrist")
     rollback(root, camera="wrist")
     assert load_installed(root, camera="wrist").version == 1
     assert [len(installed_versions(root, name)) for name in cameras(root)] == [1, 2]
     for bad in ("../main", "Wrist", ""):
-        with raises_code(InstallError, "camera-name"):
+        with raises("camera-name", InstallError):
             load_installed(root, camera=bad)
 
 
@@ -200,6 +200,7 @@ plain = st.recursive(
 )
 
 
+@settings(max_examples=40)
 @given(plain)
 def test_the_hash_is_over_the_same_bytes_as_ever(value: object) -> None:
     assert canonical_json(value).encode() == msgspec.json.encode(value, order="deterministic")
@@ -236,7 +237,7 @@ print(found.validity.state)
 def test_a_damaged_file_is_never_loaded(root: Path) -> None:
     path = load_installed(root).path
     path.write_bytes(path.read_bytes().replace(b"translation_m: [", b"translation_m: [1", 1))
-    with raises_code(CalibrationFileError, "damaged-calibration"):
+    with raises("damaged-calibration", CalibrationFileError):
         load_installed(root)
 
 

@@ -12,14 +12,14 @@ import pytest
 
 from calibrate.errors import CalibrationFileError, InstallError
 from calibrate.files import versions as module
-from calibrate.files.calibration import FramePose, read_calibration, write_calibration
+from calibrate.files.calibration import read_calibration
 from calibrate.files.install import change_text, install, installed_calibration, rollback
 from calibrate.files.lines import append_line
 from calibrate.files.versions import installed_versions, read_log
-from calibrate.geometry import Transform, perturb
 from calibrate.job import SolvedRecording
 from recordings.files import write_atomically
-from tests.calibrate.calling import raises_code
+from tests.calibrate.sessions import shifted
+from tests.codes import raises
 from tests.durability import disk_order
 
 
@@ -41,15 +41,6 @@ def test_nothing_points_to_a_calibration_before_it_is_on_the_disk(  # type: igno
     ]
 
 
-def test_a_calibration_file_is_whole_before_it_has_its_name(
-    solved_real: SolvedRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with disk_order(monkeypatch) as order:
-        write_calibration(solved_real.calibration, tmp_path / "c.yaml")
-    temporary = order[0].removeprefix("sync ")
-    assert order == [f"sync {temporary}", f"rename {temporary} c.yaml", f"sync {tmp_path.name}"]
-
-
 @pytest.mark.parametrize("what", ["generation", "current"])
 def test_what_does_not_read_back_as_written_is_not_installed(  # type: ignore[no-untyped-def]
     make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
@@ -68,7 +59,7 @@ def test_what_does_not_read_back_as_written_is_not_installed(  # type: ignore[no
         monkeypatch.setattr(
             module, "read_bounded", lambda path: read(path)[: -1 if path.name == "current" else None]
         )
-        with raises_code(InstallError, "read-back"):
+        with raises("read-back", InstallError):
             install(new, root)
     assert len(read_log(root)) == (1 if what == "generation" else 2)
 
@@ -91,7 +82,7 @@ def test_a_full_disk_says_what_is_installed_now(  # type: ignore[no-untyped-def]
     for name in ("write_atomically", "append_line"):
         monkeypatch.setattr(f"calibrate.files.versions.{name}", full)
     monkeypatch.setattr("calibrate.files.versions.sync_folder", lambda path: full(path, b""))
-    with raises_code(InstallError, "install-io", switched=switched):
+    with raises("install-io", InstallError, switched=switched):
         install(make_file(1e-4), tmp_path / "root")
     current = next(g.number for g in installed_versions(tmp_path / "root") if g.current)
     assert current == 1 + switched
@@ -114,7 +105,7 @@ def test_rollback_passes_over_a_damaged_version(make_file, tmp_path: Path) -> No
     with pytest.raises(CalibrationFileError):
         install(middle.path, root)
     assert rollback(root).number == 1
-    with raises_code(InstallError, "damaged-version", generation=2):
+    with raises("damaged-version", InstallError, generation=2):
         rollback(root, to=2)
     assert [(g.number, g.current, bool(g.problem)) for g in installed_versions(root)] == [
         (1, True, False),
@@ -125,12 +116,10 @@ def test_rollback_passes_over_a_damaged_version(make_file, tmp_path: Path) -> No
 
 def test_a_change_is_told_in_millimetres_and_degrees(solved_real: SolvedRecording) -> None:
     before = solved_real.calibration
-    delta = [0.0, 0.0003, -0.0004, np.radians(0.03), 0.0, np.radians(0.04)]
-    moved = Transform("flange", "camera", perturb(before.transform.matrix, np.array(delta)))
-    after = msgspec.structs.replace(before, result=FramePose.of(moved))
+    after = shifted(before, 0.0, 0.0003, -0.0004, np.radians(0.03), 0.0, np.radians(0.04))
     assert change_text(before, after).startswith("0.500 mm, 0.0500° (")
     assert change_text(None, after) == ""
-    fixed = FramePose.of(Transform("base", "camera", moved.matrix))
+    fixed = msgspec.structs.replace(after.result, parent_frame="base")
     assert change_text(before, msgspec.structs.replace(after, mount="eye-to-hand", result=fixed)) == ""
 
 
@@ -138,12 +127,12 @@ def test_what_was_configured_for_the_cell_is_held_against_the_file(  # type: ign
     make_file, solved_real: SolvedRecording, tmp_path: Path
 ) -> None:
     robot, camera = solved_real.calibration.robot, solved_real.calibration.camera
-    with raises_code(InstallError, "objection", objections=1):
+    with raises("objection", InstallError, objections=1):
         install(make_file(), tmp_path / "s", camera_serial="4712")
-    with raises_code(InstallError, "objection", objections=1):
+    with raises("objection", InstallError, objections=1):
         install(make_file(), tmp_path / "s", robot_serial="4711")
     unknown = make_file(robot=msgspec.structs.replace(robot, serial=""))
-    with raises_code(InstallError, "objection", objections=1):
+    with raises("objection", InstallError, objections=1):
         install(unknown, tmp_path / "s", robot_serial="4711")
     assert installed_versions(tmp_path / "s") == []
     install(make_file(), tmp_path / "s", robot_serial=robot.serial, camera_serial=camera.serial)

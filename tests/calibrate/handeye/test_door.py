@@ -19,8 +19,8 @@ from calibrate.handeye import (
     solve_views,
     view_information,
 )
-from tests.calibrate.calling import raises_code
 from tests.calibrate.cells import LOW, make_cell
+from tests.codes import raises
 
 CELL = make_cell(np.random.default_rng(0), 8, LOW)
 F, C = CELL.views.base_from_flange, CELL.views.camera_from_board
@@ -53,7 +53,7 @@ def test_lists_are_taken_like_arrays():
     ids=["from_poses", "ViewSet", "view_information"],
 )
 def test_a_misspelt_mount_is_refused(made, mount):
-    with raises_code(UsageError, "choice", name="mount", given=str(mount)):
+    with raises("choice", UsageError, name="mount", given=str(mount)):
         made(mount)
 
 
@@ -61,7 +61,7 @@ def test_a_misspelt_mount_is_refused(made, mount):
     "made", [lambda: SolveOptions(profile="robst"), lambda: JobOptions(lens_model="plumb-bob")]
 )
 def test_a_misspelt_choice_is_refused(made):
-    with raises_code(UsageError, "choice"):
+    with raises("choice", UsageError):
         made()
 
 
@@ -82,7 +82,7 @@ def test_a_misspelt_choice_is_refused(made):
     ],
 )
 def test_a_wrong_shape_is_refused(made):
-    with raises_code(BadViewsError, "shape"):
+    with raises("shape", BadViewsError):
         made()
 
 

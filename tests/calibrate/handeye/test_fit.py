@@ -6,10 +6,9 @@ import pytest
 from calibrate.gates import GateInputs, judge
 from calibrate.geometry import pose, rotation_exp, transform_points
 from calibrate.handeye.solution import Reading
-from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.handeye.solve import solve_views
 from tests.calibrate.cells import MID, MOUNTS, QUICK, changed, inside, make_cell, slipped
 
-OPTIONS = SolveOptions(holdout=True, folds=True)
 SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])
 
 
@@ -31,7 +30,7 @@ def moved_cell(seed, mount, what, at, views=24, size=1.0):
 )
 def test_a_move_half_way_is_named_with_its_place_and_does_not_pass(mount, what, size):
     views, _, _ = moved_cell(0, mount, what, 12, size=size)
-    solution = solve_views(views, OPTIONS)
+    solution = solve_views(views, QUICK)
     assert solution.session.reading is (Reading.CAMERA_MOVED if what == "camera" else Reading.BOARD_MOVED)
     assert abs(solution.session.at - 12) <= 1
     assert "session" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
@@ -49,7 +48,7 @@ def test_a_move_half_way_is_named_with_its_place_and_does_not_pass(mount, what, 
 def test_a_camera_that_moved_near_the_end_never_passes(at):
     """X of before the move is of no use to anybody now."""
     views, X, _ = moved_cell(1, "eye-in-hand", "camera", at)
-    solution = solve_views(views, OPTIONS)
+    solution = solve_views(views, QUICK)
     assert inside(solution, X) or [g.name for g in judge(solution, GateInputs()) if not g.passed]
 
 

@@ -20,7 +20,8 @@ from calibrate.geometry import (
 )
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.views import ViewSet
-from tests.calibrate.cells import LOW, MID, MOUNTS, error_mm_deg, exact_motions, make_cell
+from tests.calibrate.cells import LOW, MID, MOUNTS, QUICK, error_mm_deg, exact_motions, make_cell
+from tests.codes import raises
 
 ROOT = Path(__file__).parents[3]
 BOTH = pytest.mark.parametrize("profile", ["robust", "paper"])
@@ -49,11 +50,11 @@ def test_the_blogs_equations_hold_through_the_same_code_for_both_mounts(mount):
     assert error_mm_deg(solution.board_place.matrix, cell.Y)[0] < 1.5
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_any_mount_is_found(seed):
     rng = np.random.default_rng(seed)
     X = pose(random_rotation(rng), 0.5 * rng.normal(size=3))
-    solution = solve_views(make_cell(rng, 15, LOW, X=X).views)
+    solution = solve_views(make_cell(rng, 15, LOW, X=X).views, QUICK)
     assert solution.certificate.certified
     assert error_mm_deg(solution.matrix, X)[0] < 0.6
 
@@ -96,9 +97,8 @@ def test_no_rotation_no_result(profile):
     rng = np.random.default_rng(0)
     X = pose(random_rotation(rng), [0.1, 0, 0])
     H = pose(np.broadcast_to(random_rotation(rng), (10, 3, 3)), rng.normal(size=(10, 3)))
-    with pytest.raises(DegenerateMotionError) as refused:
+    with raises("rotation-range", DegenerateMotionError):
         solve_views(in_front(H, X, rng), SolveOptions(profile=profile))
-    assert refused.value.code == "rotation-range"
 
 
 @BOTH
@@ -116,10 +116,9 @@ def test_one_axis_is_refused_and_named(profile):
 
 def test_identical_views_are_refused():
     view = make_cell(np.random.default_rng(0), 1, LOW).views.views[0]
-    with pytest.raises(CalibrationError) as refused:
+    with raises("poses-identical", CalibrationError):
         cell = make_cell(np.random.default_rng(0), 1, LOW)
         solve_views(replace(cell.views, views=(view,) * 8))
-    assert refused.value.code == "poses-identical"
 
 
 @pytest.mark.parametrize("with_pixels", [True, False])
@@ -174,9 +173,8 @@ def test_a_singular_camera_matrix_is_refused(entry):
     cell = make_cell(np.random.default_rng(0), 8, LOW)
     (_, *rest), second, third = cell.camera.matrix
     camera = msgspec.structs.replace(cell.camera, matrix=((entry, *rest), second, third))
-    with pytest.raises(BadViewsError) as refused:
+    with raises("camera-matrix", BadViewsError):
         solve_views(replace(cell.views, camera=camera))
-    assert refused.value.code == "camera-matrix"
 
 
 def test_thousands_of_views_end_in_bounded_time():
@@ -186,12 +184,11 @@ def test_thousands_of_views_end_in_bounded_time():
     keep = C[:, 2, 3] > 0.05
     H = perturb(H, 1e-4 * rng.normal(size=(3_000, 6)))
     start = time.process_time()
-    solution = solve_views(poses_only(H[keep], C[keep]), SolveOptions(holdout=False))
+    solution = solve_views(poses_only(H[keep], C[keep]), QUICK)
     assert time.process_time() - start < 20
     assert error_mm_deg(solution.matrix, X)[0] < 0.05
-    with pytest.raises(BadViewsError) as refused:
+    with raises("too-many-views", BadViewsError):
         solve_views(poses_only(np.repeat(H[:5], 5000, axis=0), np.repeat(C[:5], 5000, axis=0)))
-    assert refused.value.code == "too-many-views"
 
 
 def test_a_covariance_is_positive_and_predicts_the_error_at_work():

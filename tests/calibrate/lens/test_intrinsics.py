@@ -43,20 +43,16 @@ def around(count: int, seed: int = 1, distance_m: float = 0.32) -> list[Array]:
 
 
 def test_parameters_are_as_exact_as_the_corners_allow() -> None:
-    """Over 20 draws of noise of 0.1 px."""
+    """Over 8 draws of noise of 0.1 px."""
     errors = []
-    for seed in range(20):
+    for seed in range(8):
         found = calibrate_intrinsics(views_of(CAMERA, around(12, seed), 0.1, seed))
         errors.append((np.array(found.camera.matrix) - CAMERA.matrix)[[0, 0, 1], [0, 2, 2]])
     assert float(np.sqrt(np.mean(np.square(errors)))) < 1.0
 
 
 def test_what_the_pictures_cannot_tell_stays_near_its_usual_value() -> None:
-    small_and_central = [
-        pose(rotation_exp([0.3 * np.cos(a), 0.3 * np.sin(a), 0]), [-0.075, -0.06, 1.5])
-        for a in np.linspace(0, 6, 8)
-    ]
-    found = calibrate_intrinsics(views_of(CAMERA, small_and_central, 0.2))
+    found = calibrate_intrinsics(views_of(CAMERA, nearly_frontal(0.3, 1.5), 0.2))
     assert abs(found.camera.distortion[4]) < 1.0
 
 
@@ -138,7 +134,7 @@ def test_too_few_and_impossible_views_are_refused() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_corners_that_are_none_are_refused() -> None:
-    for seed in range(12):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         views = views_of(CAMERA, around(6, seed))
         anywhere = tuple(replace(v, pixels=rng.uniform(0, 480, v.pixels.shape)) for v in views)

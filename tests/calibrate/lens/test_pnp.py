@@ -38,12 +38,6 @@ def scene(spec: BoardSpec, count: int, mount: Mount, seed: int, noise: float) ->
     return seen, perturb(flange, rng.normal(size=(count, 6)) * noise)
 
 
-def test_the_turned_frame_is_the_board_seen_turned() -> None:
-    for spec, quarters in ((TWO_WAYS, 2), (FOUR_WAYS, 1)):
-        turned = board_from_turned(spec, quarters)
-        assert np.linalg.matrix_power(turned, 4 // quarters) == pytest.approx(np.eye(4), abs=1e-12)
-
-
 @settings(max_examples=15)
 @given(
     seed=st.integers(0, 10_000),

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibrate.handeye.axxb.evolution import (
-    EvolutionSettings,
-    _partners,
-    evolve,
-)
+from calibrate.handeye.axxb.evolution import EvolutionSettings, _partners, evolve
 from calibrate.handeye.axxb.pairs import consecutive_pairs
 from calibrate.handeye.axxb.paper import BOX, SETTINGS, solve_paper
 from tests.calibrate.cells import LOW, make_cell

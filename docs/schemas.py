@@ -18,9 +18,9 @@ from calibrate.cli.contracts import (
     SolveJson,
 )
 from calibrate.cli.follow import Followed
+from calibrate.cli.importing import ImportJson
 from calibrate.files.calibration import Calibration
 from calibrate.files.validity import Validity
-from recordings.cli.importing import ImportJson
 from recordings.errors import ErrorReport
 from recordings.info import RecordingInfo
 from recordings.recover import Recovery

@@ -5,6 +5,7 @@ Board frame: origin in the first point, x along a row, y down the columns, z int
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 
 import cv2
@@ -83,6 +84,29 @@ def usual_markers(kind: BoardKind, square_m: float) -> tuple[float | None, str |
     if kind is BoardKind.APRIL_GRID:
         return 0.3 * square_m, None
     return None, "DICT_4X4_50" if kind is BoardKind.ARUCO else None
+
+
+def typed_board(text: str) -> BoardSpec:
+    """Parse a typed board: '8x5 30' is a chessboard of 8 × 5 inner corners, squares of 30 mm.
+
+    Other kinds are named first; marker size (charuco) or gap (april-grid) and dictionary come last, unless
+    the defaults: 'charuco 8x6 30 22 DICT_5X5_100'. Raises BoardError.
+    """
+    in_mm = re.sub(r"(\d+(?:\.\d+)?) *cm\b", lambda cm: f"{10 * float(cm[1]):g}", text.replace("×", "x"))
+    words = re.sub(r"(?<=\d) *mm|,", " ", in_mm).split()
+    try:
+        kind = BoardKind.CHESSBOARD if words[0][0].isdigit() else BoardKind(words.pop(0).lower())
+        columns, rows = (int(part) for part in words[0].lower().split("x"))
+        dictionary = words.pop().upper() if words[-1].upper().startswith("DICT_") else None
+        size_m, *marker = (float(word) / 1000 for word in words[1:])
+        usual_m, usual = usual_markers(kind, size_m)
+        if len(marker) > (usual_m is not None) or min(columns, rows) < 3 or not 0.002 <= size_m <= 0.5:
+            raise ValueError
+    except (ValueError, IndexError):
+        raise BoardError("no-board-typed", typed=text) from None
+    board = BoardSpec(kind, columns, rows, size_m, marker[0] if marker else usual_m, dictionary or usual)
+    check_board(board)
+    return board
 
 
 def tag_dictionary(spec: BoardSpec) -> str:

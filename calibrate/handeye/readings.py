@@ -48,7 +48,7 @@ def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
     as_recorded = _fit(views, seed)
     base = -np.inf if as_recorded is None else as_recorded.log_evidence
     best = Explanation(Reading.AS_RECORDED, 0.0)
-    winning = _CLEAR + np.log(max(len(views), 2))
+    winning = clear_gain(len(views))
     for reading, changed, at, charge in _readings(views, as_recorded):
         fit = _fit(changed, seed)
         if fit is None:
@@ -63,6 +63,11 @@ def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
                 reading = Reading.MILLIMETRES
             best = Explanation(reading, float(gain), at, factor)
     return best
+
+
+def clear_gain(views: int) -> float:
+    """Log evidence by which a reading of this many views has to win."""
+    return float(_CLEAR + np.log(max(views, 2)))
 
 
 def _fit(views: PoseViews, seed: int) -> PoseFit | None:

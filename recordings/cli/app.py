@@ -11,10 +11,11 @@ RECORDINGS = LazyGroup(
             ("recordings info session.mcap", "recordings info SESSION-FOLDER --json"),
         ),
         "import": LazyCommand(
-            "recordings.cli.importing:import_command",
+            "calibrate.cli.importing:import_command",  # the board in the images judges how poses are read
             (
                 "recordings import FOLDER -o mine.mcap",
-                "recordings import BAG --dry-run  # says what would be taken",
+                "recordings import FOLDER --dry-run  # says what would be taken, and why",
+                "recordings import FOLDER --mount eye-in-hand --convention kuka-abc -o mine.mcap",
                 "recordings import BAG --dataset dataset.yaml --flange tool0 -o mine.mcap",
             ),
         ),

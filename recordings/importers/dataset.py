@@ -48,7 +48,17 @@ _TURN_LIMIT_RAD = 4 * math.pi
 """No joint turns this far: such numbers are degrees."""
 
 
-class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PosesTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the poses of a folder lie that is no `poses.csv`, and how they are read."""
+
+    table: str
+    """File and place in it, digits of names as #; as `recordings import` says it."""
+    images: str
+    """Folder and name of the images, digits of the name as #."""
+    convention: str
+
+
+class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Content of dataset.yaml; a bag may tell the camera itself."""
 
     mount: Mount
@@ -56,6 +66,7 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     camera: CameraModel | None = None
     robot: str | RobotIdentity = ""
     note: str = ""
+    poses: PosesTold | None = None
 
     def session(self, source: Path, camera: CameraModel, created_ns: int = 0, note: str = "") -> SessionInfo:
         """Description of a recording made from `source`; `note` where dataset.yaml has none."""

@@ -23,6 +23,7 @@ from recordings.images import (
 from recordings.importers.dataset import (
     DATASET_FILE,
     POSES_FILE,
+    Dataset,
     PoseRow,
     read_dataset,
     read_poses,
@@ -43,8 +44,9 @@ _HEADER_BYTES = 1024 * 1024
 """A JPEG's size may stand behind large comments."""
 
 
-_OF_ARM = {UR_KINEMATICS_NAME: "application/yaml", ARM_KINEMATICS_NAME: "application/json"}
+_OF_ARM = (UR_KINEMATICS_NAME, ARM_KINEMATICS_NAME)
 """Optional files of a folder: the table of the arm as its maker calibrated it."""
+_MEDIA = {".yaml": "application/yaml", ".csv": "text/csv", ".json": "application/json"}
 
 
 @dataclass(frozen=True)
@@ -66,24 +68,33 @@ def import_folder(
     if not folder.is_dir():
         raise ImportSourceError("no-folder", path=folder)
     dataset, dataset_bytes = read_dataset(folder / DATASET_FILE)
+    rows, poses_bytes = read_poses(folder)
+    beside = {DATASET_FILE: dataset_bytes, POSES_FILE: poses_bytes}
+    for name in _OF_ARM:
+        if (folder / name).exists():
+            beside[name] = read_small_file(folder / name, strict_yaml.LIMIT_BYTES)
+    return write_views(folder, output, dataset, rows, beside, progress)
+
+
+def write_views(
+    folder: Path,
+    output: Path | None,
+    dataset: Dataset,
+    rows: list[PoseRow],
+    beside: dict[str, bytes],
+    progress: Progress = lambda done, total, text: None,
+) -> Imported:
+    """`import_folder` once everything is known; `beside`: attachments by name."""
     if (camera := dataset.camera) is None:
         raise ImportSourceError("dataset-value", path=folder / DATASET_FILE, key="camera")
-    rows, poses_bytes = read_poses(folder)
-    arm = {
-        name: read_small_file(folder / name, strict_yaml.LIMIT_BYTES)
-        for name in _OF_ARM
-        if (folder / name).exists()
-    }
     size = camera.width, camera.height
     for row in rows:
         _beginning(folder, row, size, _HEADER_BYTES)
     if output is None:
         return Imported(folder, len(rows), 0)
     with derived_recording(output, dataset.session(folder, camera)) as writer:
-        writer.attach(DATASET_FILE, "application/yaml", dataset_bytes)
-        writer.attach(POSES_FILE, "text/csv", poses_bytes)
-        for name, content in arm.items():
-            writer.attach(name, _OF_ARM[name], content)
+        for name, content in beside.items():
+            writer.attach(name, _MEDIA[Path(name).suffix], content)
         for index, row in enumerate(rows):
             _write_view(writer, folder, index, row, size)
             progress(index + 1, len(rows), "importing")

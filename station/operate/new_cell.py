@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import yaml
 
-from calibrate.boards.model import board_points, check_board, usual_markers
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, transform_points
 from recordings.files import ASKED_FOR, write_atomically
 from recordings.schema.messages import BoardKind, BoardSpec
@@ -91,29 +91,6 @@ def summary(draft: Draft, step: CellStep) -> str:
     return ""
 
 
-def read_board(text: str) -> BoardSpec:
-    """Parse a typed board: '8x5 30' is a chessboard of 8 × 5 inner corners, squares of 30 mm.
-
-    Other kinds are named first; marker size (charuco) or gap (april-grid) and dictionary come last, unless
-    the defaults: 'charuco 8x6 30 22 DICT_5X5_100'. Raises ConfigError, BoardError.
-    """
-    in_mm = re.sub(r"(\d+(?:\.\d+)?) *cm\b", lambda cm: f"{10 * float(cm[1]):g}", text.replace("×", "x"))
-    words = re.sub(r"(?<=\d) *mm|,", " ", in_mm).split()
-    try:
-        kind = BoardKind.CHESSBOARD if words[0][0].isdigit() else BoardKind(words.pop(0).lower())
-        columns, rows = (int(part) for part in words[0].lower().split("x"))
-        dictionary = words.pop().upper() if words[-1].upper().startswith("DICT_") else None
-        size_m, *marker = (float(word) / 1000 for word in words[1:])
-        usual_m, usual = usual_markers(kind, size_m)
-        if len(marker) > (usual_m is not None) or min(columns, rows) < 3 or not 0.002 <= size_m <= 0.5:
-            raise ValueError
-    except (ValueError, IndexError):
-        raise ConfigError("no-board-typed", typed=text) from None
-    board = BoardSpec(kind, columns, rows, size_m, marker[0] if marker else usual_m, dictionary or usual)
-    check_board(board)
-    return board
-
-
 def check_address(text: str) -> None:
     """ConfigError for an address in numbers that is none; names are left to the network."""
     address = text.partition(" ")[0]
@@ -125,7 +102,7 @@ def check_address(text: str) -> None:
 
 
 def board_words(board: BoardSpec) -> str:
-    """Write a board as `read_board` reads it."""
+    """Write a board as `typed_board` reads it."""
     kind = () if board.kind is BoardKind.CHESSBOARD else (board.kind.value,)
     sizes = (f"{1000 * size_m:g}" for size_m in (board.square_m, board.marker_m) if size_m)
     named = (board.dictionary,) if board.dictionary else ()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from calibrate.boards.model import describe_board
+from calibrate.boards.model import describe_board, typed_board
 from recordings.errors import CodedError
 from recordings.schema.messages import Mount
 from station.cell.errors import StationError
@@ -132,7 +132,7 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
 
 def _board_typed(setup: CellSetup, text: str) -> Action:
     try:
-        board = flow.read_board(text)
+        board = typed_board(text)
     except CodedError:
         if setup.counts is not None and text == typed(setup, CellStep.BOARD).strip():
             return Action("", "Type the size of a square in mm", "The corners were counted in the image.")
@@ -202,7 +202,7 @@ async def accept(setup: CellSetup, step: CellStep, text: str) -> bool:
             return True
         case CellStep.BOARD:
             if text and (draft.board is None or text != flow.board_words(draft.board)):
-                setup.set_board(flow.read_board(text))  # the next Enter goes on
+                setup.set_board(typed_board(text))  # the next Enter goes on
                 return False
             return draft.board is not None
         case CellStep.VIEWS:

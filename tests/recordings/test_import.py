@@ -7,7 +7,6 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +14,7 @@ import pytest
 
 from recordings.cli import main
 from recordings.exporters.folder import export_recording
-from recordings.importers.dataset import read_poses
+from recordings.importers.conventions import NAMED
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind
@@ -276,32 +275,6 @@ def test_every_real_dataset_imports(datasets: Path, tmp_path: Path) -> None:
 DOCUMENT = Path(__file__).parent.parent.parent / "docs/integrator/import.md"
 
 
-def test_the_recipes_for_poses_of_other_tools_give_the_pose(tmp_path: Path) -> None:
-    """Rows as they stand in the document, for one flange pose told in each convention."""
-    from scipy.spatial.transform import Rotation
-
-    text = DOCUMENT.read_text()
-    recipe: dict[str, Any] = {}
-    exec(text.partition("```python\n")[2].partition("```")[0], recipe)
-    true, offset = Rotation.from_rotvec([0.4, -1.9, 0.7]), Rotation.from_rotvec([0.3, 0.1, -0.2])
-    t, o = np.array([0.31, -0.42, 0.55]), np.array([0.01, -0.02, 0.15, 0.3, 0.1, -0.2])
-    wanted = recipe["matrix"](t, true)
-    tcp = [*(t + true.apply(o[:3])), *(true * offset).as_rotvec()]
-    a, b, c = true.as_euler("ZYX", degrees=True)
-    told: dict[str, dict[str, Any]] = {
-        "UR pendant": {"p": np.array(tcp), "o": o},
-        "ROS": {"t": t, "q": true.as_quat()},
-        "w first": {"t": t, "q": np.roll(true.as_quat(), 1)},
-        "OpenCV": {"t": t[:, None], "R": true.as_matrix()},
-        "HALCON": {"p": [*t, *true.as_euler("XYZ", degrees=True), 0]},
-        "roll, pitch, yaw": {"t": t, "rpy": true.as_euler("xyz")},
-        "KUKA": {"x": 310, "y": -420, "z": 550, "A": a, "B": b, "C": c},
-    }
-    for tool, names in told.items():
-        row = next(line for line in text.splitlines() if line.startswith(f"| {tool}"))
-        formula = re.findall(r"`(matrix\(.*?)`", row.split(" | ")[-1])[0]
-        np.testing.assert_allclose(eval(formula, recipe | names), wanted, atol=1e-12, err_msg=tool)
-    (tmp_path / "poses").mkdir()
-    recipe["write_poses"](tmp_path / "poses/poses.csv", {"a.png": wanted})
-    (row_read,), _ = read_poses(tmp_path / "poses")
-    np.testing.assert_allclose(row_read.base_from_flange, wanted, atol=1e-12)
+def test_the_document_names_every_convention() -> None:
+    rows = [line.split("|")[1] for line in DOCUMENT.read_text().splitlines() if line.startswith("| `")]
+    assert set(NAMED) <= {name for row in rows for name in re.findall(r"`([\w-]+)`", row)}

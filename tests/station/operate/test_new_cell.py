@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from calibrate.boards.detect import detect
+from calibrate.boards.model import typed_board
 from calibrate.geometry import difference, inverse
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import BoardKind, BoardSpec, Image, Mount, Stamps
@@ -104,11 +105,11 @@ def test_it_is_taken_up_where_it_was_left(done: tuple[Draft, object], tmp_path: 
 
 
 def test_a_board_is_typed_as_people_write_it() -> None:
-    board = flow.read_board("8×5 30mm")
+    board = typed_board("8×5 30mm")
     assert (board.columns, board.rows, board.square_m) == (8, 5, 0.03)
-    charuco = flow.read_board("ChArUco 8x6 30 20 dict_5x5_100")
+    charuco = typed_board("ChArUco 8x6 30 20 dict_5x5_100")
     assert (charuco.kind, charuco.marker_m, charuco.dictionary) == (BoardKind.CHARUCO, 0.02, "DICT_5X5_100")
-    assert flow.read_board("8x5 2.3cm") == flow.read_board("8x5 2.3 cm") == flow.read_board("8x5 23")
+    assert typed_board("8x5 2.3cm") == typed_board("8x5 2.3 cm") == typed_board("8x5 23")
     for wrong in (
         "",
         "8x5",
@@ -120,9 +121,9 @@ def test_a_board_is_typed_as_people_write_it() -> None:
         "squares 8x5 30",
     ):
         with raises("no-board-typed"):
-            flow.read_board(wrong)
+            typed_board(wrong)
     with raises("board-marker"):
-        flow.read_board("charuco 8x6 30 40")
+        typed_board("charuco 8x6 30 40")
 
 
 class NoHardware:
@@ -177,8 +178,8 @@ BOARDS = ("8x5 23", "charuco 8x6 23", "circles 7x6 23", "asymmetric-circles 4x11
 
 @pytest.mark.parametrize("words", BOARDS)
 def test_a_cell_is_found_and_planned_with_every_board(words: str, tmp_path: Path) -> None:
-    board = flow.read_board(words)
-    assert flow.read_board(flow.board_words(board)) == board
+    board = typed_board(words)
+    assert typed_board(flow.board_words(board)) == board
     truth = msgspec.structs.replace(make_cell("paper-binned", seed=11, noise="mid"), board=board)
     draft = draft_of(truth)
     found = guided_views.find_cell(draft)

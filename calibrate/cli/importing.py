@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import shlex
 from contextlib import nullcontext
 from pathlib import Path
@@ -11,13 +12,20 @@ from typing import Annotated
 import msgspec
 import typer
 
+from calibrate.boards.model import typed_board
+from calibrate.imported import Given, believe
+from calibrate.pipeline import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
+from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, BagPlan, import_bag
-from recordings.importers.dataset import DATASET_FILE, POSES_FILE
-from recordings.importers.folder import import_folder
+from recordings.importers.dataset import DATASET_FILE, POSES_FILE, PoseRow, read_dataset
+from recordings.importers.folder import import_folder, write_views
+from recordings.importers.messages import Progress
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import StandstillLimits
+from recordings.importers.tables import look
 from recordings.plain_text import plain_text
+from recordings.schema.messages import Mount
 from recordings.schema.stillness import POSITION_M, ROTATION_RAD
 
 
@@ -25,7 +33,7 @@ def import_command(
     source: Annotated[
         Path,
         typer.Argument(
-            help="A folder (dataset.yaml, poses.csv, images), a ROS 2 bag, or an MCAP file",
+            help="A folder with images and robot poses, a ROS 2 bag, or an MCAP file",
             show_default=False,
         ),
     ],
@@ -33,7 +41,20 @@ def import_command(
         Path | None, typer.Option("-o", "--output", help="The recording to write (.mcap).")
     ] = None,
     dataset: Annotated[
-        Path | None, typer.Option(help="dataset.yaml of a bag: mount, board. Default: in or beside it.")
+        Path | None, typer.Option(help="dataset.yaml: mount, board. Default: in or beside the source.")
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="File or folder of the robot's poses, where others may be meant.")
+    ] = None,
+    convention: Annotated[
+        str | None,
+        typer.Option(
+            help="How poses are written: zivid, kuka-abc, euler-ZYX-deg-mm … Default: by the board."
+        ),
+    ] = None,
+    mount: Annotated[Mount | None, typer.Option(help="eye-in-hand or eye-to-hand.")] = None,
+    board: Annotated[
+        str | None, typer.Option(help="Such as '9x6 25' (mm) or 'charuco 8x6 30 22 DICT_5X5_100'.")
     ] = None,
     image_topic: Annotated[str | None, typer.Option(help="Topic of the images.")] = None,
     pose_topic: Annotated[
@@ -56,8 +77,9 @@ def import_command(
 ) -> None:
     """Turn other people's images and poses into a recording.
 
-    Of a bag the stops of the arm are found, and the last image of each is taken. poses.csv:
-    image,x,y,z,qx,qy,qz,qw (and j1 … j6), where the flange is in the robot's base, in metres and radians.
+    Of a folder, files, formats, units, order of angles and board are found: the reading is taken by which the
+    board stays put, and written beside the recording (NAME.dataset.yaml). Of a bag the stops of the arm are
+    found, and the last image of each is taken.
     """
     if output is None and not dry_run:
         raise typer.BadParameter("name the recording to write with -o, or ask with --dry-run")
@@ -68,6 +90,10 @@ def import_command(
         if (source / DATASET_FILE).is_file() and (source / POSES_FILE).is_file():
             done = import_folder(source, target, progress)
             facts = ImportJson(str(target or ""), done.images, done.size_bytes)
+        elif source.is_dir() and not _is_bag(source):
+            told = dataset or _told(source, output)
+            given = Given(convention, mount, None if board is None else typed_board(board))
+            facts = _import_found(source, target, told, poses, given, progress)
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg))
@@ -79,6 +105,34 @@ def import_command(
         _print_import(facts)
 
 
+def _is_bag(folder: Path) -> bool:
+    return any(path.suffix in (".mcap", ".bag", ".db3", ".zstd") for path in folder.iterdir())
+
+
+def _told(source: Path, output: Path | None) -> Path | None:
+    """The description of a folder: in it, or as an earlier import wrote it beside its recording."""
+    beside = [] if output is None else [output.with_suffix("." + DATASET_FILE)]
+    return next((path for path in (source / DATASET_FILE, *beside) if os.path.lexists(path)), None)
+
+
+@single_threaded_opencv()
+def _import_found(
+    source: Path, target: Path | None, told: Path | None, poses: Path | None, given: Given, progress: Progress
+) -> ImportJson:
+    """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
+    described = None if told is None else read_dataset(told)[0]
+    believed = believe(look(source, poses), given, described)
+    dataset = believed.dataset
+    rows = [
+        PoseRow(n, str(path.relative_to(source)), T) for n, (path, T) in enumerate(believed.poses.items(), 1)
+    ]
+    content = msgspec.yaml.encode(dataset)
+    done = write_views(source, target, dataset, rows, {DATASET_FILE: content}, progress)
+    if target is not None and told is None:
+        write_atomically(target.with_suffix("." + DATASET_FILE), content)
+    return ImportJson(str(target or ""), done.images, done.size_bytes, found=believed.facts)
+
+
 class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
     """`recordings import --json`"""
 
@@ -88,10 +142,14 @@ class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
     bytes: int
     bag: BagPlan | None = None
     """Options of a bag or an MCAP file."""
+    found: dict[str, tuple[str, str]] = {}
+    """Of a folder: what → (what is believed, its evidence)."""
 
 
 def _print_import(facts: ImportJson) -> None:
     """Print what `recordings import` took, or would take."""
+    for what, (believed, evidence) in facts.found.items():
+        print(plain_text(f"{what:<11}{believed:<42}{evidence}".rstrip()))
     if bag := facts.bag:
         print(plain_text(f"images    {bag.image_topic} ({bag.images}), {bag.camera}"))
         print(plain_text(f"poses     {bag.poses_from}, paired by stamp within {bag.bound_ms:.2f} ms"))

@@ -1,0 +1,137 @@
+"""How other programs and pendants write a pose in numbers, and what the numbers alone say about it.
+
+One table for imports, posted arms and exports. A name spells out what it means, `euler-ZYX-deg-mm`, or is one
+of `NAMED`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from recordings.errors import ImportSourceError
+from recordings.importers.messages import Array
+
+_REACH_LIMIT_M = 5.0
+"""A larger median distance from the base is no arm's in metres: such numbers are millimetres."""
+_REACH_LEAST_M = 0.01
+"""A smaller one is no arm's in the unit that makes it so."""
+_UNIT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Convention:
+    """How the numbers of one pose are to be read."""
+
+    rotation: str
+    """matrix (rows of 4), xyzw, wxyz, rotvec, or a sequence of axes as scipy has it: `ZYX` about the moved
+    axes, `xyz` about fixed ones, the angles in that order."""
+    unit_m: float = 1.0
+    degrees: bool = False
+    inverse: bool = False
+    """The base in the tool is told, not the tool in the base."""
+    rotation_first: bool = False
+    looks_back: bool = False
+    """The frame's z points backwards and y upwards, as OpenGL's cameras have it."""
+
+    @property
+    def name(self) -> str:
+        euler = self.rotation if self.rotation in _FORMS else f"euler-{self.rotation}"
+        signs = {"deg": self.degrees, "mm": self.unit_m == 1e-3, "inverse": self.inverse}
+        return "-".join([euler, *(sign for sign, holds in signs.items() if holds)])
+
+    def poses(self, numbers: Array) -> Array:
+        """Rigid transforms (n, 4, 4), metres, of (n, 12 or 16) for a matrix, (n, 7) or (n, 6)."""
+        n = len(numbers)
+        T = np.broadcast_to(np.eye(4), (n, 4, 4)).copy()
+        if self.rotation == "matrix":
+            T[:, :3] = numbers[:, :12].reshape(n, 3, 4)
+            T[:, :3, :3] = Rotation.from_matrix(T[:, :3, :3]).as_matrix()  # of few digits
+        else:
+            turn, at = numbers[:, 3:], numbers[:, :3]
+            if self.rotation_first:
+                turn, at = numbers[:, :-3], numbers[:, -3:]
+            T[:, :3, :3], T[:, :3, 3] = self._rotation(turn).as_matrix(), at
+        T[:, :3, 3] *= self.unit_m
+        if self.looks_back:
+            T[:, :3, 1:3] *= -1
+        return np.asarray(np.linalg.inv(T) if self.inverse else T)
+
+    def _rotation(self, turn: Array) -> Rotation:
+        if self.rotation in ("xyzw", "wxyz"):
+            return Rotation.from_quat(turn if self.rotation == "xyzw" else np.roll(turn, -1, axis=1))
+        if self.rotation == "rotvec":
+            return Rotation.from_rotvec(turn, degrees=self.degrees)
+        return Rotation.from_euler(self.rotation, turn, degrees=self.degrees)
+
+
+_MM = 1e-3
+_FORMS = ("matrix", "xyzw", "wxyz", "rotvec")
+_SEQUENCES = [
+    turned
+    for order in [*permutations("XYZ"), *("".join(p) + p[0] for p in permutations("XYZ", 2))]
+    for turned in ("".join(order), "".join(order).lower())
+]
+"""Every order of angles, about moved axes and about fixed ones."""
+NAMED = {
+    "zivid": Convention("matrix", _MM),
+    "kuka-abc": Convention("ZYX", _MM, True),
+    "fanuc-xyzwpr": Convention("xyz", _MM, True),
+    "abb-quaternion": Convention("wxyz", _MM),
+    "ur-rotvec": Convention("rotvec"),
+    "xarm-rpy": Convention("xyz", _MM, True),
+    "easy-handeye": Convention("xyzw"),
+    "moveit": Convention("matrix"),
+    "halcon-gba": Convention("XYZ", degrees=True),
+    "halcon-abg": Convention("xyz", degrees=True),
+    "colmap": Convention("wxyz", inverse=True, rotation_first=True),
+    "nerf": Convention("matrix", looks_back=True),
+}
+
+
+def convention(name: str) -> Convention:
+    """The convention of a name. Raises ImportSourceError that lists the names."""
+    if name in NAMED:
+        return NAMED[name]
+    told = re.fullmatch(r"(?:euler-)?(\w+)((?:-(?:deg|rad|mm|m|inverse))*)", name)
+    if not told or told[1] not in (*_FORMS, *_SEQUENCES):
+        raise ImportSourceError("no-convention", name=name, names=", ".join(NAMED))
+    signs = told[2].split("-")
+    return Convention(told[1], _MM if "mm" in signs else 1.0, "deg" in signs, "inverse" in signs)
+
+
+def possible(numbers: Array) -> list[tuple[Convention, str]]:
+    """Conventions that numbers (n, k) allow by themselves, each with its evidence; the usual ones first."""
+    n, k = numbers.shape
+    if k in (12, 16):
+        R = numbers[:, :12].reshape(n, 3, 4)[:, :, :3]
+        miss = float(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max())
+        right = miss < 0.02 and bool((np.linalg.det(R) > 0).all())
+        found = [(Convention("matrix"), f"rows at right angles within {miss:.1g}")] if right else []
+        at = numbers[:, 3:12:4]
+    elif k == 7:
+        miss = float(np.abs(np.linalg.norm(numbers[:, 3:], axis=1) - 1).max())
+        near = f"quaternions of length 1 within {miss:.1g}"
+        found = [(Convention(form), near) for form in ("xyzw", "wxyz") if miss < _UNIT_TOLERANCE]
+        at = numbers[:, :3]
+    else:
+        largest, at = float(np.abs(numbers[:, 3:]).max()), numbers[:, :3]
+        forms = ("rotvec", "xyz", "ZYX", *(s for s in _SEQUENCES if s not in ("xyz", "ZYX")))
+        units = [unit for unit in (False, True) if unit or largest <= 2 * math.pi + 0.01]
+        found = [
+            (Convention(form, degrees=unit), f"angles to {largest:.4g} {'°' if unit else 'rad'}")
+            for unit in units
+            for form in forms
+            if unit or form != "rotvec" or largest <= math.pi + 0.01
+        ]
+    reach = float(np.median(np.linalg.norm(at, axis=1)))
+    unit_m = _MM if reach > _REACH_LIMIT_M else 1.0
+    if reach * unit_m < _REACH_LEAST_M:
+        return []
+    told = f"reach {reach:.4g} {'mm' if unit_m == _MM else 'm'}"
+    return [(replace(each, unit_m=unit_m), f"{evidence}, {told}") for each, evidence in found]

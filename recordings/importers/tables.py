@@ -1,0 +1,318 @@
+"""What lies in anyone's folder: images, tables of numbers that may be poses, what describes board and camera.
+
+Every data file becomes a plain tree (dicts, lists, numbers, texts). Nodes of the same place in it, and of
+files that differ by digits only, are the rows of one table.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import yaml
+
+from recordings import strict_yaml
+from recordings.files import read_file
+from recordings.importers.messages import Array
+
+_FILES_LIMIT, _BYTES_LIMIT, _ARRAY_LIMIT_BYTES = 5000, 4 * 1024 * 1024, 128 * 1024
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
+_SUFFIXES = (".json", ".yaml", ".yml", ".xml", ".csv", ".txt", ".dat", ".toml", ".tsv", ".script")
+_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
+_IMAGE = re.compile(rf"[^\s,;'\"\[\]]+(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))})\b", re.I)
+_POSE_SIZES = (6, 7, 12, 16)
+_POSITION = re.compile(r"pos|position|trans\w*|tvec|t|xyz|p|location")
+_ROTATION = re.compile(r"rot\w*|ori\w*|quat\w*|rvec|r|rpy|euler\w*|rodrigues")
+_COLUMNS = {
+    "xyzw": ("qx", "qy", "qz", "qw"),
+    "": ("rx", "ry", "rz"),
+    "xyz": ("roll", "pitch", "yaw"),
+    "ZYX": ("a", "b", "c"),
+}
+"""Names of columns behind x, y, z, and the rotation that they name."""
+_ROBOT = re.compile(r"robot|arm|tcp|tool|flange|gripper|hand(?!_?eye)|eef|end|ee$|location", re.I)
+_OTHERS = re.compile(
+    r"cam|board|marker|target|obj|eye|chess|tag|detect|joint|angle|result|valid|guess|waiting", re.I
+)
+"""Words of tables that tell of the robot's pose, and of something else."""
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Numbers that may be poses, one row each."""
+
+    name: str
+    """File and place in it, digits as #."""
+    rotation: str
+    """What names of columns or the form of the numbers say of the rotation; empty: nothing."""
+    numbers: Array
+    """(n, k), k of 6, 7, 12 and 16"""
+    images: list[str]
+    """Name of the row's image as told beside it; empty: none."""
+    places: list[tuple[int, ...]]
+    """Numbers in the row's file name and place, its order."""
+
+    @property
+    def of_robot(self) -> bool:
+        """Read from its last words that say either."""
+        name = re.sub(r"hand_?eye|(?i:eye_?(in|to|on)_?hand)", "", self.name)
+        for part in reversed(re.split(r"[ /.]", name)):
+            if re.search("joint|angle", part):
+                return False
+            if _ROBOT.search(part) or _OTHERS.search(part):
+                return bool(_ROBOT.search(part))
+        return True
+
+
+@dataclass
+class Lies:
+    """All that was found."""
+
+    root: Path
+    images: dict[str, list[Path]] = field(default_factory=dict)
+    """Images by their folder and their name with digits as #."""
+    tables: list[Table] = field(default_factory=list)
+    cameras: list[tuple[Array, tuple[float, ...]]] = field(default_factory=list)
+    """Matrix (3, 3) and distortion, each once."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Values of leaves that describe a board, by lower-case key."""
+    words: str = ""
+    """The folder's last names, names of files and keys: what may say how the camera is mounted."""
+
+
+@dataclass
+class _Row:
+    numbers: list[float]
+    rotation: str
+    image: str
+    place: tuple[int, ...]
+
+
+def look(source: Path, poses: Path | None = None) -> Lies:
+    """Read what lies in `source`; numbers only of `poses`, a file or a folder, where it is given."""
+    found, rows = Lies(source), defaultdict[tuple[str, ...], list[_Row]](list)
+    words = ["/".join(source.resolve().parts[-3:])]
+    files = sorted((p for p in source.rglob("*") if p.is_file()), key=natural)[:_FILES_LIMIT]
+    images = defaultdict[str, list[Path]](list)
+    for path in files if poses is None or poses.is_relative_to(source) else [*files, poses]:
+        if path.suffix.lower() in IMAGE_SUFFIXES:
+            images[_family(path.relative_to(source))].append(path)
+            continue
+        tree = None if path.name.startswith((".", "README", "CMake")) else read_tree(path)
+        if tree is None:
+            continue
+        name = str(path.relative_to(source)) if path.is_relative_to(source) else path.name
+        words.append(name)
+        told = defaultdict[tuple[str, ...], list[_Row]](list)
+        for node in _nodes(tree, (), ""):
+            _facts(node, found)
+            words.extend(node.keys[-1:])
+            if isinstance(node.value, str):
+                words.append(node.value[:60])
+            row = _pose(node.value) if poses is None or path == poses or poses in path.parents else None
+            if row is not None:
+                numbers, rotation, key = row
+                named = ".".join((*node.keys, key)).strip(".")
+                place = (*map(int, re.findall(r"\d+", name)), *node.place)
+                told[named, rotation, str(len(numbers))].append(_Row(numbers, rotation, node.image, place))
+        for (named, *form), each in told.items():  # files of one row each make a table together
+            rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
+    found.images = dict(images)
+    found.words = " ".join(dict.fromkeys(words))
+    for (name, rotation, _), each in rows.items():
+        if len(each) >= 3:
+            beside = [row.image for row in each], [row.place for row in each]
+            found.tables.append(Table(name, rotation, np.array([row.numbers for row in each]), *beside))
+    return found
+
+
+def natural(path: Path | str) -> list[Any]:
+    """Sort key by which 2 comes before 10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(path))]
+
+
+def _family(path: Path) -> str:
+    return str(path.parent / _pattern(path.name))
+
+
+def _pattern(path: Path | str) -> str:
+    return re.sub(r"\d+", "#", str(path))
+
+
+def read_tree(path: Path) -> Any:
+    """A data file as dicts, lists, numbers and texts; None: no such file, or not readable as what it says."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix in (".npy", ".npz"):
+            content = read_file(path, _ARRAY_LIMIT_BYTES)  # larger: an image of depths
+            loaded = np.load(BytesIO(content), allow_pickle=False)
+            return loaded.tolist() if suffix == ".npy" else {key: loaded[key].tolist() for key in loaded}
+        if suffix not in _SUFFIXES:
+            return None
+        content = read_file(path, _BYTES_LIMIT)
+        if suffix == ".json":
+            return json.loads(content)
+        if suffix in (".yaml", ".yml"):
+            plain = re.sub(rb"^%YAML.*\n|!!opencv-matrix|!!python/\S+", b"", content)
+            return strict_yaml.load_plain(plain)
+        if suffix == ".toml":
+            return tomllib.loads(content.decode())
+        if suffix == ".xml":
+            return _of_xml(ElementTree.fromstring(content))
+        return _of_text(content.decode("utf-8-sig", "replace"))
+    except (OSError, ValueError, EOFError, RecursionError, yaml.YAMLError, ElementTree.ParseError):
+        return None
+
+
+def _of_xml(element: ElementTree.Element) -> Any:
+    if not len(element):
+        numbers = [float(number) for number in _NUMBER.findall(element.text or "")]
+        return numbers if len(numbers) > 1 else numbers[0] if numbers else (element.text or "").strip()
+    children = [(child.tag, _of_xml(child)) for child in element]
+    unique = len({tag for tag, _ in children}) == len(children)
+    return dict(children) if unique else [child for _, child in children]
+
+
+def _of_text(text: str) -> Any:
+    """Lines with as many numbers, and the same words, are rows; four of four numbers are a matrix."""
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(("#", "%"))]
+    header = re.split(r"[,;\t]", lines[0]) if lines else []
+    if len(header) >= 6 and not _NUMBER.search(lines[0]):
+        names = [re.sub(r"\W.*", "", name.strip().lower()) for name in header]
+        cells = [re.split(r"[,;\t]", line) for line in lines[1:]]
+        return [dict(zip(names, map(_value, row), strict=False)) for row in cells]
+    groups = defaultdict[tuple[str, int], list[Any]](list)
+    for line in lines:
+        image = _IMAGE.search(line)
+        rest = line.replace(image[0], "") if image else line
+        inside = [_numbers(part) for part in re.findall(r"\[([^\[\]]+)\]", rest)]
+        numbers = next((part for part in inside if len(part) in _POSE_SIZES), _numbers(rest))
+        said = _NUMBER.sub("", re.sub(r"\[.*?\]", "", rest))
+        label = " ".join(re.findall(r"[A-Za-z]\w*", said))[:40]
+        row = {"image": image[0], "pose": numbers} if image else numbers
+        groups[label, len(numbers)].append(row)
+    tree: dict[str, Any] = {}
+    for (label, count), group in groups.items():
+        plain = [row for row in group if isinstance(row, list)]
+        if count == 4 and len(plain) % 4 == 0 and plain and np.allclose(plain[3::4], [0, 0, 0, 1], atol=1e-6):
+            value: Any = [plain[at : at + 4] for at in range(0, len(plain), 4)]
+        elif count == 1:
+            value = [row[0] for row in plain]
+        else:
+            value = group
+        while isinstance(value, list) and len(value) == 1:
+            value = value[0]
+        tree[label if label not in tree else f"{label} {count}"] = value
+    return tree.get("") if set(tree) == {""} else tree
+
+
+def _value(text: str) -> Any:
+    numbers = _numbers(text)
+    return numbers[0] if len(numbers) == 1 else numbers or text.strip()
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(number) for number in _NUMBER.findall(text)]
+
+
+@dataclass
+class _Node:
+    value: Any
+    keys: tuple[str, ...]
+    place: tuple[int, ...]
+    image: str
+
+
+def _nodes(tree: Any, keys: tuple[str, ...], image: str, place: tuple[int, ...] = ()) -> Iterator[_Node]:
+    """The tree's nodes, those inside of a pose left out."""
+    yield _Node(tree, keys, place, image)
+    if isinstance(tree, list) and _pose(tree) is not None:
+        return
+    if isinstance(tree, dict):
+        named = next((v for v in tree.values() if isinstance(v, str) and _IMAGE.fullmatch(v)), image)
+        for key, value in tree.items():
+            digits = tuple(map(int, re.findall(r"\d+", str(key))))
+            yield from _nodes(value, (*keys, _pattern(str(key))), named, (*place, *digits))
+    elif isinstance(tree, list):
+        for at, value in enumerate(tree):
+            if isinstance(value, (dict, list)):
+                yield from _nodes(value, keys, image, (*place, at))
+
+
+def _flat(value: Any) -> list[float] | None:
+    """The numbers of a number, of lists of them, of {x, y, z, w} and of OpenCV's matrix."""
+    if isinstance(value, dict):
+        told = {str(key).lower(): each for key, each in value.items()}
+        if "data" in told and "rows" in told:
+            return _flat(told["data"])
+        names = next((n for n in ("xyzw", "xyz") if set(n) == set(told)), "")
+        return _flat([told[name] for name in names]) if names else None
+    if isinstance(value, list):
+        parts = [_flat(part) for part in value]
+        return None if None in parts else [number for part in parts if part for number in part]
+    return [float(value)] if isinstance(value, (int, float)) and not isinstance(value, bool) else None
+
+
+def _pose(value: Any) -> tuple[list[float], str, str] | None:
+    """(numbers, what is known of the rotation, key that names it) of a node that can be a pose, or None."""
+    plain = isinstance(value, list) or (isinstance(value, dict) and "data" in value)
+    numbers = _flat(value) if plain else None
+    if numbers is not None:
+        nested = isinstance(value, list) and any(isinstance(row, list) and len(row) > 1 for row in value)
+        if len(numbers) not in _POSE_SIZES or (nested and len(numbers) < 12):
+            return None
+        if len(numbers) == 16 and not any(numbers[3:15:4]) and any(numbers[12:15]):
+            numbers = [numbers[4 * column + row] for row in range(4) for column in range(4)]
+        return (numbers, "", "") if np.isfinite(numbers).all() else None
+    if not isinstance(value, dict):
+        return None
+    told = {re.sub(r"\(.*|_?(m|mm|deg|rad)$", "", str(key).lower()): each for key, each in value.items()}
+    for rotation, columns in _COLUMNS.items():
+        if {"x", "y", "z", *columns} <= told.keys():
+            flat = _flat([told[name] for name in ("x", "y", "z", *columns)])
+            return (flat, rotation, "") if flat is not None else None
+    parts: dict[str, list[float]] = {}
+    named = ""
+    for part, words, sizes in (("position", _POSITION, (3,)), ("rotation", _ROTATION, (3, 4, 9))):
+        for key, each in told.items():
+            flat = _flat(each)
+            if flat is not None and len(flat) in sizes and any(map(words.fullmatch, key.split("_"))):
+                named = key if len(key.split("_")) > 1 and part not in parts else named
+                parts.setdefault(part, flat)
+    if len(parts) < 2:
+        return None
+    at, turn = parts["position"], parts["rotation"]
+    if len(turn) == 9:
+        return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])], "", named
+    return at + turn, "", named
+
+
+def _facts(node: _Node, found: Lies) -> None:
+    """Note a camera's matrix, by its form, and what describes a board."""
+    numbers = _flat(node.value) if isinstance(node.value, (list, dict)) else None
+    key = node.keys[-1].lower() if node.keys else ""
+    if numbers and len(numbers) >= 9:
+        K = np.array(numbers[:9]).reshape(3, 3)
+        if K[0, 0] > 100 and K[1, 1] > 100 and not K[1, 0] and np.allclose(K[2], [0, 0, 1]):
+            beside = tuple(numbers[9:14]) if len(numbers) in (13, 14) else ()
+            if not any(np.allclose(K, other) for other, _ in found.cameras):
+                found.cameras.append((K, beside))
+            return
+    if numbers and "dist" in key and len(numbers) in (4, 5, 8) and found.cameras and not found.cameras[-1][1]:
+        found.cameras[-1] = found.cameras[-1][0], tuple(numbers)
+    if isinstance(node.value, dict):
+        told = {str(k).lower(): v for k, v in node.value.items()}
+        if {"fx", "fy", "cx", "cy"} <= told.keys() and not found.cameras:
+            K = np.array([[told["fx"], 0, told["cx"]], [0, told["fy"], told["cy"]], [0, 0, 1]], float)
+            found.cameras.append((K, ()))
+    if not isinstance(node.value, (dict, list)) or (numbers and len(numbers) == 2):
+        found.facts.setdefault(key, numbers or node.value)

@@ -1,0 +1,218 @@
+"""Folders as other programs leave them: read as they are meant, asked about, or refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibrate import imported
+from calibrate.imported import Given, believe
+from calibrate.kinematics import MODELS
+from recordings.cli import main
+from recordings.importers.tables import look
+from recordings.reader import open_recording
+from tests.calibrate.sessions import Scene, write_session
+from tests.codes import raises
+from tests.command_line import call
+
+Write = Callable[[Path, np.ndarray], None]
+TURNED = Scene(views=12)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """A folder of images, and base_from_flange (n, 4, 4) at each."""
+    folder = tmp_path_factory.mktemp("camera")
+    recording = open_recording(write_session(folder / "session.mcap", TURNED))
+    for view, image in recording.images():
+        cv2.imwrite(str(folder / f"{view.index + 1}.png"), image.pixels)
+    (folder / "session.mcap").unlink()
+    return folder, np.array([view.base_from_flange for view in recording.views()])
+
+
+@pytest.fixture
+def put(
+    images: tuple[Path, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Path]:
+    """Copy the images beside poses that `write` writes; the board is looked for once for all tests."""
+
+    def make(write: Write, change: Callable[[np.ndarray], np.ndarray] = lambda T: T) -> Path:
+        folder = tmp_path / "data"
+        folder.mkdir()
+        for path in images[0].iterdir():
+            (folder / path.name).hardlink_to(path)
+        write(folder, change(images[1]))
+        return folder
+
+    look_for = imported._see
+
+    def seen(lies, given, paths):  # type: ignore[no-untyped-def]
+        key = (given.board, json.dumps(lies.facts), len(paths))
+        if key not in _SEEN:
+            _SEEN[key] = look_for(lies, given, paths)
+        found = _SEEN[key]
+        renamed = {path.name: path for path in paths}
+        views = {renamed[path.name]: view for path, view in found.views.items()}
+        candidates = {renamed[path.name]: each for path, each in found.candidates.items()}
+        return imported.replace(found, views=views, candidates=candidates)
+
+    monkeypatch.setattr(imported, "_see", seen)
+    return make
+
+
+_SEEN: dict[object, imported._Seen] = {}
+
+
+def euler(order: str, unit: float = 1.0, degrees: bool = False) -> Callable[[np.ndarray], np.ndarray]:
+    def rows(T: np.ndarray) -> np.ndarray:
+        angles = Rotation.from_matrix(T[:, :3, :3]).as_euler(order, degrees=degrees)
+        return np.column_stack([T[:, :3, 3] * unit, angles])
+
+    return rows
+
+
+def quaternions(T: np.ndarray, roll: int = 0) -> np.ndarray:
+    return np.column_stack([T[:, :3, 3], np.roll(Rotation.from_matrix(T[:, :3, :3]).as_quat(), roll, 1)])
+
+
+def kuka(folder: Path, T: np.ndarray) -> None:
+    np.savetxt(folder / "robot_pose.csv", euler("ZYX", 1e3, True)(T), delimiter=",", header="X,Y,Z,A,B,C")
+
+
+def rotation_vectors(folder: Path, T: np.ndarray) -> None:
+    rotvec = Rotation.from_matrix(T[:, :3, :3]).as_rotvec()
+    rows = np.column_stack([T[:, :3, 3], rotvec]).tolist()
+    (folder / "tcp_pose.txt").write_text("\n".join(f"[{row}]" for row in rows))
+
+
+def matrices_in_blocks(folder: Path, T: np.ndarray) -> None:
+    T = T.copy()
+    T[:, :3, 3] *= 1000
+    (folder / "gripper2base.txt").write_text(f"{len(T)}\n")
+    with (folder / "gripper2base.txt").open("a") as file:
+        for each in T:
+            np.savetxt(file, each)
+            file.write("\n")
+
+
+def one_yaml_each(folder: Path, T: np.ndarray) -> None:
+    (folder / "tcp_pose").mkdir()
+    for n, row in enumerate(quaternions(T), 1):
+        keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
+        lines = (f"{key}: {value!r}" for key, value in zip(keys, row.tolist(), strict=True))
+        (folder / f"tcp_pose/{n}.yaml").write_text("\n".join(sorted(lines)))
+
+
+def opencvs_yaml(folder: Path, T: np.ndarray) -> None:
+    file = cv2.FileStorage(str(folder / "end2base.yml"), cv2.FILE_STORAGE_WRITE)
+    for n, each in enumerate(T):
+        file.write(f"pose_{n}", each)
+    file.release()
+
+
+def opencvs_xml(folder: Path, T: np.ndarray) -> None:
+    file = cv2.FileStorage(str(folder / "end2base.xml"), cv2.FILE_STORAGE_WRITE)
+    for n, each in enumerate(T):
+        file.write(f"pose_{n}", each)
+    file.release()
+
+
+def json_by_image(folder: Path, T: np.ndarray) -> None:
+    rows = [
+        {"image": f"{n + 1}.png", "robot_pose": {"position": row[:3], "orientation": row[3:]}}
+        for n, row in enumerate(quaternions(T, 1).tolist())
+    ]
+    (folder / "samples.json").write_text(json.dumps(rows[::-1]))
+
+
+def arrays(folder: Path, T: np.ndarray) -> None:
+    np.savez(folder / "arm_poses.npz", arm_pose=euler("xyz")(T))
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        kuka,
+        rotation_vectors,
+        matrices_in_blocks,
+        one_yaml_each,
+        opencvs_yaml,
+        opencvs_xml,
+        json_by_image,
+        arrays,
+    ],
+)
+def test_poses_are_read_as_they_are_meant(
+    write: Write, put: Callable[..., Path], images: tuple[Path, np.ndarray]
+) -> None:
+    found = believe(look(put(write)))
+    assert found.dataset.mount == "eye-in-hand"
+    for n, T in enumerate(images[1], 1):
+        (pose,) = (pose for path, pose in found.poses.items() if path.name == f"{n}.png")
+        np.testing.assert_allclose(pose, T, atol=1e-6)
+    board = TURNED.board
+    assert {found.dataset.board.columns, found.dataset.board.rows} == {board.columns, board.rows}
+    assert found.dataset.board.square_m == pytest.approx(board.square_m, rel=0.02)
+
+
+def unnamed(folder: Path, T: np.ndarray) -> None:
+    np.savetxt(folder / "poses.txt", euler("ZYX", 1e3, True)(T))
+
+
+def test_what_no_motion_can_tell_is_asked(put: Callable[..., Path], images: tuple[Path, np.ndarray]) -> None:
+    """A camera in hand looks like a fixed one with inverted poses."""
+    lies = look(put(unnamed))
+    with raises("which-mount", mount="eye-in-hand"):
+        believe(lies)
+    straight = believe(lies, Given(mount="eye-in-hand"))
+    np.testing.assert_allclose(list(straight.poses.values()), images[1], atol=1e-6)
+    turned = believe(lies, Given(mount="eye-to-hand"))
+    np.testing.assert_allclose(list(turned.poses.values()), np.linalg.inv(images[1]), atol=1e-6)
+
+
+def test_names_that_contradict_the_motion_are_no_answer(put: Callable[..., Path]) -> None:
+    """`robot_pose` says tool in base; then the motion says in hand, and no name may say otherwise."""
+    folder = put(kuka)
+    (folder / "eye_to_hand.txt").write_text("of a fixed camera")
+    with raises("which-mount"):
+        believe(look(folder))
+
+
+@pytest.mark.parametrize("change", [lambda T: T[::-1], lambda T: np.roll(T, 1, axis=0)])
+def test_poses_of_other_images_are_refused(
+    change: Callable[[np.ndarray], np.ndarray], put: Callable[..., Path]
+) -> None:
+    with raises("no-reading"):
+        believe(look(put(kuka, change)))
+
+
+def test_the_boards_own_poses_are_not_taken_for_the_robots(put: Callable[..., Path]) -> None:
+    """They agree with the images perfectly."""
+    camera_from_board = np.array(TURNED.camera_from_board())
+    with raises("no-reading"):
+        believe(look(put(kuka, lambda T: camera_from_board)))
+
+
+def test_what_was_believed_needs_no_flags_again(put: Callable[..., Path], tmp_path: Path) -> None:
+    folder, out = put(unnamed), tmp_path / "mine.mcap"
+    assert call(main, "import", folder, "-o", out).returncode == 1
+    told = call(main, "import", folder, "-o", out, "--mount", "eye-in-hand", "--json")
+    assert told.returncode == 0, told.stderr
+    assert json.loads(told.stdout)["found"]["mount"][0] == "eye-in-hand"
+    first = open_recording(out)
+    out.unlink()
+    assert call(main, "import", folder, "-o", out).returncode == 0
+    assert open_recording(out).views() == first.views()
+    assert first.info.mount == "eye-in-hand"
+    assert first.info.robot.model not in MODELS
+
+
+def test_a_folder_without_poses_says_what_is_there(put: Callable[..., Path]) -> None:
+    with raises("no-pairs", tables="none"):
+        believe(look(put(lambda folder, T: None)))

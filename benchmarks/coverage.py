@@ -98,7 +98,7 @@ def measure(task: tuple[int, Mount, int]) -> CoverageTrial:
             cell = imperfect_cell(rng, mount, row.wrong, row.known, row.model)
             solution = solve_views(cell.views, SolveOptions(intrinsics_from_same_pictures=not row.known.lens))
     except CalibrationError as problem:
-        return CoverageTrial((problem.hypothesis or type(problem).__name__,))
+        return CoverageTrial((str(problem.values.get("hypothesis", type(problem).__name__)),))
     used = set(solution.used)
     seen = picture_coverage(cell.views.select([k for k, v in enumerate(cell.views) if v.index in used]))
     gates = judge(solution, GateInputs(None if row.known.lens else seen))

@@ -93,7 +93,7 @@ def what_is_said(folder: Path, output: Path) -> Said:
         import_folder(folder, output)
         job = solve_recording(output)
     except (CalibrationError, RecordingError) as error:
-        hypothesis = str(getattr(error, "hypothesis", "") or "")
+        hypothesis = str(error.values.get("hypothesis", ""))
         return Said(hypothesis or error.code, hypothesis, (), str(error), answered=False)
     answer = job.calibration.quality
     assert answer.session is not None

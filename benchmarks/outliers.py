@@ -95,9 +95,10 @@ def measure(task: tuple[str, float, Mount, int]) -> OutlierTrial:
         try:
             solution = solve_views(spoilt.views, _OPTIONS)
         except CalibrationError as problem:
-            named = problem.hypothesis or type(problem).__name__
+            named = str(problem.values.get("hypothesis", type(problem).__name__))
             truly = named == spoilt.reading.value
-            return OutlierTrial(False, named, oracle, truly, bool(problem.hypothesis) and not truly)
+            falsely = "hypothesis" in problem.values and not truly
+            return OutlierTrial(False, named, oracle, truly, falsely)
         reading = solution.session.reading
     passed = all(gate.passed for gate in judge(solution, GateInputs()))
     truly, falsely = _named(solution, spoilt, set(bad.tolist()))

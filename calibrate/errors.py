@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from recordings.errors import CodedError, Value
+from recordings.errors import CodedError
 
 
 class CalibrationError(CodedError):
@@ -12,8 +12,6 @@ class CalibrationError(CodedError):
 
     package = "calibrate"
     code = "calibration"
-    hypothesis: str = ""
-    """The cause as a word for programs, where it is known."""
 
 
 class UsageError(CalibrationError):
@@ -39,13 +37,13 @@ class TooFewViewsError(CalibrationError):
 class SquaresCountedError(TooFewViewsError):
     """A chessboard was declared in squares, not in inner corners; values: `columns`, `rows` seen."""
 
-    code = hypothesis = "squares-counted"
+    code = "squares-counted"
 
 
 class MirroredImagesError(TooFewViewsError):
     """The board's markers can be read only in the mirror image."""
 
-    code = hypothesis = "mirrored"
+    code = "mirrored"
 
 
 class DegenerateMotionError(CalibrationError):
@@ -61,13 +59,9 @@ class BadViewsError(CalibrationError):
 
 
 class PosesDisagreeError(BadViewsError):
-    """Robot poses and images contradict each other; `hypothesis` is the code of the reading that fits."""
+    """Robot poses and images contradict each other; value `hypothesis`: the code of the reading that fits."""
 
     code = "poses-disagree"
-
-    def __init__(self, code: str = "", /, *, hypothesis: str = "", **values: Value) -> None:
-        super().__init__(code, **values)
-        self.hypothesis = hypothesis
 
 
 class CalibrationFileError(CalibrationError):

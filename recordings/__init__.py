@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from recordings.errors import MissingSegmentError as MissingSegmentError
     from recordings.errors import RecordingError as RecordingError
     from recordings.errors import UnfinishedRecordingError as UnfinishedRecordingError
-    from recordings.exporters.folder import export_recording as export_recording
+    from recordings.exporters.export import export_recording as export_recording
     from recordings.images import viewable as viewable
     from recordings.importers.bag import import_bag as import_bag
     from recordings.importers.folder import import_folder as import_folder
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "errors": "BadImageError CodedError CorruptRecordingError MissingSegmentError RecordingError "
     "UnfinishedRecordingError",
-    "exporters.folder": "export_recording",
+    "exporters.export": "export_recording",
     "images": "viewable",
     "importers.bag": "import_bag",
     "importers.folder": "import_folder",

@@ -37,8 +37,6 @@ from recordings.schema.messages import SessionInfo
 
 DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
-
-
 MOST_DISAGREEMENT = 3.0
 _BY_CHANCE = 0.001
 """A smaller p is not worth a second look."""
@@ -80,12 +78,8 @@ def drift_check(
     if calibration_file is None:
         camera = open_recording(source).info.camera_identity.name or MAIN_CAMERA
     calibration, _ = named_or_installed(calibration_file, root, camera)
-    options = JobOptions(
-        board=None if board is None else read_board(board),
-        camera=calibration.intrinsics.model,
-        threads=threads,
-    )
     with detection_progress() as progress:
+        options = _options(board, calibration, threads)
         prepared = prepare_views(source, options, progress, fewest=FEWEST_FOR_DRIFT_CHECK)
     info = prepared.recording.info
     try:
@@ -105,7 +99,7 @@ def drift_check(
     elif proves_nothing:
         out.print(OWN_VIEWS.format(recording=source), style="yellow")
     else:
-        out.print(check_text(result, calibration), style="green" if result.passed else "bold red")
+        _tell(result, check_text(result, calibration))
         if before:
             out.print(f"Earlier drift checks: {sum(before)} of {len(before)} passed.")
         if trend is not None:
@@ -128,43 +122,33 @@ def _check_production(
 ) -> None:
     """Test production pictures. An alarm puts the installed calibration in doubt; none proves nothing."""
     calibration, _ = named_or_installed(calibration_file, root, camera)
-    options = JobOptions(
-        board=None if board is None else read_board(board),
-        camera=calibration.intrinsics.model,
-        threads=threads,
-    )
     with tempfile.TemporaryDirectory(prefix="drift-check-") as place, detection_progress() as progress:
         recording = Path(place) / f"{folder.resolve().name}.mcap"
         import_folder(folder, recording)
-        prepared = prepare_views(recording, options, progress, fewest=1)
-    info = prepared.recording.info
-    if info.mount != calibration.mount:
-        raise OtherCellError(
-            where=str(folder), differs="mounting", found=info.mount, calibrated=calibration.mount
-        )
-    known = known_cell(calibration, prepared.loaded.board)
-    result = check_production(prepared.views, known)
+        prepared = prepare_views(recording, _options(board, calibration, threads), progress, fewest=1)
+    mount = prepared.recording.info.mount
+    if mount != calibration.mount:
+        raise OtherCellError(where=str(folder), differs="mounting", found=mount, calibrated=calibration.mount)
+    result = check_production(prepared.views, known_cell(calibration, prepared.loaded.board))
     alarm = calibration_file is None and not result.passed
     validity = _judge(result, folder.name, datetime.now(UTC), root, camera) if alarm else None
     if as_json:
         print_json(_plain(result, None, False, validity))
     else:
-        text = f"PASS: nothing moved, by {len(prepared.views)} pictures."
-        if not result.passed:
-            text = (
-                f"FAIL: camera or tag shifted {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° within the "
-                f"last {result.views} pictures (p = {result.p_value:.1e}). Check both, and run station "
-                "drift-check."
-            )
-        out.print(text, style="green" if result.passed else "bold red")
+        _tell(result, production_text(result, len(prepared.views)))
         _print_validity(validity)
     if not result.passed:
         raise typer.Exit(DRIFTED)
 
 
 def _options(board: Path | None, calibration: Calibration, threads: int | None) -> JobOptions:
+    """Look for the board through the lens of the calibration."""
     spec = None if board is None else read_board(board)
     return JobOptions(board=spec, camera=calibration.intrinsics.model, threads=threads)
+
+
+def _tell(result: DriftCheck, text: str) -> None:
+    out.print(text, style="green" if result.passed else "bold red")
 
 
 def _print_validity(validity: Validity | None) -> None:
@@ -255,6 +239,16 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
     if result.disagreement > MOST_DISAGREEMENT:
         text += f" Noise {result.disagreement:.1f}× higher than at calibration. Check board and robot."
     return text
+
+
+def production_text(result: DriftCheck, pictures: int) -> str:
+    """Verdict on production pictures, and what to do."""
+    if result.passed:
+        return f"PASS: nothing moved, by {pictures} pictures."
+    return (
+        f"FAIL: camera or tag shifted {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° within the last "
+        f"{result.views} pictures (p = {result.p_value:.1e}). Check both, and run station drift-check."
+    )
 
 
 def _next_step(result: DriftCheck) -> str:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from calibrate.boards.model import board_from_turned, looks_same_turns
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array, inverse, pose, rotation_exp, rotation_log, transform_points
+from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
+from calibrate.handeye.axxb.pairs import screw_invariants
 from calibrate.handeye.corner_fit import fit_corners
 from calibrate.projection import camera_matrix, project_at, undistort
 from calibrate.views import BoardView, ViewSet, observe_views
@@ -180,11 +181,8 @@ def _disagreement(mount: Mount, flange: Array, pose: Array, later_flange: Array,
         A = inverse(later_flange) @ flange
     else:
         A = later_flange @ inverse(flange)
-    B = later_pose @ inverse(pose)
-    alpha, beta = rotation_log(A[..., :3, :3]), rotation_log(B[..., :3, :3])
-    angle_a, angle_b = np.linalg.norm(alpha, axis=-1), np.linalg.norm(beta, axis=-1)
-    along_a = (alpha * A[..., :3, 3]).sum(axis=-1) / np.maximum(angle_a, 1e-9)
-    along_b = (beta * B[..., :3, 3]).sum(axis=-1) / np.maximum(angle_b, 1e-9)
+    angle_a, along_a = screw_invariants(A)
+    angle_b, along_b = screw_invariants(later_pose @ inverse(pose))
     # The axis of a small turn is not known, nor is the sign of that of a half turn.
     trust = np.minimum(1.0, np.minimum(angle_a, angle_b) / 0.2)
     pitch_miss = np.abs(along_a - along_b)

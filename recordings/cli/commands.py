@@ -54,7 +54,7 @@ def export_command(
 
     An excerpt solves like the whole: its images are lossless PNG, its robot states those around the images.
     """
-    from recordings.exporters.folder import export_recording
+    from recordings.exporters.export import export_recording
 
     path = export_recording(open_recording(recording), output, to)
     print(json.dumps({"output": str(path)}) if as_json else f"{path} written")

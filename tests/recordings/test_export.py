@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.cli import main
 from recordings.exporters.excerpt import write_excerpt
-from recordings.exporters.folder import export_recording
+from recordings.exporters.export import export_recording
 from recordings.importers.folder import import_folder
 from recordings.mcap.output import OutputFile
 from recordings.reader import open_recording

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from recordings.cli import main
-from recordings.exporters.folder import export_recording
+from recordings.exporters.export import export_recording
 from recordings.importers.conventions import NAMED
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording

@@ -82,13 +82,12 @@ def all_pairs(H: Array, camera_from_board: Array, limit: int = MAX_PAIRS) -> Pai
 
 
 def screw_invariants(motion: Array) -> tuple[Array, Array]:
-    """Compute angle (n,) rad and translation along the axis (n,) m of motions (n, 4, 4).
+    """Compute angle (...) rad and translation along the axis (...) m of motions (..., 4, 4).
 
     Both are the same for A and B of a right pair, whatever X is (Chen 1991). The pitch of a motion that
     does not rotate is its length.
     """
-    log = rotation_log(motion[:, :3, :3])
-    angle = np.linalg.norm(log, axis=1)
-    axis = log / np.maximum(angle, 1e-12)[:, None]
-    along = np.einsum("ni,ni->n", axis, motion[:, :3, 3])
-    return angle, np.where(angle > 1e-9, along, np.linalg.norm(motion[:, :3, 3], axis=1))
+    log, t = rotation_log(motion[..., :3, :3]), motion[..., :3, 3]
+    angle = np.linalg.norm(log, axis=-1)
+    along = (log * t).sum(axis=-1) / np.maximum(angle, 1e-12)
+    return angle, np.where(angle > 1e-9, along, np.linalg.norm(t, axis=-1))

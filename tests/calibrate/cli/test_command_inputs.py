@@ -16,7 +16,7 @@ from calibrate.cli.files import read_camera
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration, write_calibration
 from recordings.errors import UnfinishedRecordingError
-from recordings.exporters.folder import export_recording
+from recordings.exporters.export import export_recording
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel

@@ -160,7 +160,7 @@ def test_a_misread_recording_is_refused_or_closes_the_session_gate(reading, moun
     try:
         solution = solve_views(views, QUICK)
     except PosesDisagreeError as problem:
-        assert problem.hypothesis == reading.value
+        assert problem.values["hypothesis"] == reading.value
         return
     assert solution.session.reading is reading
     assert reading.value in {remark.code for remark in solution.warnings}
@@ -203,4 +203,4 @@ def test_poses_of_another_recording_are_refused_without_a_reading():
     poses = cell("eye-in-hand", 1).views.base_from_flange
     with pytest.raises(PosesDisagreeError) as refused:
         solve_views(with_flange(cell("eye-in-hand").views, poses))
-    assert refused.value.hypothesis == Reading.AS_RECORDED.value
+    assert refused.value.values["hypothesis"] == Reading.AS_RECORDED.value

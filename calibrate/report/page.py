@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
 
@@ -25,16 +24,13 @@ from calibrate.files.formatting import (
     verdict_text,
 )
 from calibrate.geometry import Array, difference
-from calibrate.handeye.reprojection import bent_points
 from calibrate.job import SolvedRecording
-from calibrate.lens.pnp import solve_pnp
-from calibrate.projection import intrinsics_names, intrinsics_vector, project_at, project_pixels
+from calibrate.projection import intrinsics_names, intrinsics_vector, project_pixels
 from calibrate.report import html, plots
-from calibrate.results import SHAPE
-from calibrate.views import board_in_camera, observe_views
+from calibrate.views import board_in_camera
 from recordings import strict_yaml
 from recordings.images import viewable
-from recordings.schema.messages import CameraModel, View
+from recordings.schema.messages import View
 
 _FIRST_WIDTH_PX, _OTHER_WIDTH_PX, _PICTURES_LIMIT = 720, 320, 12
 """A page stays below a megabyte."""
@@ -47,13 +43,12 @@ _AHEAD_PX = 1e6
 
 def report_page(job: SolvedRecording) -> str:
     """Make the whole page."""
-    modelled = _modelled_pixels(job)
     return html.page(
         f"Calibration of {job.recording.info.name}",
         [
             *_verdict(job),
             html.side_by_side("first", (_picture(job), _first_facts(job))),
-            html.side_by_side("plots", _plots(job, modelled)),
+            html.side_by_side("plots", _plots(job)),
             html.folded("Camera pose", _result(job), printed=True),
             html.folded("Gates", _gates(job), printed=True),
             html.folded("Error sources", _error(job)),
@@ -213,30 +208,7 @@ def _error(job: SolvedRecording) -> Iterator[str]:
     )
 
 
-ModelledPixels = dict[int, tuple[Array, Array]]
-"""Pose number → (found, modelled) pixels."""
-
-
-def _modelled_pixels(job: SolvedRecording) -> ModelledPixels:
-    """By the board's own pose, through the final lens."""
-    camera, board = job.solution.camera, job.solution.board
-    # Solving began with poses through the first lens: they would shift every corner alike.
-    refitted = solve_pnp(replace(job.views, camera=camera))
-    kept = {view.index: view for view in job.solution.kept}
-    views = replace(refitted, views=tuple(kept.get(view.index, view) for view in refitted))
-    shape = np.zeros(len(SHAPE)) if board is None else board.numbers
-    points = bent_points(observe_views(views), shape)
-    return {
-        view.index: (
-            view.pixels,
-            project_at(camera, view.camera_from_board, points[i, : len(view.pixels)]),
-        )
-        for i, view in enumerate(views)
-        if view.camera_from_board is not None
-    }
-
-
-def _plots(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
+def _plots(job: SolvedRecording) -> Iterator[str]:
     solution = job.solution
     if px := solution.residual_px:
         limit = next((gate.limit for gate in job.gates if gate.name == "view_rms_px"), None)
@@ -252,24 +224,6 @@ def _plots(job: SolvedRecording, modelled: ModelledPixels) -> Iterator[str]:
     if shares := error_shares(job.calibration):
         answer = "Shares of the variance of the camera pose."
         yield html.figure(plots.shares(shares), answer, "Where does the error come from?")
-    if pairs := [both for index, both in modelled.items() if index in set(solution.used)]:
-        pixels = np.concatenate([found for found, _ in pairs])
-        misses = np.concatenate([found - shown for found, shown in pairs])
-        middles, means = _mean_by_field(pixels, misses, solution.camera)
-        answer = (
-            f"Mean of the corners in a field: at most {np.linalg.norm(means, axis=1).max():.2f} px off. "
-            "Long arrows side by side: it does not fit."
-        )
-        drawn = plots.field_misses(middles, means, solution.camera)
-        yield html.figure(drawn, answer, "Does the lens model fit everywhere?")
-
-
-def _mean_by_field(pixels: Array, misses: Array, camera: CameraModel) -> tuple[Array, Array]:
-    """Middles (n, 2) of the image's fields that hold corners, and the mean miss (n, 2) in each; px."""
-    size = np.array([camera.width, camera.height]) / plots.FIELDS
-    fields, owner = np.unique(pixels // size, axis=0, return_inverse=True)
-    means = [misses[owner.ravel() == place].mean(axis=0) for place in range(len(fields))]
-    return (fields + 0.5) * size, np.array(means)
 
 
 def _lens(job: SolvedRecording) -> Iterator[str]:
@@ -316,14 +270,11 @@ def _views(job: SolvedRecording) -> Iterator[str]:
 
 def _provenance(job: SolvedRecording) -> Iterator[str]:
     calibration = job.calibration
-    origin, robot, camera = calibration.provenance, calibration.robot, calibration.camera
+    origin = calibration.provenance
     rows = [
         ("recording", f"{origin.recording}, SHA-256 {origin.recording_sha256}"),
         ("source", calibration.source),
-        ("mount", calibration.mount),
-        ("board", describe_board(calibration.board)),
-        ("robot", f"{robot.model} {robot.serial} {robot.controller_version}".strip()),
-        ("camera", f"{camera.vendor} {camera.model} {camera.serial} ({camera.driver})".strip()),
+        ("controller, driver", f"{calibration.robot.controller_version}, {calibration.camera.driver}"),
         ("profile, seed", f"{origin.profile}, {origin.seed}"),
         ("software", ", ".join(f"{name} {version}" for name, version in origin.software.items())),
         ("solved", calibration.created),

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
-from functools import wraps
-from typing import Any, Concatenate, ParamSpec, TypeAlias
+from collections.abc import Mapping
+from typing import Any
 
 import matplotlib
-import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from calibrate.geometry import Array
-from recordings.schema.messages import CameraModel
-
-_BLUE, _RED, _GREY, _ORANGE = "#0969da", "#b42318", "#8c959f", "#bc4c00"
-FIELDS = (8, 6)
-"""Columns and rows of fields into which the image is divided."""
-STYLE: Any = {
+_BLUE, _RED, _ORANGE = "#0969da", "#b42318", "#bc4c00"
+_STYLE: Any = {
     "svg.hashsalt": "report",
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -30,33 +25,23 @@ STYLE: Any = {
 }
 
 
-Axes: TypeAlias = Any
-"""Matplotlib's Axes."""
-P = ParamSpec("P")
+def _axes() -> tuple[Figure, Axes]:
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(3.5, 1.9), layout="constrained")
+        return figure, figure.subplots()
 
 
-def drawn(width: float, height: float) -> Callable[[Callable[Concatenate[Axes, P], None]], Callable[P, str]]:
-    """Make a function that fills axes one that returns them as SVG; sizes in inches."""
-
-    def decorate(fill: Callable[Concatenate[Axes, P], None]) -> Callable[P, str]:
-        @wraps(fill)
-        def svg(*args: P.args, **named: P.kwargs) -> str:
-            buffer = io.StringIO()
-            with matplotlib.rc_context(STYLE):
-                figure = Figure(figsize=(width, height), layout="constrained")
-                fill(figure.subplots(), *args, **named)
-                figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-            text = buffer.getvalue()
-            return text[text.index("<svg") :]
-
-        return svg
-
-    return decorate
+def _svg(figure: Figure) -> str:
+    buffer = io.StringIO()
+    with matplotlib.rc_context(_STYLE):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
 
 
-@drawn(4.6, 1.9)
-def by_view(axes: Axes, values: Mapping[int, float], unit: str, limit: float | None = None) -> None:
+def by_view(values: Mapping[int, float], unit: str, limit: float | None = None) -> str:
     """A bar for each pose, the largest marked; the limit where it is near."""
+    figure, axes = _axes()
     largest = max(values, key=lambda index: values[index])
     axes.bar(
         [index + 1 for index in values],
@@ -64,33 +49,18 @@ def by_view(axes: Axes, values: Mapping[int, float], unit: str, limit: float | N
         color=[_ORANGE if index == largest else _BLUE for index in values],
     )
     axes.set(xlabel="pose", ylabel=unit)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if limit is not None and values[largest] > 0.3 * limit:
         axes.axhline(limit, color=_RED, linewidth=1.5)
+    return _svg(figure)
 
 
-@drawn(4.6, 1.9)
-def shares(axes: Axes, values: Mapping[str, float]) -> None:
+def shares(values: Mapping[str, float]) -> str:
     """A bar for each source with its share, the largest above."""
+    figure, axes = _axes()
     bars = axes.barh(list(values), [100 * share for share in values.values()], color=_BLUE)
     axes.bar_label(bars, fmt="%.0f %%", padding=3)
     axes.set(xlim=(0, 118 * max(values.values())), xticks=[])
     axes.invert_yaxis()
     axes.grid(False)
-
-
-@drawn(4.6, 1.9)
-def field_misses(axes: Axes, middles: Array, misses: Array, camera: CameraModel) -> None:
-    """An arrow for each field of the image: mean miss (n, 2) px at `middles` (n, 2).
-
-    A quarter of a pixel, or the largest where that is more, is as long as a field.
-    """
-    longest = max(0.25, float(np.linalg.norm(misses, axis=1).max(initial=0.0)))
-    scale = longest * FIELDS[0] / camera.width
-    axes.scatter(*middles.T, s=6, color=_GREY)
-    axes.quiver(*middles.T, *misses.T, angles="xy", scale_units="xy", scale=scale, color=_ORANGE, width=0.006)
-    axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), xticks=[], yticks=[])
-    axes.set_aspect("equal")
-    axes.grid(False)
-    for spine in axes.spines.values():
-        spine.set_visible(True)
+    return _svg(figure)

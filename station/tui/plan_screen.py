@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar, Literal
 
 from textual.app import ComposeResult
@@ -17,9 +16,9 @@ from station.tui.frame import Line
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
-from station.tui.words import MARKS, UNKNOWN, Mark, dim, facts, limit_bar, lines, many, mark
+from station.tui.words import MARKS, UNKNOWN, Mark, dim, facts, lines, many, mark
 
-COLUMNS = ("#", "error after", "", "state", "reason")
+COLUMNS = ("#", "error after", "state", "reason")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves)."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
@@ -28,7 +27,6 @@ NEW_FOR_ARM = "Plan 25 poses that also tell the errors of the arm's table, board
 POSE_VERBS = {"retake": Retake, "skip": Skip}
 SIGMA_SHOWN_MM = 100.0
 """Larger errors are not shown: after the first poses they are metres, which say nothing."""
-BAR_CELLS = 7
 _STATES: dict[str, tuple[Mark, str]] = {
     "planned": ("todo", "planned"),
     "done": ("done", "saved"),
@@ -37,7 +35,7 @@ _STATES: dict[str, tuple[Mark, str]] = {
 }
 
 
-def row_of(pose: PoseStatus, goal_mm: float) -> tuple[Content, ...]:
+def row_of(pose: PoseStatus) -> tuple[Content, ...]:
     """Make a row of the table."""
     sigma_mm = pose.estimated_sigma_mm or pose.predicted_sigma_mm
     shown = f"{sigma_mm:7.2f}" if sigma_mm and sigma_mm <= SIGMA_SHOWN_MM else f"{UNKNOWN:>7}"
@@ -46,14 +44,9 @@ def row_of(pose: PoseStatus, goal_mm: float) -> tuple[Content, ...]:
         kind, word = "look", "to be captured again"
     elif pose.state == "failed" and pose.reason:
         word = f"failed: {pose.reason}"
-    bar = Content()
-    if sigma_mm:  # 1 at the goal, 0 at a tenth of it, 2 at ten times as much
-        reach = max(0.05, 1 + math.log10(max(sigma_mm, 1e-6) / goal_mm))
-        bar = limit_bar(reach, 1.0, BAR_CELLS, "$ok" if sigma_mm <= goal_mm else "$warn", 0.5)
     return (
         Content.styled(f"{pose.index + 1:>3} ", "$foreground") + mark(kind),
         facts(("", shown, "mm")),
-        bar,
         Content.styled(word, MARKS[kind][1]),
         Content.styled(pose.why or pose.name, "$foreground"),
     )
@@ -111,9 +104,8 @@ class PlanScreen(StationScreen):
         super().show(known)
         if (status := known.status) is None:
             return
-        goal_mm = status.estimate.goal_mm or 0.5
         self.query_one("#plan-facts", Line).show(known)
-        self.table.show([row_of(pose, goal_mm) for pose in status.session.poses])
+        self.table.show([row_of(pose) for pose in status.session.poses])
         self.draw_panels(known)
 
     def _why(self, known: Known, width: int, height: int) -> Content:

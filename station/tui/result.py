@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from typing import ClassVar
@@ -144,12 +143,11 @@ def _row(
 
 
 def evidence(result: Result, calibration: Calibration) -> Content:
-    """Write what installing changes, the camera's pose, every view, and what was installed so far."""
+    """Write what installing changes, the camera's pose, the views, and what was installed so far."""
     sections = {
         "Change": change_lines(result, calibration),
         "Camera pose": pose_lines(calibration),
-        "Left-out views": left_out_lines(calibration),
-        "Reprojection error per view": residual_lines(calibration),
+        "Views": view_lines(calibration),
         "Installed so far": log_lines(result),
     }
     return Content("\n\n").join(
@@ -181,30 +179,13 @@ def pose_lines(calibration: Calibration) -> list[Content]:
     return [*rows, *map(Content, arm_sentences(calibration))]
 
 
-def left_out_lines(calibration: Calibration) -> list[Content]:
+def view_lines(calibration: Calibration) -> list[Content]:
     held_out, folds = figures(calibration).get("held_out"), calibration.quality.cross_validation
     rows = [] if held_out is None else [Content(f"{held_out.value} {held_out.label} {held_out.about}")]
     if folds is not None:
         rows.append(Content(f"{folds.rms_mm:.2f} mm over folds, claimed {folds.claimed_mm:.2f} mm"))
-    return [*(rows or [dim("no views were held out")]), Content(noise_text(calibration))]
-
-
-def residual_lines(calibration: Calibration) -> list[Content]:
-    """Draw the reprojection error of each view; rejected views with their reason come first."""
-    rms = {v.index: v.rms_px for v in calibration.quality.views if v.rms_px is not None}
-    limit = next((g.limit for g in calibration.quality.gates if g.name == "view_rms_px"), None)
-    rows = [mark("look", f"view {r.index + 1} rejected: {r.reason}") for r in calibration.views.rejected]
-    # A limit far above every view would leave nothing to be seen.
-    reach = min(limit or math.inf, 4 * max(rms.values(), default=0.0)) or 1.0
-    rows.append(dim(f"bars to {reach:.2g} px" + (f", limit {limit:g} px" if limit else "")))
-    weights = {v.index: v.weight for v in calibration.views.weights}
-    for index, value in sorted(rms.items()):
-        doubt = weights.get(index, 1.0) < 0.5
-        colour = "$bad" if limit and value > limit else "$warn" if doubt else "$accent"
-        bar = limit_bar(value, reach, BAR_CELLS, colour, 1.0)
-        suspect = mark("look", " suspect") if doubt else Content()
-        rows.append(dim(f"{index + 1:>3} ") + bar + Content(f" {value:.3f} px ") + suspect)
-    return rows
+    rejected = (f"view {view.index + 1} rejected: {view.reason}" for view in calibration.views.rejected)
+    return [*rows, Content(noise_text(calibration)), *(mark("look", text) for text in rejected)]
 
 
 def log_lines(result: Result) -> list[Content]:

@@ -139,7 +139,7 @@ async def test_run_stop_resume_finish_solve_install(desk_with: MakeDesk) -> None
     screen.press("i")
     await shows(screen, "Install this calibration")
     screen.press("tab", "enter")
-    await shows(screen, "Installed")
+    await shows(screen, "Installed. b undoes it")
 
     installed = installed_calibration(desk.rig.root)
     assert installed.source == "simulated"

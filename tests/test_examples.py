@@ -50,13 +50,6 @@ def test_every_command_ends_its_help_with_examples_that_parse(program: str, name
         assert parse(line) == name
 
 
-def test_the_first_steps_parse() -> None:
-    given = examples_in(PROGRAMS["station"].epilog)
-    assert len(given) == 5
-    for line in given:
-        parse(line)
-
-
 def commands_in(text: str) -> list[str]:
     """Lines of code blocks that are one whole command: not those with `…`, `[…]` or `a|b` in them.
 

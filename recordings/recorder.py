@@ -59,12 +59,11 @@ class Recorder:
         path: Path,
         info: SessionInfo,
         *,
-        lossless_png: bool = False,
         queue_limit_bytes: int = QUEUE_LIMIT_BYTES,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Creates the file and starts the thread. Raises RecordingError."""
-        self._writer = RecordingWriter(path, info, lossless_png=lossless_png)
+        self._writer = RecordingWriter(path, info)
         self.part_path = self._writer.part_path
         self.dropped = 0
         self.error: RecordingError | None = None

@@ -18,8 +18,9 @@ from station.cell.config import REAL_DRIVERS, StationConfig
 from station.cell.errors import ConfigError, RobotError
 from station.cell.process import RealTimeThreads
 from station.cell.status import StationState
-from station.devices.base import Camera, Trigger
+from station.devices.base import Camera
 from station.devices.cell import Cell
+from station.devices.serial_trigger import SerialTrigger
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
 from station.server.stop_server import StopServer
@@ -163,7 +164,7 @@ def configured_cell(config: StationConfig, text: bytes, log_dir: Path) -> Cell:
     """Make the cell of a configuration, not connected. ConfigError for devices that exclude each other."""
     from station.devices.ur import UrRobot
 
-    trigger = _trigger(config)
+    trigger = None if config.trigger is None else SerialTrigger(config.trigger)
     camera, source = _camera(config, trigger)
     return Cell(
         config=config,
@@ -175,7 +176,7 @@ def configured_cell(config: StationConfig, text: bytes, log_dir: Path) -> Cell:
     )
 
 
-def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Source]:
+def _camera(config: StationConfig, trigger: SerialTrigger | None) -> tuple[Camera, Source]:
     if config.camera.driver == "aravis":
         from station.devices.aravis import AravisCamera
 
@@ -185,11 +186,3 @@ def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Sou
 
         return WebcamCamera(config.camera), "real"
     raise ConfigError("unreal-camera", driver=config.camera.driver, drivers=" or ".join(REAL_DRIVERS))
-
-
-def _trigger(config: StationConfig) -> Trigger | None:
-    if config.trigger is None:
-        return None
-    from station.devices.serial_trigger import SerialTrigger
-
-    return SerialTrigger(config.trigger)

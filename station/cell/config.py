@@ -190,7 +190,7 @@ class StillnessConfig(Section, frozen=True):
 
 
 class CaptureConfig(Section, frozen=True):
-    lossless_png: bool = False
+    GONE: ClassVar = frozenset({"lossless_png"})
     time_bound_s: Positive = 0.02
     """Largest bound of the image time for which a pose is accepted. At the stillness limit of 2 mrad/s it is
     0.04 mm at one metre."""

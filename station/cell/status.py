@@ -112,29 +112,15 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
         return None if self.state is None else self.state.joints_rad
 
 
-class StreamCounts(msgspec.Struct, frozen=True):
-    """Counts of frames damaged or lost on the network since the camera was opened."""
-
-    complete: int = 0
-    incomplete: int = 0
-    """Frames with missing packets"""
-    unbuffered: int = 0
-    """Frames lost for want of a free buffer: the program was too slow"""
-    missing_packets: int = 0
-    resend_requests: int = 0
-    resent_packets: int = 0
-
-
 class CameraCounts(msgspec.Struct, frozen=True):
     """Counts of a camera's frames, for the status."""
 
     frames: int = 0
-    """Frames that came, glimpses and previews included"""
+    """Frames that came, glimpses included"""
     missing: int = 0
     """Frames triggered or numbered by the camera that never came complete"""
     paired: int = 0
     """Frames that belong to a pulse of the trigger box"""
-    stream: StreamCounts = StreamCounts()
 
 
 class FrameTiming(msgspec.Struct, frozen=True):

@@ -15,7 +15,6 @@ from station.cell.status import MotionPreview
 from station.cli.attended import Attended, attended, confirmed, no_terminal
 from station.cli.console import AsJson, Socket, err, print_json
 from station.operate.stop_test import AcceptanceTest
-from station.protocol.verbs import Configuration
 
 _SHOWN = ("reaction", "rest", "distance")
 
@@ -60,11 +59,10 @@ async def _accept(socket: Path | None, joint: int, speed_m_s: float, quiet: bool
             raise RefusedError("playback")
         if quiet and not shell.simulated:
             raise no_terminal("--json prompts nobody, and is for simulated cells only.")
-        host = (await shell.client.call(Configuration())).robot.host
         tester = _ShellTester(shell, quiet)
-        root = shell.client.root
-        assert root is not None
-        test = AcceptanceTest(shell.client, tester, TraceRecorder(host), speed_m_s, joint)
+        root, config = shell.client.root, shell.client.config
+        assert root is not None and config is not None
+        test = AcceptanceTest(shell.client, tester, TraceRecorder(config.robot.host), speed_m_s, joint)
         try:
             acceptance = await test.run()
         except BaseException:

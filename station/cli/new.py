@@ -63,7 +63,7 @@ class OpenCamera:
     async def open(self) -> None:
         await self._camera.open()
 
-    async def glimpse(self) -> Image | None:
+    async def glimpse(self) -> Image:
         async with self._changing:
             return await self._camera.glimpse()
 

@@ -11,10 +11,11 @@ import msgspec
 from recordings.schema.messages import CameraIdentity, Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
-from station.cell.status import CameraCounts, FrameTiming, StreamCounts
+from station.cell.status import CameraCounts, FrameTiming
 from station.devices.aravis_device import GenicamDevice
-from station.devices.base import DeviceThread, Trigger
+from station.devices.base import DeviceThread
 from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
+from station.devices.serial_trigger import SerialTrigger
 
 _CLOCK_READINGS = 8
 _GLIMPSE_S = 1.0
@@ -23,7 +24,7 @@ _GLIMPSE_S = 1.0
 class AravisCamera:
     """GenICam camera behind `devices.base.Camera`; with `camera.trigger: hardware` fired by `trigger`."""
 
-    def __init__(self, config: CameraConfig, trigger: Trigger | None = None) -> None:
+    def __init__(self, config: CameraConfig, trigger: SerialTrigger | None = None) -> None:
         if config.trigger == "hardware" and trigger is None:
             raise CameraError("no-trigger")
         self._config = config
@@ -32,7 +33,6 @@ class AravisCamera:
         self._worker = DeviceThread("aravis")
         self._busy = asyncio.Lock()
         self._clock = FrameClock(config.trigger_delay_us)
-        self._newest: Image | None = None
         self.identity = CameraIdentity(driver="aravis")
         self.counter = FrameCounter()
 
@@ -41,9 +41,7 @@ class AravisCamera:
         return self._clock.timing
 
     def counts(self) -> CameraCounts:
-        """Counts of frames; those of the network since the camera was last opened."""
-        device = self._device
-        return self.counter.counts(StreamCounts() if device is None else device.counts())
+        return self.counter.counts()
 
     async def open(self) -> CameraIdentity:
         async with self._busy:
@@ -57,10 +55,9 @@ class AravisCamera:
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
         async with self._busy:
-            self._newest = await self._one(timeout_s, sequenced=True)
-            return self._newest
+            return await self._one(timeout_s, sequenced=True)
 
-    async def glimpse(self) -> Image | None:
+    async def glimpse(self) -> Image:
         """Take an image that is not recorded, triggered like any other, by the trigger box too."""
         async with self._busy:
             return await self._one(_GLIMPSE_S, sequenced=False)
@@ -86,18 +83,6 @@ class AravisCamera:
         )
         return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
 
-    async def preview(self) -> Image | None:
-        """Take a new image where the camera is idle and software-triggered, else return the newest one."""
-        if self._busy.locked() or self._config.trigger == "hardware":
-            return self._newest
-        async with self._busy:
-            try:
-                self._newest = await self._one(_GLIMPSE_S, sequenced=False)
-                return self._newest
-            except CameraError:
-                self.counter.restart()
-                return None
-
     async def close(self) -> None:
         device, self._device = self._device, None
         await self._worker.close(device.close if device is not None else lambda: None)
@@ -107,7 +92,6 @@ class AravisCamera:
         self.identity = device.open(self.identity.serial)
         self._device = device
         self.counter.restart()
-        self.counter.ids = device.frame_ids
         self._clock.restart()
         for _ in range(_CLOCK_READINGS):
             device.latch(self._clock.readings)

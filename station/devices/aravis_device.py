@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
-from station.cell.status import StreamCounts
 from station.devices.clocks import monotonic_from_wall_ns
-from station.devices.frame_ids import FrameIds
 from station.devices.frame_time import DeviceClock
 from station.devices.genicam_settings import Applied, apply_settings, read_settings, require_settings
 from station.devices.pixels import bytes_per_pixel, decode
@@ -70,17 +68,6 @@ class GenicamDevice:
         if self._controls and camera is not None and not camera.get_device().is_controller():
             self._lost = True
         return self._lost
-
-    @property
-    def frame_ids(self) -> FrameIds:
-        """Width of the frame ids by the camera's transport."""
-        mode = "GevGVSPExtendedIDMode"
-        camera = self._camera
-        if not camera.is_gv_device() or (
-            camera.is_feature_available(mode) and camera.get_string(mode) == "On"
-        ):
-            return FrameIds.WIDE
-        return FrameIds.BLOCK
 
     def open(self, serial: str = "") -> CameraIdentity:
         """Find, set up and start the camera. `serial`: accept only this one; empty: as configured."""
@@ -186,21 +173,6 @@ class GenicamDevice:
             self._stream.push_buffer(buffer)
             count += 1
         return count
-
-    def counts(self) -> StreamCounts:
-        """Counts of frames on the network since the camera was opened. Callable from any thread."""
-        stream = self._stream
-        if stream is None:
-            return StreamCounts()
-        number = stream.get_info_uint64_by_name
-        return StreamCounts(
-            complete=number("n_completed_buffers"),
-            incomplete=number("n_failures"),
-            unbuffered=number("n_underruns"),
-            missing_packets=number("n_missing_packets"),
-            resend_requests=number("n_resend_requests"),
-            resent_packets=number("n_resent_packets"),
-        )
 
     def trigger(self) -> None:
         with self._explained("triggering the camera"):

@@ -13,7 +13,6 @@ from station.cell.arm_acceptance import StopWay
 from station.cell.clock_fit import ClockFit
 from station.cell.errors import StaleStateError
 from station.cell.status import ArmCondition, CameraCounts, FrameTiming
-from station.devices.frames import TriggerPulse
 
 T = TypeVar("T")
 
@@ -192,26 +191,10 @@ class Camera(Protocol):
         `region`, where there is one: x, y, width, height of the images, pixels.
         """
 
-    async def glimpse(self) -> Image | None:
+    async def glimpse(self) -> Image:
         """Take an image, exposed after this call and of any size, that is not numbered or recorded.
 
-        None from a camera that cannot (playback). Raises CameraError within about a second.
+        For screens, and to see whether something moves. Raises CameraError within about a second.
         """
-
-    async def preview(self) -> Image | None:
-        """Return a recent image for the screen, never recorded; None when there is none."""
-
-    async def close(self) -> None: ...
-
-
-class Trigger(Protocol):
-    async def open(self) -> str:
-        """Open the box and return its identity text. Raises TriggerError."""
-
-    @property
-    def pulses(self) -> int:
-        """Pulses that the box counted since it was opened, from any cause."""
-
-    async def fire(self) -> TriggerPulse: ...
 
     async def close(self) -> None: ...

@@ -13,7 +13,8 @@ from recordings.schema.messages import CameraModel, Source
 from station.cell.arm_acceptance import ArmSubject, not_accepted, read_acceptance
 from station.cell.config import SPEED_CAP_M_S, StationConfig
 from station.cell.pose_plan import Plan
-from station.devices.base import Camera, Robot, Trigger
+from station.devices.base import Camera, Robot
+from station.devices.serial_trigger import SerialTrigger
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Cell:
     camera: Camera
     source: Source
     """`real` only when both arm and camera are real."""
-    trigger: Trigger | None = None
+    trigger: SerialTrigger | None = None
     config_text: bytes = b""
     """Content of the configuration file, for the recording."""
     config_path: str = ""

@@ -6,8 +6,7 @@ import msgspec
 
 from recordings.schema.messages import FrameTime, Image
 from station.cell.errors import CameraError
-from station.cell.status import CameraCounts, FrameTiming, StreamCounts
-from station.devices.frame_ids import LAST_BLOCK_ID, FrameIds, frames_between
+from station.cell.status import CameraCounts, FrameTiming
 from station.devices.frame_time import (
     UNKNOWN_READOUT_S,
     DeviceClock,
@@ -17,6 +16,7 @@ from station.devices.frame_time import (
 )
 
 RETAKE = "Retake this pose."
+LARGEST_IDS = tuple((1 << bits) - 1 for bits in (8, 16, 32, 64))
 
 
 class FrameCounter:
@@ -26,14 +26,12 @@ class FrameCounter:
     error counting restarts with the next frame, so that a lost frame costs one pose only.
     """
 
-    def __init__(self, ids: FrameIds = FrameIds.WIDE) -> None:
-        self.ids = ids
-        """Width of frame ids, set by the driver."""
+    def __init__(self) -> None:
         self.frames = 0
         """Numbered frames accepted; the newest has this sequence number minus 1."""
         self.missing = 0
         self.seen = 0
-        """Frames accepted, previews included."""
+        """Frames accepted, glimpses included."""
         self.paired = 0
         """Frames accepted for a pulse of the trigger box."""
         self._last_id: int | None = None
@@ -46,12 +44,12 @@ class FrameCounter:
     def accept(self, frame_id: int | None, pulse_count: int | None = None, *, sequenced: bool = True) -> int:
         """Check a frame; return its sequence number. `pulse_count`: of the trigger box, for this trigger.
 
-        `sequenced=False`: a preview, which takes no sequence number.
+        `sequenced=False`: a glimpse, which takes no sequence number.
         Raises CameraError for a frame that is not the next one or a pulse count that did not grow by one.
         """
         last_id, last_pulse = self._last_id, self._last_pulse
         self._last_id, self._last_pulse = frame_id, pulse_count
-        frames = self._step(last_id, frame_id)
+        frames = frames_between(last_id, frame_id)
         pulses = 1 if last_pulse is None or pulse_count is None else pulse_count - last_pulse
         if frames is None:
             raise CameraError("frame-ids-restarted", frame=frame_id, after=last_id)
@@ -67,17 +65,8 @@ class FrameCounter:
         self.paired += pulse_count is not None
         return self.frames - 1
 
-    def _step(self, last_id: int | None, frame_id: int | None) -> int | None:
-        if last_id is None or frame_id is None:
-            return 1
-        if last_id == frame_id == 0:
-            return 1  # 0 twice: this camera does not number frames
-        if frame_id > LAST_BLOCK_ID:  # extended ids of a camera that does not announce them
-            self.ids = FrameIds.WIDE
-        return frames_between(last_id, frame_id, self.ids)
-
-    def counts(self, stream: StreamCounts | None = None) -> CameraCounts:
-        return CameraCounts(self.seen, self.missing, self.paired, stream or StreamCounts())
+    def counts(self) -> CameraCounts:
+        return CameraCounts(self.seen, self.missing, self.paired)
 
     def lost(self, pulse_count: int | None = None) -> None:
         """Note a trigger without a frame; `pulse_count`: count of the trigger box at it."""
@@ -89,6 +78,19 @@ class FrameCounter:
         """Note frames that came without a trigger; return the error to raise."""
         self.restart()
         return CameraError("surplus-frames", frames=frames)
+
+
+def frames_between(earlier_id: int | None, later_id: int | None) -> int | None:
+    """Count frames from one id to a later one: 1 for the next, 0 for the same; 1 without ids, or 0 twice.
+
+    After the largest number of 8 to 64 bits comes 0, or 1 (GigE Vision, where 0 means no number). None: the
+    camera began to number anew, which tells nothing about frames between.
+    """
+    if earlier_id is None or later_id is None or earlier_id == later_id == 0:
+        return 1
+    if later_id < earlier_id:
+        return 1 if earlier_id in LARGEST_IDS and later_id <= 1 else None
+    return later_id - earlier_id
 
 
 class TriggerPulse(msgspec.Struct, frozen=True):

@@ -6,7 +6,6 @@ Driver and source of new recordings are `playback`, so that played-back data nev
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -74,9 +73,7 @@ class PlaybackCamera:
         return self.identity
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        if not self._playing:
-            raise CameraError("not-open")
-        picture = await asyncio.to_thread(self._robot.picture)
+        picture = await self.glimpse()
         self._taken += 1
         now_ns = time.monotonic_ns()
         return msgspec.structs.replace(
@@ -90,14 +87,10 @@ class PlaybackCamera:
     async def settings(self) -> dict[str, object]:
         return {"device": str(self._robot.path)}
 
-    async def glimpse(self) -> Image | None:
-        """Return None: a recorded image cannot show whether the image moves now."""
-        return None
-
-    async def preview(self) -> Image | None:
-        with contextlib.suppress(CameraError):
-            return await asyncio.to_thread(self._robot.picture) if self._playing else None
-        return None
+    async def glimpse(self) -> Image:
+        if not self._playing:
+            raise CameraError("not-open")
+        return await asyncio.to_thread(self._robot.picture)
 
     async def close(self) -> None:
         self._playing = False

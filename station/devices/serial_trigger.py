@@ -47,7 +47,7 @@ def unframe(line: bytes) -> str | None:
 
 
 class SerialTrigger:
-    """Trigger box behind `devices.base.Trigger`."""
+    """Trigger box on a serial line; all methods raise TriggerError."""
 
     def __init__(self, config: TriggerConfig) -> None:
         self._config = config

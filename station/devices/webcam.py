@@ -46,7 +46,6 @@ class WebcamCamera:
         self._config = config
         self._video: cv2.VideoCapture | None = None
         self._worker = DeviceThread("webcam")
-        self._newest: Image | None = None
         self._fixed: dict[str, float] = {}
         """Exposure and focus at opening; only those that the camera has"""
         self._frames = self._seen = self._missing = 0
@@ -70,20 +69,13 @@ class WebcamCamera:
         except CameraError:
             self._missing += 1
             raise
-        self._newest = self._numbered(image)
-        return self._newest
+        return self._numbered(image)
 
     async def settings(self) -> dict[str, object]:
         return await self._run(self._settings, _GLIMPSE_S)
 
-    async def glimpse(self) -> Image | None:
+    async def glimpse(self) -> Image:
         return await self._run(partial(self._fresh, _GLIMPSE_S), _GLIMPSE_S)
-
-    async def preview(self) -> Image | None:
-        try:
-            return await self.glimpse()
-        except CameraError:
-            return self._newest
 
     async def close(self) -> None:
         await self._worker.close(self._release)

@@ -202,16 +202,11 @@ class CellSetup:
 
 async def _exposed(camera: CameraReader) -> Image:
     """Take an image, adjusting the exposure to `GREY_WANTED` in a few tries. Raises CameraError."""
-    image = None
     for _ in range(4):
         image = await camera.glimpse()
-        if image is None:
-            continue
         mean = float(np.mean(image.pixels)) / (1 if image.pixels.dtype == np.uint8 else 257)
         wanted_us = float(np.clip(camera.exposure_us * GREY_WANTED / max(mean, 2.0), *EXPOSURE_US))
         if 0.6 < mean / GREY_WANTED < 1.5 or wanted_us == camera.exposure_us:
             return image
         await camera.expose(wanted_us)
-    if image is None:
-        raise StationError("camera-dark")
     return image

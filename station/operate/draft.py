@@ -64,7 +64,7 @@ class ArmReader(Protocol):
 class CameraReader(Protocol):
     """A camera that shows what it sees."""
 
-    async def glimpse(self) -> Image | None:
+    async def glimpse(self) -> Image:
         """An image exposed after this call. Raises CameraError."""
 
     async def expose(self, exposure_us: float) -> None:

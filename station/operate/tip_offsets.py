@@ -30,7 +30,7 @@ from station.cell.layout import flange_pose
 from station.cell.status import StationStatus
 from station.operate.ending import after_touches
 from station.protocol.client import Client
-from station.protocol.verbs import Configuration, Observe
+from station.protocol.verbs import Observe
 
 LOOK_S = 30.0
 _TOUCHING_M, _BESIDE_M = 0.01, 0.05
@@ -60,10 +60,9 @@ async def see_board(link: Client, file: Path) -> SeenBoard:
     if not seen.corners:
         advice = "Jog the arm or lay the board so that the camera sees it whole."
         raise RefusedError("no-board", reason="No board in the image.", advice=advice)
-    configured = (await link.call(Configuration())).pointer
     tip_m, pointer = seen.tcp_offset[:3], "the pendant's tool"
-    if configured is not None:
-        tip_m, pointer = configured.tip_m, "the configured pointer"
+    if link.config is not None and link.config.pointer is not None:
+        tip_m, pointer = link.config.pointer.tip_m, "the configured pointer"
     elif np.linalg.norm(tip_m) < _SHORTEST_M:
         raise RefusedError("no-pointer")
     points = board_points(calibration.board)[list(seen.corners)]

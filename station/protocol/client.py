@@ -16,6 +16,7 @@ import msgspec
 from recordings.errors import ErrorData
 from recordings.files import MAIN_CAMERA
 from recordings.plain_text import plain_data
+from station.cell.config import StationConfig
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus
 from station.protocol.messages import LINE_LIMIT_BYTES, Request
@@ -91,8 +92,8 @@ class Client:
         self._reading: asyncio.Task[None] | None = None
         self.root: Path | None = None
         """Folder in which the daemon keeps sessions and installed calibrations; None until connected."""
-        self.camera = MAIN_CAMERA
-        self.max_age_days: float | None = None
+        self.config: StationConfig | None = None
+        """The daemon's cell as it is configured; None until connected."""
         self.own_id: int | None = None
         """The daemon's number of this connection, by which the lease names it."""
         self.guard: Callable[[Verb[object]], AbstractContextManager[object]] = nullcontext
@@ -119,9 +120,13 @@ class Client:
         except StationError:
             await self.close()
             raise
-        self.root, self.camera, self.own_id = Path(hello.root), hello.camera, hello.client_id
-        self.max_age_days = hello.max_age_days
+        self.root, self.config, self.own_id = Path(hello.root), hello.config, hello.client_id
         return self
+
+    @property
+    def camera(self) -> str:
+        """Name of the daemon's camera, under which its calibrations are installed."""
+        return MAIN_CAMERA if self.config is None else self.config.camera.name
 
     @property
     def connected(self) -> bool:

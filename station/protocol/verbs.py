@@ -13,7 +13,6 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 import msgspec
 
-from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, Vector6
 from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
@@ -89,10 +88,8 @@ class Welcome(msgspec.Struct, frozen=True):
     """Number of this connection, by which the lease names it."""
     root: str
     """Folder of sessions and installed calibrations."""
-    camera: str = MAIN_CAMERA
-    """Name of the daemon's camera, under which its calibrations are installed."""
-    max_age_days: float | None = None
-    """Largest age of the last proof of a calibration in this cell; None: no limit."""
+    config: StationConfig
+    """The cell as it is configured."""
 
 
 class LoadedPlan(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -315,12 +312,6 @@ class Observe(Verb[Observation], frozen=True):
 
 class Doctor(Verb[list[Check]], frozen=True):
     """Run the preflight check."""
-
-    control = False
-
-
-class Configuration(Verb[StationConfig], frozen=True):
-    """Return the cell as it is configured."""
 
     control = False
 

@@ -124,8 +124,6 @@ class SessionDispatcher:
                 return await session.previews.observe(verb.tag)
             case verbs.Doctor():
                 return await checklist(context, session.devices.troubles)
-            case verbs.Configuration():
-                return context.cell.config
         return None
 
     async def _welcome(self, caller: Peer, who: str) -> verbs.Welcome:
@@ -133,12 +131,7 @@ class SessionDispatcher:
         said = "".join(c for c in who if c.isprintable())[:_WHO_LIMIT] or user
         caller.told = said if said.split(" ")[0] == user else f"{user} ({said})"
         context = self._session.context
-        return verbs.Welcome(
-            caller.client_id,
-            str(context.root),
-            context.cell.config.camera.name,
-            context.cell.config.validity.max_age_days,
-        )
+        return verbs.Welcome(caller.client_id, str(context.root), context.cell.config)
 
     def _plan_facts(self) -> verbs.PlanFacts:
         queue = self._session.context.require_queue()

@@ -168,8 +168,7 @@ def _unusable(sighting: BoardDetection) -> PoseFailedError | None:
 class ImageWatch:
     """Measures image motion between three images while the arm settles, again as long as something moves.
 
-    Runs within a `with` block; `look` is for `StillnessMonitor.settle`. If the camera cannot take such images
-    (playback), or fails, the motion is not measured.
+    Runs within a `with` block; `look` is for `StillnessMonitor.settle`. Not measured if the camera fails.
     """
 
     def __init__(self, context: SessionContext, index: int) -> None:
@@ -219,15 +218,17 @@ class ImageWatch:
         self._blind = True
 
     async def _measure(self) -> tuple[int, float] | None:
-        """Return the time before three images, and the motion in them; None when the camera cannot."""
+        """Return the time before three images, and the motion in them; None: nobody waits any more."""
         begun_ns, images = time.monotonic_ns(), list[Pixels]()
         for gap_s in GAPS_S:
             await asyncio.sleep(gap_s)
             try:
                 image = await self._context.cell.camera.glimpse()
             except CameraError:  # one lost frame is no reason to look no more
-                image = None if self._ended else await self._context.cell.camera.glimpse()
-            if image is None or self._ended:
+                if self._ended:
+                    return None
+                image = await self._context.cell.camera.glimpse()
+            if self._ended:
                 return None
             images.append(viewable(image.pixels, image.pixel_format))
         motion_px = await self._context.workers.call(

@@ -10,7 +10,7 @@ from calibrate.errors import CalibrationError
 from calibrate.files.loader import load_installed
 from calibrate.files.validity import ValidityState, validity_text
 from recordings.plain_text import bytes_text
-from station.cell.errors import CameraError, RobotError
+from station.cell.errors import CameraError, RobotError, TriggerError
 from station.cell.process import GRANT_REAL_TIME, in_real_time
 from station.cell.status import StationState
 from station.devices.discovery import USB3_MBIT_S, FoundCamera, UsbCamera, discover, discover_usb
@@ -87,14 +87,9 @@ async def _camera_check(context: SessionContext, troubles: dict[str, str]) -> Ch
     camera = context.cell.camera
     try:
         async with asyncio.timeout(6.0):
-            image = await camera.preview()
-            if image is None:
-                await camera.settings()  # raises where the camera is gone
-    except (CameraError, TimeoutError) as error:
+            await camera.glimpse()
+    except (CameraError, TriggerError, TimeoutError) as error:
         return Check("camera", "failed", str(error) or "no answer", "check cable and power of the camera")
-    if image is None:
-        remedy = "check its cable and power, then take one by hand (F3, F2 on the screen)"
-        return Check("camera", "warning", f"{camera.identity.model}: no image", remedy)
     return Check("camera", "ok", f"{camera.identity.model} {camera.identity.serial}")
 
 

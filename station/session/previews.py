@@ -14,7 +14,7 @@ from recordings.schema.messages import BoardSpec, Image
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, preview_image, sight
 from station.cell.config import matrix4
-from station.cell.errors import CameraError, RefusedError
+from station.cell.errors import RefusedError, StationError
 from station.cell.layout import flange_pose
 from station.cell.status import StationState
 from station.cell.stillness import NotStillError
@@ -25,6 +25,7 @@ from station.session.context import SessionContext
 PREVIEW_PERIOD_S = 0.2
 SIDES = (16, 1024)
 _OBSERVE_S = 5.0
+_TAKING = (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING)
 
 
 class Previewer:
@@ -88,13 +89,11 @@ class Previewer:
     async def _take(self) -> None:
         context = self._context
         self._taken_s = time.monotonic()
-        if context.store.state is StationState.CAPTURING or context.workers.waiting:
+        if context.store.state in _TAKING or context.workers.waiting:
             return  # camera or worker are needed by the capture
         try:
-            image = await context.cell.camera.preview()
-        except CameraError:
-            image = None
-        if image is None:
+            image = await context.cell.camera.glimpse()
+        except StationError:
             return
         config = context.cell.config
         try:
@@ -107,7 +106,7 @@ class Previewer:
             sighting = None
         self._picture, self._sighting = image, sighting
         self._count += 1
-        if sighting is not None and context.store.state is not StationState.WRITING:
+        if sighting is not None and context.store.state not in _TAKING:
             context.store.update(detection=sighting.status)
 
 

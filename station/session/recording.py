@@ -169,7 +169,7 @@ class SessionRecording:
             | ({"robot stops": stops} if (stops := self._cell.acceptance_trouble(self._root)) else {}),
         )
         path = segment_path(self.folder, self.segment)
-        recorder = Recorder(path, info, lossless_png=config.capture.lossless_png)
+        recorder = Recorder(path, info)
         try:
             enter_part(self.folder, info.name, info.part, path.name)
         except RecordingError:

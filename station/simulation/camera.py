@@ -15,9 +15,9 @@ from recordings.schema.messages import CameraIdentity, ClockReading, Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.cell.status import CameraCounts, FrameTiming
-from station.devices.base import DeviceThread, Trigger
-from station.devices.frame_ids import FrameIds
+from station.devices.base import DeviceThread
 from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
+from station.devices.serial_trigger import SerialTrigger
 from station.simulation.launch import ChildProcess
 from station.simulation.truth import CellTruth
 
@@ -34,7 +34,7 @@ class RenderedCamera:
         truth: CellTruth,
         controller_host: str,
         config: CameraConfig | None = None,
-        trigger: Trigger | None = None,
+        trigger: SerialTrigger | None = None,
     ) -> None:
         """`trigger`: the box that fires it, whose pulses reach `pulse`; None: triggered by software."""
         self._truth = truth
@@ -48,7 +48,7 @@ class RenderedCamera:
         self._frames: asyncio.Queue[Image | BaseException] = asyncio.Queue()
         self._asking = asyncio.Lock()
         self._clock = FrameClock()
-        self.counter = FrameCounter(FrameIds.BLOCK)
+        self.counter = FrameCounter()
 
     @property
     def identity(self) -> CameraIdentity:
@@ -123,16 +123,10 @@ class RenderedCamera:
             "gain_db": self._gain_db,
         }
 
-    async def glimpse(self) -> Image | None:
+    async def glimpse(self) -> Image:
         """Render a new image at half the size."""
         async with self._asking:
             return _dated(await self._call("preview"))
-
-    async def preview(self) -> Image | None:
-        try:
-            return await self.glimpse()
-        except CameraError:
-            return None
 
     async def inject(self, fault: str, value: object = None) -> None:
         """Inject a fault of `CameraFaults`."""

@@ -11,8 +11,9 @@ import msgspec
 
 from recordings.schema.messages import Mount
 from station.cell.config import StationConfig, TriggerConfig
-from station.devices.base import Camera, Trigger
+from station.devices.base import Camera
 from station.devices.cell import Cell
+from station.devices.serial_trigger import SerialTrigger
 from station.simulation.cells import make_cell
 from station.simulation.launch import start_controller
 from station.simulation.truth import CellTruth, NoiseLevel, SceneName, write_truth
@@ -51,10 +52,9 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
     with ExitStack() as ends:
         host, attachments = start_cell(truth, folder, ends, options.time_scale)
         config = cell_config(truth, host)
-        trigger: Trigger | None = None
+        trigger: SerialTrigger | None = None
         changes: dict[str, object] = {}
         if options.hardware_trigger:
-            from station.devices.serial_trigger import SerialTrigger
             from station.simulation.trigger import SimulatedTriggerBox
 
             box = ends.enter_context(SimulatedTriggerBox())
@@ -105,7 +105,7 @@ def _camera(
     config: StationConfig,
     truth: CellTruth,
     folder: Path,
-    trigger: Trigger | None,
+    trigger: SerialTrigger | None,
     ends: ExitStack,
 ) -> tuple[Camera, Callable[[], None]]:
     """Make the camera, and the function that an edge on its trigger line calls."""

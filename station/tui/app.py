@@ -138,14 +138,13 @@ class StationApp(KnowingApp):
             self.result_path = ""  # another session begins: what was looked at is no part of it
         if not self._greeted:
             self._greeted = True
+            self.known = replace(self.known, configuration=self.desk.client.config)
             self.greet()
 
     @work(exit_on_error=False)
     async def greet(self) -> None:
-        """Learn the cell, if the daemon tells it; show what is missing to who starts for the first time."""
+        """Show what is missing to who starts for the first time."""
         status = self.known.shown
-        with contextlib.suppress(OSError, StationError):
-            self.known = replace(self.known, configuration=await self.desk.client.call(verbs.Configuration()))
         if status.playback:
             return
         missing, root = status.state is StationState.DISCONNECTED, self.desk.client.root

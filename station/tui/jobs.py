@@ -69,7 +69,8 @@ async def install_result(desk: Desk, result: Result, calibration: Calibration) -
     if not await desk.question(Confirm("Install this calibration?", body, yes="Install")):
         return
     cell: Cell = "simulated" if desk.known.live is not None and desk.known.live.simulated else "real"
-    oldest = desk.client.max_age_days
+    config = desk.client.config
+    oldest = None if config is None else config.validity.max_age_days
     put = partial(install, Path(result.path), state_root(result.path), cell=cell, max_age_days=oldest)
     try:
         try:

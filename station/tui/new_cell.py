@@ -148,8 +148,6 @@ class NewCell(ThemedApp[Ending]):
         assert self.setup.camera is not None
         begun_s, step = time.monotonic(), self.step
         image = await self.setup.camera.glimpse()
-        if image is None:
-            return
         counted = self.setup.counts
         found = await asyncio.to_thread(self.setup.look, begun_s, image, step)
         line = self.query_one("#typed", Input)

@@ -196,7 +196,6 @@ class CameraInMemory:
         self.fail: list[str] = []
         self.taken = 0
         self.jumps = 0
-        self.blind = False
         self.glimpses = 0
         self.glimpse_fails: list[str] = []
 
@@ -223,18 +222,13 @@ class CameraInMemory:
     async def settings(self) -> dict[str, object]:
         return {"exposure_us": 1000.0}
 
-    async def glimpse(self) -> Image | None:
+    async def glimpse(self) -> Image:
         """A small picture that jumps by `jumps` rows between two looks."""
         self.glimpses += 1
-        if self.blind:
-            return None
         if self.glimpse_fails:
             raise CameraError(reason=self.glimpse_fails.pop(0))
         image = np.roll(GLIMPSED, self.jumps * (self.glimpses % 2), axis=0)
         return Image(image, Stamps(), 0, 0)
-
-    async def preview(self) -> Image | None:
-        return await self.capture()
 
     async def close(self) -> None:
         return None

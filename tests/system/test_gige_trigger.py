@@ -9,7 +9,7 @@ import pytest
 from recordings.reader import open_recording
 from station.cli.attended import attended
 from station.cli.demo import simulated_daemon
-from station.devices.frame_ids import frames_between
+from station.devices.frames import frames_between
 from station.protocol.verbs import LoadPlan, Purpose
 from station.simulation.cells import cell_config, make_cell
 from tests.station.quick_plan import quick_plan

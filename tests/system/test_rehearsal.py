@@ -25,7 +25,7 @@ from station.cli.daemon import own_daemon
 from station.operate.motion import wait_until_idle
 from station.operate.new_cell import write_config
 from station.protocol.client import Client
-from station.protocol.verbs import Configuration, GetPlan, MakePlan, Purpose
+from station.protocol.verbs import GetPlan, MakePlan, Purpose
 from station.simulation.cells import make_cell
 from station.simulation.truth import read_truth
 from tests.command_line import call
@@ -82,7 +82,7 @@ async def test_nothing_of_the_configuration_is_connected_to(
         async with Client(control) as client:
             status = await wait_until_idle(client)
             assert status.simulated and status.state is StationState.IDLE
-            assert (await client.call(Configuration())).robot.host not in (ROBOT, "")
+            assert client.config is not None and client.config.robot.host not in (ROBOT, "")
             assert status.robot.speed_limit_m_s == 0.2
             await client.call(MakePlan(4, 0), timeout_s=60.0)
             assert len((await client.call(GetPlan())).plan.poses) == 4

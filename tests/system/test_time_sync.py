@@ -70,7 +70,7 @@ async def test_the_pose_at_mid_exposure_is_right_while_the_arm_moves(
         await camera.open()
         end_s = asyncio.get_running_loop().time() + _UNTIL_CLOCKS_ARE_KNOWN_S
         while asyncio.get_running_loop().time() < end_s:
-            await camera.preview()
+            await camera.glimpse()
             await camera.capture()
         with AdminClient(host) as admin:
             rows = [await one(robot, camera, admin, truth) for _ in range(PICTURES)]

@@ -32,7 +32,7 @@ from station.cell.status import (
     StationStatus,
 )
 from station.protocol.client import Client
-from station.protocol.verbs import VERBS, Configuration, Done, Preview, PreviewImage, Verb, Watch
+from station.protocol.verbs import VERBS, Done, Preview, PreviewImage, Verb, Watch
 from station.simulation.placement import cell_description
 from station.tui.app import StationApp
 from tests.patience import PATIENCE_S
@@ -74,10 +74,10 @@ class FakeLink(Client):
 
     def __init__(self) -> None:
         super().__init__(Path("/nowhere/control.sock"))
-        self.own_id, self.root = 7, Path("/nowhere")
+        self.own_id, self.root, self.config = 7, Path("/nowhere"), CELL
         self.asked: list[Verb[Any]] = []
         self.refuse: dict[str, Exception] = {}
-        self.answers: dict[str, Any] = {"prepare": SUMMARY, "preview": _image(), "configuration": CELL}
+        self.answers: dict[str, Any] = {"prepare": SUMMARY, "preview": _image()}
         self.silent = asyncio.Event()
         """While set nothing is answered, as by a daemon that hangs."""
         self.same_image, self._images = False, 0
@@ -100,7 +100,7 @@ class FakeLink(Client):
 
     @property
     def verbs(self) -> list[str]:
-        return [verb.verb() for verb in self.asked if not isinstance(verb, (Configuration, Preview, Watch))]
+        return [verb.verb() for verb in self.asked if not isinstance(verb, (Preview, Watch))]
 
     async def request(self, verb: str, *, timeout_s: float = 0.0, **args: object) -> object:
         self.asked.append(msgspec.convert(args, VERBS[verb]))

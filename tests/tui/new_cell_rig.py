@@ -20,7 +20,7 @@ class RenderedReader:
         self.exposure_us = 10_000.0
         self.camera = RenderedCamera(truth, host, CameraConfig(exposure_us=self.exposure_us))
 
-    async def glimpse(self) -> Image | None:
+    async def glimpse(self) -> Image:
         return await self.camera.capture()
 
     async def expose(self, exposure_us: float) -> None:

@@ -33,7 +33,7 @@ def calibration(tmp_path: Path, daemon: Daemon) -> Path:
 
 async def begin(pilot: Pilot[None], link: FakeLink, calibration: Path, daemon: Daemon) -> None:
     """On the result screen, `h`."""
-    link.answers |= {"observe": daemon.observation, "configuration": daemon.configuration}
+    link.answers["observe"], link.config = daemon.observation, daemon.config
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
     pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
     await pilot.press("4")

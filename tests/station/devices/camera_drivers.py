@@ -18,7 +18,7 @@ from recordings.schema.messages import CameraModel, Image
 from station.cell.config import CameraConfig, TriggerConfig
 from station.devices import webcam
 from station.devices.aravis import AravisCamera
-from station.devices.base import Camera, Trigger
+from station.devices.base import Camera
 from station.devices.playback import PlaybackCamera, PlaybackRobot
 from station.devices.serial_trigger import SerialTrigger
 from station.devices.webcam import WebcamCamera
@@ -40,7 +40,7 @@ class Driver:
     """One driver and what stands behind it."""
 
     camera: Camera
-    trigger: Trigger | None = None
+    trigger: SerialTrigger | None = None
     """Opened before the camera, closed after it"""
     silence: Callable[[], AbstractAsyncContextManager[object]] | None = None
     """While it lasts the camera sends nothing; None: this one cannot be late"""

@@ -14,8 +14,7 @@ import pytest
 from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
-from station.devices.frame_ids import frames_between
-from station.devices.frames import TriggerPulse
+from station.devices.frames import TriggerPulse, frames_between
 from station.simulation.launch import SimulatedGige
 from tests.codes import raises
 from tests.numbered_gige import numbered_picture, start_numbered

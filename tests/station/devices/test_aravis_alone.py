@@ -15,7 +15,6 @@ from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import GenicamDevice
 from station.devices.frame_time import DeviceClock
-from station.devices.frames import TriggerPulse
 from station.devices.genicam_settings import Applied, apply_settings, require_settings
 from tests.codes import raises
 
@@ -91,25 +90,10 @@ class Device:
     def close(self) -> None: ...
 
 
-class Box:
-    fired = 0
-
-    async def fire(self) -> TriggerPulse:
-        self.fired += 1
-        return TriggerPulse(self.fired, 0)
-
-
-def opened(device: Device, config: CameraConfig, trigger: Any = None) -> AravisCamera:
-    camera: Any = AravisCamera(config, trigger)
+def opened(device: Device, config: CameraConfig) -> AravisCamera:
+    camera: Any = AravisCamera(config)
     camera._device = device
     return camera  # type: ignore[no-any-return]
-
-
-async def test_a_preview_fires_no_trigger_box() -> None:
-    box = Box()
-    camera = opened(Device(), CameraConfig(trigger="hardware"), box)
-    assert await camera.preview() is None and box.fired == 0
-    await camera.close()
 
 
 async def test_a_frame_that_nobody_asked_for_costs_the_pose_not_the_next() -> None:

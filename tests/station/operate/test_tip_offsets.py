@@ -20,7 +20,7 @@ from station.cell.config import PointerConfig, matrix4
 from station.cell.errors import RefusedError
 from station.cell.status import RobotStatus, StationStatus
 from station.operate.tip_offsets import SeenBoard, read_touch, see_board
-from station.protocol.verbs import Configuration, Observation, Observe
+from station.protocol.verbs import Observation, Observe
 from station.simulation.cells import cell_config, make_cell
 from tests.codes import raises
 from tests.recordings.small_recording import make_state
@@ -61,13 +61,13 @@ class Daemon:
             pixels=tuple((float(u), float(v)) for u, v in view.pixels),
         )
         self.observation = msgspec.structs.replace(self.observation, **changes)
-        self.configuration = msgspec.structs.replace(
+        self.config = msgspec.structs.replace(
             cell_config(self.truth), pointer=PointerConfig(TIP), board=self.truth.board
         )
 
     async def call(self, verb: Any, *, timeout_s: float = 0.0) -> Any:
-        assert isinstance(verb, (Observe, Configuration))
-        return self.observation if isinstance(verb, Observe) else self.configuration
+        assert isinstance(verb, Observe)
+        return self.observation
 
     async def seen(self, folder: Path) -> SeenBoard:
         write_calibration(self.calibration, folder / "c.yaml")
@@ -102,7 +102,7 @@ async def test_the_pointer_is_the_configured_one_else_the_pendants(
 ) -> None:
     daemon = Daemon()
     if not configured:
-        daemon.configuration = msgspec.structs.replace(daemon.configuration, pointer=None)
+        daemon.config = msgspec.structs.replace(daemon.config, pointer=None)
     board = await daemon.seen(tmp_path)
     corner = board_points(daemon.truth.board)[CORNER]
     touch = read_touch(board, CORNER, daemon.touching(corner, tip))
@@ -135,7 +135,7 @@ async def test_what_is_not_known_is_refused(tmp_path: Path) -> None:
         with raises("no-robot-state"):
             read_touch(board, CORNER, status)
     bare = Daemon(tcp_offset=(0.0,) * 6)
-    bare.configuration = msgspec.structs.replace(bare.configuration, pointer=None)
+    bare.config = msgspec.structs.replace(bare.config, pointer=None)
     with raises("no-pointer"):
         await bare.seen(tmp_path)
 

@@ -26,6 +26,12 @@ from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer
 from station.server.dispatch import SessionDispatcher
 from tests.patience import PATIENCE_S, until
 
+CELL = {
+    "robot": {},
+    "camera": {},
+    "board": {"kind": "chessboard", "columns": 7, "rows": 6, "square_m": 0.025},
+}
+
 
 class RecordingHandler(SessionDispatcher):
     """Remembers what arrived; `slow` answers when told to."""
@@ -47,7 +53,7 @@ class RecordingHandler(SessionDispatcher):
         if verb == "skip":
             return {"index": msgspec.json.decode(args)["index"]}
         self.order.append(verb)
-        return {"pid": peer.pid, "client_id": peer.client_id, "root": "/"}
+        return {"pid": peer.pid, "client_id": peer.client_id, "root": "/", "config": CELL}
 
     def gone(self, peer: Peer) -> None:
         self.lost.append(peer.client_id)

@@ -74,7 +74,7 @@ async def test_control_that_nobody_has_goes_to_the_first_that_needs_it(rig: Rig,
     for verb, code in (("go", "no-control"), ("record", "wrong-state"), ("retake", "wrong-arguments")):
         with raises(code):  # an approval of another's motion, nothing that could be done, no request
             await dispatcher.handle(BERT, verb, NONE if verb == "retake" else arguments(verb, small_plan))
-    await dispatcher.handle(BERT, "configuration", NONE)
+    await dispatcher.handle(BERT, "plan", NONE)
     assert store.status.lease.client_id is None
     await dispatcher.handle(BERT, "skip", arguments("skip", small_plan))
     assert store.status.lease.client_id == BERT.client_id

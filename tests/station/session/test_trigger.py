@@ -55,7 +55,7 @@ async def test_17_a_camera_that_loses_the_first_frame_after_a_pause_is_woken(
         await asyncio.sleep(0.3)
         raise CameraError()
 
-    async def dozing_glimpse() -> Image | None:
+    async def dozing_glimpse() -> Image:
         if not triggered():
             raise CameraError()
         return await glimpse()

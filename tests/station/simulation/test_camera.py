@@ -86,11 +86,11 @@ async def test_frames_are_numbered_over_the_wrap_and_stamped_by_the_cameras_own_
     assert abs(middle_ns - true_middle_ns) / 1e9 < bound_s < 0.02
 
 
-async def test_preview_is_smaller_and_never_counts_as_a_frame_and_unknown_faults_are_refused(
+async def test_a_glimpse_is_smaller_and_never_counts_as_a_frame_and_unknown_faults_are_refused(
     camera: RenderedCamera,
 ) -> None:
-    preview = await camera.preview()
-    assert preview is not None and preview.pixels.shape == (512, 640)
+    glimpse = await camera.glimpse()
+    assert glimpse.pixels.shape == (512, 640)
     with raises("camera-refused"):
         await camera.inject("gremlins")
     assert (await camera.capture()).sequence == 0
@@ -117,9 +117,9 @@ async def test_without_a_controller_the_camera_says_so(cell: CellTruth) -> None:
     rendered = RenderedCamera(cell, "127.254.253.252")
     await rendered.open()
     try:
-        with raises("camera-refused"):
-            await rendered.capture()
-        assert await rendered.preview() is None
+        for look in (rendered.capture, rendered.glimpse):
+            with raises("camera-refused"):
+                await look()
     finally:
         await rendered.close()
 
@@ -147,7 +147,7 @@ async def test_while_it_starts_nothing_is_said_of_its_clock(
     opening = asyncio.create_task(rendered.open())
     while not while_starting:
         await asyncio.sleep(0.001)
-    await rendered.preview()
+    await rendered.glimpse()
     assert while_starting[0] is None
     assert rendered.timing is not None and rendered.timing.source == "latched"
     await opening

@@ -253,3 +253,22 @@ def inverse_left_jacobian(v: Array) -> Any:
     c = np.where(half < 5e-5, 1 / 12, (1 - half / np.tan(half)) / (4 * half * half))
     S = skew(v)
     return np.eye(3) - S / 2 + c * (S @ S)
+
+
+def rotation_from_rpy(angles: ArrayLike) -> Any:
+    """Convert roll, pitch, yaw (3,) about fixed axes, radians, to R (3, 3) = Rz Ry Rx, as URDF does."""
+    x, y, z = rotation_exp(np.diag(np.asarray(angles, float)))
+    return z @ y @ x
+
+
+def roll_pitch_yaw(R: Array) -> tuple[float, float, float]:
+    """Convert R (3, 3) to roll, pitch, yaw about fixed axes, radians: the inverse of `rotation_from_rpy`.
+
+    Yaw is computed after the roll, Rz(yaw) Ry(pitch) = R Rx(roll)ᵀ. So the three stay accurate together near
+    a pitch of 90°, where SciPy's lose half the digits and where a camera that looks along the flange is.
+    """
+    roll = np.arctan2(R[2, 1], R[2, 2])
+    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
+    across = R[:, 1] * np.cos(roll) - R[:, 2] * np.sin(roll)
+    yaw = np.arctan2(-across[0], across[1])
+    return float(roll), float(pitch), float(yaw)

@@ -13,7 +13,7 @@ import numpy as np
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, MirroredImagesError, SquaresCountedError, TooFewViewsError
-from calibrate.geometry import pose, rotation_exp
+from calibrate.geometry import pose, rotation_from_rpy
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.kinematics import MODELS, RobotModel, table_of_axes
 from calibrate.results import RejectedView
@@ -132,9 +132,7 @@ def arm_of_ros(content: bytes, robot: str) -> RobotModel:
         links = strict_yaml.load_plain(content)["kinematics"]
         for link in _LINKS:
             *origin, roll, pitch, yaw = (float(links[link][name]) for name in _ORIGIN)
-            turns = zip((yaw, pitch, roll), np.eye(3)[::-1], strict=True)
-            z, y, x = (rotation_exp(angle * axis) for angle, axis in turns)
-            chain.append(chain[-1] @ pose(z @ y @ x, origin))
+            chain.append(chain[-1] @ pose(rotation_from_rpy([roll, pitch, yaw]), origin))
     except (KeyError, TypeError) as problem:
         raise ValueError(f"not as ur_calibration writes it: {problem!r}") from None
     frames = np.array(chain)

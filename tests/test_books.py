@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from calibrate.files.calibration import read_calibration, write_calibration
+from tests.calibrate.files.test_driver_frames import DRIVERS, as_echo
 from tests.calibrate.sessions import Scene, shifted, write_session
 from tests.command_line import call
 from tests.test_examples import PROGRAMS, commands_in, parse
@@ -39,6 +40,7 @@ def prepare(folder: Path) -> None:
     run("recordings export session.mcap --to folder -o FOLDER")
     run("station doctor --example > station.yaml")
     run("station plan --config station.yaml -o plan.yaml")
+    (folder / "driver.yaml").write_text(as_echo(DRIVERS["realsense d435"][2]))
     joints = [pose["joints_rad"] for pose in yaml.safe_load((folder / "plan.yaml").read_text())["poses"]]
     rows = [",".join(map(str, pose)) for pose in joints]
     (folder / "poses.csv").write_text("\n".join([",".join(f"j{i}_rad" for i in range(1, 7)), *rows]) + "\n")

@@ -18,6 +18,7 @@ from calibrate.files import exports
 from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, read_calibration, write_output
 from calibrate.files.exports import FORMATS, FrameNames
+from calibrate.files.exports.drivers import fixed_frames
 from calibrate.files.folders import cameras, current_validity, readable_folder
 from calibrate.files.formatting import override_text, pose_text, summary, verdict_text
 from calibrate.files.proof import read_bounded
@@ -62,15 +63,31 @@ def export(
     to: Annotated[FormatName, typer.Option("--to", help=_FORMATS_HELP)],
     file: Named = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Default: stdout")] = None,
-    base: Annotated[str, typer.Option(help="Name of the robot's base there")] = FrameNames.base,
-    flange: Annotated[str, typer.Option(help="Name of its flange")] = FrameNames.flange,
+    base: Annotated[
+        str, typer.Option(help="Name of the robot's base there; base_link is turned")
+    ] = FrameNames.base,
+    flange: Annotated[
+        str, typer.Option(help="Name of its flange there; flange is turned")
+    ] = FrameNames.flange,
     frame: Annotated[
-        str, typer.Option("--camera", help="Name of the camera's optical frame (default: NAME_optical_frame)")
+        str,
+        typer.Option(
+            "--camera", help="Name of the camera's optical frame (default: NAME_calibrated_optical_frame)"
+        ),
     ] = "",
-    body: Annotated[str, typer.Option(help="Name of its body frame (default: NAME_link)")] = "",
+    body: Annotated[str, typer.Option(help="Name of its body frame (default: NAME_calibrated_link)")] = "",
     camera: Annotated[
         str, typer.Option("--of", help="Name of the camera, in a cell with several")
     ] = MAIN_CAMERA,
+    attach: Annotated[
+        str, typer.Option(help="Place the camera driver's own topmost frame, e.g. camera_link")
+    ] = "",
+    driver_tf: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="The driver's static transforms: bag, URDF, launch file or `ros2 topic echo /tf_static`"
+        ),
+    ] = None,
     arm: Annotated[
         Path | None, typer.Option("--arm", help="urdf: your arm's URDF, to be written as the corrected arm")
     ] = None,
@@ -82,7 +99,15 @@ def export(
     """
     calibration, validity = named_or_installed(file, root, camera)
     names = FrameNames.of_camera(camera if file is None else calibration.camera_name)
-    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity)
+    frames = FrameNames(
+        base,
+        flange,
+        frame or names.camera,
+        body or names.body,
+        validity,
+        attach,
+        fixed_frames(driver_tf or []),
+    )
     given = None if arm is None else read_bounded(arm)
     content = exports.export(calibration, str(to.value), frames, given)
     if validity is not None and validity.state is not ValidityState.VALID:

@@ -19,7 +19,7 @@ from calibrate.errors import UsageError
 from calibrate.files.calibration import write_calibration, write_output
 from calibrate.files.formatting import summary
 from calibrate.files.install import install_line
-from calibrate.geometry import rotation_log
+from calibrate.geometry import roll_pitch_yaw
 from calibrate.handeye.solution import camera_frames
 from calibrate.job import JobOptions, SolvedRecording
 from calibrate.pipeline import prepare_views, solve_recording, solver_options
@@ -140,12 +140,12 @@ def _peer_cells(peer: PeerResult) -> tuple[str, ...]:
 
 
 def _table_of_X(results: list[PeerResult]) -> Table:
-    """Translation, and rotation as axis times angle."""
-    table = Table("method", "x mm", "y mm", "z mm", "rx °", "ry °", "rz °", box=None)
+    """Translation, and rotation about fixed axes, as `show` writes them."""
+    table = Table("method", "x mm", "y mm", "z mm", "roll °", "pitch °", "yaw °", box=None)
     for peer in results:
         if peer.matrix is None:
             table.add_row(peer.name, "-")
             continue
-        turn = [f"{v:.4f}" for v in np.degrees(rotation_log(peer.matrix[:3, :3]))] if peer.rigid else ["-"]
+        turn = [f"{v:.4f}" for v in np.degrees(roll_pitch_yaw(peer.matrix[:3, :3]))] if peer.rigid else ["-"]
         table.add_row(peer.name, *(f"{1e3 * v:.3f}" for v in peer.matrix[:3, 3]), *turn)
     return table

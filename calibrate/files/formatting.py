@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
-from scipy.spatial.transform import Rotation
 
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override, source_stamp
 from calibrate.files.touch import Touch, agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
+from calibrate.geometry import roll_pitch_yaw
 from calibrate.results import BoardShape
 
 
@@ -94,7 +95,7 @@ def override_text(override: Override) -> str:
 def pose_text(calibration: Calibration) -> str:
     """Write the position in mm, then roll, pitch, yaw about fixed axes in degrees."""
     x, y, z = (v * 1000 for v in calibration.result.translation_m)
-    roll, pitch, yaw = Rotation.from_quat(calibration.result.rotation_xyzw).as_euler("xyz", degrees=True)
+    roll, pitch, yaw = np.degrees(roll_pitch_yaw(calibration.transform.rotation))
     return f"{x:.3f}  {y:.3f}  {z:.3f} mm,  roll {roll:.4f}°  pitch {pitch:.4f}°  yaw {yaw:.4f}°"
 
 

@@ -46,8 +46,11 @@ def urdf(path, points, parent):
     )
     robot = urdf_parser_py.urdf.URDF.from_xml_string(path.read_text())
     assert robot.get_root() == parent
-    assert robot.get_chain(parent, "camera_optical_frame", links=False)[0] == "camera_link_joint"
-    found = yourdfpy.URDF.load(str(path)).get_transform("camera_optical_frame", parent)
+    assert (
+        robot.get_chain(parent, "camera_calibrated_optical_frame", links=False)[0]
+        == "camera_calibrated_link_joint"
+    )
+    found = yourdfpy.URDF.load(str(path)).get_transform("camera_calibrated_optical_frame", parent)
     return {"camera": into_camera(points, found[:3, :3], found[:3, 3])}
 
 
@@ -74,7 +77,7 @@ def ros_camera_info(path, points, parent):
 
 def static_transform(words, points, parent):
     said = {name.removeprefix("--"): value for name, value in zip(words[::2], words[1::2], strict=True)}
-    assert (said["frame-id"], said["child-frame-id"]) == (parent, "camera_optical_frame")
+    assert (said["frame-id"], said["child-frame-id"]) == (parent, "camera_calibrated_optical_frame")
     R = Rotation.from_quat([float(said[f"q{axis}"]) for axis in "xyzw"]).as_matrix()
     return {"camera": into_camera(points, R, [float(said[axis]) for axis in "xyz"])}
 
@@ -85,12 +88,12 @@ def ros_launch(path, points, parent):
 
 
 def halcon(path, points, parent):
-    """read_pose: f 2 is 'Rp+T', 'abg', 'point': R = Rz Ry Rx, degrees and metres; points into the camera."""
+    """read_pose: f 0 is 'Rp+T', 'gba', 'point': R = Rx Ry Rz, degrees and metres; points into the camera."""
     read = {
         line[0]: line[1:].split() for line in path.read_text().splitlines() if line[:1] in ("f", "r", "t")
     }
-    assert read["f"] == ["2"]
-    R = Rotation.from_euler("xyz", [float(v) for v in read["r"]], degrees=True)
+    assert read["f"] == ["0"]
+    R = Rotation.from_euler("XYZ", [float(v) for v in read["r"]], degrees=True)
     return {"camera": R.apply(points) + [float(v) for v in read["t"]]}
 
 

@@ -98,4 +98,7 @@ def test_a_urdf_of_a_learned_arm_is_the_corrected_arm_with_its_camera(
     flange = np.array([arm.base_from_flange(row).matrix for row in q])
     assert np.abs(chained(library, path, "world", "tool0", postures) - flange).max() < 1e-9
     camera = flange @ X if mount == "eye-in-hand" else np.broadcast_to(X, flange.shape)
-    assert np.abs(chained(library, path, "world", "camera_optical_frame", postures) - camera).max() < 1e-9
+    assert (
+        np.abs(chained(library, path, "world", "camera_calibrated_optical_frame", postures) - camera).max()
+        < 1e-9
+    )

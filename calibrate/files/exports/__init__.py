@@ -45,6 +45,8 @@ def export(
     if frames.validity is not None:
         anyway = "a calibration file that is named is exported all the same"
         require_usable(frames.validity, "The installed calibration", anyway)
+    if frames.attach and name not in ("ros-launch", "urdf"):
+        raise ExportError("attach-of", format=name)
     if arm is not None:
         if name != "urdf":
             raise ExportError("arm-of-urdf")

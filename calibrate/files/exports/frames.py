@@ -1,9 +1,9 @@
-"""Names of the frames in exported files, the comment in every export, and roll, pitch, yaw."""
+"""Frames in exported files: their names, where they stand, and the comment in every export."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,21 @@ import yaml
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, source_stamp
 from calibrate.files.validity import Validity, validity_text
-from calibrate.geometry import Array, pose
+from calibrate.geometry import Array, inverse, pose
+from calibrate.kinematics import MODELS
 from recordings.files import MAIN_CAMERA
+from recordings.importers.frames import FrameTree
 
 BODY_FROM_OPTICAL: Array = pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """REP-103: a body frame looks along x with z up, an optical frame along z with y down."""
+_TURNED = {
+    "base_link": ("base", pose(np.diag([-1, -1, 1]), [0, 0, 0])),
+    "flange": ("tool0", pose([[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0, 0, 0])),
+}
+"""Frames of ROS that are not the controller's → (the one that is, how it stands in them on a UR).
+
+Of ur_description. Other makers turn them otherwise.
+"""
 
 
 class ExportError(CalibrationError):
@@ -28,32 +38,80 @@ class ExportError(CalibrationError):
 
 @dataclass(frozen=True)
 class FrameNames:
-    """Names of the frames in an exported file.
+    """Names of the frames in an exported file, and what is known of where they stand.
 
-    Defaults of the UR ROS driver: its `base` is the controller's (base_link is turned by 180°), and its
-    `tool0` is the controller's flange (its `flange` is turned).
+    As ROS names them, `base` and `tool0` are the controller's own frames, and any other name is taken for
+    theirs. But `base_link` and `flange` (perhaps with a prefix) are turned against them: known of a UR, else
+    by `fixed`. No camera driver uses the default names of the camera's frames, so none gets two parents.
     """
 
     base: str = "base"
     flange: str = "tool0"
-    camera: str = "camera_optical_frame"
-    body: str = "camera_link"
+    camera: str = "camera_calibrated_optical_frame"
+    body: str = "camera_calibrated_link"
     validity: Validity | None = None
     """Validity of the installed calibration, for the comment; None: the export is of a file."""
+    attach: str = ""
+    """A camera driver's topmost frame, placed so that its frame `camera` is the lens; empty: none."""
+    fixed: FrameTree = field(default_factory=FrameTree)
+    """What drivers publish of frames that stand still to each other (`drivers.fixed_frames`)."""
 
     @classmethod
     def of_camera(cls, name: str) -> FrameNames:
         """Make the frame names of a cell's camera: its name is a prefix, except for `main`."""
-        return cls() if name == MAIN_CAMERA else cls(camera=f"{name}_optical_frame", body=f"{name}_link")
+        if name == MAIN_CAMERA:
+            return cls()
+        return cls(camera=f"{name}_calibrated_optical_frame", body=f"{name}_calibrated_link")
 
     def parent(self, calibration: Calibration) -> str:
         return self.flange if calibration.mount == "eye-in-hand" else self.base
 
     @property
+    def name(self) -> str:
+        """Name of the camera."""
+        return self.body.removesuffix("_link").removesuffix("_calibrated") or "camera"
+
+    @property
     def node(self) -> str:
         """Name of the camera's ROS node: letters, digits and underscores."""
-        name = re.sub(r"\W", "_", self.body.removesuffix("_link"), flags=re.ASCII)
+        name = re.sub(r"\W", "_", self.name, flags=re.ASCII)
         return name if name[:1].isalpha() else f"camera{name}"
+
+    def place(self, calibration: Calibration, X: Array) -> Array:
+        """Compute parent_from_camera (4, 4) of X (4, 4), in which the parent is the controller's frame.
+
+        Raises ExportError for a frame that is turned against it, nobody says how.
+        """
+        parent = self.parent(calibration)
+        own = "tool0" if calibration.mount == "eye-in-hand" else "base"
+        turned = next((name for name in _TURNED if parent.endswith(name)), "")
+        if turned:
+            own = parent.removesuffix(turned) + _TURNED[turned][0]
+        if self.fixed.chain(parent, own):
+            return self._between(parent, own) @ X
+        if turned and calibration.robot.model not in MODELS:
+            raise ExportError("frame-turned", frame=parent, own=own)
+        return np.asarray(_TURNED[turned][1] @ X if turned else X)
+
+    def attached(self, parent: str, parent_from_camera: Array) -> Array:
+        """Compute parent_from_attach (4, 4): the driver's frame `camera` is then the calibrated lens.
+
+        Raises ExportError where the driver has no such frames, or `attach` would get a second parent.
+        """
+        parents = {child: above for above, child in self.fixed.edges}
+        if parents.get(self.attach, parent) != parent:
+            raise ExportError("two-parents", frame=self.attach, parent=parents[self.attach])
+        lenses = sorted(
+            name for name in parents if name.endswith("optical_frame") and self.fixed.chain(self.attach, name)
+        )
+        lens = self.camera if self.fixed.chain(self.attach, self.camera) or len(lenses) != 1 else lenses[0]
+        if not self.fixed.chain(self.attach, lens):
+            known = ", ".join(lenses) or "none"
+            raise ExportError("no-lens-frame", attach=self.attach, camera=self.camera, lenses=known)
+        return np.asarray(parent_from_camera @ inverse(self._between(self.attach, lens)))
+
+    def _between(self, parent: str, child: str) -> Array:
+        return np.asarray(self.fixed.track(parent, child).at(np.zeros(1, np.int64))[0])
 
 
 def comment(calibration: Calibration, frames: FrameNames, corrected: bool = False) -> str:
@@ -74,14 +132,7 @@ def commented_yaml(calibration: Calibration, frames: FrameNames, plain: dict[str
     return f"# {comment(calibration, frames)}\n{yaml.safe_dump(plain, sort_keys=False, **layout)}"
 
 
-def roll_pitch_yaw(R: Array) -> tuple[float, float, float]:
-    """Convert R (3, 3) to roll, pitch, yaw about fixed axes, radians.
-
-    Yaw is computed after the roll, Rz(yaw) Ry(pitch) = R Rx(roll)ᵀ. So the three stay accurate together near
-    a pitch of 90°, where SciPy's lose half the digits and where a camera that looks along the flange is.
-    """
-    roll = np.arctan2(R[2, 1], R[2, 2])
-    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
-    across = R[:, 1] * np.cos(roll) - R[:, 2] * np.sin(roll)
-    yaw = np.arctan2(-across[0], across[1])
-    return float(roll), float(pitch), float(yaw)
+def how_to_attach(frames: FrameNames) -> str:
+    """Say in a comment how these frames and those of a camera's driver become one tree."""
+    how = " For the frames of a camera's driver: export --attach camera_link --driver-tf FILE."
+    return "" if frames.attach else how

@@ -16,20 +16,21 @@ from calibrate.files.exports.frames import (
     ExportError,
     FrameNames,
     comment,
-    roll_pitch_yaw,
+    how_to_attach,
 )
 from calibrate.files.proof import content_sha256
-from calibrate.geometry import Array, inverse, pose, rotation_exp
+from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, roll_pitch_yaw, rotation_exp
 from calibrate.kinematics import RobotModel, link_frames
 
 
 def urdf(calibration: Calibration, frames: FrameNames) -> str:
-    """Make a complete URDF: the robot's frame, the camera's body and its optical frame."""
+    """Make a complete URDF: the robot's frame and the camera, or the driver's frame that carries it."""
     parent = frames.parent(calibration)
     name = quoteattr(f"{frames.node}_calibrated")
     return (
-        f"{commented(comment(calibration, frames))}<robot name={name}>\n<link name={quoteattr(parent)}/>\n"
-        f"{camera(calibration.transform.matrix, parent, frames)}</robot>\n"
+        f"{commented(comment(calibration, frames) + how_to_attach(frames))}"
+        f"<robot name={name}>\n<link name={quoteattr(parent)}/>\n"
+        f"{camera(frames.place(calibration, calibration.transform.matrix), parent, frames)}</robot>\n"
     )
 
 
@@ -40,7 +41,13 @@ def commented(note: str) -> str:
 
 
 def camera(parent_from_optical: Array, parent: str, frames: FrameNames) -> str:
-    """Make links and joints of the camera's body and its optical frame, carried by the link `parent`."""
+    """Make links and joints of the camera's body and its optical frame, carried by the link `parent`.
+
+    With a driver's frame to attach: of that frame alone, for the driver has the others.
+    """
+    if frames.attach:
+        link = f"<link name={quoteattr(frames.attach)}/>\n"
+        return link + _joint(parent, frames.attach, frames.attached(parent, parent_from_optical))
     return (
         f"<link name={quoteattr(frames.body)}/>\n<link name={quoteattr(frames.camera)}/>\n"
         + _joint(parent, frames.body, parent_from_optical @ inverse(BODY_FROM_OPTICAL))
@@ -96,7 +103,8 @@ def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
     table, X = arm.installable()
     if table is None:
         raise ExportError("no-ur-table")
-    values = numbers([*X.translation_m, *X.quaternion_xyzw])
+    placed = frames.place(calibration, X.matrix)
+    values = numbers([*placed[:3, 3], *quaternion_from_matrix(placed[:3, :3])])
     note = (
         f"{comment(calibration, frames, corrected=True)}\n"
         f"{arm.model}: use it only with this camera pose, and this one only with it:\n"

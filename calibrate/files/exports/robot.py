@@ -18,9 +18,18 @@ import numpy as np
 
 from calibrate.chain import Chain
 from calibrate.files.calibration import Calibration, CorrectedArm
-from calibrate.files.exports.frames import ExportError, FrameNames, comment, roll_pitch_yaw
+from calibrate.files.exports.frames import ExportError, FrameNames, comment
 from calibrate.files.exports.models import camera, commented, numbers, table_of
-from calibrate.geometry import Array, difference, inverse, pose, rotation_angle, rotation_exp
+from calibrate.geometry import (
+    Array,
+    difference,
+    inverse,
+    pose,
+    roll_pitch_yaw,
+    rotation_angle,
+    rotation_exp,
+    rotation_from_rpy,
+)
 from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.pairs import all_pairs
 from calibrate.handeye.metrics import mean_pose
@@ -42,9 +51,12 @@ def corrected_urdf(calibration: Calibration, frames: FrameNames, given: bytes) -
     arm = table_of(calibration)
     true, (_, X) = arm.chain, arm.installable()
     try:
-        robot = _Urdf.read(given)
-        if taken := {frames.body, frames.camera} & {element.get("name") for element in robot.root}:
-            raise ValueError(f"{min(taken)} is in it already: name others with --camera and --body")
+        robot = Urdf.read(given)
+        own = {frames.attach} if frames.attach else {frames.body, frames.camera}
+        if taken := own & {element.get("name") for element in robot.root}:
+            raise ValueError(
+                f"{min(taken)} is in it already: name others with --camera and --body, or --attach"
+            )
         found, B, T = _recognise(list(_paths(robot, len(true.axes), frames)), arm)
     except (ElementTree.ParseError, expat.ExpatError, KeyError, TypeError, ValueError) as problem:
         raise ExportError("urdf", why=str(problem)) from None
@@ -64,7 +76,9 @@ def corrected_urdf(calibration: Calibration, frames: FrameNames, given: bytes) -
 
 # --- reading ---
 @dataclass(frozen=True, eq=False)
-class _Urdf:
+class Urdf:
+    """A plain URDF. ValueError and expat's errors for anything else."""
+
     given: bytes
     root: Element
     at: dict[Element, int]
@@ -73,7 +87,7 @@ class _Urdf:
     """By the link that each carries."""
 
     @classmethod
-    def read(cls, given: bytes) -> _Urdf:
+    def read(cls, given: bytes) -> Urdf:
         if b"xacro:" in given or b"<!DOCTYPE" in given or b"\0" in given:
             raise ValueError("it is no plain URDF in UTF-8 (xacro robot.xacro > robot.urdf)")
         starts: list[int] = []
@@ -118,10 +132,10 @@ def _three(element: Element, name: str, default: str = "0 0 0") -> Array:
     return found
 
 
-def _origin(joint: Element) -> Array:
+def origin_of(joint: Element) -> Array:
+    """Read parent_from_child (4, 4) of a joint at 0."""
     origin = _child(joint, "origin")
-    x, y, z = (rotation_exp(turn) for turn in np.diag(_three(origin, "rpy")))
-    return pose(z @ y @ x, _three(origin, "xyz"))
+    return pose(rotation_from_rpy(_three(origin, "rpy")), _three(origin, "xyz"))
 
 
 # --- recognising ---
@@ -180,7 +194,7 @@ def _onto(frame: Array, axis: Array, point: Array, direction: Array) -> Array:
     return pose(turn @ frame[:3, :3], point + direction * (direction @ (frame[:3, 3] - point)))
 
 
-def _paths(robot: _Urdf, n: int, frames: FrameNames) -> Iterator[_Path]:
+def _paths(robot: Urdf, n: int, frames: FrameNames) -> Iterator[_Path]:
     """Yield the paths of n turning joints from the base, to the flange of this name if there is one."""
     links = [link.attrib["name"] for link in robot.root.findall("link")]
     for name, default in ((frames.base, FrameNames.base), (frames.flange, FrameNames.flange)):
@@ -198,11 +212,11 @@ def _paths(robot: _Urdf, n: int, frames: FrameNames) -> Iterator[_Path]:
         moving = [joint for joint in path if joint.get("type") != "fixed"]
         turns = all(j.get("type") in ("revolute", "continuous") and j.find("mimic") is None for j in moving)
         if len(moving) == n and turns and all(joint.get("type") == "fixed" for joint in back):
-            *_, up = accumulate(map(_origin, back), np.matmul, initial=np.eye(4))
+            *_, up = accumulate(map(origin_of, back), np.matmul, initial=np.eye(4))
             axes = np.array([_three(_child(joint, "axis"), "xyz", "1 0 0") for joint in moving])
             axes /= np.linalg.norm(axes, axis=1, keepdims=True)
             turning = [path.index(joint) for joint in moving]
-            yield _Path(base, tip, inverse(up), path, np.array(list(map(_origin, path))), turning, axes)
+            yield _Path(base, tip, inverse(up), path, np.array(list(map(origin_of, path))), turning, axes)
 
 
 def _recognise(paths: list[_Path], arm: CorrectedArm) -> tuple[_Path, Array, Array]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.files.calibration import Calibration
-from calibrate.files.exports.frames import FrameNames, comment, commented_yaml
-from calibrate.geometry import Array
+from calibrate.files.exports.frames import FrameNames, comment, commented_yaml, how_to_attach
+from calibrate.geometry import Array, quaternion_from_matrix
 from calibrate.projection import camera_matrix, distortion
 
 
@@ -17,7 +17,7 @@ def ros_camera_info(calibration: Calibration, frames: FrameNames) -> str:
     plain = {
         "image_width": camera.width,
         "image_height": camera.height,
-        "camera_name": frames.body.removesuffix("_link") or "camera",
+        "camera_name": frames.name,
         "camera_matrix": _matrix(K),
         "distortion_model": "rational_polynomial" if len(D) == 8 else camera.distortion_model,
         "distortion_coefficients": _matrix(D[None]),
@@ -34,15 +34,18 @@ def _matrix(values: Array) -> dict[str, object]:
 
 def _publisher_arguments(calibration: Calibration, frames: FrameNames) -> list[str]:
     """Make static_transform_publisher's arguments; with a quaternion, as angles have several conventions."""
-    values = (*calibration.result.translation_m, *calibration.result.rotation_xyzw)
+    parent, child = frames.parent(calibration), frames.attach or frames.camera
+    T = frames.place(calibration, calibration.transform.matrix)
+    T = frames.attached(parent, T) if frames.attach else T
+    values = (*T[:3, 3], *quaternion_from_matrix(T[:3, :3]))
     names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
     found = [part for name, value in zip(names, values, strict=True) for part in (name, repr(float(value)))]
-    return [*found, "--frame-id", frames.parent(calibration), "--child-frame-id", frames.camera]
+    return [*found, "--frame-id", parent, "--child-frame-id", child]
 
 
 def ros_launch(calibration: Calibration, frames: FrameNames) -> str:
     listed = ",\n".join(f"                {part!r}" for part in _publisher_arguments(calibration, frames))
-    return f'''# {comment(calibration, frames)}
+    return f'''# {comment(calibration, frames)}{how_to_attach(frames)}
 from launch import LaunchDescription
 from launch_ros.actions import Node
 

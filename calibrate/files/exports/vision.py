@@ -10,9 +10,8 @@ from calibrate.files.exports.frames import (
     FrameNames,
     comment,
     commented_yaml,
-    roll_pitch_yaw,
 )
-from calibrate.geometry import inverse
+from calibrate.geometry import inverse, roll_pitch_yaw
 from calibrate.projection import camera_matrix, distortion
 
 
@@ -47,15 +46,15 @@ def zivid(calibration: Calibration, frames: FrameNames) -> str:
 def halcon(calibration: Calibration, frames: FrameNames) -> str:
     """Write for `read_pose`, as calibrate_hand_eye gives it: tool_in_cam_pose or base_in_cam_pose.
 
-    Metres and degrees; representation 2 is 'Rp+T', 'abg', 'point': R = Rz Ry Rx.
+    Metres and degrees; representation 0, create_pose's usual one, is 'Rp+T', 'gba', 'point': R = Rx Ry Rz.
     """
     matrix = inverse(calibration.transform.matrix)
     name = "tool_in_cam_pose" if calibration.mount == "eye-in-hand" else "base_in_cam_pose"
-    turned = " ".join(repr(float(np.degrees(v))) for v in roll_pitch_yaw(matrix[:3, :3]))
+    turned = " ".join(repr(-float(np.degrees(v))) for v in roll_pitch_yaw(matrix[:3, :3].T))
     moved = " ".join(repr(float(v)) for v in matrix[:3, 3])
     return (
-        f"# {comment(calibration, frames)}\n# {name}\n"
+        f"# {comment(calibration, frames)}\n# {name}, 'Rp+T', 'gba', 'point'\n"
         "#\n# 3D POSE PARAMETERS: rotation and translation\n#\n\n"
-        f"# Used representation type:\nf 2\n\n# Rotation angles [deg] or Rodriguez-vector:\nr {turned}\n\n"
+        f"# Used representation type:\nf 0\n\n# Rotation angles [deg] or Rodriguez-vector:\nr {turned}\n\n"
         f"# Translational vector (x y z [m]):\nt {moved}\n"
     )

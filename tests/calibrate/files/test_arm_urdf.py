@@ -147,7 +147,9 @@ def test_the_file_s_forward_kinematics_is_the_corrected_arm_s(calibration: Calib
         np.testing.assert_allclose(by_hand(written, q, "world", OWN[name]), flange, atol=1e-10)
         assert np.abs(by_hand(given, q, "world", OWN[name]) - flange).max() > 1e-4
         camera = flange @ X if calibration.mount == "eye-in-hand" else X
-        np.testing.assert_allclose(by_hand(written, q, "world", "camera_optical_frame"), camera, atol=1e-10)
+        np.testing.assert_allclose(
+            by_hand(written, q, "world", "camera_calibrated_optical_frame"), camera, atol=1e-10
+        )
     assert bare(written) == bare(given)
 
 
@@ -167,7 +169,7 @@ def test_other_signs_a_tool_and_a_turned_base_are_found(calibration: Calibration
     arm = calibration.arm_table
     places = []
     for q in within(arm, 5):
-        camera = by_hand(written, signs * q, "world", "camera_optical_frame")
+        camera = by_hand(written, signs * q, "world", "camera_calibrated_optical_frame")
         flange = arm.base_from_flange(q).matrix
         true = flange @ X if calibration.mount == "eye-in-hand" else X
         places.append(true @ inverse(camera))
@@ -210,7 +212,7 @@ def test_another_arm_is_refused_with_the_distance(calibration: Calibration) -> N
         lambda text: text[:-10],
         lambda text: text.replace(b"<robot", b"<!DOCTYPE robot><robot"),
         lambda text: text.replace(b"<link name=\"world\"/>", b"<xacro:arm/>"),
-        lambda text: text.replace(b"link_3", b"camera_link"),
+        lambda text: text.replace(b"link_3", b"camera_calibrated_link"),
         lambda text: text.replace(b"xyz=\"0.0 ", b"xyz=\"nan "),
         lambda text: text.decode().encode("utf-16"),
         lambda text: b"<sdf/>",

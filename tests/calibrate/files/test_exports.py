@@ -198,8 +198,10 @@ def test_urdf_chain_ends_in_the_optical_frame(calibration: Calibration) -> None:
     tree = ElementTree.fromstring(export(calibration, "urdf"))
     first, second = tree.findall("joint")
     assert first.find("parent").attrib["link"] == parent_of(calibration)  # type: ignore[union-attr]
-    assert first.find("child").attrib["link"] == second.find("parent").attrib["link"] == "camera_link"  # type: ignore[union-attr]
-    assert second.find("child").attrib["link"] == "camera_optical_frame"  # type: ignore[union-attr]
+    assert (
+        first.find("child").attrib["link"] == second.find("parent").attrib["link"] == "camera_calibrated_link"
+    )  # type: ignore[union-attr]
+    assert second.find("child").attrib["link"] == "camera_calibrated_optical_frame"  # type: ignore[union-attr]
     body, optical = urdf_origin(first), urdf_origin(second)
     same(body @ optical, calibration)
     # REP-103: what the optical frame has ahead (z), the body has along x; optical right (x) is body -y.

@@ -1,0 +1,102 @@
+"""Frames that stand still to each other, as a driver publishes or describes them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibrate.files.exports.frames import ExportError
+from calibrate.files.exports.robot import Urdf, origin_of
+from calibrate.files.proof import read_bounded
+from calibrate.geometry import quaternion_from_matrix, rotation_from_rpy
+from recordings import strict_yaml
+from recordings.importers.bags import open_bag
+from recordings.importers.frames import FrameTree
+from recordings.importers.messages import FrameMessage, Kind
+
+_NO_TRANSFORMS = (
+    AttributeError, KeyError, TypeError, ValueError,
+    expat.ExpatError, ElementTree.ParseError, strict_yaml.StrictYamlError,
+)  # fmt: skip
+_BAGS = (".bag", ".db3", ".mcap")
+_PUBLISHER = re.compile(r"Node\(|<node|static_transform_publisher")
+_NUMBERS = ("x", "y", "z", "roll", "pitch", "yaw", "qx", "qy", "qz", "qw")
+_ARGUMENT = re.compile(r"""--([a-z-]+)[\s"',]+([^\s"',]+)""")
+
+
+def fixed_frames(paths: Iterable[Path]) -> FrameTree:
+    """Read static transforms: a bag's /tf_static, a URDF's fixed joints, the arguments of
+    static_transform_publisher in a launch file, or YAML as `ros2 topic echo /tf_static` prints it.
+
+    Raises ExportError for a file without any, or where a frame has two parents; ImportSourceError for a bag.
+    """
+    tree = FrameTree()
+    for path in paths:
+        try:
+            found = list(_of_bag(path) if path.is_dir() or path.suffix in _BAGS else _of_text(path))
+        except _NO_TRANSFORMS as problem:
+            raise ExportError("no-fixed-frames", path=path, why=repr(problem)) from None
+        if not found:
+            raise ExportError("no-fixed-frames", path=path, why="there are none")
+        tree.add(found)
+    parents: dict[str, str] = {}
+    for parent, child in tree.edges:
+        if parents.setdefault(child, parent) != parent:
+            raise ExportError("two-parents", frame=child, parent=f"{parents[child]} and {parent}")
+    return tree
+
+
+def _of_bag(path: Path) -> Iterator[FrameMessage]:
+    bag = open_bag(path)
+    try:
+        for name, topic in bag.topics.items():
+            if topic.kind is Kind.TRANSFORMS and name.endswith("tf_static"):
+                for frames in bag.values(name):
+                    yield from frames  # type: ignore[misc]  # of this kind they are lists
+    finally:
+        bag.close()
+
+
+def _of_text(path: Path) -> Iterator[FrameMessage]:
+    content = read_bounded(path)
+    text = content.decode()
+    if "<robot" in text:
+        for joint in Urdf.read(content).joints.values():
+            if joint.get("type") == "fixed":
+                parent, child = (joint.find(tag).attrib["link"] for tag in ("parent", "child"))  # type: ignore[union-attr]
+                T = origin_of(joint)
+                yield _frame(parent, child, T[:3, 3], quaternion_from_matrix(T[:3, :3]))
+    elif "--child-frame-id" in text:
+        for part in _PUBLISHER.split(text):
+            said = dict(_ARGUMENT.findall(part))
+            if "child-frame-id" in said:
+                numbers = [float(said.get(name, 0)) for name in _NUMBERS]
+                told, by_angles = numbers[6:], quaternion_from_matrix(rotation_from_rpy(numbers[3:6]))
+                turn = told if any(told) else by_angles
+                yield _frame(said["frame-id"], said["child-frame-id"], numbers[:3], turn)
+    else:
+        for part in re.split(r"^---", text, flags=re.MULTILINE):
+            yield from _told(strict_yaml.load_plain(part.encode()))
+
+
+def _told(node: Any) -> Iterator[FrameMessage]:
+    """Walk through plain data to every transform with a stamp."""
+    if isinstance(node, dict) and "child_frame_id" in node:
+        at, turn = node["transform"]["translation"], node["transform"]["rotation"]
+        numbers = [at[axis] for axis in "xyz"], [turn[axis] for axis in "xyzw"]
+        yield _frame(node["header"]["frame_id"], node["child_frame_id"], *numbers)
+    elif isinstance(node, (dict, list)):
+        for below in node.values() if isinstance(node, dict) else node:
+            yield from _told(below)
+
+
+def _frame(parent: str, child: str, position_m: ArrayLike, rotation_xyzw: ArrayLike) -> FrameMessage:
+    at, turn = (tuple(np.asarray(v, float).tolist()) for v in (position_m, rotation_xyzw))
+    return FrameMessage(0, parent, child, at, turn)

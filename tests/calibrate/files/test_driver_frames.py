@@ -1,0 +1,223 @@
+"""Our frames and a driver's become one tree: the lens stands where it was calibrated, one parent a frame."""
+
+from __future__ import annotations
+
+import ast
+import re
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibrate.files.calibration import Calibration, FramePose
+from calibrate.files.exports import FrameNames, export
+from calibrate.files.exports.drivers import fixed_frames
+from calibrate.geometry import Array, Transform, pose, rotation_exp
+from calibrate.job import SolvedRecording
+from recordings.schema.messages import RobotIdentity
+from tests.codes import raises
+
+OPTICAL = (-np.pi / 2, 0, -np.pi / 2)
+Frames = dict[str, tuple[str, tuple[float, ...], tuple[float, ...]]]
+"""Child → parent, xyz, rpy."""
+DRIVERS: dict[str, tuple[str, str, Frames]] = {
+    "realsense d435": (
+        "camera_link",
+        "camera_color_optical_frame",
+        {
+            "camera_depth_frame": ("camera_link", (0, 0, 0), (0, 0, 0)),
+            "camera_depth_optical_frame": ("camera_depth_frame", (0, 0, 0), OPTICAL),
+            "camera_color_frame": ("camera_link", (0, 0.015, 0), (0, 0, 0)),
+            "camera_color_optical_frame": ("camera_color_frame", (0, 0, 0), OPTICAL),
+        },
+    ),
+    "zed 2": (
+        "zed_camera_link",
+        "zed_left_camera_optical_frame",
+        {
+            "zed_camera_center": ("zed_camera_link", (0, 0, 0.015), (0, 0.05, 0)),
+            "zed_left_camera_frame": ("zed_camera_center", (-0.01, 0.06, 0), (0, 0, 0)),
+            "zed_left_camera_optical_frame": ("zed_left_camera_frame", (0, 0, 0), OPTICAL),
+            "zed_right_camera_frame": ("zed_camera_center", (-0.01, -0.06, 0), (0, 0, 0)),
+            "zed_right_camera_optical_frame": ("zed_right_camera_frame", (0, 0, 0), OPTICAL),
+        },
+    ),
+}
+"""The topmost frame, the calibrated lens, and the frames, as the drivers' descriptions have them."""
+
+
+@pytest.fixture(params=["eye-in-hand", "eye-to-hand"])
+def calibration(request: pytest.FixtureRequest, solved_real: SolvedRecording) -> Calibration:
+    parent = "flange" if request.param == "eye-in-hand" else "base"
+    X = pose(rotation_exp([0.4, -2.1, 1.3]), [0.123456789, -0.5, 1.75])
+    result = FramePose.of(Transform(parent, "camera", X))
+    robot = RobotIdentity("UR10e")
+    return msgspec.structs.replace(solved_real.calibration, mount=request.param, result=result, robot=robot)
+
+
+def matrix(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Array:
+    return pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
+
+
+def as_urdf(frames: Frames) -> str:
+    links = {*frames, *(parent for parent, _, _ in frames.values())}
+    return "<robot name='driver'>" + "".join(f"<link name='{name}'/>" for name in sorted(links)) + "".join(
+        f"<joint name='{child}_joint' type='fixed'><parent link='{parent}'/><child link='{child}'/>"
+        f"<origin xyz='{' '.join(map(str, xyz))}' rpy='{' '.join(map(repr, rpy))}'/></joint>"
+        for child, (parent, xyz, rpy) in frames.items()
+    ) + "</robot>"  # fmt: skip
+
+
+def as_launch(frames: Frames) -> str:
+    nodes = "".join(
+        "Node(package='tf2_ros', executable='static_transform_publisher', arguments=["
+        f"'--frame-id', '{parent}', '--child-frame-id', '{child}', "
+        + ", ".join(
+            f"'--{name}', '{value!r}'"
+            for name, value in zip(("x", "y", "z", "roll", "pitch", "yaw"), (*xyz, *rpy), strict=True)
+        )
+        + "]),\n"
+        for child, (parent, xyz, rpy) in frames.items()
+    )
+    return f"LaunchDescription([{nodes}])"
+
+
+def as_echo(frames: Frames) -> str:
+    """Two messages, as `ros2 topic echo` divides them."""
+    told = []
+    for child, (parent, xyz, rpy) in frames.items():
+        q = Rotation.from_euler("xyz", rpy).as_quat().tolist()
+        told.append(
+            "- header:\n    stamp: {sec: 1, nanosec: 2}\n"
+            f"    frame_id: {parent}\n  child_frame_id: {child}\n  transform:\n    translation: "
+            f"{{x: {xyz[0]!r}, y: {xyz[1]!r}, z: {xyz[2]!r}}}\n    rotation: "
+            f"{{x: {q[0]!r}, y: {q[1]!r}, z: {q[2]!r}, w: {q[3]!r}}}\n"
+        )
+    return f"transforms:\n{told[0]}---\ntransforms:\n{''.join(told[1:])}---\n"
+
+
+def as_bag(frames: Frames, folder: Path) -> None:
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    of = store.types
+    with Writer(folder, version=9) as writer:
+        topic = writer.add_connection("/tf_static", "tf2_msgs/msg/TFMessage", typestore=store)
+        for child, (parent, xyz, rpy) in frames.items():
+            turn = of["geometry_msgs/msg/Quaternion"](*Rotation.from_euler("xyz", rpy).as_quat().tolist())
+            moved = of["geometry_msgs/msg/Transform"](of["geometry_msgs/msg/Vector3"](*xyz), turn)
+            header = of["std_msgs/msg/Header"](of["builtin_interfaces/msg/Time"](1, 0), parent)
+            stamped = of["geometry_msgs/msg/TransformStamped"](header, child, moved)
+            message = of["tf2_msgs/msg/TFMessage"]([stamped])
+            writer.write(topic, 1, store.serialize_cdr(message, "tf2_msgs/msg/TFMessage"))
+
+
+def written(frames: Frames, kind: str, folder: Path) -> Path:
+    path = folder / f"driver.{kind}"
+    if kind == "bag folder":
+        as_bag(frames, path)
+    else:
+        path.write_text({"urdf": as_urdf, "launch.py": as_launch, "yaml": as_echo}[kind](frames))
+    return path
+
+
+def published(launch: bytes) -> tuple[str, str, Array]:
+    """Parent, child and parent_from_child by static_transform_publisher's rule."""
+    found = re.search(r"arguments=(\[.*?\])", launch.decode(), re.DOTALL)
+    assert found is not None
+    words = ast.literal_eval(found[1])
+    said = dict(zip(words[::2], words[1::2], strict=True))
+    R = Rotation.from_quat([float(said[f"--q{axis}"]) for axis in "xyzw"]).as_matrix()
+    return said["--frame-id"], said["--child-frame-id"], pose(R, [float(said[f"--{a}"]) for a in "xyz"])
+
+
+def looked_up(tree: dict[str, tuple[str, Array]], parent: str, child: str) -> Array:
+    """By tf2's rule: one parent a frame, the product along the chain."""
+    T = np.eye(4)
+    while child != parent:
+        child, edge = tree[child]
+        T = edge @ T
+    return T
+
+
+def joined(driver: Frames, parent: str, child: str, T: Array) -> dict[str, tuple[str, Array]]:
+    assert child not in driver  # it would have two parents
+    return {name: (above, matrix(*place)) for name, (above, *place) in driver.items()} | {child: (parent, T)}
+
+
+@pytest.mark.parametrize("kind", ["urdf", "launch.py", "yaml", "bag folder"])
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_the_driver_s_lens_is_where_it_was_calibrated(
+    calibration: Calibration, driver: str, kind: str, tmp_path: Path
+) -> None:
+    top, lens, frames = DRIVERS[driver]
+    names = FrameNames(camera=lens, attach=top, fixed=fixed_frames([written(frames, kind, tmp_path)]))
+    parent, child, T = published(export(calibration, "ros-launch", names))
+    tree = joined(frames, parent, child, T)
+    assert np.abs(looked_up(tree, parent, lens) - calibration.transform.matrix).max() < 1e-9
+    of_urdf = ElementTree.fromstring(export(calibration, "urdf", names))
+    assert {link.get("name") for link in of_urdf.iter("link")} >= {parent, top}
+    (joint,) = of_urdf.findall("joint")
+    origin = joint.find("origin")
+    assert origin is not None
+    numbers = [tuple(map(float, origin.attrib[name].split())) for name in ("xyz", "rpy")]
+    np.testing.assert_allclose(matrix(*numbers), T, atol=1e-12)
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_without_a_driver_s_frames_ours_have_names_of_their_own(
+    calibration: Calibration, driver: str
+) -> None:
+    frames = DRIVERS[driver][2]
+    parent, child, T = published(export(calibration, "ros-launch"))
+    joined(frames, parent, child, T)
+    ours = {joint.find("child").get("link") for joint in  # type: ignore[union-attr]
+            ElementTree.fromstring(export(calibration, "urdf")).iter("joint")}  # fmt: skip
+    assert not ours & {*frames, *(above for above, _, _ in frames.values())}
+
+
+def test_frames_that_are_turned_against_the_controllers_are_turned(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    """By ur_description for a UR, by the robot's own transforms for any other arm, else refused."""
+    in_hand = calibration.mount == "eye-in-hand"
+    turned, own = ("left_flange", "left_tool0") if in_hand else ("left_base_link", "left_base")
+    names = {"flange" if in_hand else "base": turned}
+    rpy = (np.pi / 2, 0.0, np.pi / 2) if in_hand else (0.0, 0.0, np.pi)
+    parent, _, T = published(export(calibration, "ros-launch", FrameNames(**names)))  # type: ignore[arg-type]
+    assert parent == turned
+    np.testing.assert_allclose(T, matrix((0, 0, 0), rpy) @ calibration.transform.matrix, atol=1e-12)
+    other = msgspec.structs.replace(calibration, robot=RobotIdentity("irb1200"))
+    with raises("frame-turned", frame=turned, own=own):
+        export(other, "ros-launch", FrameNames(**names))  # type: ignore[arg-type]
+    place = (0.0, 0.1, 0.2), (0.0, np.pi / 2, 0.0)
+    path = written({own: (turned, *place)}, "urdf", tmp_path)
+    told = FrameNames(fixed=fixed_frames([path]), **names)  # type: ignore[arg-type]
+    _, _, T = published(export(other, "ros-launch", told))
+    np.testing.assert_allclose(T, matrix(*place) @ calibration.transform.matrix, atol=1e-12)
+
+
+def test_what_would_give_a_frame_two_parents_or_no_lens_is_refused(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    top, lens, frames = DRIVERS["realsense d435"]
+    odometry: Frames = {top: ("odom", (0, 0, 0), (0, 0, 0))}
+    held = fixed_frames([written(frames | odometry, "urdf", tmp_path)])
+    with raises("two-parents", frame=top, parent="odom"):
+        export(calibration, "ros-launch", FrameNames(camera=lens, attach=top, fixed=held))
+    fixed = fixed_frames([written(frames, "urdf", tmp_path)])
+    with raises("no-lens-frame", lenses="camera_color_optical_frame, camera_depth_optical_frame"):
+        export(calibration, "urdf", FrameNames(attach=top, fixed=fixed))
+    with raises("attach-of"):
+        export(calibration, "zivid", FrameNames(camera=lens, attach=top, fixed=fixed))
+    both = {**frames, "camera_depth_frame": ("odom", (0, 0, 0), (0, 0, 0))}
+    with raises("two-parents", frame="camera_depth_frame"):
+        fixed_frames([written(frames, "yaml", tmp_path), written(both, "urdf", tmp_path)])  # type: ignore[arg-type]
+    for content in ("", "<robot", "no: transforms", "[", "child_frame_id: a"):
+        (tmp_path / "none").write_text(content)
+        with raises("no-fixed-frames"):
+            fixed_frames([tmp_path / "none"])

@@ -117,9 +117,10 @@ class Daemon:
 
     def _speed_rad_s(self) -> float | None:
         try:
-            return max(map(abs, self.session.context.cell.robot.latest().joint_speeds_rad_s))
+            speeds = self.session.context.cell.robot.latest().joint_speeds_rad_s
         except RobotError:
             return None
+        return max(map(abs, speeds), default=None)
 
     async def _tell(self) -> None:
         """Send changes of the status to watchers, gathered for a moment."""
@@ -166,9 +167,11 @@ def configured_cell(config: StationConfig, text: bytes, log_dir: Path) -> Cell:
 
     trigger = None if config.trigger is None else SerialTrigger(config.trigger)
     camera, source = _camera(config, trigger)
+    robot = UrRobot(config.robot, log_dir)
     return Cell(
         config=config,
-        robot=UrRobot(config.robot, log_dir),
+        robot=robot,
+        mover=robot,
         camera=camera,
         source=source,
         trigger=trigger,

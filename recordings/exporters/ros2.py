@@ -22,8 +22,8 @@ from recordings.schema.messages import CameraModel, Matrix4, View
 from recordings.schema.topics import Topic
 from recordings.schema.viewing import (
     CAMERA_FRAME,
-    JOINT_NAMES,
     base_from_flange,
+    joint_names,
     quaternion_xyzw,
 )
 from recordings.segment import RecordingSegment
@@ -99,7 +99,7 @@ def _arm(messages: _Messages, segment: RecordingSegment) -> Iterator[_Entry]:
         joints = messages.make(
             "sensor_msgs/msg/JointState",
             messages.header(time_ns, ""),
-            JOINT_NAMES,
+            joint_names(len(state.joints_rad)),
             np.array(state.joints_rad),
             np.array(state.joint_speeds_rad_s),
             np.empty(0),

@@ -172,13 +172,6 @@ def _write_states(writer: RecordingWriter, chosen: Selection) -> None:
             joint_speeds_rad_s=moving,
             target_joints_rad=at,
             tcp_pose=tcp_pose,
-            robot_mode=0,
-            safety_mode=0,
-            safety_status_bits=0,
-            runtime_state=0,
-            robot_status_bits=0,
-            speed_scaling=1.0,
-            target_speed_fraction=1.0,
         )
         writer.robot_state(state)
 

@@ -21,6 +21,8 @@ Source = Literal["real", "simulated", "playback", "imported"]
 Vector6 = tuple[float, float, float, float, float, float]
 Joints = Annotated[tuple[float, ...], msgspec.Meta(min_length=5, max_length=7)]
 """One number a joint, base first; an arm has five to seven."""
+ToldJoints = Annotated[tuple[float, ...], msgspec.Meta(max_length=7)]
+"""As `Joints`; empty where the arm does not tell them."""
 Matrix4 = tuple[tuple[float, ...], ...]
 """4×4, row major"""
 
@@ -178,21 +180,21 @@ class ClockReading(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class RobotState(msgspec.Struct, frozen=True):
-    """One sample of the controller, at its full rate. Joint order: base … wrist 3, rad."""
+    """One sample of the controller, at its full rate. Joint order: base first, rad."""
 
     stamps: Stamps
-    joints_rad: Vector6
-    joint_speeds_rad_s: Vector6
-    target_joints_rad: Vector6
+    joints_rad: ToldJoints
+    joint_speeds_rad_s: ToldJoints
+    target_joints_rad: ToldJoints
     tcp_pose: Vector6
     """base_from_tcp as the controller reports it: x y z [m], rotation vector [rad]; raw."""
-    robot_mode: int
-    safety_mode: int
-    safety_status_bits: int
-    runtime_state: int
-    robot_status_bits: int
-    speed_scaling: float
-    target_speed_fraction: float
+    robot_mode: int = 0
+    safety_mode: int = 0
+    safety_status_bits: int = 0
+    runtime_state: int = 0
+    robot_status_bits: int = 0
+    speed_scaling: float = 1.0
+    target_speed_fraction: float = 1.0
 
 
 class Image(msgspec.Struct, frozen=True, eq=False):

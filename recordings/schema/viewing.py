@@ -36,6 +36,13 @@ JOINT_NAMES = [
     f"{joint}_joint" for joint in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ]
 """Names of the UR ROS driver."""
+
+
+def joint_names(count: int) -> list[str]:
+    """Names of an arm's joints: those of the UR ROS driver for six."""
+    return JOINT_NAMES if count == len(JOINT_NAMES) else [f"joint_{i + 1}" for i in range(count)]
+
+
 DETECTED = (0.1, 0.9, 0.2)
 """Colour of corners as they were detected."""
 _NS = 1_000_000_000
@@ -118,7 +125,8 @@ def _matrix(pose: Vector6) -> NDArray[np.float64]:
 
 def joint_states(state: RobotState, time_ns: int) -> Any:
     message = JointStates()
-    for name, position, velocity in zip(JOINT_NAMES, state.joints_rad, state.joint_speeds_rad_s, strict=True):
+    speeds = state.joint_speeds_rad_s or (0.0,) * len(state.joints_rad)
+    for name, position, velocity in zip(joint_names(len(speeds)), state.joints_rad, speeds, strict=True):
         message.joints.add(name=name, position=position, velocity=velocity)
     _stamp(message, time_ns)
     return message

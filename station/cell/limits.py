@@ -241,6 +241,8 @@ def _margin_problems(gaps: Array, contacts: Sequence[Contact], name: str) -> lis
 def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeometry) -> PlanCheck:
     """Check a plan move by move, from joints (6,) where the arm is; None: from its first pose."""
     problems = list(_plan_problems(plan, geometry))
+    if any(problem.limit == "joints" for problem in problems):
+        return PlanCheck((), tuple(problems))
     if not any(problem.limit == "speed" for problem in problems):
         geometry = with_plan_speeds(geometry, plan)
     before = start_joints_rad
@@ -274,6 +276,8 @@ def _plan_problems(plan: Plan, geometry: CellGeometry) -> list[Problem]:
     wrong = []
     if not plan.poses:
         wrong.append(("poses", "it has no poses"))
+    if any(len(pose.joints_rad) != 6 for pose in plan.poses):
+        wrong.append(("joints", "its poses must have six joint angles each"))
     if not (plan.joint_speed_rad_s >= SLOWEST_RAD_S and plan.joint_acceleration_rad_s2 >= SLOWEST_RAD_S2):
         least = f"{SLOWEST_RAD_S:g} rad/s and {SLOWEST_RAD_S2:g} rad/s²"
         wrong.append(("speed", f"its joint speed and acceleration must be at least {least}"))

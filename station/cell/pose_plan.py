@@ -7,7 +7,7 @@ from typing import Literal
 
 import msgspec
 
-from recordings.schema.messages import Matrix4, Mount, Vector6
+from recordings.schema.messages import Matrix4, Mount, ToldJoints
 
 Criterion = Literal["A", "D", "arm", "all"]
 """Criterion of a plan. A: smallest error of X; arm: smallest error over the workspace with the arm's
@@ -28,7 +28,8 @@ class ExpectedView(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unkno
 
 class PlannedPose(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
     name: str
-    joints_rad: Vector6
+    joints_rad: ToldJoints
+    """Target (6,), rad; of a pose to which a person brought the arm, as the arm told them."""
     base_from_flange: Matrix4 | None = None
     """Expected flange pose; checked against the arm's kinematics."""
     view: ExpectedView | None = None

@@ -20,6 +20,7 @@ from recordings.schema.messages import (
 )
 from station.cell.arm_acceptance import StopTestMove
 from station.cell.clock_fit import ClockFit
+from station.cell.config import vector6
 
 
 class StationState(StrEnum):
@@ -98,6 +99,10 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Present speed of the fastest modelled point."""
     speed_limit_m_s: float = 0.25
     still: bool = False
+    by_hand: bool = False
+    """A person moves this arm and the station only reads its pose: its STOP is on its own pendant."""
+    notice: str = ""
+    """What a person should know of the arm that is no fault; empty: nothing."""
 
     @property
     def connected(self) -> bool:
@@ -109,7 +114,8 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def joints_rad(self) -> Vector6 | None:
-        return None if self.state is None else self.state.joints_rad
+        """Joints (6,) of an arm that the station moves; None: not connected, or moved by hand."""
+        return None if self.state is None or self.by_hand else vector6(self.state.joints_rad)
 
 
 class CameraCounts(msgspec.Struct, frozen=True):

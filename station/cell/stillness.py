@@ -14,7 +14,8 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from calibrate.kinematics import JOINT_NAMES, RobotModel, forward
+from calibrate.geometry import pose_from_rotvec
+from calibrate.kinematics import JOINT_NAMES
 from recordings.schema.messages import RobotState, Stillness
 from recordings.schema.stillness import LEAST_SAMPLES, scatter
 from station.cell.config import StillnessConfig
@@ -27,6 +28,14 @@ POLL_S = 0.02
 KEPT_SAMPLES = 4096
 
 
+_TOO_FEW = "too few robot states"
+
+
+def _speed_rad_s(state: RobotState) -> float:
+    """Speed of the fastest joint; 0 where none is told."""
+    return max(map(abs, state.joint_speeds_rad_s), default=0.0)
+
+
 class NotStillError(StationError):
     """The arm did not settle in time; the message names what moved, and by how much."""
 
@@ -36,12 +45,13 @@ class NotStillError(StationError):
 class StillnessMonitor:
     """Monitor of the arm's rest. Subscribe `add` to the robot's states; call `measure` at any time."""
 
-    def __init__(self, model: RobotModel, limits: StillnessConfig) -> None:
-        self._model = model
+    def __init__(self, limits: StillnessConfig) -> None:
         self._limits = limits
         self._states: deque[RobotState] = deque(maxlen=KEPT_SAMPLES)
         self.moved_ns = 0
-        """Host monotonic time of the newest sample in which a joint moved, or of the first one."""
+        """Host monotonic time of the newest sample in which the arm moved, or of the first one."""
+        self._rested_m = (0.0, 0.0, 0.0)
+        """Where the tool was then, in `base`."""
 
     def add(self, state: RobotState) -> None:
         """Add a state, in order; quick. Call from one thread only."""
@@ -49,8 +59,9 @@ class StillnessMonitor:
         now_s = state.stamps.controller_s
         if states and now_s <= states[-1].stamps.controller_s:
             states.clear()  # the controller restarted
-        if not states or max(map(abs, state.joint_speeds_rad_s)) > self._limits.joint_speed_rad_s:
-            self.moved_ns = state.stamps.host_monotonic_ns
+        away_m = math.dist(state.tcp_pose[:3], self._rested_m)
+        if not states or away_m > self._limits.position_m or self._turns(state):
+            self.moved_ns, self._rested_m = state.stamps.host_monotonic_ns, state.tcp_pose[:3]
         states.append(state)
         while states[0].stamps.controller_s < now_s - 1.5 * self._limits.window_s:
             states.popleft()
@@ -58,8 +69,8 @@ class StillnessMonitor:
     def measure(self, image_motion_px: float | None = None) -> Stillness | None:
         """Measure over the newest window; None while there are too few states or a gap among them.
 
-        Position scatter: largest distance of the flange from its mean place; rotation scatter: largest angle
-        to the newest orientation; joint speed: the fastest joint in any sample.
+        Position scatter: largest distance of the told pose from its mean place; rotation scatter: largest
+        angle to the newest orientation; joint speed: the fastest joint in any sample, 0 where none is told.
         """
         kept = list(self._states.copy())
         if not kept:
@@ -70,10 +81,11 @@ class StillnessMonitor:
         covered = kept[0].stamps.controller_s <= begin_s + 0.1 * self._limits.window_s
         if len(window) < LEAST_SAMPLES or not covered or np.diff(times).max() > self._limits.window_s / 3:
             return None
-        position_m, rotation_rad = scatter(forward(self._model, [s.joints_rad for s in window]))
+        poses = np.array([s.tcp_pose for s in window])
+        position_m, rotation_rad = scatter(pose_from_rotvec(poses[:, :3], poses[:, 3:]))
         return Stillness(
             window_s=float(times[-1] - times[0]),
-            max_joint_speed_rad_s=float(np.abs([s.joint_speeds_rad_s for s in window]).max()),
+            max_joint_speed_rad_s=max(_speed_rad_s(s) for s in window),
             position_scatter_m=position_m,
             rotation_scatter_rad=rotation_rad,
             image_motion_px=image_motion_px,
@@ -101,7 +113,7 @@ class StillnessMonitor:
     def at_rest(self) -> bool:
         """Tell whether the arm rests, by its joints alone; cheap while the arm moves."""
         states = self._states.copy()
-        if not states or max(map(abs, states[-1].joint_speeds_rad_s)) > self._limits.joint_speed_rad_s:
+        if not states or self._turns(states[-1]):
             return False
         found = self.measure()
         return found is not None and not self.unrest(found)
@@ -123,7 +135,7 @@ class StillnessMonitor:
         while True:
             old = alive() is None
             found = self.measure() if not old else None
-            unrest = self.unrest(found) if found is not None else "too few robot states"
+            unrest = self.unrest(found) if found is not None else _TOO_FEW
             code = "no-news" if old else "not-settled"
             if found is None or unrest:
                 resting_since_ns = None
@@ -144,9 +156,20 @@ class StillnessMonitor:
                 raise NotStillError(code, unrest=unrest, limit_s=self._limits.timeout_s, **measured)
             await asyncio.sleep(POLL_S)
 
+    def _turns(self, state: RobotState) -> bool:
+        return _speed_rad_s(state) > self._limits.joint_speed_rad_s
+
     def require_rest(self, state: RobotState) -> None:
-        """Raise NotStillError when the arm moved in this state, as it may move after having settled."""
+        """Raise NotStillError when the arm moved in this state, as it may move after having settled.
+
+        Where no speeds are told: when it moves over the newest window, in which this state is.
+        """
         speeds, limit = np.abs(state.joint_speeds_rad_s), self._limits.joint_speed_rad_s
+        if not len(speeds):
+            found = self.measure()
+            if unrest := self.unrest(found) if found is not None else _TOO_FEW:
+                raise NotStillError(unrest=unrest, limit_s=self._limits.window_s)
+            return
         joint = int(speeds.argmax())
         if speeds[joint] > limit:
             raise NotStillError(

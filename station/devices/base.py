@@ -54,8 +54,8 @@ def _run_and_release(job: Callable[[], T]) -> T:
         raise
 
 
-class Robot(Protocol):
-    """An arm. Connecting only reads; `start_control`, after an approval, replaces the robot's program.
+class Arm(Protocol):
+    """An arm that tells its pose. Nothing here sends it anything that moves or stops it.
 
     `devices.news` defines how late the states that it reports may be.
     """
@@ -85,17 +85,6 @@ class Robot(Protocol):
     @property
     def identity(self) -> RobotIdentity: ...
 
-    @property
-    def control(self) -> bool:
-        """True while the control program runs on the robot and takes moves from this station."""
-
-    @property
-    def control_path(self) -> str:
-        """Driver of the arm: ur_rtde or script; empty where no real arm moves."""
-
-    def control_trouble(self) -> tuple[str, str]:
-        """Say why this driver cannot be used, and the remedy; both empty: it can."""
-
     def condition(self, state: RobotState) -> ArmCondition:
         """Describe the arm's condition in one of its states."""
 
@@ -105,11 +94,7 @@ class Robot(Protocol):
 
     @property
     def notice(self) -> str:
-        """Hint for people during a move that is no fault, such as a low speed slider; empty: none."""
-
-    @property
-    def remote(self) -> bool | None:
-        """Whether remote control is on; None where there is no such switch or it is not known."""
+        """Hint for people that is no fault, such as a low speed slider during a move; empty: none."""
 
     async def connect(self) -> RobotIdentity:
         """Read the identity and start the state stream. Raises RobotError."""
@@ -122,6 +107,27 @@ class Robot(Protocol):
 
     def clock(self) -> ClockFit | None:
         """Return the controller's clock against the host's; None while not known."""
+
+    async def close(self) -> None: ...
+
+
+class Mover(Protocol):
+    """What moves an arm. `start_control`, after an approval, replaces the robot's program."""
+
+    @property
+    def control(self) -> bool:
+        """True while the control program runs on the robot and takes moves from this station."""
+
+    @property
+    def control_path(self) -> str:
+        """Driver of the arm: ur_rtde or script; empty where no real arm moves."""
+
+    def control_trouble(self) -> tuple[str, str]:
+        """Say why this driver cannot be used, and the remedy; both empty: it can."""
+
+    @property
+    def remote(self) -> bool | None:
+        """Whether remote control is on; None where there is no such switch or it is not known."""
 
     async def start_control(self) -> None:
         """Start the control process. Call only after a motion approval. RobotError when refused."""
@@ -145,21 +151,19 @@ class Robot(Protocol):
     async def end_control(self) -> None:
         """Stop the control program and end its process."""
 
-    async def close(self) -> None: ...
-
 
 NEWS_POLL_S = 0.005
 
 
-async def fresh(robot: Robot) -> RobotState:
+async def fresh(robot: Arm) -> RobotState:
     """Wait for a current state of the arm and return it. StaleStateError when none comes."""
     while (state := robot.news()) is None:
         await asyncio.sleep(NEWS_POLL_S)
     return state
 
 
-async def ready(robot: Robot) -> RobotState:
-    """Wait as `fresh` does; RobotError where nothing may be captured now (see `Robot.check`)."""
+async def ready(robot: Arm) -> RobotState:
+    """Wait as `fresh` does; RobotError where nothing may be captured now (see `Arm.check`)."""
     while (state := robot.check()) is None:
         await asyncio.sleep(NEWS_POLL_S)
     return state

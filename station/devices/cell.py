@@ -12,18 +12,21 @@ import msgspec
 from recordings.schema.messages import CameraModel, Source
 from station.cell.arm_acceptance import ArmSubject, not_accepted, read_acceptance
 from station.cell.config import SPEED_CAP_M_S, StationConfig
+from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan
-from station.devices.base import Camera, Robot
+from station.devices.base import Arm, Camera, Mover
 from station.devices.serial_trigger import SerialTrigger
 
 
 @dataclass(frozen=True)
 class Cell:
     config: StationConfig
-    robot: Robot
+    robot: Arm
     camera: Camera
     source: Source
     """`real` only when both arm and camera are real."""
+    mover: Mover | None = None
+    """What moves the arm, its driver; None: a person does, and the station sends the arm nothing."""
     trigger: SerialTrigger | None = None
     config_text: bytes = b""
     """Content of the configuration file, for the recording."""
@@ -42,18 +45,31 @@ class Cell:
     def simulated(self) -> bool:
         return self.source == "simulated"
 
+    def require_mover(self) -> Mover:
+        """Return what moves the arm. RefusedError where a person does."""
+        if self.mover is None:
+            raise RefusedError("moved-by-hand", robot=self.robot.identity.model)
+        return self.mover
+
+    async def stop(self, reason: str) -> None:
+        """Decelerate the arm now, by both stop paths; an arm that a person moves is sent nothing."""
+        if self.mover is not None:
+            await self.mover.stop(reason)
+
     @property
     def subject(self) -> ArmSubject:
         """Arm, firmware, payload and control path, to which an acceptance test is bound."""
-        robot, identity = self.robot, self.robot.identity
+        mover, identity = self.require_mover(), self.robot.identity
         firmware = identity.controller_version
         return ArmSubject(
-            self.source, identity.model, identity.serial, firmware, robot.payload, robot.control_path
+            self.source, identity.model, identity.serial, firmware, mover.payload, mover.control_path
         )
 
     def acceptance_trouble(self, root: Path) -> str:
         """Say why a real arm's stops are not accepted; empty: they are, or no real arm moves."""
-        if self.source != "real" or not self.robot.identity.serial or not self.robot.control_path:
+        if self.mover is None or self.source != "real":
+            return ""
+        if not self.robot.identity.serial or not self.mover.control_path:
             return ""
         speed_m_s = min(self.config.limits.speed_m_s, SPEED_CAP_M_S)
         return not_accepted(read_acceptance(root), self.subject, speed_m_s)

@@ -269,6 +269,7 @@ def playback_cell(recording: Path) -> Cell:
     return Cell(
         config=config,
         robot=robot,
+        mover=robot,
         camera=PlaybackCamera(robot),
         source="playback",
         plan=robot.plan(),

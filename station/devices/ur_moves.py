@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from recordings.schema.messages import RobotState, Vector6
+from recordings.schema.messages import RobotState
 from station.cell.config import SLOWEST_RAD_S, SLOWEST_RAD_S2
 from station.cell.errors import RobotError
 from station.devices.news import MOVING_S
@@ -54,7 +54,9 @@ def is_running(word: int) -> bool:
     return bool(word & 1 << 15)
 
 
-def beside(start_rad: Vector6, target_rad: Sequence[float], joints_rad: Vector6) -> tuple[int, float]:
+def beside(
+    start_rad: Sequence[float], target_rad: Sequence[float], joints_rad: Sequence[float]
+) -> tuple[int, float]:
     """Find the joint furthest from the straight path, counted from 0, and its deviation (rad).
 
     A joint move is straight in joint space, all joints in step, as the check of its path assumes.
@@ -69,7 +71,7 @@ def beside(start_rad: Vector6, target_rad: Sequence[float], joints_rad: Vector6)
 
 @dataclass
 class MoveWatch:
-    start_rad: Vector6
+    start_rad: Sequence[float]
     """Joints (6,) when the move was requested."""
     target_rad: Sequence[float]
     operation_before: int

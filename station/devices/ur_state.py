@@ -205,10 +205,10 @@ class StateReader:
                 self.history.clear()  # the controller's clock went back
         state = RobotState(
             stamps=Stamps(host_monotonic_ns=monotonic_ns, host_wall_ns=wall_ns, controller_s=controller_s),
-            joints_rad=v[1:7],  # type: ignore[arg-type]  # struct gave exactly six
-            joint_speeds_rad_s=v[7:13],  # type: ignore[arg-type]
-            target_joints_rad=v[13:19],  # type: ignore[arg-type]
-            tcp_pose=v[19:25],  # type: ignore[arg-type]
+            joints_rad=v[1:7],
+            joint_speeds_rad_s=v[7:13],
+            target_joints_rad=v[13:19],
+            tcp_pose=v[19:25],  # type: ignore[arg-type]  # struct gave exactly six
             robot_mode=int(v[25]),
             safety_mode=int(v[26]),
             safety_status_bits=int(v[27]),
@@ -286,7 +286,7 @@ def state_at(history: Sequence[RobotState], clock: ClockFit | None, host_monoton
     )
 
 
-def _mix(first: Vector6, second: Vector6, fraction: float) -> Vector6:
+def _mix(first: Sequence[float], second: Sequence[float], fraction: float) -> Vector6:
     return vector6(x + (y - x) * fraction for x, y in zip(first, second, strict=True))
 
 

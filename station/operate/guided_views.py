@@ -22,7 +22,7 @@ from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotState, Vector6
 from station.analysis.estimation import quick_sigma, solve_quickly
 from station.analysis.worker import CapturedView, assess
-from station.cell.config import matrix4
+from station.cell.config import matrix4, vector6
 from station.cell.layout import board_place, flange_pose
 from station.operate.draft import Draft, GuidedView
 
@@ -58,7 +58,7 @@ def image_trouble(image: Image, found: Detection) -> tuple[str, str]:
 def guided_view(state: RobotState, tcp_offset: Vector6, found: Detection) -> GuidedView:
     """Make a view from the state of an arm at rest and a detection."""
     return GuidedView(
-        state.joints_rad,
+        vector6(state.joints_rad),
         matrix4(flange_pose(state, tcp_offset)),
         tuple(int(k) for k in found.indices),
         tuple((float(x), float(y)) for x, y in found.pixels),

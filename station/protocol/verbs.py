@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 import msgspec
 
-from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, Vector6
+from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, ToldJoints, Vector6
 from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
@@ -32,6 +32,8 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
 
     states: ClassVar[frozenset[S]] = _ANY
     control: ClassVar[bool] = True
+    moves: ClassVar[bool] = False
+    """For arms that the station moves only."""
     spoken: ClassVar[str] = ""
     """Name for people; empty: the verb's name."""
     wire: ClassVar[str] = ""
@@ -128,7 +130,7 @@ class Observation(msgspec.Struct, frozen=True, omit_defaults=True):
     rested_s: float
     """Time for which the arm had rested by then."""
     base_from_flange: Matrix4
-    joints_rad: Vector6
+    joints_rad: ToldJoints
     width: int
     height: int
     tcp_offset: Vector6 = (0.0,) * 6
@@ -205,6 +207,7 @@ class LoadPlan(Verb[PlanFacts], frozen=True):
     """Load a plan, checked; refused with all its problems."""
 
     states = _LOADING
+    moves = True
     spoken = "another plan"
     plan: Plan
 
@@ -213,6 +216,7 @@ class MakePlan(Verb[PlanFacts], frozen=True):
     """Make a plan in a worker process and load it."""
 
     states = _LOADING
+    moves = True
     spoken = "a new plan"
     poses: Annotated[int, msgspec.Meta(ge=4, le=200)] = 25
     seed: int = 0
@@ -236,6 +240,7 @@ class Prepare(Verb[MotionPreview], frozen=True):
     """Check the whole path from where the arm is and offer its approval."""
 
     states = RESTING
+    moves = True
     spoken = "a motion"
     purpose: Purpose = Purpose.RUN
     stop_test: StopTest | None = None
@@ -246,6 +251,7 @@ class Go(Verb[Done], frozen=True):
     """Approve exactly the motion that was offered, once."""
 
     states = RESTING
+    moves = True
     token: str
     plan_sha256: str = ""
     headless: bool = False
@@ -269,6 +275,7 @@ class Retake(Verb[Done], frozen=True):
     """Plan a pose once more."""
 
     states = RUNNING | RESTING
+    moves = True
     index: int
 
 

@@ -13,6 +13,7 @@ from recordings.plain_text import bytes_text
 from station.cell.errors import CameraError, RobotError, TriggerError
 from station.cell.process import GRANT_REAL_TIME, in_real_time
 from station.cell.status import StationState
+from station.devices.base import Mover
 from station.devices.discovery import USB3_MBIT_S, FoundCamera, UsbCamera, discover, discover_usb
 from station.protocol.verbs import Check
 from station.session.context import SessionContext
@@ -48,18 +49,20 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
         Check("robot", "ok", f"{identity.model} {identity.serial} at {host}, {condition.mode}"),
         Check("safety", "failed" if condition.held else "ok", condition.safety, condition.held),
     ]
-    if robot.remote is False:
+    if (mover := context.cell.mover) is None:
+        return [checks[0], Check("control", "skipped", "a person moves this arm: STOP is on its own pendant")]
+    if mover.remote is False:
         checks.append(Check("remote control", "failed", "local", "switch the pendant to Remote (top right)"))
     else:
-        words = "remote" if robot.remote else "this controller has no remote switch"
+        words = "remote" if mover.remote else "this controller has no remote switch"
         checks.append(Check("remote control", "ok", words))
-    checks.append(await ASKED.run(_control_check, context))
+    checks.append(await ASKED.run(_control_check, context, mover))
     return checks
 
 
-def _control_check(context: SessionContext) -> Check:
-    path = context.cell.robot.control_path
-    trouble, remedy = context.cell.robot.control_trouble()
+def _control_check(context: SessionContext, mover: Mover) -> Check:
+    path = mover.control_path
+    trouble, remedy = mover.control_trouble()
     if trouble:
         return Check("control", "failed", trouble, remedy)
     if trouble := context.cell.acceptance_trouble(context.root):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,11 +18,11 @@ from recordings.errors import CodedError, RecordingError, Value
 from recordings.images import viewable
 from recordings.recorder import Recorder
 from recordings.recover import recover_recording
-from recordings.schema.messages import CameraModel, CaptureEvent, Image, RobotState, Stamps, Vector6
+from recordings.schema.messages import CameraModel, CaptureEvent, Image, RobotState, Stamps
 from station.analysis.pool import Workers
 from station.analysis.worker import BoardDetection, CapturedView, sight
-from station.cell.collision import CellGeometry
 from station.cell.errors import RefusedError
+from station.cell.layout import arm_model
 from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import ready
@@ -56,7 +56,6 @@ class SessionContext:
     """Shared state of a session. For the event loop's thread only, unless stated otherwise."""
 
     cell: Cell
-    geometry: CellGeometry
     store: StatusStore
     workers: Workers
     stillness: StillnessMonitor
@@ -180,9 +179,9 @@ class SessionContext:
         )
 
 
-def displacement(context: SessionContext, before: Vector6, after: Vector6) -> str:
+def displacement(context: SessionContext, before: Sequence[float], after: Sequence[float]) -> str:
     """Describe the flange's motion between two joints (6,), as '84 mm and 22°'."""
-    delta = difference(*forward(context.geometry.model, [after, before]))
+    delta = difference(*forward(arm_model(context.cell.config.robot), [after, before]))
     distance_m, angle_rad = np.linalg.norm(delta[:3]), np.linalg.norm(delta[3:])
     return f"{1000 * distance_m:.0f} mm and {np.degrees(angle_rad):.0f}°"
 

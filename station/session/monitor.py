@@ -13,6 +13,7 @@ import msgspec
 from recordings.schema.messages import RobotState
 from station.cell.config import SPEED_CAP_M_S
 from station.cell.errors import RobotError
+from station.cell.layout import cell_geometry
 from station.cell.limits import point_speed_m_s
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import CameraStatus, RecorderStatus, RobotStatus, StationState, TriggerStatus
@@ -39,6 +40,8 @@ class Monitor:
         self._states_seen = 0
         self._states, self._frames = Rate(), Rate()
         self._wall_ahead_ns = _wall_ahead_ns()
+        moved = context.cell.mover is not None
+        self._geometry = cell_geometry(context.cell.config) if moved else None
         context.cell.robot.subscribe(self._count)
 
     def _count(self, state: RobotState) -> None:
@@ -77,25 +80,30 @@ class Monitor:
             self._context.store.event("wall-clock-set", text, "warning", step_s=round(step_s, 1))
 
     def _robot(self) -> RobotStatus:
-        context, robot = self._context, self._context.cell.robot
+        context, robot, mover = self._context, self._context.cell.robot, self._context.cell.mover
         shown = RobotStatus(
             identity=robot.identity,
             rate_hz=round(self._states.update(self._states_seen)),
-            remote=robot.remote,
-            control=robot.control,
-            control_path=robot.control_path,
+            remote=mover.remote if mover else None,
+            control=mover is not None and mover.control,
+            control_path=mover.control_path if mover else "",
             not_accepted=self._files.not_accepted,
             speed_limit_m_s=min(context.cell.config.limits.speed_m_s, SPEED_CAP_M_S),
+            by_hand=mover is None,
+            notice=robot.notice,
         )
         try:
             state = robot.latest()
         except RobotError:
             return shown
+        speed_m_s = 0.0
+        if self._geometry is not None:
+            speed_m_s = point_speed_m_s(self._geometry, state.joints_rad, state.joint_speeds_rad_s)
         return msgspec.structs.replace(
             shown,
             state=state,
             condition=robot.condition(state),
-            speed_m_s=round(point_speed_m_s(context.geometry, state.joints_rad, state.joint_speeds_rad_s), 3),
+            speed_m_s=round(speed_m_s, 3),
             still=context.stillness.at_rest,
         )
 

@@ -16,6 +16,7 @@ from recordings.files import require_free_space
 from recordings.schema.messages import RobotState, Vector6
 from station.analysis.worker import check_run
 from station.cell.arm_acceptance import StopTestMove
+from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import PlanCheck
 from station.cell.pose_plan import Plan
@@ -73,7 +74,7 @@ async def previewed(context: SessionContext, motion: Motion, notes: tuple[str, .
     except (RecordingError, OSError) as full:
         raise RefusedError("disk-full", reason=str(full)) from None
     arm = await context.arm()
-    start = arm.joints_rad
+    start = vector6(arm.joints_rad)
     queue, poses = motion.queue, motion.poses
     plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
     check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
@@ -99,7 +100,7 @@ async def previewed(context: SessionContext, motion: Motion, notes: tuple[str, .
 async def _refused(context: SessionContext, plan: Plan, check: PlanCheck, start: Vector6) -> LimitError:
     """Make the error for a plan that is not free, special if only the path to its first pose is not."""
     refused = LimitError("plan", problems=len(check.problems), listed=_listed(check))
-    if not plan.poses or len(check.problems) > len(check.moves[0].problems):
+    if not check.moves or len(check.problems) > len(check.moves[0].problems):
         return refused
     cell, first_rad = context.cell, plan.poses[0].joints_rad
     if (await context.workers.call(check_run, cell.config, plan, first_rad)).problems:
@@ -120,7 +121,7 @@ async def _refused(context: SessionContext, plan: Plan, check: PlanCheck, start:
     )
 
 
-def _degrees(joints_rad: Vector6) -> str:
+def _degrees(joints_rad: Sequence[float]) -> str:
     return ", ".join(f"{math.degrees(q):.0f}" for q in joints_rad) + "°"
 
 

@@ -165,7 +165,7 @@ class SessionRecording:
             plan_sha256=plan_sha256,
             config_sha256=self._cell.config_sha256,
             software=software()
-            | {"robot control": self._cell.robot.control_path or "none"}
+            | {"robot control": (mover.control_path if (mover := self._cell.mover) else "") or "none"}
             | ({"robot stops": stops} if (stops := self._cell.acceptance_trouble(self._root)) else {}),
         )
         path = segment_path(self.folder, self.segment)

@@ -12,6 +12,7 @@ import numpy as np
 from recordings.errors import ErrorData, RecordingError
 from recordings.schema.messages import Vector6
 from station.cell.collision import CellGeometry
+from station.cell.config import vector6
 from station.cell.errors import (
     LimitError,
     SafetyStopError,
@@ -45,7 +46,7 @@ class Run:
     """Execution of one approval. Run `drive` as a task; when cancelled it ends after writing its data."""
 
     def __init__(self, context: SessionContext, go: MotionApproval) -> None:
-        self._context = context
+        self._context, self._mover = context, context.cell.require_mover()
         self._go = go
         self._queue = go.motion.queue
         self._geometry = self._cell_geometry()
@@ -73,12 +74,12 @@ class Run:
         except SafetyStopError as error:
             failed(self._context, error)  # the controller itself stopped the arm
         except Exception as error:
-            await self._context.cell.robot.stop(str(error))
+            await self._context.cell.stop(str(error))
             if isinstance(error, StationError) and self._may_go_on(error):
                 return error
             failed(self._context, error)
         finally:
-            await self._context.cell.robot.end_control()
+            await self._mover.end_control()
         return None
 
     def _may_go_on(self, error: StationError | RecordingError) -> bool:
@@ -129,7 +130,7 @@ class Run:
             if context.recording is not None:
                 # Save the poses before anything moves, so that a restart finds them.
                 await context.recording.save_state(self._queue)
-            await context.cell.robot.start_control()
+            await self._mover.start_control()
             here = (await fresh(context.cell.robot)).joints_rad  # starting control takes a second or two
             require_start(here, self._go.start_joints_rad, "while control was started")
             if self._records:
@@ -159,8 +160,8 @@ class Run:
     async def _motion(self) -> None:
         """Drive what was approved, to the state that follows it."""
         if (test := self._go.motion.stop_test) is not None:
-            here = (await self._context.arm()).joints_rad
-            move = self._drive(here, self._queue.pose(0).joints_rad, "stop test")
+            here = vector6((await self._context.arm()).joints_rad)
+            move = self._drive(here, vector6(self._queue.pose(0).joints_rad), "stop test")
             await stop_half_way(self._context, test, here, move)
             return
         recording = self._context.require_recording()
@@ -226,7 +227,7 @@ class Run:
     async def _move_to(self, index: int) -> None:
         """Move to a pose from where the arm is. LimitError when the path is not free."""
         context, queue = self._context, self._queue
-        here, target = (await context.arm()).joints_rad, queue.pose(index).joints_rad
+        here, target = (vector6(at.joints_rad) for at in (await context.arm(), queue.pose(index)))
         queue.mark(index, "moving")
         context.store.enter(StationState.MOVING)
         context.show_poses(index)
@@ -245,12 +246,12 @@ class Run:
         if moved_rad > JOGGED_RAD:  # less may be settling
             when = "while its path was checked"
             raise LimitError("arm-moved", when=when, moved_rad=moved_rad, limit_rad=JOGGED_RAD, advice="")
-        await self._context.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
+        await self._mover.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 
     async def _rest(self) -> None:
         """Enter the state after the last pose of the approval: finished, or paused with the reason."""
         context, queue = self._context, self._queue
-        await context.cell.robot.end_control()  # before finishing, as heartbeats end with the run
+        await self._mover.end_control()  # before finishing, as heartbeats end with the run
         if context.requests.halt:
             return
         if context.requests.finish or (not queue.open and not queue.failed):

@@ -18,7 +18,6 @@ from recordings.errors import RecordingError
 from station.analysis.pool import Workers
 from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import RefusedError, RobotError
-from station.cell.layout import cell_geometry
 from station.cell.pose_plan import Plan
 from station.cell.session_folder import SessionState, interrupted_session
 from station.cell.status import LeaseStatus, MotionPreview, StationState, StationStatus
@@ -58,14 +57,11 @@ class Session:
 
     def __init__(self, cell: Cell, root: Path) -> None:
         config, playback = cell.config, cell.source == "playback"
-        geometry = cell_geometry(config)
         self.store = StatusStore(
             StationStatus(simulated=cell.simulated, playback=playback, cell=config.name, mount=config.mount)
         )
-        monitor = StillnessMonitor(geometry.model, config.stillness)
-        self.context = SessionContext(
-            cell, geometry, self.store, Workers(start_worker, warm_up), monitor, root
-        )
+        monitor = StillnessMonitor(config.stillness)
+        self.context = SessionContext(cell, self.store, Workers(start_worker, warm_up), monitor, root)
         self.approvals = ApprovalManager(time.monotonic)
         self.supervisor = SessionSupervisor(self.context, self._jogged, self._void)
         self.devices = DeviceConnector(self.context)
@@ -118,7 +114,7 @@ class Session:
     async def stop(self, who: str) -> None:
         """Stop the arm now, from any client, in any state; latched until acknowledged."""
         if self.store.state is StationState.STOPPED:
-            await self.context.cell.robot.stop(f"STOP by {who}")
+            await self.context.cell.stop(f"STOP by {who}")
             return
         await self._halt(StationState.STOPPED, f"STOP by {who}.", "stop")
 
@@ -141,7 +137,7 @@ class Session:
         self.store.enter(state, reason, cause)
         if run is not None:
             run.cancel()
-        await context.cell.robot.stop(reason)
+        await context.cell.stop(reason)
         self.store.event(cause, reason, "warning")
         if run is not None:
             await asyncio.wait({run}, timeout=STOP_WAIT_S)
@@ -361,6 +357,8 @@ class Session:
         self._require_state(verb)
 
     def _require_state(self, verb: type[Verb[object]]) -> None:
+        if verb.moves:
+            self.context.cell.require_mover()
         if (refusal := verb.refusal(self.store.state)) is not None:
             raise refusal
 

@@ -54,7 +54,7 @@ async def stop_motion(context: SessionContext, test: StopTest) -> Motion:
     state = await context.arm()
     if (fraction := state.target_speed_fraction) < _SLIDER_FULL:
         raise RefusedError("slider-low", fraction=fraction)
-    plan = await MOTION.run(_free_move, context, test, state.joints_rad)
+    plan = await MOTION.run(_free_move, context, test, vector6(state.joints_rad))
     move = StopTestMove(
         test.way,
         context.cell.subject,
@@ -108,7 +108,6 @@ async def stop_half_way(
     move: Coroutine[object, object, None],
 ) -> None:
     """Run the move, stop it in the middle, and enter `idle` however it ended. Raises SafetyStopError."""
-    robot = context.cell.robot
     context.store.enter(StationState.MOVING)
     driving = asyncio.create_task(move)
     try:
@@ -118,7 +117,7 @@ async def stop_half_way(
     except SafetyStopError:
         raise
     except (RobotError, LimitError) as error:
-        await robot.stop("stop test")
+        await context.cell.stop("stop test")
         said, ended_by = str(error), error.code
     finally:
         driving.cancel()
@@ -146,5 +145,5 @@ async def _give_stop(
     if test.way is StopWay.FROZEN:
         time.sleep(FROZEN_S)  # blocks the event loop on purpose, and with it heartbeat and STOP
     else:
-        robot.stop_one_way(test.way)
+        context.cell.require_mover().stop_one_way(test.way)
     context.store.event(STOP_GIVEN, f"stop given: {test.way.value}", moment_ns=moment_ns)

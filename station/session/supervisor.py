@@ -15,6 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from recordings.schema.messages import Vector6
+from station.cell.config import vector6
 from station.cell.errors import RobotError, StaleStateError
 from station.cell.status import StationState
 from station.cell.stillness import JOGGED_RAD
@@ -66,8 +67,8 @@ class SessionSupervisor:
 
     def _round(self, number: int) -> None:
         self.first()
-        if self._context.store.state in RUNNING:
-            self._context.cell.robot.heartbeat()
+        if self._context.store.state in RUNNING and (mover := self._context.cell.mover) is not None:
+            mover.heartbeat()
         if number % STATUS_TICKS == 0:
             self._look()
         self.ticked()
@@ -124,13 +125,13 @@ class SessionSupervisor:
     def _watch_rest(self) -> None:
         """Detect when the arm is moved while the session is paused, which voids an offered motion."""
         context = self._context
-        if context.store.state is not StationState.PAUSED:
+        if context.store.state is not StationState.PAUSED or context.cell.mover is None:
             return
         try:
             state = context.cell.robot.latest()
         except RobotError:
             return
-        pause, joints = context.store.entered, state.joints_rad
+        pause, joints = context.store.entered, vector6(state.joints_rad)
         if self._rest is None or self._rest[0] != pause:
             if max(map(abs, state.joint_speeds_rad_s)) < RESTING_RAD_S:  # not while the arm still brakes
                 self._rest = pause, joints

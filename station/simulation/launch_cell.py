@@ -73,9 +73,11 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
         if options.hardware_trigger:
             box.on_pulse = pulse
         started = ends.pop_all()
+    robot = UrRobot(config.robot, folder)
     return Cell(
         config=config,
-        robot=UrRobot(config.robot, folder),
+        robot=robot,
+        mover=robot,
         camera=camera,
         source="simulated",
         trigger=trigger,

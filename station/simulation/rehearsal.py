@@ -52,9 +52,11 @@ def rehearsed_cell(config: StationConfig, path: str, folder: Path, seed: int = 0
         "robot_sigma_mm": 1e3 * REPEATABILITY_M,
         "robot_sigma_deg": float(np.degrees(REPEATABILITY_RAD)),
     }
+    robot = UrRobot(simulated.robot, folder)
     return Cell(
         config=simulated,
-        robot=UrRobot(simulated.robot, folder),
+        robot=robot,
+        mover=robot,
         camera=RenderedCamera(truth, host, simulated.camera),
         source="simulated",
         config_path=path,

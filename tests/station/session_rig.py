@@ -273,7 +273,7 @@ class Rig:
         robot = robot or self.arm
         if source == "playback":
             self.arm.control_path = ""  # nothing drives a recorded arm
-        cell = Cell(memory_config(), robot, self.camera, source, attachments={"truth.json": b"{}"})
+        cell = Cell(memory_config(), robot, self.camera, source, robot, attachments={"truth.json": b"{}"})
         self.session = Session(cell, root)
         self.session.context.workers = self.worker  # type: ignore[assignment]
         self.states: list[StationState] = []

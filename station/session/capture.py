@@ -58,7 +58,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
         name=context.require_queue().pose(index).name,
         picture_sequence=image.sequence,
         base_from_flange=matrix4(flange_pose(state, context.cell.robot.identity.tcp_offset)),
-        joints_rad=state.joints_rad,
+        joints_rad=state.joints_rad or None,
         attempt=attempt,
         stamps=stamps,
         time_bound_s=bound_s,

@@ -116,7 +116,8 @@ class Session:
         if self.store.state is StationState.STOPPED:
             await self.context.cell.stop(f"STOP by {who}")
             return
-        await self._halt(StationState.STOPPED, f"STOP by {who}.", "stop")
+        sent = "" if self.context.cell.mover is not None else " Nothing was sent: use the arm's own pendant."
+        await self._halt(StationState.STOPPED, f"STOP by {who}.{sent}", "stop")
 
     async def lease_lost(self, client_id: int, how: str = "The connection of {} was lost.") -> None:
         """Stop the arm as the client in control is gone; going on needs a new approval."""

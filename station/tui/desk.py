@@ -33,6 +33,7 @@ STATUS_PERIOD_S = 0.25
 """Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
 RECONNECT_S = 1.0
 GONE = "The daemon ended: the controller stops the arm. This screen goes on when a daemon serves again."
+NOT_OURS = "The station cannot stop this arm: press STOP or the EMERGENCY STOP on its own pendant."
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
 REMEDIES = {
     "nothing-installed": "4 shows the newest result, i installs it.",
@@ -182,6 +183,9 @@ class Desk:
 
     async def stop(self) -> None:
         """STOP, whatever is shown, and also where nobody answers or no connection is left."""
+        if self.known.status is not None and self.known.status.robot.by_hand:
+            self.app.notify(NOT_OURS, severity="error", timeout=10)
+            return
         if not self.client.connected:
             if self.client.send_stop():
                 self.app.notify("STOP was sent without a connection: look at the arm.", severity="warning")

@@ -22,6 +22,8 @@ from station.tui.words import MARKS, UNKNOWN, dim, duration, shortened, size, st
 R = TypeVar("R")
 STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
 STOP_NARROW = "STOP F12", "STOPPED"
+STOP_ELSEWHERE = "STOP on\nits own\npendant", "STOP is on the arm's\nown pendant"
+"""In place of STOP where a person moves the arm, which the station cannot stop."""
 DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
 """How the bar names the way in which the arm is controlled."""
 RAIL_WIDE = 96
@@ -32,16 +34,23 @@ ANSWER = Action(
 
 
 class StopBlock(Static):
-    """STOP, on every screen and question: never dimmed, covered or cut; a click presses it too."""
+    """STOP, on every screen and question: never dimmed, covered or cut; a click presses it too.
+
+    Where a person moves the arm it says whose STOP it is, and is no button.
+    """
 
     latched: reactive[bool] = reactive(False)
+    by_hand: reactive[bool] = reactive(False)
 
     def render(self) -> Content:
-        words = STOP_NARROW if self.size.width < 16 else STOP_WIDE
-        return Content(words[self.latched])
+        narrow = self.size.width < 16
+        if self.by_hand:
+            return Content(STOP_ELSEWHERE[not narrow])
+        return Content((STOP_NARROW if narrow else STOP_WIDE)[self.latched])
 
     async def on_click(self) -> None:
-        await self.app.run_action("stop")
+        if not self.by_hand:
+            await self.app.run_action("stop")
 
 
 class Line(Static):
@@ -103,7 +112,10 @@ class Frame(Horizontal):
     def show(self, known: Known) -> None:
         for line in self.query(Line):
             line.show(known)
-        self.query_one(StopBlock).latched = known.live is not None and known.live.state in LATCHED
+        stop, live = self.query_one(StopBlock), known.live
+        stop.latched = live is not None and live.state in LATCHED
+        stop.by_hand = live is not None and live.robot.by_hand
+        stop.set_class(stop.by_hand, "-by-hand")
 
 
 def bar_line(known: Known, title: str, width: int) -> Content:
@@ -143,6 +155,10 @@ def _bar_parts(known: Known, title: str) -> Iterator[Content]:
 
 def _robot_parts(status: StationStatus) -> Iterator[Content]:
     robot = status.robot
+    if robot.by_hand:
+        yield Content.styled(f"  {robot.model or 'no arm'}", "bold $strong") + dim(" moved by a person")
+        yield Content.styled(f"  {robot.notice}", "$warn")
+        return
     safe = robot.condition.safety or "not known"
     style = "bold $strong" if robot.condition.safety == "NORMAL" else "bold $warn"
     yield Content.assemble(("  safety ", "$dim"), (safe, style))

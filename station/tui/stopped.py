@@ -48,8 +48,8 @@ def stopped_text(status: StationStatus) -> Content:
     )
     pendant = mark("look", held) if (held := robot.condition.held) else mark("done", "nothing to clear there")
     safety = Content.assemble(("safety ", "$dim"), (robot.condition.safety or UNKNOWN, "bold $strong"))
-    rests = ""
-    if robot.connected and status.cause in ("stop", *STOPPED_BY):  # else its news may be old
+    rests = ""  # its news may be old
+    if robot.connected and not robot.by_hand and status.cause in ("stop", *STOPPED_BY):
         rests = " The arm stands still." if robot.still else " The arm is told to stop."
     return lines(
         Content.styled(f"{STOPPED_BY.get(status.cause, status.reason)}{rests}", "bold $strong"),

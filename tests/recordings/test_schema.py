@@ -99,7 +99,7 @@ def test_any_bytes_are_a_message_or_a_schema_error(data: bytes) -> None:
 
 def test_a_vector_of_the_wrong_length_is_refused() -> None:
     message = message_class(RobotState).FromString(encode(make_state(0)))
-    message.joints_rad.append(1.0)
+    message.tcp_pose.append(1.0)
     with pytest.raises(SchemaError):
         decode(RobotState, message.SerializeToString())
 

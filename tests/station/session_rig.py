@@ -29,7 +29,6 @@ from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
 from station.cell.status import ArmCondition, CameraCounts, DetectionStatus, Event, FrameTiming, StationState
-from station.devices.base import Robot
 from station.devices.cell import Cell
 from station.devices.news import Evidence
 from station.devices.ur import control_trouble
@@ -267,13 +266,16 @@ def memory_config() -> StationConfig:
 class Rig:
     """A started session and its devices. Client 1 is the operator, 2 somebody else."""
 
-    def __init__(self, root: Path, source: Any = "simulated", robot: Robot | None = None) -> None:
-        """`robot`: in place of the arm in memory."""
+    def __init__(
+        self, root: Path, source: Any = "simulated", robot: Any = None, by_hand: bool = False
+    ) -> None:
+        """`robot`: in place of the arm in memory. `by_hand`: a person moves it, not the station."""
         self.arm, self.camera, self.worker = ArmInMemory(), CameraInMemory(), WorkerInThisProcess()
         robot = robot or self.arm
         if source == "playback":
             self.arm.control_path = ""  # nothing drives a recorded arm
-        cell = Cell(memory_config(), robot, self.camera, source, robot, attachments={"truth.json": b"{}"})
+        mover = None if by_hand else robot
+        cell = Cell(memory_config(), robot, self.camera, source, mover, attachments={"truth.json": b"{}"})
         self.session = Session(cell, root)
         self.session.context.workers = self.worker  # type: ignore[assignment]
         self.states: list[StationState] = []

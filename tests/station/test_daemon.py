@@ -25,7 +25,8 @@ from tests.station.session_rig import ArmInMemory, CameraInMemory, WorkerInThisP
 @pytest.fixture
 def daemon(tmp_path: Path) -> Iterator[Daemon]:
     """Not yet running; it serves on the socket `s`."""
-    cell = Cell(memory_config(), ArmInMemory(), CameraInMemory(), "simulated")
+    arm = ArmInMemory()
+    cell = Cell(memory_config(), arm, CameraInMemory(), "simulated", arm)
     made = Daemon(cell, tmp_path / "root", tmp_path / "s")
     made.session.context.workers = WorkerInThisProcess()  # type: ignore[assignment]
     yield made

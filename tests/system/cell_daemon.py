@@ -67,9 +67,11 @@ def main() -> None:
     place, hangs = Path(root), os.environ.get("CELL_HANGS", "")
     if hangs == "disk":
         let_the_disk_hang()
+    arm = UrRobot(config.robot, place)
     cell = Cell(
         config=config,
-        robot=UrRobot(config.robot, place),
+        robot=arm,
+        mover=arm,
         camera=(HangingCamera if hangs == "camera" else RenderedCamera)(truth, host, config.camera),
         source="simulated",
         attachments={"truth.json": Path(truth_file).read_bytes()},

@@ -191,6 +191,23 @@ async def test_stop_stands_whole_on_every_screen_and_question(
             await pilot.app.pop_screen()
 
 
+@pytest.mark.parametrize("size", SIZES)
+async def test_the_screens_have_no_stop_for_an_arm_that_a_person_moves(
+    link: FakeLink, size: tuple[int, int]
+) -> None:
+    status = idle()
+    link.show(msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, by_hand=True)))
+    async with opened(link, size, notifications=True) as pilot:
+        block = pilot.app.screen.query_one(StopBlock)
+        words = str(block.render())
+        assert "pendant" in words and "F12" not in words
+        assert max(map(len, words.splitlines())) <= block.size.width and words.count("\n") < block.size.height
+        await pilot.click(StopBlock)
+        await pilot.press("f12")
+        await until(pilot, lambda: bool(pilot.app._notifications))
+        assert "stop" not in link.verbs
+
+
 async def test_stop_can_be_clicked_in_the_wizard_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stops: list[CellSetup] = []
 

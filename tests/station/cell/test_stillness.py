@@ -8,10 +8,11 @@ import math
 import msgspec
 import pytest
 
-from calibrate.kinematics import MODELS
+from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import RobotState, Stamps
 from station.cell.config import StillnessConfig
 from station.cell.errors import StaleStateError
+from station.cell.layout import pose_vector
 from station.cell.stillness import NotStillError, StillnessMonitor
 from tests.codes import raises
 from tests.station.devices.test_ur_moves import STATE
@@ -21,16 +22,18 @@ HOME = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
 
 def state(at_s: float, joint_rad: float = 0.0, speed_rad_s: float = 0.0) -> RobotState:
     """Joint 2 displaced and moving."""
+    joints = (HOME[0], HOME[1] + joint_rad, *HOME[2:])
     return msgspec.structs.replace(
         STATE,
         stamps=Stamps(controller_s=at_s),
-        joints_rad=(HOME[0], HOME[1] + joint_rad, *HOME[2:]),
+        joints_rad=joints,
+        tcp_pose=pose_vector(forward(MODELS["UR10"], joints)),
         joint_speeds_rad_s=(0.0, speed_rad_s, 0.0, 0.0, 0.0, 0.0),
     )
 
 
 def monitor(**limits: float) -> StillnessMonitor:
-    return StillnessMonitor(MODELS["UR10"], StillnessConfig(**limits))
+    return StillnessMonitor(StillnessConfig(**limits))
 
 
 def shake(found: StillnessMonitor, seconds: float, amplitude_rad: float, frequency_hz: float = 8.0) -> None:
@@ -76,7 +79,9 @@ def test_a_slow_creep_is_no_rest_although_no_speed_is_reported() -> None:
 def test_a_flange_that_only_turns_on_the_spot_is_no_rest() -> None:
     m = monitor()
     for i in range(60):
-        turned = msgspec.structs.replace(state(i * 0.008), joints_rad=(*HOME[:5], 0.001 * i * 0.008))
+        joints = (*HOME[:5], 0.001 * i * 0.008)
+        pose = pose_vector(forward(MODELS["UR10"], joints))
+        turned = msgspec.structs.replace(state(i * 0.008), joints_rad=joints, tcp_pose=pose)
         m.add(turned)
     found = m.measure()
     assert found is not None and found.position_scatter_m < 1e-9

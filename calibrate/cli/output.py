@@ -12,6 +12,8 @@ from typing import Literal
 from calibrate.errors import UsageError
 from calibrate.recorded_views import Progress as LoadProgress
 from recordings.cli.console import AsJson as AsJson
+from recordings.cli.console import OpenReport as OpenReport
+from recordings.cli.console import open_report as open_report
 from recordings.cli.console import plain_console, progress_bar
 from recordings.cli.console import print_json as print_json
 from recordings.files import read_beginning

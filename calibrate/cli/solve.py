@@ -13,7 +13,16 @@ from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.cli.contracts import CompareJson, SolveJson
-from calibrate.cli.output import AsJson, check_target, detection_progress, out, print_json
+from calibrate.cli.output import (
+    AsJson,
+    OpenReport,
+    check_target,
+    detection_progress,
+    err,
+    open_report,
+    out,
+    print_json,
+)
 from calibrate.cli.solve_options import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.errors import UsageError
 from calibrate.files.calibration import write_calibration, write_output
@@ -42,6 +51,7 @@ def solve(
     ] = None,
     as_json: AsJson = False,
     report: Annotated[Path | None, typer.Option(help="Also write the report (HTML)")] = None,
+    opened: OpenReport = False,
     verify: Verify = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
@@ -53,6 +63,8 @@ def solve(
     """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target, "calibration")
+    if opened and report is None:
+        report = target.with_suffix(".html")
     if report is not None:
         check_target(report, "report")
         if os.path.realpath(report) == os.path.realpath(target):
@@ -73,6 +85,8 @@ def solve(
             out.print(
                 f"Next: {install_line(job.calibration.source, target, _root_of(target))}", soft_wrap=True
             )
+    if opened and report is not None:
+        open_report(report, err)
     if not job.passed:
         raise typer.Exit(GATE_FAILED)
 

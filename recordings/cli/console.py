@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
@@ -16,6 +20,7 @@ from rich.segment import Segment
 
 from recordings.plain_text import plain_text
 
+OpenReport = Annotated[bool, typer.Option("--open", help="Open the report in a browser")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else")]
 
 
@@ -41,6 +46,24 @@ def progress_bar(label: str, console: Console) -> Iterator[Callable[[int, int, s
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total, name: bar.update(task, completed=done, total=total, description=name)
+
+
+def open_in_browser(page: Path) -> bool:
+    """Open a local file in the desktop's browser; False: there is no desktop here, or no way to ask it."""
+    mac = sys.platform == "darwin"
+    command = shutil.which("open" if mac else "xdg-open")
+    if command is None or not (mac or os.environ.keys() & {"DISPLAY", "WAYLAND_DISPLAY"}):
+        return False
+    quiet = subprocess.DEVNULL  # what a browser says would be written across the terminal
+    asked = subprocess.Popen([command, page], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+    threading.Thread(target=asked.wait, daemon=True).start()
+    return True
+
+
+def open_report(page: Path, console: Console) -> None:
+    """Open a report, or say that there is no desktop."""
+    if not open_in_browser(page):
+        console.print(f"No desktop was found here: open {page} in a browser.", soft_wrap=True)
 
 
 class _Hook(RenderHook):

@@ -31,7 +31,7 @@ from station.cell.process import die_with_parent
 from station.cell.status import DetectionStatus
 from station.protocol.verbs import PreviewImage
 
-JPEG_LIMIT_BYTES = 40_000
+JPEG_LIMIT_BYTES = 200_000
 """Largest JPEG: in base64 it must fit into one line of the protocol."""
 _QUALITIES = (75, 50, 30, 15)
 

@@ -20,7 +20,7 @@ from station.cell.pose_plan import Plan
 from station.cell.status import PoseStatus
 
 STATE_FILE = "session.json"
-CALIBRATION_FILE = "calibration.yaml"
+CALIBRATION_FILE, REPORT_FILE = "calibration.yaml", "report.html"
 _ACTIVE = "active"
 _NAME_ATTEMPTS = 100
 _LISTED = 200

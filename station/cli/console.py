@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from recordings.cli.console import AsJson as AsJson
+from recordings.cli.console import OpenReport as OpenReport
+from recordings.cli.console import open_report as open_report
 from recordings.cli.console import plain_console
 from recordings.cli.console import print_json as print_json
 

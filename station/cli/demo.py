@@ -25,10 +25,10 @@ from recordings.files import state_root
 from recordings.reader import open_recording
 from recordings.schema.messages import Matrix4, Mount
 from station.cell.errors import ConfigError, StationError
-from station.cell.session_folder import CALIBRATION_FILE
+from station.cell.session_folder import CALIBRATION_FILE, REPORT_FILE
 from station.cell.status import StationStatus
 from station.cli.attended import attended
-from station.cli.console import AsJson, Headless, err, out, print_json
+from station.cli.console import AsJson, Headless, OpenReport, err, open_report, out, print_json
 from station.cli.daemon import own_daemon
 from station.cli.session import PosesJson
 from station.cli.simulated import GigE, Mounting, Noise, Scene, Seed
@@ -37,7 +37,6 @@ from station.simulation.netns import is_isolated, isolated_command
 from station.simulation.truth import CellTruth
 
 PLAN_S = 120.0
-_REPORT_FILE = "report.html"
 _GATE_FAILED = 4
 
 
@@ -80,12 +79,13 @@ def demo_command(
     gige: GigE = False,
     headless: Headless = False,
     as_json: AsJson = False,
+    opened: OpenReport = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
 ) -> None:
     """Run the whole job on a simulated cell: no hardware needed.
 
-    Takes about a minute and ends with the paths of recording, calibration and report (open it in a browser).
-    The same cell to play with: `station`.
+    Takes about a minute and ends with the paths of recording, calibration and report. `--open` shows the
+    report in a browser. The same cell to play with: `station`.
 
     Exit codes: 0 done, 1 failed, 3 poses missing, 4 a gate failed.
     """
@@ -121,7 +121,7 @@ def demo_command(
         poses=PosesJson(len(outcome.session.poses), outcome.session.captured),
         recording=outcome.session.recording,
         calibration=str(made / CALIBRATION_FILE),
-        report=str(made / _REPORT_FILE),
+        report=str(made / REPORT_FILE),
         gates_passed=all(gate.passed for gate in solved.quality.gates),
         approved_again=outcome.session.approved_again,
     )
@@ -131,6 +131,8 @@ def demo_command(
         _show_demo(result, arm is not None and arm.offered, time.monotonic() - started_s)
         for sentence in arm_sentences(solved):
             out.print(sentence)
+    if opened:
+        open_report(Path(result.report), err)
     if not result.gates_passed:
         raise typer.Exit(_GATE_FAILED)
     if result.poses.captured < result.poses.planned:
@@ -178,7 +180,7 @@ def _solved(outcome: StationStatus) -> Calibration:
             "demo-unfinished", captured=session.captured, poses=len(session.poses), saved=saved, why=why
         )
     folder = Path(session.folder)
-    calibration, report = str(folder / CALIBRATION_FILE), str(folder / _REPORT_FILE)
+    calibration, report = str(folder / CALIBRATION_FILE), str(folder / REPORT_FILE)
     command = [sys.executable, "-m", "calibrate.cli", "solve", session.recording]
     command += ["--output", calibration, "--report", report]
     done = subprocess.run(command, capture_output=True, text=True)

@@ -22,7 +22,7 @@ from station.protocol.verbs import Observation, Observe, PreviewImage
 from station.session.capture import at_exposure
 from station.session.context import SessionContext
 
-PREVIEW_PERIOD_S = 0.2
+PREVIEW_PERIOD_S = 0.1
 SIDES = (16, 1024)
 _OBSERVE_S = 5.0
 _TAKING = (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING)

@@ -29,14 +29,15 @@ from station.operate.motion import prepared_motion
 from station.protocol import verbs
 from station.protocol.client import Client
 from station.protocol.states import RUNNING
-from station.protocol.verbs import Purpose
+from station.protocol.verbs import PreviewImage, Purpose
 from station.tui.attendance import Attendance
 from station.tui.capture_screen import CaptureScreen
 from station.tui.connect import ConnectScreen
-from station.tui.desk import Desk, KnowingApp, StatusChanged
+from station.tui.desk import SILENT_S, Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion
 from station.tui.installed import Marks, marks, read_result, read_sessions, state_root
 from station.tui.jobs import check_drift, solve_session
+from station.tui.live_page import SIDE_PX, LivePage, live_of
 from station.tui.log_screen import LogScreen
 from station.tui.plan_screen import PlanScreen
 from station.tui.result import ResultScreen
@@ -48,6 +49,8 @@ from station.tui.widgets.preview import PreviewPane, sharp_widget
 GO_TO = Binding.Group("go to", compact=True)
 LOOK_S = 2.0
 PREVIEW_PERIOD_S = 0.25
+LIVE_PERIOD_S = 0.1
+"""Between two pictures for a browser while the arm rests."""
 SETTLED_S = 2.0
 ACKNOWLEDGE = "Leave STOPPED or FAULT after looking"
 DECELERATES = "It decelerates at once, and the session pauses."
@@ -88,6 +91,9 @@ class StationApp(KnowingApp):
         Binding("f9", "solve_newest", "Solve", tooltip="Solve the session just recorded"),
         Binding("f3", "freedrive", "Freedrive", tooltip="Freedrive: move the arm by hand"),
         Binding("f2", "ask('record')", "Image", tooltip="Capture an image here (freedrive)"),
+        Binding(
+            "o", "open_live", "Live picture", show=False, tooltip="The live picture, large, in a browser"
+        ),
         Binding("f4", "release", "Release", show=False, tooltip="Release control of the arm"),
         *(
             Binding(DIGITS[s.MODE], f"open('{s.MODE}')", s.MODE.title(), group=GO_TO, tooltip=s.TIP)
@@ -104,6 +110,7 @@ class StationApp(KnowingApp):
         self._marks: tuple[str, Marks] | None = None
         """The shown file, and marks of all below the root, when they were read."""
         self._greeted = False
+        self._live_page: LivePage | None = None
 
     def on_mount(self) -> None:
         self.run_worker(self.desk.follow(), group="follow", exit_on_error=False)
@@ -125,6 +132,23 @@ class StationApp(KnowingApp):
             for preview in self.screen.query(PreviewPane):
                 with contextlib.suppress(OSError, StationError):
                     await preview.fetch(self.desk.client)
+
+    @work(exclusive=True, group="live page", exit_on_error=False)
+    async def action_open_live(self) -> None:
+        """Open the live page, and feed it for as long as a browser asks."""
+        page = self._live_page = self._live_page or LivePage()
+        self.notify(page.open(), timeout=60, markup=False)
+        picture = PreviewImage()
+        while True:
+            await asyncio.sleep(PREVIEW_PERIOD_S if self.known.works else LIVE_PERIOD_S)
+            if page.watched:
+                with contextlib.suppress(OSError, StationError):
+                    picture = await self.desk.client.call(verbs.Preview(SIDE_PX, SIDE_PX), timeout_s=SILENT_S)
+                page.publish(live_of(self.known, picture))
+
+    async def on_unmount(self) -> None:
+        if self._live_page is not None:
+            await asyncio.to_thread(self._live_page.close)
 
     def on_status_changed(self, message: StatusChanged) -> None:
         before, status = self.known.live, message.status

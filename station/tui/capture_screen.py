@@ -24,7 +24,7 @@ class CaptureScreen(StationScreen):
     def body(self) -> ComposeResult:
         with Horizontal(id="live"):
             with Vertical(id="live-left"):
-                with Box("Camera", id="picture", below="+ found corners"):
+                with Box("Camera", id="picture", below="+ found corners  o: in a browser"):
                     yield PreviewPane(id="preview")
                     yield Line(lambda known, _: quality_line(known.shown), id="quality")
                 yield Panel("What happened", newest_events, id="events", below="6 all")

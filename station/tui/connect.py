@@ -70,7 +70,7 @@ class ConnectScreen(StationScreen):
         with Horizontal(id="connect"):
             with VerticalScroll(id="checklist-scroll", classes="panel"):
                 yield Line(lambda known, width: checklist_text(known.checks, width), id="checklist")
-            with Box("Camera", id="connect-picture"):
+            with Box("Camera", id="connect-picture", below="o: in a browser"):
                 yield PreviewPane(id="preview")
 
     def show(self, known: Known) -> None:

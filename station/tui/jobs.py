@@ -14,7 +14,7 @@ from calibrate.files.calibration import Calibration
 from calibrate.files.install import Cell, install, rollback, withdraw
 from calibrate.files.validity import ValidityState
 from calibrate.files.versions import InstalledVersion, before_current, installed_versions
-from station.cell.session_folder import CALIBRATION_FILE
+from station.cell.session_folder import CALIBRATION_FILE, REPORT_FILE
 from station.operate.drift_check import check_arguments, recorded, start_drift_check
 from station.operate.motion import Approve
 from station.tui.desk import Desk
@@ -30,7 +30,7 @@ NO_VERDICT = "Another plan was loaded: the drift check has no verdict. Its views
 
 async def solve_session(desk: Desk, recording: str, folder: str) -> None:
     """Solve, and show the result."""
-    output, report = (str(Path(folder) / name) for name in (CALIBRATION_FILE, "report.html"))
+    output, report = (str(Path(folder) / name) for name in (CALIBRATION_FILE, REPORT_FILE))
     what = ("solve", recording, "-o", output, "--report", report)
     code = await desk.question(JobScreen(f"Solving {Path(folder).name}", "calibrate.cli", *what))
     if code in (0, 4):

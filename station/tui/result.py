@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -21,6 +22,8 @@ from calibrate.files.touch import LIMIT_SIGMAS, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import ValidityState, validity_text
 from calibrate.files.versions import same_solve
 from calibrate.results import Gate
+from recordings.cli.console import open_in_browser
+from station.cell.session_folder import REPORT_FILE
 from station.operate.ending import Way, after_drift_check, after_solve
 from station.tui.installed import Result, local
 from station.tui.jobs import install_result, undo_install
@@ -210,6 +213,7 @@ class ResultScreen(StationScreen):
         Binding("i", "act('install')", "Install", tooltip="Make this the cell's calibration; b undoes it"),
         Binding("b", "act('undo')", "Undo", tooltip="Back to the calibration before, or none"),
         Binding("h", "act('touch test')", "Touch test", tooltip="Bring the tip onto corners of the board"),
+        Binding("o", "report", "Report", tooltip="Open the report in a browser"),
         Binding("d", "app.drift_check", "Drift check", tooltip="Capture a drift check of what is installed"),
     ]
 
@@ -242,6 +246,14 @@ class ResultScreen(StationScreen):
 
     def on_data_table_row_selected(self, event: DataTable.RowSelected) -> None:
         self.notify(self._rows[event.cursor_row][1], timeout=10, markup=False)
+
+    def action_report(self) -> None:
+        result = self.known.result
+        report = Path(REPORT_FILE) if result is None else Path(result.path).with_name(REPORT_FILE)
+        if result is None or not report.is_file():
+            self.notify("There is no report of it: F9 on 5 solves again and writes one.")
+        elif not open_in_browser(report):
+            self.notify(f"No desktop was found here. The report: {report}", timeout=60, markup=False)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def action_act(self, what: str) -> None:

@@ -1,0 +1,207 @@
+"""The live picture in a browser: one read-only page, served on loopback by the screen's own process.
+
+It is for eyes at the arm. Nothing that a browser sends reaches the daemon: a thread answers with what the
+screen published last. There is no verb, no form and no other method than GET.
+"""
+
+from __future__ import annotations
+
+import hmac
+import os
+import secrets
+import socket
+import socketserver
+import tempfile
+import threading
+import time
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+
+import msgspec
+
+from recordings.cli.console import open_in_browser
+from station.protocol.verbs import PreviewImage
+from station.tui.capture_panels import quality_line
+from station.tui.frame import bar_line
+from station.tui.task import Known, next_action
+
+LOOPBACK = "127.0.0.1"
+SIDE_PX = 1024
+"""Pixels to ask for on either side: the most that the daemon sends."""
+BROWSERS = 8
+"""Connections at a time, each a thread; more are closed unread."""
+BREATH_S = 0.02
+"""Rest after a connection too many, and before an answer to a stranger: a flood costs STOP no time."""
+STALLED_S = 5.0
+"""A reader that takes longer for one answer, or says nothing for so long, is let go."""
+NEWS_S = 1.0
+"""An answer waits so long for a newer picture, so nobody can ask more often than pictures come."""
+WATCHED_S = 3.0
+PAGE = Path(__file__).with_suffix(".html").read_bytes()
+OWN_SCRIPT = (
+    "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; "
+    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+
+
+class Live(msgspec.Struct, frozen=True):
+    """What the page shows: the sentences of the screen, its picture and what is saved."""
+
+    bar: str
+    next: str
+    why: str
+    """Why, or how; a person should look when `look`."""
+    look: bool
+    seen: str
+    """What is found in the picture."""
+    still: bool
+    saved: int
+    """Views saved so far: the page sounds when it grows."""
+    old: bool
+    picture: PreviewImage
+
+
+def live_of(known: Known, picture: PreviewImage) -> Live:
+    """Say what the screens say, in the same words."""
+    status, action = known.shown, next_action(known)
+    return Live(
+        bar_line(known, "Live", 1000).plain.strip(),
+        f"{action.key}  {action.label}".strip(),
+        action.why,
+        action.look,
+        quality_line(status).plain,
+        status.robot.still,
+        status.session.captured,
+        known.old,
+        picture,
+    )
+
+
+class LivePage:
+    """Serves the page from a thread while the screen lives; `close` ends it.
+
+    The token that lets a browser read is in the address's fragment, which browsers send to nobody.
+    """
+
+    def __init__(self) -> None:
+        self._news = threading.Condition()
+        self._body, self._asked_s = b"{}", -WATCHED_S
+        self._token = secrets.token_urlsafe(16)
+        self._door: Path | None = None
+        self._server = _Server(self)
+        self.port = int(self._server.server_address[1])
+        self.address = f"http://{LOOPBACK}:{self.port}/#{self._token}"
+        threading.Thread(target=self._server.serve_forever, name="live-page", daemon=True).start()
+
+    @property
+    def watched(self) -> bool:
+        """A browser asked within the last seconds."""
+        return time.monotonic() - self._asked_s < WATCHED_S
+
+    def publish(self, live: Live) -> None:
+        """Give waiting browsers this, and those that ask from now on."""
+        body = msgspec.json.encode(live)
+        with self._news:
+            self._body = body
+            self._news.notify_all()
+
+    def newest(self) -> bytes:
+        """Wait for the next picture; after a while the last one again."""
+        self._asked_s = time.monotonic()
+        with self._news:
+            self._news.wait(NEWS_S)
+            return self._body
+
+    def knows(self, token: str) -> bool:
+        return hmac.compare_digest(token.encode(), f"Bearer {self._token}".encode())
+
+    def open(self) -> str:
+        """Open it in this computer's browser; return what to tell the person.
+
+        Everybody may read the arguments of a browser's process. So it is given a file of its own user, which
+        leads to the address with the token.
+        """
+        if "SSH_CONNECTION" in os.environ:
+            port = f"{self.port}:{LOOPBACK}:{self.port}"
+            return f"On your computer: ssh -L {port} {socket.gethostname()}\nThen open {self.address}"
+        if self._door is None:
+            handle, name = tempfile.mkstemp(".html", "station-live-")  # readable by this user alone
+            self._door = Path(name)
+            with os.fdopen(handle, "w") as file:
+                file.write(f'<!doctype html><meta http-equiv="refresh" content="0;url={self.address}">')
+        if open_in_browser(self._door):
+            return f"The live picture opens in the browser. If not: {self.address}"
+        return f"No desktop was found here. The live picture: {self.address}"
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        if self._door is not None:
+            self._door.unlink(missing_ok=True)
+
+
+class _Server(socketserver.ThreadingTCPServer):
+    daemon_threads = True
+
+    def __init__(self, page: LivePage) -> None:
+        self.page, self._places = page, threading.BoundedSemaphore(BROWSERS)
+        super().__init__((LOOPBACK, 0), _Reader)
+
+    def process_request(self, request: socket.socket | tuple[bytes, socket.socket], address: object) -> None:
+        if self._places.acquire(blocking=False):
+            super().process_request(request, address)
+        else:
+            self.shutdown_request(request)
+            time.sleep(BREATH_S)
+
+    def process_request_thread(
+        self, request: socket.socket | tuple[bytes, socket.socket], address: object
+    ) -> None:
+        try:
+            super().process_request_thread(request, address)
+        finally:
+            self._places.release()
+
+    def handle_error(self, request: object, address: object) -> None:
+        """A browser that went away is no error."""
+
+
+class _Reader(BaseHTTPRequestHandler):
+    """One browser's connection: the page, and with the token the news."""
+
+    server: _Server
+    protocol_version, timeout = "HTTP/1.1", STALLED_S
+
+    def do_GET(self) -> None:
+        page, own = self.server.page, [f"{host}:{self.server.page.port}" for host in (LOOPBACK, "localhost")]
+        origin = self.headers.get("Origin")
+        # Another site's page may make a browser ask here, under a name of its own for this address.
+        if self.headers.get("Host") not in own or origin not in (None, *(f"http://{host}" for host in own)):
+            self._refuse(403)
+        elif self.path == "/":
+            self._answer("text/html; charset=utf-8", PAGE)
+        elif self.path == "/news" and page.knows(self.headers.get("Authorization", "")):
+            self._answer("application/json", page.newest())
+        else:
+            self._refuse(403 if self.path == "/news" else 404)
+
+    def _refuse(self, code: int) -> None:
+        time.sleep(BREATH_S)
+        self.send_error(code)
+
+    def _answer(self, kind: str, body: bytes) -> None:
+        self.send_response(200)
+        for name, value in (
+            ("Content-Type", kind),
+            ("Content-Length", str(len(body))),
+            ("Cache-Control", "no-store"),
+            ("Content-Security-Policy", OWN_SCRIPT),
+            ("Referrer-Policy", "no-referrer"),
+            ("X-Content-Type-Options", "nosniff"),
+        ):
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing: the terminal is the screen's."""

@@ -1,0 +1,184 @@
+"""The live picture in a browser: shown to its person, to nobody else, and of no weight for STOP."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import socket
+import subprocess
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.tui.app import StationApp
+from station.tui.live_page import BROWSERS, LivePage
+from tests.tui.conftest import FakeLink, idle, in_session, opened, said, until
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+@pytest.fixture(autouse=True)
+def desktop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A desktop whose browser only notes its arguments; the file with the notes."""
+    asked = tmp_path / "asked"
+    (tmp_path / "xdg-open").write_text(f'#!/bin/sh\nprintf %s "$*" > {asked}.new; mv {asked}.new {asked}\n')
+    (tmp_path / "xdg-open").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    return asked
+
+
+def page_of(app: StationApp) -> LivePage:
+    assert isinstance(app, StationApp) and app._live_page is not None
+    return app._live_page
+
+
+def answer(page: LivePage, path: str = "/news", method: str = "GET", **headers: str) -> tuple[int, bytes]:
+    address, token = page.address.split("/#")
+    asked = urllib.request.Request(address + path, method=method)
+    for name, value in ({"Authorization": f"Bearer {token}"} | headers).items():
+        asked.add_header(name, value)
+    try:
+        with urllib.request.urlopen(asked) as told:
+            return told.status, told.read()
+    except urllib.error.HTTPError as refusal:
+        return refusal.code, b""
+
+
+async def test_a_browser_is_led_there_without_the_token_in_its_arguments(
+    link: FakeLink, desktop: Path
+) -> None:
+    async with opened(link) as pilot:
+        await pilot.press("o")
+        await until(pilot, desktop.exists)
+        door, page = Path(desktop.read_text()), page_of(pilot.app)  # type: ignore[arg-type]
+        assert door.stat().st_mode & 0o777 == 0o600
+        assert page.address in door.read_text()
+        code, body = await asyncio.to_thread(answer, page)
+        live = json.loads(body)
+        assert (code, live["next"], live["old"]) == (200, "F5  Start the capture", False)
+        await until(pilot, lambda: b"jpeg_base64" in page._body)
+    assert not door.exists()
+
+
+async def test_over_ssh_it_says_the_port_to_forward(link: FakeLink, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.1 1 10.0.0.2 22")
+    async with opened(link, notifications=True) as pilot:
+        await pilot.press("o")
+        await until(pilot, lambda: f"-L {page_of(pilot.app).port}:" in said(pilot))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def page() -> Iterator[LivePage]:
+    page = LivePage()
+    yield page
+    page.close()
+
+
+@pytest.mark.parametrize(
+    ("code", "asked"),
+    [
+        (200, {}),
+        (200, {"Origin": "http://localhost:{port}", "Host": "localhost:{port}"}),
+        (403, {"Authorization": "Bearer guess"}),
+        (403, {"Host": "evil.example:{port}"}),
+        (403, {"Origin": "http://evil.example"}),
+        (501, {"method": "POST"}),
+        (501, {"method": "OPTIONS"}),
+        (404, {"path": "/../themes.py"}),
+    ],
+)
+def test_only_its_person_reads_it_and_nobody_writes(page: LivePage, code: int, asked: dict[str, str]) -> None:
+    assert answer(page, **{k: v.format(port=page.port) for k, v in asked.items()})[0] == code  # type: ignore[arg-type]
+
+
+async def test_slow_readers_and_a_thousand_requests_reach_neither_the_daemon_nor_stop(link: FakeLink) -> None:
+    link.answers["preview"] = link.answers["preview"].__class__("x" * 5_000_000)  # more than a link's buffers
+    async with opened(link) as pilot:
+        await pilot.press("o")
+        await until(pilot, lambda: pilot.app._live_page)  # type: ignore[attr-defined]
+        page = page_of(pilot.app)  # type: ignore[arg-type]
+        host, token = page.address[len("http://") :].split("/#")
+        asked = f"GET /news HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
+        slow = [socket.create_connection(("127.0.0.1", page.port)) for _ in range(BROWSERS)]
+        for reader in slow:
+            reader.sendall(asked)
+        await until(pilot, lambda: b"xxx" in page._body)
+
+        def flood() -> None:
+            for _ in range(1000):
+                with socket.socket() as late:
+                    late.setblocking(False)
+                    late.connect_ex(("127.0.0.1", page.port))
+
+        await asyncio.to_thread(flood)
+        await pilot.press("f12")
+        await until(pilot, lambda: "stop" in link.verbs)
+        assert link.verbs == ["stop"]
+        assert page._server._places._value == 0, "no reader was let in beyond the bound"
+        for reader in slow:
+            reader.close()
+        await until(pilot, lambda: page._server._places._value)  # and then another is served
+
+
+@contextmanager
+def browser(page: Path, folder: Path) -> Iterator[Any]:
+    """Chromium on a local page, driven by its pipe: a function that evaluates JavaScript in it."""
+    (their_in, ours), (mine, their_out) = os.pipe(), os.pipe()
+    bash = f"exec 3<&{their_in} 4>&{their_out}; exec {CHROMIUM} --headless --no-sandbox --disable-gpu"
+    command = ["bash", "-c", f"{bash} --user-data-dir={folder} --remote-debugging-pipe {page.as_uri()}"]
+    quiet = subprocess.DEVNULL
+    process = subprocess.Popen(command, pass_fds=(their_in, their_out), stdout=quiet, stderr=quiet)
+    os.close(their_in), os.close(their_out)
+    session: dict[str, str] = {}
+    with os.fdopen(ours, "wb", 0) as to, os.fdopen(mine, "rb") as back:
+
+        def ask(method: str, **parameters: object) -> Any:
+            to.write(
+                json.dumps({"id": 1, "method": method, "params": parameters, **session}).encode() + b"\0"
+            )
+            while True:
+                said = json.loads(b"".join(iter(lambda: back.read(1) or b"\0", b"\0")))
+                if said.get("id") == 1:
+                    return said["result"]
+
+        (tab,) = [each for each in ask("Target.getTargets")["targetInfos"] if each["type"] == "page"]
+        session.update(ask("Target.attachToTarget", targetId=tab["targetId"], flatten=True))
+        try:
+            yield lambda code: ask("Runtime.evaluate", expression=code)["result"].get("value")
+        finally:
+            process.terminate()
+            process.wait()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+async def test_chromium_shows_picture_next_action_and_what_is_saved(
+    link: FakeLink, tmp_path: Path, desktop: Path
+) -> None:
+    async with opened(link) as pilot:
+        await pilot.press("o")
+        await until(pilot, desktop.exists)
+        with browser(Path(desktop.read_text()), tmp_path / "profile") as evaluate:
+
+            async def shows(code: str, wanted: object) -> None:
+                shown = None
+                for _ in range(600):
+                    shown = await asyncio.to_thread(evaluate, code)
+                    if shown == wanted:
+                        return
+                    await pilot.pause(0.1)
+                assert shown == wanted
+
+            await shows("document.querySelector('#next b')?.textContent", "F5  Start the capture")
+            await shows("document.querySelector('svg')?.getAttribute('viewBox')", "0 0 128 96")
+            await shows("document.querySelector('.cross')?.getAttribute('d').split('M').length", 3)
+            link.show(in_session(idle(), captured=4))
+            await shows("document.querySelector('#saved')?.textContent", "4")

@@ -161,12 +161,20 @@ class Daemon:
             notify(f"STATUS={text}")
 
 
-def configured_cell(config: StationConfig, text: bytes, log_dir: Path) -> Cell:
-    """Make the cell of a configuration, not connected. ConfigError for devices that exclude each other."""
-    from station.devices.ur import UrRobot
+def configured_cell(config: StationConfig, text: bytes, log_dir: Path, control: Path) -> Cell:
+    """Make the cell of a configuration, not connected. ConfigError for devices that exclude each other.
 
+    `control`: path of the control socket, beside which poses are posted.
+    """
     trigger = None if config.trigger is None else SerialTrigger(config.trigger)
     camera, source = _camera(config, trigger)
+    if config.robot.driver == "posted":
+        from station.devices.posted import PostedArm
+
+        arm = PostedArm(config, source, control)
+        return Cell(config, arm, camera, source, trigger=trigger, config_text=text)
+    from station.devices.ur import UrRobot
+
     robot = UrRobot(config.robot, log_dir)
     return Cell(
         config=config,

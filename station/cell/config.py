@@ -72,7 +72,10 @@ ControlPath = Literal["ur_rtde", "script"]
 
 
 class RobotConfig(Section, frozen=True):
+    driver: Literal["ur", "posted"] = "ur"
+    """ur: a Universal Robots arm. posted: any arm, moved by a person, whose pose a program posts."""
     model: str = "UR10"
+    """Model of the arm; of a posted one, its name"""
     host: str = ""
     serial: str = ""
     """Serial number; when given, other arms are refused."""

@@ -38,6 +38,9 @@ def load_config(path: Path) -> tuple[StationConfig, bytes]:
         content = read_file(path, strict_yaml.LIMIT_BYTES)
         loaded = strict_yaml.read(content, StationConfig)
         wrong = [_placed(problem, loaded.lines) for problem in _contradictions(loaded.value)]
+        if loaded.value.robot.driver == "posted" and "robot.model" not in loaded.lines:
+            unnamed = ("robot.model", "the posted arm has no name", "Give it one, such as 'xArm 6'.")
+            wrong.append(_placed(unnamed, loaded.lines))
     except OSError as error:
         raise ConfigError("unreadable-config", path=path, reason=error.strerror) from None
     except StrictYamlError as error:
@@ -64,6 +67,8 @@ def missing_for_capture(config: StationConfig) -> Iterator[YamlProblem]:
     if (driver := config.camera.driver) not in REAL_DRIVERS:
         remedy = "Choose aravis or webcam, or rehearse: `--rehearse`."
         yield YamlProblem(0, "camera.driver", f"'{driver}' shows no real image", remedy)
+    if config.robot.driver == "posted":
+        return
     if config.camera.model is None or config.camera.model.matrix is None:
         yield YamlProblem(0, "camera.model", "planning needs a rough lens (matrix)", _FOCAL_LENGTH)
     for name, what in (("camera_guess", "the camera"), ("board_guess", "the board")):
@@ -75,9 +80,13 @@ def missing_for_capture(config: StationConfig) -> Iterator[YamlProblem]:
 def _contradictions(config: StationConfig) -> Iterator[Problem]:
     """Find what types cannot express."""
     limits, robot = config.limits, config.robot
-    if robot.model not in MODELS:
+    if robot.driver == "posted":
+        for key in ("host", "kinematics", "control"):
+            if getattr(robot, key):
+                yield f"robot.{key}", "is for arms that the station moves", "Leave it out, or choose `ur`."
+    elif robot.model not in MODELS:
         yield "robot.model", f"'{robot.model}' is not known", f"Give one of {', '.join(MODELS)}."
-    if not robot.host:
+    if not robot.host and robot.driver == "ur":
         remedy = "Read it on the pendant: menu (top right) → About, or Settings → System → Network."
         yield "robot.host", "the controller's address is missing", remedy
     least, most = limits.joints_min_rad, limits.joints_max_rad

@@ -105,14 +105,20 @@ def printed_corners(board: BoardSpec) -> Array:
     return np.array([(x0, y0, 0.0), (x1, y0, 0.0), (x1, y1, 0.0), (x0, y1, 0.0)])
 
 
-def layout_of(config: StationConfig) -> CellLayout:
-    """Make the layout of a cell from its configuration. ConfigError names what is missing."""
+def known_places(config: StationConfig) -> tuple[CameraModel, PoseGuess, PoseGuess]:
+    """Return lens, initial camera pose and initial board pose. ConfigError names what is missing."""
     camera, mount_guess, place_guess = config.camera.model, config.camera_guess, config.board_guess
     if camera is None or camera.matrix is None:
         raise ConfigError("no-lens")
     if mount_guess is None or place_guess is None:
         missing = "camera_guess" if mount_guess is None else "board_guess"
         raise ConfigError("no-guess", missing=missing)
+    return camera, mount_guess, place_guess
+
+
+def layout_of(config: StationConfig) -> CellLayout:
+    """Make the layout of a cell from its configuration. ConfigError names what is missing."""
+    camera, mount_guess, place_guess = known_places(config)
     return CellLayout(
         config.mount,
         camera,

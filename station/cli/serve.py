@@ -68,16 +68,16 @@ def serve_command(
     log_to_stderr()
     go_before_others(DAEMON_NICENESS)
     real_time = RealTimeThreads()  # before a simulated controller is started, which is given the same
-    place = state_root(root)
+    place, control = state_root(root), socket or default_socket()
     # What only one kind of cell needs is loaded only for it.
     if config is not None and rehearse:
         from station.cell.config_file import load_config
         from station.simulation.rehearsal import FOLDER, rehearsed_cell
 
         place /= FOLDER
-        cell = rehearsed_cell(load_config(config)[0], str(config), place / "simulation", seed)
+        cell = rehearsed_cell(load_config(config)[0], str(config), place / "simulation", control, seed)
     elif config is not None:
-        cell = _real_cell(config, place)
+        cell = _real_cell(config, place, control)
     elif replay is not None:
         from station.devices.playback import playback_cell
 
@@ -87,15 +87,15 @@ def serve_command(
 
         options = SimulationOptions(scene, seed, noise, mount, time_scale, gige, hardware_trigger)
         cell = simulated_cell(options, place / "simulation")
-    asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin, real_time))
+    asyncio.run(serve_cell(cell, place, control, end_with_stdin, real_time))
 
 
-def _real_cell(config: Path, root: Path) -> Cell:
+def _real_cell(config: Path, root: Path, control: Path) -> Cell:
     from station.cell.config_file import load_config
     from station.daemon import configured_cell
 
     loaded, text = load_config(config)
-    return replace(configured_cell(loaded, text, root), config_path=str(config.absolute()))
+    return replace(configured_cell(loaded, text, root, control), config_path=str(config.absolute()))
 
 
 async def serve_cell(

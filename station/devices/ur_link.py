@@ -18,6 +18,7 @@ from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.cell.layout import arm_model
 from station.cell.status import ArmCondition
+from station.devices.history import state_at
 from station.devices.news import CURRENT_S, MOVING_S, RESTING_S, Evidence, is_loopback, largest_gap
 from station.devices.ur_condition import condition, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
@@ -29,7 +30,7 @@ from station.devices.ur_probe import (
     open_dashboard,
     unsupported_model,
 )
-from station.devices.ur_state import POLL_S, Payload, Sample, StateReader, state_at
+from station.devices.ur_state import POLL_S, Payload, Sample, StateReader
 from station.devices.ur_tool import Installation, PrimaryReader, TcpCheck, check_payload
 
 log = logging.getLogger(__name__)

@@ -47,8 +47,8 @@ class SessionSupervisor:
         self._failure = ""
         self._rest: tuple[int, Vector6] | None = None
         """Number of the present pause (`store.entered`), and the joints (6,) at rest in it."""
-        self._silent = False
-        """True while the robot's states are later than allowed."""
+        self._silent = ""
+        """Code of what is wrong while the robot's states are later than allowed; empty: they are not."""
         self._late_since_s = 0.0
         """Since when states are late (host monotonic); 0: they are not."""
         self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
@@ -100,12 +100,16 @@ class SessionSupervisor:
         except StaleStateError as error:
             if not self._silent:
                 self._lost()
-            self._silent = True
-            if store.state is StationState.IDLE:
+            new, self._silent = error.code != self._silent, error.code
+            if store.state is StationState.DISCONNECTED:
+                store.update(reason=str(error), cause=error.code)
+            elif store.state is StationState.IDLE:
                 store.enter(StationState.DISCONNECTED, error)
                 store.problem(error, said="robot lost: {}")
+            elif new and store.state is StationState.FREE_DRIVE:
+                store.problem(error)
             return
-        self._silent = False
+        self._silent = ""
         if self._late_since_s:
             self._tell_delay(self._late_since_s)
             self._late_since_s = 0.0

@@ -7,13 +7,15 @@ import pickle
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
 
+from calibrate.geometry import Array
 from recordings.schema.messages import CameraIdentity, ClockReading, Image
 from station.cell.config import CameraConfig
-from station.cell.errors import CameraError
+from station.cell.errors import CameraError, RobotError
 from station.cell.status import CameraCounts, FrameTiming
 from station.devices.base import DeviceThread
 from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
@@ -35,8 +37,13 @@ class RenderedCamera:
         controller_host: str,
         config: CameraConfig | None = None,
         trigger: SerialTrigger | None = None,
+        flange: Callable[[], Array] | None = None,
     ) -> None:
-        """`trigger`: the box that fires it, whose pulses reach `pulse`; None: triggered by software."""
+        """`trigger`: the box that fires it, whose pulses reach `pulse`; None: triggered by software.
+
+        `flange`: returns base_from_flange (4, 4) of a posted arm; None: the controller is asked for it.
+        """
+        self._flange = flange
         self._truth = truth
         self._trigger = trigger
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -92,6 +99,7 @@ class RenderedCamera:
     async def capture(self, timeout_s: float = 5.0) -> Image:
         """Trigger once and return that frame; a frame from before the trigger is an error."""
         async with self._asking:
+            await self._place()
             await self._read_clock()
             if surplus := self._frames.qsize():
                 self._frames = asyncio.Queue()
@@ -126,6 +134,7 @@ class RenderedCamera:
     async def glimpse(self) -> Image:
         """Render a new image at half the size."""
         async with self._asking:
+            await self._place()
             return _dated(await self._call("preview"))
 
     async def inject(self, fault: str, value: object = None) -> None:
@@ -138,6 +147,16 @@ class RenderedCamera:
         if process is not None:
             process.kill()  # ends a call that is under way, too
             await self._thread.close(ChildProcess(process).stop)
+
+    async def _place(self) -> None:
+        """Bring the camera to where a posted arm is now. CameraError where nothing is posted."""
+        if self._flange is None:
+            return
+        try:
+            place = self._flange()
+        except RobotError as error:
+            raise CameraError.from_data(error.data) from None
+        await self._call("place", place)
 
     def _check_settings(self, frame: Image) -> None:
         found, wanted = (frame.exposure_us, frame.gain_db), (self._exposure_us, self._gain_db)

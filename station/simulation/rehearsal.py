@@ -13,15 +13,15 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrate.geometry import perturb
+from calibrate.geometry import Array, perturb
 from recordings.schema.messages import CameraModel
 from station.cell.config import PoseGuess, StationConfig, matrix4, vector6
-from station.cell.layout import guess_matrix, layout_of, require_kept_clear
+from station.cell.layout import flange_pose, guess_matrix, known_places, layout_of, require_kept_clear
 from station.devices.cell import Cell
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.camera import RenderedCamera
-from station.simulation.launch_cell import start_cell
-from station.simulation.truth import CellTruth
+from station.simulation.launch_cell import TRUTH, start_cell
+from station.simulation.truth import CellTruth, write_truth
 
 FOLDER = "rehearsal"
 """Subfolder of the state folder, which keeps rehearsals apart from real data."""
@@ -35,15 +35,18 @@ _FOCAL_SHARE, _K1 = 0.02, -0.05
 _NORMAL_EXPOSURE_US = 10_000.0
 
 
-def rehearsed_cell(config: StationConfig, path: str, folder: Path, seed: int = 0) -> Cell:
+def rehearsed_cell(config: StationConfig, path: str, folder: Path, control: Path, seed: int = 0) -> Cell:
     """Start the simulated devices of a configuration; blocking (seconds).
 
-    `path`: of the configuration's file. `folder` takes the truth and logs. Raises ConfigError
-    where planning lacks something, LimitError where the board cannot be looked at, StationError.
+    `path`: of the configuration's file. `folder` takes the truth and logs. `control`: path of the control
+    socket. Raises ConfigError where planning lacks something, LimitError where the board cannot be looked at,
+    StationError. A posted arm stays one: its program declares that its poses are simulated.
     """
     from station.devices.ur import UrRobot
 
     truth = truth_within(config, seed)
+    if config.robot.driver == "posted":
+        return _posted_cell(without_devices(config, ""), path, folder, control, truth)
     ends = ExitStack()
     host, attachments = start_cell(truth, folder, ends)
     simulated = without_devices(config, host)
@@ -66,6 +69,21 @@ def rehearsed_cell(config: StationConfig, path: str, folder: Path, seed: int = 0
     )
 
 
+def _posted_cell(config: StationConfig, path: str, folder: Path, control: Path, truth: CellTruth) -> Cell:
+    from station.devices.posted import PostedArm
+
+    arm = PostedArm(config, "simulated", control)
+
+    def flange() -> Array:
+        return flange_pose(arm.latest(), arm.identity.tcp_offset)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write_truth(truth, folder / TRUTH)
+    camera = RenderedCamera(truth, "", config.camera, flange=flange)
+    attachments = {TRUTH: (folder / TRUTH).read_bytes()}
+    return Cell(config, arm, camera, "simulated", config_path=path, attachments=attachments)
+
+
 def without_devices(config: StationConfig, host: str) -> StationConfig:
     """Replace the devices of a configuration by the simulated controller at `host` and camera.
 
@@ -80,23 +98,24 @@ def without_devices(config: StationConfig, host: str) -> StationConfig:
 
 def truth_within(config: StationConfig, seed: int) -> CellTruth:
     """Draw a true cell that agrees with the configuration; its arm starts where the board is seen."""
-    require_kept_clear(config)
-    layout = layout_of(config)
-    assert config.camera_guess is not None and config.board_guess is not None  # checked by layout_of
-    rng = np.random.default_rng([22, seed])
-    group, _ = candidate_pool(layout, PlanOptions(seed=seed), None, rng)
-    middle = np.abs(group.joints_rad - np.median(group.joints_rad, axis=0)).max(axis=1).argmin()
-    camera = config.camera
+    rng, camera = np.random.default_rng([22, seed]), config.camera
+    lens, camera_guess, board_guess = known_places(config)
+    start = np.zeros(6)
+    if config.robot.driver == "ur":
+        require_kept_clear(config)
+        group, _ = candidate_pool(layout_of(config), PlanOptions(seed=seed), None, rng)
+        middle = np.abs(group.joints_rad - np.median(group.joints_rad, axis=0)).max(axis=1).argmin()
+        start = group.joints_rad[middle]
     return CellTruth(
         scene=FOLDER,
         seed=seed,
         mount=config.mount,
         robot_model=config.robot.model,
         board=config.board,
-        camera=_lens_within(layout.camera, camera.model_is_rough, rng),
-        camera_mount=matrix4(_within(config.camera_guess, rng)),
-        board_place=matrix4(_within(config.board_guess, rng)),
-        start_joints_rad=vector6(group.joints_rad[middle]),
+        camera=_lens_within(lens, camera.model_is_rough, rng),
+        camera_mount=matrix4(_within(camera_guess, rng)),
+        board_place=matrix4(_within(board_guess, rng)),
+        start_joints_rad=vector6(start),
         robot_sigma_m=REPEATABILITY_M,
         robot_sigma_rad=REPEATABILITY_RAD,
         # Choose the light for which the configured exposure and gain are right.

@@ -122,7 +122,7 @@ def test_pictures_that_are_not_real_never_stand_beside_a_real_arm(tmp_path: Path
     path = tmp_path / "station.yaml"
     path.write_text(GOOD.replace("driver: aravis", "driver: rendered"))
     with raises("unreal-camera"):
-        configured_cell(*load_config(path), tmp_path)
+        configured_cell(*load_config(path), tmp_path, tmp_path / "control.sock")
     assert "camera.driver" in [problem.where for problem in missing_for_capture(load_config(path)[0])]
 
 
@@ -130,7 +130,7 @@ def test_pictures_that_are_not_real_never_stand_beside_a_real_arm(tmp_path: Path
 def test_a_webcam_is_a_device_of_this_computer(tmp_path: Path, device: str) -> None:
     path = tmp_path / "station.yaml"
     path.write_text(GOOD.replace("driver: aravis, device: KJ001", f"driver: webcam, device: '{device}'"))
-    assert configured_cell(*load_config(path), tmp_path).source == "real"
+    assert configured_cell(*load_config(path), tmp_path, tmp_path / "control.sock").source == "real"
 
 
 @pytest.mark.parametrize("wrong", ["device: film.avi", "device: 'http://127.0.0.1/v'", "trigger: hardware"])

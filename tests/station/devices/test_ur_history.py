@@ -8,7 +8,7 @@ import pytest
 
 from recordings.schema.messages import RobotState, Stamps
 from station.cell.clock_fit import ClockFit
-from station.devices.ur_state import state_at
+from station.devices.history import state_at
 from tests.codes import raises
 from tests.station.devices.test_ur_moves import STATE
 

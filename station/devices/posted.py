@@ -1,0 +1,312 @@
+"""An arm that a person moves and whose pose a program posts, behind `devices.base.Arm`.
+
+The program writes lines (`devices.posts`) to a Unix socket beside the control socket. The first program has
+the arm until it ends. Nothing is ever sent to the arm; a program that is refused is told why and let go.
+Reading is slow on purpose: whatever is written to the socket, control and STOP in the same loop go on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import os
+import socket
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import msgspec
+
+from calibrate.geometry import rotation_angle, rotation_exp
+from recordings.importers.conventions import Convention
+from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState, Source, Stamps, Vector6
+from recordings.schema.stillness import LEAST_SAMPLES
+from station.cell.clock_fit import ClockFit
+from station.cell.config import StationConfig
+from station.cell.errors import RobotError, StaleStateError, StationError
+from station.cell.socket_folder import make_folder, peer_of
+from station.cell.status import ArmCondition
+from station.devices.clocks import ClockEstimator
+from station.devices.history import HISTORY_S, state_at
+from station.devices.news import CURRENT_S, RESTING_S
+from station.devices.posts import Declaration, Post, read_declaration, read_post
+
+log = logging.getLogger(__name__)
+
+SOURCES: dict[Source, str] = {"real": "live", "simulated": "simulated", "playback": "playback"}
+"""What a program must declare in a cell of each kind."""
+READ_BYTES, PAUSE_S, LINES_READ = 8192, 0.005, 10
+"""So much is read at once, then a pause; of what came together only the newest lines are looked at."""
+LINE_BYTES = 2048
+DECLARED_S = 3.0
+"""Longest wait for a program's first line, in which it keeps others away."""
+WRONG_S = 1.0
+"""After a wrong post nothing is captured for so long."""
+TOLD_S = 10.0
+"""So long a notice stays."""
+JUMP_M_S, JUMP_RAD_S = 2.5, 10.0
+"""Ten times the speed to which arms are limited while a person is near (0.25 m/s); more is no motion."""
+ARRIVAL_S = 0.1
+"""Posts without a time of their own may have been held up for so long on their way."""
+CLOCK_STEP_S = 1.0
+"""Step of a program's clock against this computer's that is no delay."""
+
+
+def post_socket(control: Path) -> Path:
+    """Return the path of the socket to which poses are posted, beside the control socket."""
+    return control.with_suffix(".post")
+
+
+class PostedArm:
+    """`source`: the cell's. `control`: path of its control socket."""
+
+    def __init__(self, config: StationConfig, source: Source, control: Path) -> None:
+        self.identity = RobotIdentity(model=config.robot.model, serial=config.robot.serial)
+        self.guided = False
+        self.notice = ""
+        self.kinematics: ArmKinematics | None = None
+        self.path = post_socket(control)
+        self._source = source
+        self._late_s = max(CURRENT_S, config.stillness.window_s / 2)
+        """Age up to which a pose is the present one: at least `LEAST_SAMPLES` come in a window of rest."""
+        self._slowest_s = config.stillness.window_s / LEAST_SAMPLES
+        self._server: asyncio.Server | None = None
+        self._links: set[asyncio.StreamWriter] = set()
+        self._poster = ""
+        """The program that has the arm; empty: none."""
+        self._declared = Declaration("live")
+        self._written: Convention | None = None
+        self._callbacks: list[Callable[[RobotState], None]] = []
+        self._states: deque[RobotState] = deque()
+        self._clock: ClockEstimator | None = None
+        """None: the posts have no time of their own."""
+        self._period_s = 0.0
+        """Between posts, smoothed."""
+        self._wrong: StaleStateError | None = None
+        self._wrong_s = self._told_s = 0.0
+        self._came = asyncio.Event()
+
+    # -- as an arm ---------------------------------------------------------------------------------------
+
+    async def connect(self) -> RobotIdentity:
+        """Listen, and return when a program has posted a pose. StationError where nothing can listen."""
+        if self._server is None:
+            make_folder(self.path.parent)
+            old = os.umask(0o117)
+            try:
+                self.path.unlink(missing_ok=True)
+                self._server = await asyncio.start_unix_server(self._serve, self.path, limit=READ_BYTES)
+            except OSError as error:
+                raise StationError("socket", path=self.path, reason=str(error)) from None
+            finally:
+                os.umask(old)
+        await self._came.wait()
+        return self.identity
+
+    def subscribe(self, callback: Callable[[RobotState], None]) -> None:
+        self._callbacks.append(callback)
+
+    def latest(self) -> RobotState:
+        if (state := self.news()) is None:
+            raise self._silent()
+        return state
+
+    def news(self) -> RobotState | None:
+        if time.monotonic() > self._told_s + TOLD_S:
+            self.notice = ""
+        if not self._poster or not self._states:
+            raise self._recent_wrong() or StaleStateError(
+                "post-nobody", robot=self.identity.model, socket=self.path
+            )
+        if (wrong := self._recent_wrong()) is not None:
+            raise wrong
+        age_s = self._age_s()
+        if age_s > max(RESTING_S, self._late_s):
+            raise self._silent()
+        return self._states[-1] if age_s <= self._late_s else None
+
+    def check(self) -> RobotState | None:
+        return self.news()
+
+    def delay(self, pause_s: float, since_s: float) -> StaleStateError | None:
+        return None
+
+    def condition(self, state: RobotState) -> ArmCondition:
+        return ArmCondition()
+
+    def at(self, host_monotonic_ns: int) -> RobotState:
+        return state_at(self._states.copy(), self.clock(), host_monotonic_ns)
+
+    def clock(self) -> ClockFit | None:
+        """The program's clock against the host's, or how late poses by arrival may be."""
+        if self._clock is not None:
+            return self._clock.fit()
+        return ClockFit(0.0, 0.0, 0.0, 0.0, self._latency_s) if self._states else None
+
+    async def close(self) -> None:
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+            for link in self._links:
+                link.transport.abort()
+            self.path.unlink(missing_ok=True)
+
+    def _age_s(self) -> float:
+        return time.monotonic() - self._states[-1].stamps.host_monotonic_ns / 1e9
+
+    def _silent(self) -> StaleStateError:
+        return StaleStateError("post-silent", poster=self._poster or "no program", age_s=self._age_s())
+
+    def _recent_wrong(self) -> StaleStateError | None:
+        return self._wrong if time.monotonic() < self._wrong_s + WRONG_S else None
+
+    @property
+    def _latency_s(self) -> float:
+        """How late a pose may be when it is posted: as declared, else a period, in which one is asked for."""
+        declared_s = self._declared.late_s
+        return self._period_s + PAUSE_S if declared_s is None else declared_s
+
+    # -- for programs ------------------------------------------------------------------------------------
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        poster, holds = _name_of(writer.get_extra_info("socket")), False
+        self._links.add(writer)
+        try:
+            if self._poster:
+                raise RobotError("post-refused", poster=poster, reason=f"{self._poster} has the arm")
+            self._poster, holds = poster, True
+            await self._take(reader)
+        except (StationError, OSError) as error:
+            self._tell(str(error))
+            answer = {"code": getattr(error, "code", "socket"), "text": str(error)}
+            with contextlib.suppress(OSError):
+                writer.write(msgspec.json.encode(answer) + b"\n")
+                await asyncio.wait_for(writer.drain(), DECLARED_S)
+        finally:
+            if holds:
+                self._poster = ""
+                self._begin_anew()
+            self._links.discard(writer)
+            writer.close()
+
+    async def _take(self, reader: asyncio.StreamReader) -> None:
+        """Take a program's lines until it ends. RobotError where it is none for this cell."""
+        lines = _lines(reader)
+        try:
+            first, *others = await asyncio.wait_for(anext(lines), DECLARED_S)
+        except (TimeoutError, StopAsyncIteration):
+            raise RobotError("post-undeclared", reason="nothing was written") from None
+        self._declared, self._written = read_declaration(first)
+        self._require_of_this_cell(self._declared)
+        self._posts(others)
+        async for some in lines:
+            self._posts(some)
+
+    def _require_of_this_cell(self, declared: Declaration) -> None:
+        wanted, model = SOURCES[self._source], self.identity.model
+        if declared.source != wanted:
+            reason = f"its poses are {declared.source}, the cell takes {wanted} ones"
+        elif declared.robot and declared.robot != model:
+            reason = f"it posts the arm {declared.robot}, the cell's is {model}"
+        else:
+            return
+        raise RobotError("post-refused", poster=self._poster, reason=reason)
+
+    def _posts(self, lines: list[bytes]) -> None:
+        arrived_ns = time.monotonic_ns()
+        if len(lines) > LINES_READ:
+            self._tell(f"{self._poster} posts too fast: only the newest poses are read")
+        try:
+            found = [read_post(line, self._written) for line in lines[-LINES_READ:] if line.strip()]
+            for post, pose in found if found and found[-1][0].t is not None else found[-1:]:
+                self._add(post, pose, arrived_ns)
+        except StaleStateError as error:
+            self._wrong, self._wrong_s = StaleStateError.from_data(error.data), time.monotonic()
+
+    def _add(self, post: Post, pose: Vector6, arrived_ns: int) -> None:
+        before = self._states[-1] if self._states else None
+        if (post.t is None) is not (self._clock is None):
+            self._begin_anew()
+            before, self._clock = None, None if post.t is None else ClockEstimator()
+        told_s = arrived_ns / 1e9 if post.t is None else post.t
+        wrong: StaleStateError | None = None
+        if before is not None:
+            step_s, waited_s = (
+                told_s - before.stamps.controller_s,
+                (arrived_ns - before.stamps.host_monotonic_ns) / 1e9,
+            )
+            if step_s == 0:
+                return  # posted again: no news
+            if step_s > waited_s + CLOCK_STEP_S:
+                wrong = StaleStateError("post-clock", step_s=step_s, passed_s=waited_s)
+            if step_s < 0 or wrong is not None:
+                self._begin_anew()
+            else:
+                self._period_s += 0.05 * (step_s - self._period_s) if self._period_s else step_s
+                wrong = _jump(before.tcp_pose, pose, step_s if post.t is not None else max(step_s, ARRIVAL_S))
+        if self._clock is not None:
+            self._clock.latency_s = self._latency_s
+            self._clock.add(told_s, arrived_ns)
+        joints = post.joints_rad or ()
+        stamps = Stamps(arrived_ns, time.time_ns(), told_s)
+        self._states.append(RobotState(stamps, joints, (), joints, pose))
+        while self._states[0].stamps.controller_s < told_s - HISTORY_S:
+            self._states.popleft()
+        if self._period_s > self._slowest_s:
+            rate = f"{1 / self._period_s:.3g} of at least {1 / self._slowest_s:.0f} poses a second"
+            self._tell(f"{rate}: rest is not seen; post faster, or raise stillness.window_s")
+        for callback in self._callbacks:
+            callback(self._states[-1])
+        self._came.set()
+        if wrong is not None:
+            raise wrong
+
+    def _begin_anew(self) -> None:
+        """Forget what belongs to another clock."""
+        self._states.clear()
+        self._period_s = 0.0
+        if self._clock is not None:
+            self._clock = ClockEstimator()
+
+    def _tell(self, notice: str) -> None:
+        if notice != self.notice:
+            log.warning("%s", notice)
+        self.notice, self._told_s = notice, time.monotonic()
+
+
+async def _lines(reader: asyncio.StreamReader) -> AsyncIterator[list[bytes]]:
+    """Yield the whole lines of each piece; a line that never ends is cut."""
+    rest = b""
+    while data := await reader.read(READ_BYTES):
+        *lines, rest = (rest + data).split(b"\n")
+        if len(rest) > LINE_BYTES:
+            lines, rest = [*lines, rest[:LINE_BYTES]], b""
+        if lines:
+            yield lines
+        await asyncio.sleep(PAUSE_S)
+
+
+def _jump(before: Vector6, after: Vector6, seconds: float) -> StaleStateError | None:
+    """Make the error for a way that no arm goes in this time; None: it may."""
+    distance_m = math.dist(before[:3], after[:3])
+    if distance_m <= JUMP_M_S * seconds:
+        if before[3:] == after[3:]:
+            return None
+        angle_rad = float(rotation_angle(rotation_exp(before[3:]).T @ rotation_exp(after[3:])))
+        if angle_rad <= JUMP_RAD_S * seconds:
+            return None
+        way = f"{math.degrees(angle_rad):.0f}°"
+    else:
+        way = f"{1000 * distance_m:.0f} mm"
+    return StaleStateError("post-jump", way=way, seconds=seconds)
+
+
+def _name_of(link: socket.socket) -> str:
+    """Name the program at the other end: 'python3 (pid 4711)'."""
+    pid = peer_of(link)[0]
+    with contextlib.suppress(OSError):
+        return f"{Path(f'/proc/{pid}/comm').read_text().strip()} (pid {pid})"
+    return f"pid {pid}"

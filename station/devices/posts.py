@@ -1,0 +1,112 @@
+"""Lines by which a program tells an arm's pose, and what is wrong with one.
+
+The first line of a program is a `Declaration`, every further one a `Post`. Pages: docs/integrator/any-arm.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from calibrate.geometry import is_rigid
+from recordings.errors import ImportSourceError
+from recordings.importers.conventions import Convention, convention
+from recordings.schema.messages import Joints, Vector6
+from station.cell.config import LARGEST_REACH_M, vector6
+from station.cell.errors import RobotError, StaleStateError
+from station.cell.layout import pose_vector
+
+UNIT_TOLERANCE = 1e-3
+"""Of a quaternion's length, and of a matrix's rows: of numbers written with three digits or more."""
+TURNS_RAD = 4 * math.pi
+"""A joint that has turned further was told in degrees."""
+
+
+class Declaration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a program says of itself and its posts, once."""
+
+    source: Literal["live", "simulated", "playback"]
+    robot: str = ""
+    """Name of the arm, as configured in `robot.model`; empty: not told."""
+    convention: str = ""
+    """How a pose is written, by `recordings.importers.conventions`; empty: metres and x y z w, or 4×4."""
+    late_s: float | None = None
+    """How old a pose is at most when it is posted; None: one period of the posts."""
+
+
+class Post(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Pose of the arm at one moment."""
+
+    base_from_flange: tuple[float | tuple[float, ...], ...]
+    t: float | None = None
+    """The program's monotonic clock, seconds; None: the pose is of when it arrives."""
+    joints_rad: Joints | None = None
+
+
+_DECLARATION, _POST = msgspec.json.Decoder(Declaration), msgspec.json.Decoder(Post)
+
+
+def read_declaration(line: bytes) -> tuple[Declaration, Convention | None]:
+    """Read a program's first line. RobotError where it is none."""
+    try:
+        declared = _DECLARATION.decode(line)
+        return declared, convention(declared.convention) if declared.convention else None
+    except (msgspec.DecodeError, ImportSourceError) as error:
+        raise RobotError("post-undeclared", reason=str(error)) from None
+
+
+def read_post(line: bytes, written: Convention | None) -> tuple[Post, Vector6]:
+    """Read a post; return it and its pose: x y z [m], rotation vector [rad]. StaleStateError: it is wrong."""
+    try:
+        post = _POST.decode(line)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise StaleStateError("post-unreadable", reason=str(error)) from None
+    if (largest := max(map(abs, post.joints_rad or ()), default=0.0)) > TURNS_RAD:
+        raise StaleStateError("post-degrees", angle=largest)
+    pose = _pose(post.base_from_flange, written)
+    if (away_m := math.hypot(*pose[:3])) > LARGEST_REACH_M:
+        raise StaleStateError("post-too-far", distance_m=away_m)
+    return post, pose
+
+
+def _pose(numbers: Sequence[float | tuple[float, ...]], written: Convention | None) -> Vector6:
+    rows = [x for x in numbers if isinstance(x, tuple)]
+    flat = [x for x in numbers if not isinstance(x, tuple)]
+    if written is not None:
+        return _converted([*flat, *(x for row in rows for x in row)], written)
+    if len(flat) == 7 and not rows:
+        return _by_quaternion(flat)
+    if flat or [len(row) for row in rows] != [4] * 4:
+        raise StaleStateError("post-unreadable", reason="a pose has 7 numbers, or 4 rows of 4")
+    matrix = np.array(rows)
+    if not np.isfinite(matrix).all() or not is_rigid(matrix, UNIT_TOLERANCE):
+        raise StaleStateError("post-rotation", problem="the matrix is no rotation and place, row by row")
+    return pose_vector(matrix)
+
+
+def _by_quaternion(numbers: Sequence[float]) -> Vector6:
+    """Written out, as it runs a thousand times a second: no matrix in between."""
+    *place, x, y, z, w = numbers
+    length = math.hypot(x, y, z, w)
+    if not abs(length - 1) < UNIT_TOLERANCE or not all(map(math.isfinite, numbers)):
+        raise StaleStateError("post-rotation", problem=f"the quaternion's length is {length:.3g}, not 1")
+    sine, sign = math.hypot(x, y, z), math.copysign(1.0, w)
+    scale = sign * 2 * math.atan2(sine, abs(w)) / sine if sine > 0 else 0.0
+    return vector6([*place, scale * x, scale * y, scale * z])
+
+
+def _converted(numbers: Sequence[float], written: Convention) -> Vector6:
+    turned = numbers[:4] if written.rotation_first else numbers[3:]
+    try:
+        if written.rotation in ("xyzw", "wxyz"):
+            _by_quaternion([0.0, 0.0, 0.0, *turned])
+        matrix = written.poses(np.array([numbers]))[0]
+    except (ValueError, IndexError) as error:
+        raise StaleStateError("post-unreadable", reason=f"not of the convention: {error}") from None
+    if not np.isfinite(matrix).all():
+        raise StaleStateError("post-unreadable", reason="a number is not finite")
+    return pose_vector(matrix)

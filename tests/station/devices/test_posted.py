@@ -1,0 +1,271 @@
+"""An arm whose pose a program posts: right posts are its states, wrong ones are named and not taken."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import resource
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from calibrate.geometry import pose_from_quaternion
+from recordings.schema.messages import RobotState
+from station.cell.config import RobotConfig, StillnessConfig
+from station.cell.errors import RobotError
+from station.cell.layout import flange_pose
+from station.cell.stillness import StillnessMonitor
+from station.devices.posted import PostedArm
+from tests.patience import until
+from tests.station.session_rig import memory_config
+
+LIVE = {"source": "live"}
+TURN = np.array([0.5, -0.1, 0.3, 0.8])
+POSE = [0.4, -0.2, 0.3, *(TURN / np.linalg.norm(TURN)).tolist()]
+
+
+class Poster:
+    """A program that posts to an arm's socket."""
+
+    all: ClassVar[list[Poster]] = []
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+        self.t = 100.0
+        self.all.append(self)
+
+    @classmethod
+    async def at(cls, arm: PostedArm, declared: dict[str, Any] | None = LIVE) -> Poster:
+        poster = cls(*await asyncio.open_unix_connection(arm.path))
+        if declared is not None:
+            poster.say(declared)
+        return poster
+
+    def say(self, what: dict[str, Any] | bytes) -> None:
+        self.writer.write(what if isinstance(what, bytes) else json.dumps(what).encode() + b"\n")
+
+    def post(self, pose: Any = POSE, step_s: float = 0.01, **more: Any) -> None:
+        self.t += step_s
+        self.say({"base_from_flange": pose, "t": self.t} | more)
+
+    async def rest(self, count: int = 60) -> None:
+        """Post the same pose for a while; its clock goes as this computer's."""
+        ahead_s = self.t - time.monotonic()
+        for _ in range(count):
+            self.post(step_s=time.monotonic() + ahead_s - self.t + 1e-6)
+            await asyncio.sleep(0.01)
+
+    async def refused(self) -> str:
+        """The code with which the station let go of it."""
+        async with asyncio.timeout(60):
+            code: str = json.loads(await self.reader.readline())["code"]
+        return code
+
+
+def config(model: str = "arm of three words", **still: float) -> Any:
+    import msgspec
+
+    robot, limits = RobotConfig(driver="posted", model=model, serial="A1"), StillnessConfig(**still)
+    return msgspec.structs.replace(memory_config(), robot=robot, stillness=limits)
+
+
+@pytest.fixture
+async def arm(tmp_path: Path) -> AsyncIterator[PostedArm]:
+    arm = PostedArm(config(), "real", tmp_path / "control.sock")
+    connecting = asyncio.create_task(arm.connect())
+    await until(lambda: arm.path.exists())
+    yield arm
+    connecting.cancel()
+    await arm.close()
+    while Poster.all:
+        Poster.all.pop().writer.transport.abort()
+    await asyncio.sleep(0)
+
+
+def trouble(arm: PostedArm) -> str:
+    """Code of what keeps the arm from being captured; empty: nothing."""
+    try:
+        arm.check()
+    except RobotError as error:
+        return error.code
+    return ""
+
+
+async def test_a_posted_arm_is_there_with_its_first_pose_and_its_states_carry_poses_exactly(
+    arm: PostedArm,
+) -> None:
+    states: list[RobotState] = []
+    arm.subscribe(states.append)
+    assert trouble(arm) == "post-nobody"
+    poster = await Poster.at(arm, LIVE | {"robot": "arm of three words"})
+    exact = pose_from_quaternion(POSE[:3], POSE[3:])
+    poster.post(joints_rad=[0.1] * 7)
+    poster.post(exact.tolist())
+    await until(lambda: len(states) == 2)
+    assert (await arm.connect()).model == "arm of three words"
+    for state in states:
+        assert np.abs(flange_pose(state, arm.identity.tcp_offset) - exact).max() < 1e-14
+    assert [len(state.joints_rad) for state in states] == [7, 0]
+    assert arm.latest() is states[-1]
+
+
+async def test_rest_and_the_state_of_a_moment_are_found_without_joints(arm: PostedArm) -> None:
+    still = StillnessMonitor(StillnessConfig())
+    arm.subscribe(still.add)
+    poster = await Poster.at(arm)
+    await poster.rest()
+    await until(lambda: still.at_rest)
+    seen_ns = time.monotonic_ns()
+    await poster.rest(10)
+    await until(lambda: arm.latest().stamps.host_monotonic_ns > seen_ns + 50_000_000)
+    clock = arm.clock()
+    assert clock is not None and clock.bound_s < 0.1
+    found = arm.at(seen_ns)
+    assert found.tcp_pose == arm.latest().tcp_pose and abs(found.stamps.host_monotonic_ns - seen_ns) < 1
+    poster.t = 5.0  # the program's clock begins anew: a rest from before counts no more
+    poster.post()
+    await until(lambda: arm.latest().stamps.controller_s < 10)
+    assert not still.at_rest
+
+
+async def test_poses_without_a_time_are_of_their_arrival_within_a_stated_bound(arm: PostedArm) -> None:
+    poster = await Poster.at(arm, LIVE | {"late_s": 0.015})
+    for _ in range(10):
+        poster.say({"base_from_flange": POSE})
+        await asyncio.sleep(0.02)
+    await until(lambda: trouble(arm) == "")
+    clock = arm.clock()
+    assert clock is not None and clock.bound_s == 0.015
+    now_ns = time.monotonic_ns()
+    poster.say({"base_from_flange": POSE})
+    await until(lambda: arm.latest().stamps.host_monotonic_ns > now_ns)
+    assert arm.at(now_ns).tcp_pose == arm.latest().tcp_pose
+
+
+async def test_poses_are_read_in_the_convention_that_was_declared(arm: PostedArm) -> None:
+    poster = await Poster.at(arm, LIVE | {"convention": "abb-quaternion"})
+    poster.post([400.0, -200.0, 300.0, POSE[6], *POSE[3:6]])
+    await until(lambda: trouble(arm) == "")
+    exact = pose_from_quaternion(POSE[:3], POSE[3:])
+    assert np.abs(flange_pose(arm.latest(), arm.identity.tcp_offset) - exact).max() < 1e-12
+
+
+WRONG = {
+    "millimetres": ({"base_from_flange": [400.0, -200.0, 300.0, *POSE[3:]]}, "post-too-far"),
+    "a quaternion that is none": ({"base_from_flange": [*POSE[:3], 0.5, 0.1, 0.3, 0.8, ]}, "post-rotation"),
+    "a mirror": ({"base_from_flange": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, "post-rotation"),
+    "column by column": (
+        {"base_from_flange": pose_from_quaternion(POSE[:3], POSE[3:]).T.tolist()}, "post-rotation",
+    ),
+    "degrees": ({"base_from_flange": POSE, "joints_rad": [90.0] * 6}, "post-degrees"),
+    "three joints": ({"base_from_flange": POSE, "joints_rad": [0.1] * 3}, "post-unreadable"),
+    "six numbers": ({"base_from_flange": POSE[:6]}, "post-unreadable"),
+    "another key": ({"base_from_tool": POSE}, "post-unreadable"),
+    "no JSON": (b"\x00\xff nonsense\n", "post-unreadable"),
+    "half a line": (b'{"base_from_flange": [0.1,\n', "post-unreadable"),
+    "not a number": (b'{"base_from_flange": [NaN,0,0,0,0,0,1]}\n', "post-unreadable"),
+    "a jump": ({"base_from_flange": [0.4, -0.2, 0.45, *POSE[3:]]}, "post-jump"),
+    "a turn in no time": ({"base_from_flange": [*POSE[:3], *POSE[4:], POSE[3]]}, "post-jump"),
+    "milliseconds": ({"base_from_flange": POSE, "t": 100_000.0}, "post-clock"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+async def test_a_wrong_post_is_named_and_nothing_is_taken_until_right_ones_go_on(
+    arm: PostedArm, case: str
+) -> None:
+    poster = await Poster.at(arm)
+    await poster.rest(5)
+    await until(lambda: trouble(arm) == "")
+    what, code = WRONG[case]
+    began_s = time.monotonic()
+    poster.say(what if isinstance(what, bytes) else {"t": poster.t + 0.01} | what)
+    await until(lambda: trouble(arm) == code)
+    assert time.monotonic() - began_s < 3.0
+    poster.t += 0.02 + 1e6 * (case == "milliseconds")
+    for _ in range(200):
+        poster.post()
+        if trouble(arm) == "":
+            break
+        await asyncio.sleep(0.02)
+    assert trouble(arm) == ""
+
+
+async def test_a_program_that_falls_silent_or_is_killed_is_named(arm: PostedArm) -> None:
+    poster = await Poster.at(arm)
+    await poster.rest(5)
+    for _ in range(10):
+        poster.post(step_s=0.0)  # the time stands still
+    await until(lambda: trouble(arm) == "post-silent")
+    poster.say(b'{"base_from_fl')
+    poster.writer.close()
+    await until(lambda: trouble(arm) == "post-nobody")
+    again = await Poster.at(arm)
+    await again.rest(5)
+    await until(lambda: trouble(arm) == "")
+
+
+async def test_the_first_program_has_the_arm_until_it_ends(arm: PostedArm) -> None:
+    first = await Poster.at(arm)
+    await first.rest(3)
+    second = await Poster.at(arm)
+    second.post([0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
+    assert await second.refused() == "post-refused"
+    assert "has the arm" in arm.notice
+    await first.rest(3)
+    assert arm.latest().tcp_pose[:3] == tuple(POSE[:3])
+    first.writer.close()
+    await until(lambda: trouble(arm) == "post-nobody")
+    third = await Poster.at(arm)
+    await third.rest(3)
+    await until(lambda: trouble(arm) == "")
+
+
+@pytest.mark.parametrize(
+    ("declared", "code"),
+    [
+        ({"source": "simulated"}, "post-refused"),
+        ({"source": "playback"}, "post-refused"),
+        (LIVE | {"robot": "another"}, "post-refused"),
+        ({"source": "real"}, "post-undeclared"),
+        (LIVE | {"convention": "yaw-pitch"}, "post-undeclared"),
+        ({"base_from_flange": POSE}, "post-undeclared"),
+    ],
+)
+async def test_a_program_that_declares_another_source_or_arm_is_refused(
+    arm: PostedArm, declared: dict[str, Any], code: str
+) -> None:
+    poster = await Poster.at(arm, declared)
+    poster.post()
+    assert await poster.refused() == code
+    assert trouble(arm) == "post-nobody"
+
+
+@pytest.mark.parametrize("line", [b"x" * 65536, b"{}\n" * 20_000, b"\n" * 65536])
+async def test_of_a_flood_little_is_read_and_nothing_kept(arm: PostedArm, line: bytes) -> None:
+    poster = await Poster.at(arm)
+    await poster.rest(3)
+    before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for _ in range(40):
+        poster.writer.write(line)
+        await poster.writer.drain()  # waits in the program: the station reads at its own pace
+    await until(lambda: trouble(arm) != "")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 20_000
+    poster.writer.transport.abort()
+    await until(lambda: trouble(arm) == "post-nobody")
+
+
+async def test_a_thousand_poses_a_second_are_kept(arm: PostedArm) -> None:
+    states: list[RobotState] = []
+    arm.subscribe(states.append)
+    poster = await Poster.at(arm)
+    for _ in range(100):
+        for _ in range(5):
+            poster.post(step_s=0.001)
+        await asyncio.sleep(0.005)
+    await until(lambda: bool(states) and states[-1].stamps.controller_s >= poster.t - 0.0005)
+    assert len(states) > 250 and trouble(arm) == ""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
@@ -49,15 +50,29 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
 @contextmanager
 def detection_progress() -> Iterator[LoadProgress | None]:
     """Show progress on stderr: a bar on a terminal, plain lines with CALIBRATE_PROGRESS=lines."""
-    if not err.is_terminal:
-        yield _progress_line if os.environ.get("CALIBRATE_PROGRESS") == "lines" else None
-        return
-    with progress_bar("finding the board", err) as bar:
-        yield bar
+    if err.is_terminal:
+        with progress_bar("solving", err) as bar, _stages(lambda told: bar(1, 1, told)):
+            yield bar
+    elif os.environ.get("CALIBRATE_PROGRESS") == "lines":
+        with _stages(lambda told: print(told, file=sys.stderr, flush=True)):
+            yield _progress_line
+    else:
+        yield None
 
 
 def _progress_line(done: int, total: int, name: str) -> None:
     if done == total or done % 5 == 0:
-        sys.stderr.write(f"finding the board: {done} of {total}\n")
-        sys.stderr.write("computing: some seconds, more for many images\n" * (done == total))
-        sys.stderr.flush()
+        print(f"1 of 5: finding the board in image {done} of {total}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def _stages(tell: Callable[[str], object]) -> Iterator[None]:
+    """Tell the stages of solving while this lasts."""
+    log, handler = logging.getLogger("calibrate.stages"), logging.Handler(logging.INFO)
+    handler.emit = lambda record: tell(record.getMessage())  # type: ignore[method-assign, assignment]
+    log.setLevel(logging.INFO)
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +31,8 @@ from calibrate.handeye.uncertainty import inverse_of
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, Observations, Places, ViewSet, observe_views
 
+STAGES = logging.getLogger("calibrate.stages")
+"""Tells people who wait what is computed."""
 FEWEST_FOR_ARM_ERRORS = 8
 """Fewest views from which errors of the arm can be told from noise."""
 FEWEST_USED = 3
@@ -46,11 +49,13 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = all_pairs(H, C)
     require_motion(pairs)
+    STAGES.info("2 of 5: the best start, from all pairs of views")
     certified = solve_global(pairs)
     start = agreed_start(H, BoardPoses.known(C), seed, certified.X)
     views, turned = set_boards_right(views, start.X, start.Y)
     observed, C = observe_views(views), views.camera_from_board
     state = CellState(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
+    STAGES.info("3 of 5: camera, board and lens together")
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
     log_bayes, plain, failure = None, found, ""
@@ -59,6 +64,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
         flex = flex_motion(views.base_from_flange, held)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
+        STAGES.info("4 of 5: errors of the arm")
         modelled = replace(observed, by_arm_errors=np.concatenate([links, flex], axis=2))
         try:
             found, log_bayes = estimate_with_arm_errors(modelled, found, priors, links.shape[2])

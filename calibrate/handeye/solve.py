@@ -26,7 +26,7 @@ from calibrate.handeye.diagnosis import (
     judge_lens,
 )
 from calibrate.handeye.estimate import FULL, CellFit, estimate
-from calibrate.handeye.fit import fit_cell
+from calibrate.handeye.fit import STAGES, fit_cell
 from calibrate.handeye.metrics import (
     FEWEST_FITTED,
     HELD_OUT,
@@ -138,6 +138,7 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
     seen = fit.observed.has_pixels
     lens_finding = judge_lens(fit, distance) if given and seen else None
     board_finding = judge_board(fit, distance) if seen else None
+    STAGES.info("5 of 5: proof on views left out")
     folds = cross_validate(fit, options.seed) if options.folds else None
     holdout = _holdout(fit) if options.holdout else None
     weight = found.weight

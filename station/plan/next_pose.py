@@ -69,5 +69,5 @@ def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_ra
     if found is None:
         return ""
     pose, poses = found
-    missing = f"at best {poses} more" if poses else "many more poses"
-    return f"{missing} for {1000 * goal_m:.2g} mm; the next best: {pose.why}"
+    missing = f"At least {poses} more pose{'s' * (poses > 1)}" if poses else "Many more poses"
+    return f"{missing} for {1000 * goal_m:.2g} mm. The most useful one: {pose.why}."

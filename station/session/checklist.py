@@ -189,9 +189,7 @@ def _clock_check(context: SessionContext) -> Check:
         known = "controller" if robot is not None else "camera" if frames is not None else "neither"
         return Check("clocks", "warning", f"known: {known}", "wait a few seconds and check again")
     bound_s, limit_s = robot.bound_s + frames.bound_s, context.cell.config.capture.time_bound_s
-    text = (
-        f"controller ±{1000 * robot.bound_s:.2f} ms, frames ±{1000 * frames.bound_s:.2f} ms ({frames.source})"
-    )
+    text = f"controller ±{1000 * robot.bound_s:.2f} ms, frames ±{1000 * frames.bound_s:.2f} ms"
     if frames.impossible:
         text += f", {frames.impossible} impossible stamps"
         remedy = "the camera does not stamp the start of exposure: check its timestamp settings"

@@ -23,7 +23,7 @@ STATES: dict[str, tuple[Mark, str]] = {
     "ok": ("done", "ready"),
     "warning": ("look", "look"),
     "failed": ("failed", "MISSING"),
-    "skipped": ("todo", "not used"),
+    "skipped": ("todo", "no need"),
 }
 READY = "Nothing is missing."
 NOT_READY = "This list refreshes every few seconds."

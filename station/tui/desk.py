@@ -34,6 +34,7 @@ STATUS_PERIOD_S = 0.25
 RECONNECT_S = 1.0
 GONE = "The daemon ended: the controller stops the arm. This screen goes on when a daemon serves again."
 NOT_OURS = "The station cannot stop this arm: press STOP or the EMERGENCY STOP on its own pendant."
+STOP_NOBODY = "STOP reached nobody: no station runs. If the arm moves, press the EMERGENCY STOP."
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
 REMEDIES = {
     "nothing-installed": "4 shows the newest result, i installs it.",
@@ -190,7 +191,7 @@ class Desk:
             if self.client.send_stop():
                 self.app.notify("STOP was sent without a connection: look at the arm.", severity="warning")
             else:
-                self.app.notify("No connection to the daemon: nothing was sent.", severity="error")
+                self.app.notify(STOP_NOBODY, severity="error", timeout=10)
             return
         if self.known.silent_s is not None:
             self.app.notify(STOP_UNHEARD, severity="error", timeout=10)

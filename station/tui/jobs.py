@@ -65,7 +65,8 @@ async def check_drift(desk: Desk, approves: Approve) -> None:
 
 async def install_result(desk: Desk, result: Result, calibration: Calibration) -> None:
     """Ask, then install. A simulated result installs on a simulated cell only."""
-    body = f"{result.path}\nbecomes what every program of this cell reads. b undoes it."
+    session = calibration.provenance.session
+    body = f"Session {session} becomes what every program of this cell reads. b undoes it."
     if not await desk.question(Confirm("Install this calibration?", body, yes="Install")):
         return
     cell: Cell = "simulated" if desk.known.live is not None and desk.known.live.simulated else "real"
@@ -85,6 +86,7 @@ async def install_result(desk: Desk, result: Result, calibration: Calibration) -
     except CalibrationError as refusal:
         desk.app.notify(str(refusal), title="Not installed", severity="error", timeout=20, markup=False)
         return
+    desk.app.result_path = result.path  # read again at once
     desk.app.notify("Installed. b undoes it.")
 
 

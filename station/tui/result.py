@@ -35,7 +35,7 @@ from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, shortene
 NO_RESULT = "No result yet. F9 solves the session just captured; on 5, Enter shows older ones."
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
 SIGNS: dict[str, str] = {"PASS": "✓", "PASS WITH A REASON": "▲", "FAIL": "✗"}
-BAR_CELLS, NAME_CELLS = 14, 25
+BAR_CELLS, NAME_CELLS = 14, 27
 JOBS = {"install": install_result, "touch test": run_touch_test, "undo": undo_install}
 Row = tuple[tuple[Content, ...], str]
 """A row of the table of checks, and what Enter tells of it."""
@@ -73,8 +73,8 @@ def verdict_lines(result: Result) -> Content:
     told = (
         counted["gates"] + f", {narrow} narrowly" * bool(narrow),
         counted["views"],
-        counted.get("touch", "no touch test"),
-        f"session {calibration.provenance.session}",
+        counted.get("touch", "No touch test"),
+        f"Session {calibration.provenance.session}",
     )
     return lines(*rows, Content(f"{'. '.join(told)}."))
 
@@ -131,17 +131,15 @@ def _row(
     limit_text: str = "",
     text: str = "",
 ) -> Row:
-    """Make a row: mark, name, value, bar, limit, word."""
+    """Make a row: mark, name, value, bar, limit."""
     colour = MARKS[kind][1]
     bar = Content() if value is None or limit is None else limit_bar(value, limit, BAR_CELLS, colour)
-    word = {"failed": "FAIL", "look": "look", "done": "pass", "todo": "not yet"}[kind]
     style = "bold $strong" if kind in ("failed", "look") else "$foreground"
     return (
         mark(kind) + Content(" ") + Content.styled(shortened(name, NAME_CELLS), style),
         Content.styled(shown, "bold $strong"),
         bar,
         dim(limit_text),
-        Content.styled(word, colour),
     ), text
 
 
@@ -224,7 +222,7 @@ class ResultScreen(StationScreen):
         yield Static(NO_RESULT, id="verdict")
         with Horizontal(id="result"):
             with Box("Checks", id="checks-box", below="Enter tells why"):
-                yield Rows("check", "value", "", "limit", "", id="checks")
+                yield Rows("check", "value", "", "limit", id="checks")
             with VerticalScroll(id="evidence-box", classes="panel"):
                 yield Static(id="evidence")
 

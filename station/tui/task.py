@@ -214,7 +214,7 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
         return Action("1", "See what is missing", why, look=True)
     if state in RUNNING:
         why = status.pending or status.reason or _progress(status)
-        return Action("F6", "Pause after this pose", why)
+        return Action("", "Watch the arm", f"F12 stops it at once, F6 after this pose. {why}")
     if state is StationState.SEALING:
         return Action("", "Wait", "The recording is being finished.")
     if held and state in _STILL:
@@ -232,7 +232,7 @@ def _progress(status: StationStatus) -> str:
     estimate = status.estimate
     if estimate.enough:
         return f"The goal of {estimate.goal_mm:g} mm is reached: F7 finishes, or take all poses."
-    return estimate.advice or "F12 stops the arm at once."
+    return estimate.advice
 
 
 def _at_rest(known: Known, status: StationStatus) -> Action:

@@ -57,7 +57,7 @@ def test_there_is_one_verdict_in_three_states(result: Result, verdict: str) -> N
     assert result.verdict == verdict
     if result.calibration is not None:
         assert verdict_lines(result).plain.split(", ")[0][2:] == verdict
-        assert f"session {GOOD.provenance.session}" in verdict_lines(result).plain
+        assert f"Session {GOOD.provenance.session}" in verdict_lines(result).plain
 
 
 def test_terminal_and_screen_say_the_same_figures() -> None:

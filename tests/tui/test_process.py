@@ -188,7 +188,7 @@ async def test_a_lost_screen_a_hung_and_a_killed_daemon_leave_the_session_whole(
     await desk.rig.stops()
     await shows(second, "NO DAEMON")
     second.press("f12")
-    await shows(second, "nothing was sent")
+    await shows(second, "STOP reached nobody")
     await desk.serve()
     await shows(second, "■ STOPPED")
     await shows(second, "daemon ended")

@@ -82,7 +82,7 @@ async def test_without_a_daemon_what_it_said_last_stays_and_is_marked_old(link: 
         assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose 8 of 25: OLD"
 
 
-@pytest.mark.parametrize(("heard", "told"), [(True, "without a connection"), (False, "nothing was sent")])
+@pytest.mark.parametrize(("heard", "told"), [(True, "without a connection"), (False, "EMERGENCY STOP")])
 async def test_without_a_connection_stop_is_sent_all_the_same(heard: bool, told: str) -> None:
     class Nobody(FakeLink):
         async def open(self) -> Client:

@@ -250,13 +250,16 @@ def image_motion(images: Sequence[Pixels], full_width: int = 0, box: Box | None 
     window = cv2.createHanningWindow((newest.shape[1], newest.shape[0]), cv2.CV_32F)
     # Copies, because OpenCV multiplies its input arrays by the window in place.
     shifts = [cv2.phaseCorrelate(image, newest.copy(), window)[0] for image in earlier]
-    share = 1.0 if box is None else box[2] - box[0]
-    scale = (full_width or images[-1].shape[1]) * share / newest.shape[1]
+    width = images[-1].shape[1]
+    scale = (full_width or width) / min(width, WIDTH_PX)
     return float(scale * max(np.hypot(x, y) for x, y in shifts))
 
 
 def _reduced(image: Pixels, box: Box | None) -> NDArray[np.float32]:
-    """Convert to grey, 0…255, at most `WIDTH_PX` wide."""
+    """Convert to grey, 0…255, at most `WIDTH_PX` wide, with sides whose Fourier transform is even.
+
+    Where it is odd, `cv2.phaseCorrelate` finds half a pixel of motion in images at rest.
+    """
     height, width = image.shape[:2]
     if box is not None:
         left, top, right, bottom = box
@@ -270,7 +273,10 @@ def _reduced(image: Pixels, box: Box | None) -> NDArray[np.float32]:
         grey = cv2.cvtColor(grey, cv2.COLOR_BGR2GRAY)
     scale = min(1.0, WIDTH_PX / width)
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, dtype=np.float32)
+    rows, columns = (
+        next(n for n in range(n, 0, -1) if cv2.getOptimalDFTSize(n) % 2 == 0) for n in small.shape
+    )
+    return np.asarray(small[:rows, :columns], dtype=np.float32)
 
 
 def preview_image(taken: Image, corners: Array, width: int, height: int, sequence: int) -> PreviewImage:

@@ -38,6 +38,15 @@ def test_the_shift_between_noisy_pictures_is_measured(shift_px: float) -> None:
     assert image_motion(pictures, full_width=1280) == pytest.approx(2 * (motion_px or 0))
 
 
+@pytest.mark.parametrize("size", [(122, 122), (225, 135), (130, 243)])
+def test_nothing_moves_in_images_of_any_size(size: tuple[int, int]) -> None:
+    """OpenCV's correlation is half a pixel off where a side's Fourier transform has an odd length."""
+    rows, columns = size
+    assert image_motion([seen(0.0, 7.0, k)[:rows, :columns] for k in (1, 2, 3)]) == pytest.approx(
+        0.0, abs=0.1
+    )
+
+
 def test_a_ringing_that_fits_one_gap_shows_in_the_other() -> None:
     assert image_motion([seen(3.0), seen(0.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
     assert image_motion([seen(0.0), seen(3.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)

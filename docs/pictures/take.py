@@ -2,7 +2,7 @@
 
 A simulated cell is served, captured, solved and looked at by the real screen, drawn at each size and theme
 without a terminal. Needs chromium for PNG. `-o FOLDER` puts them elsewhere; sizes and themes may be named:
-`python docs/pictures/take.py 160x48 light`. All: three sizes in the dark theme, the middle one in the light.
+`python docs/pictures/take.py 160x48 light`. All: every size in the dark theme, one in the light.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from station.protocol.client import Client
 from station.tui.app import StationApp
 from station.tui.result import ResultScreen
 
-SIZES = {"80x24": (80, 24), "120x36": (120, 36), "160x48": (160, 48)}
+SIZES = {"60x20": (60, 20), "80x24": (80, 24), "120x36": (120, 36), "160x48": (160, 48)}
 PATIENCE_S = 120.0
 LIMIT_BYTES = 60_000
 SCALE = 0.6
@@ -184,7 +184,7 @@ async def look(cameras: list[Camera], socket: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("wanted", nargs="*", help="sizes (80x24 120x36 160x48), dark, light")
+    parser.add_argument("wanted", nargs="*", help="sizes (60x20 80x24 120x36 160x48), dark, light")
     parser.add_argument("-o", "--output", type=Path, default=Path(__file__).parent)
     options = parser.parse_args()
     sizes = [word for word in options.wanted if word in SIZES] or list(SIZES)

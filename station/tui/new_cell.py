@@ -201,6 +201,9 @@ class NewCell(ThemedApp[Ending]):
         self.setup.mount = "eye-to-hand" if self.setup.mount == "eye-in-hand" else "eye-in-hand"
         self.watch_step()
 
+    def on_input_changed(self) -> None:
+        self._show()
+
     def on_input_submitted(self) -> None:
         self.action_accept()
 
@@ -316,6 +319,7 @@ class NewCell(ThemedApp[Ending]):
             yield
         except (CodedError, OSError) as problem:
             self._say("#problem", str(problem))
+            self._show()  # in place of what was awaited
 
     async def on_unmount(self) -> None:
         await self.setup.close()

@@ -202,8 +202,9 @@ async def accept(setup: CellSetup, step: CellStep, text: str) -> bool:
             return True
         case CellStep.BOARD:
             if text and (draft.board is None or text != flow.board_words(draft.board)):
-                setup.set_board(typed_board(text))  # the next Enter goes on
-                return False
+                board, counted = typed_board(text), setup.counts
+                setup.set_board(board)
+                return counted == (board.columns, board.rows)  # else the image is looked at first
             return draft.board is not None
         case CellStep.VIEWS:
             return enough(draft)

@@ -16,7 +16,7 @@ from textual.theme import BUILTIN_THEMES, Theme
 R = TypeVar("R")
 _COLOURS = {  # dark, light, the terminal's own 16 colours
     "line": ("#2F3A46", "#C2C6C6", "ansi_bright_black"),
-    "faint": ("#6A7785", "#7C858C", "ansi_white"),
+    "faint": ("#7B8894", "#666F76", "ansi_white"),
     "dim": ("#97A3B0", "#505B64", "ansi_white"),
     "strong": ("#F5F8FB", "#05090D", "ansi_bright_white"),
     "accentbg": ("#1D4E73", "#C7E0F2", "ansi_blue"),
@@ -26,7 +26,7 @@ _COLOURS = {  # dark, light, the terminal's own 16 colours
     "warn": ("#E5B454", "#865B00", "ansi_bright_yellow"),
     "warnbg": ("#5A4310", "#F7E2AE", "ansi_default"),
     "bad": ("#F07C72", "#A81F17", "ansi_bright_red"),
-    "badbg": ("#7A1F1A", "#F6CFCB", "ansi_default"),
+    "badbg": ("#641914", "#F6CFCB", "ansi_default"),
     "stop": ("#C8231B", "#C8231B", "ansi_red"),
     "onstop": ("#FFFFFF", "#FFFFFF", "ansi_bright_white"),
     "sim": ("#C9A6F2", "#5D35A0", "ansi_bright_magenta"),
@@ -34,8 +34,8 @@ _COLOURS = {  # dark, light, the terminal's own 16 colours
     "h0": ("#1A222B", "#E8EAE6", "ansi_default"),
     "h1": ("#1F4058", "#CFE3E6", "ansi_blue"),
     "h2": ("#2A6A86", "#9CCBD4", "ansi_blue"),
-    "h3": ("#3D9FB2", "#5BA7B8", "ansi_cyan"),
-    "h4": ("#7FD1C4", "#2A7F96", "ansi_cyan"),
+    "h3": ("#3D9FB2", "#37798B", "ansi_cyan"),
+    "h4": ("#7FD1C4", "#1F6074", "ansi_cyan"),
 }
 _DARK, _LIGHT, _CONSOLE = (
     dict(zip(_COLOURS, colours, strict=True)) for colours in zip(*_COLOURS.values(), strict=True)

@@ -85,8 +85,6 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
             await until(pilot, lambda: app.query_one("#typed", Input).value == "8x5 ")
             await person.type("2.3cm")
             await person.press("enter")
-            await until(pilot, lambda: app.setup.seen is not None and app.setup.seen[1].found)
-            await person.press("enter")
             await person.until_step(CellStep.VIEWS)
             for joints in guided_joints(truth)[1:]:  # it stands at the first one
                 if app.step is not CellStep.VIEWS:
@@ -116,5 +114,5 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
         off = difference(guess_matrix(guess), np.array(true))
         assert np.linalg.norm(off[:3]) < 3 * guess.sigma_m and np.linalg.norm(off[3:]) < 3 * guess.sigma_rad
     assert b"# " in content
-    assert person.keys <= 30
+    assert person.keys - len(controller.host) <= 11
     assert load_draft(tmp_path).written

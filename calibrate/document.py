@@ -40,6 +40,7 @@ from calibrate.recorded_views import LoadedViews
 from calibrate.results import Gate, Remark
 from calibrate.views import ViewSet
 from recordings.reader import Recording
+from recordings.schema.messages import BoardKind
 
 _PACKAGES = ("calibration-station", "numpy", "scipy", "opencv-python-headless", "clarabel")
 _DEG = float(np.degrees(1.0))
@@ -144,6 +145,8 @@ def software_versions() -> dict[str, str]:
 def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> Lens:
     camera, covariance = solution.camera, solution.lens_covariance
     sigma = [] if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    if not solution.residual_px:  # board poses were told: nothing is known of the lens
+        return Lens(0, 0, (), (), camera.distortion_model, None, "not known")
     if intrinsics is not None:
         rms_px = intrinsics.rms_px
     else:
@@ -206,8 +209,10 @@ def _quality(
 
 
 def _remarks(solution: Solution, loaded: LoadedViews, intrinsics: Intrinsics | None) -> list[Remark]:
-    ambiguity = ambiguity_text(loaded.board)
+    unseen = loaded.board.kind is BoardKind.UNSEEN
+    ambiguity = "" if unseen else ambiguity_text(loaded.board)
     return [
+        *([Remark("no-pictures", _NO_PICTURES)] if unseen else []),
         *(Remark("recording-loss", loss) for loss in loaded.losses),
         *([Remark("symmetric-board", ambiguity)] if ambiguity else []),
         *(
@@ -216,6 +221,12 @@ def _remarks(solution: Solution, loaded: LoadedViews, intrinsics: Intrinsics | N
         ),
         *solution.warnings,
     ]
+
+
+_NO_PICTURES = (
+    "No pictures: the board's poses were told. Not known, and judged by no gate: lens, image coverage, "
+    "reprojection, corners taken for others."
+)
 
 
 def _scaled(value: float | None, factor: float) -> float | None:

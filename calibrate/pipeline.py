@@ -28,7 +28,7 @@ from calibrate.projection import intrinsics_names
 from calibrate.recorded_views import Progress, load_views, without_views
 from calibrate.views import ViewSet
 from recordings.reader import Recording, open_recording
-from recordings.schema.messages import BoardSpec, CameraModel
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 
 _WORST_VIEW_PX = 20.0
 
@@ -91,8 +91,11 @@ def with_board_poses(
 ) -> tuple[ViewSet, Intrinsics | None]:
     """Add `camera_from_board`, through the lens found from these views where the camera has none.
 
-    Raises CalibrationError where no lens explains the corners, or the given one does not.
+    Views without corners stay as they are. Raises CalibrationError where no lens explains the corners, or the
+    given one does not.
     """
+    if board.kind is BoardKind.UNSEEN:
+        return views, None
     intrinsics = calibrate_intrinsics(views, model) if views.camera.matrix is None else None
     if intrinsics is not None:
         views = replace(views, camera=intrinsics.camera)
@@ -172,15 +175,16 @@ def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:
         ratio = options.square_m / board.square_m
         marker_m = None if board.marker_m is None else board.marker_m * ratio
         board = msgspec.structs.replace(board, square_m=options.square_m, marker_m=marker_m)
-    check_board(board)
+    if board.kind is not BoardKind.UNSEEN:
+        check_board(board)
     return board
 
 
 def picture_coverage(views: ViewSet) -> float:
-    """Share of the picture inside the outlines of the boards seen, all views together."""
+    """Share of the picture inside the outlines of the boards seen, all views together; 0 without corners."""
     scale = 64 / max(views.camera.width, views.camera.height)
     seen = np.zeros((round(views.camera.height * scale), round(views.camera.width * scale)), np.uint8)
-    for view in views:
+    for view in (view for view in views if len(view.pixels)):
         outline = cv2.convexHull((view.pixels * scale).astype(np.float32)).round().astype(np.int32)
         cv2.fillConvexPoly(seen, outline, 1)
     return float(seen.mean())

@@ -27,6 +27,7 @@ from recordings.schema.messages import (
     ARM_KINEMATICS_NAME,
     UR_KINEMATICS_NAME,
     ArmKinematics,
+    BoardKind,
     BoardSpec,
     CameraModel,
     View,
@@ -68,6 +69,8 @@ def load_views(
     """
     info = recording.info
     spec = board or info.board
+    if spec.kind is BoardKind.UNSEEN:
+        return _told_views(recording, fewest)
     model = camera or info.camera
     views: list[BoardView] = []
     missing: list[RejectedView] = []
@@ -91,6 +94,26 @@ def load_views(
         model = msgspec.structs.replace(model, width=first.width, height=first.height)
     found = ViewSet(info.mount, tuple(views), model, info.robot.model, _calibrated_arm(recording))
     return LoadedViews(found, spec, tuple(missing), seen, recording.losses)
+
+
+def _told_views(recording: Recording, fewest: int) -> LoadedViews:
+    """Take the views of a recording without pictures, in which the board's poses were told."""
+    info, told = recording.info, recording.views()
+    if len(told) < fewest:
+        raise _too_few(recording, info.board, len(told), {}, [], fewest)
+    poses = np.array([(view.base_from_flange, view.camera_from_board) for view in told], dtype=float)
+    found = ViewSet.from_poses(info.mount, poses[:, 0], poses[:, 1])
+    views = tuple(
+        replace(
+            one,
+            index=view.index,
+            name=view.name,
+            joints_rad=None if view.joints_rad is None else np.array(view.joints_rad),
+        )
+        for one, view in zip(found, told, strict=True)
+    )
+    found = replace(found, views=views, robot_model=info.robot.model, arm=_calibrated_arm(recording))
+    return LoadedViews(found, info.board, (), losses=recording.losses)
 
 
 def _calibrated_arm(recording: Recording) -> RobotModel | None:

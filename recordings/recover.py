@@ -41,7 +41,7 @@ from recordings.schema.definitions import (
     SchemaError,
     decode,
 )
-from recordings.schema.messages import View
+from recordings.schema.messages import View, without_picture
 from recordings.schema.topics import Topic, schema_bytes, schema_name
 from recordings.segment import RecordingSegment
 
@@ -280,7 +280,7 @@ def _orphans(found: Salvage) -> set[int]:
         except SchemaError:
             said = f"message {number}, a view, cannot be read"
         else:
-            if view.picture_sequence in facts.keys() & images.keys():
+            if without_picture(view) or view.picture_sequence in facts.keys() & images.keys():
                 continue
             said = f"pose {view.index + 1} (attempt {view.attempt}) lost its image"
         dropped.add(number)

@@ -33,9 +33,11 @@ from recordings.schema.messages import (
     CaptureEvent,
     ClockReading,
     Image,
+    Matrix4,
     RobotState,
     SessionInfo,
     View,
+    without_picture,
 )
 from recordings.schema.topics import Topic, parse, schema_bytes, schema_name
 
@@ -257,17 +259,19 @@ class RecordingSegment:
         views = []
         for address in self.messages(Topic.VIEW).addresses:
             view = self._message(Topic.VIEW, address, View)
-            if view.picture_sequence not in self._facts:
+            if view.picture_sequence not in self._facts and not without_picture(view):
                 raise self._corrupt(Topic.VIEW, address, f"view {view.index} names an image that is lost")
-            if not _is_rigid(view):
-                text = f"the flange pose of view {view.index} is no rigid transform"
+            if not all(
+                _is_rigid(T) for T in (view.base_from_flange, view.camera_from_board) if T is not None
+            ):
+                text = f"a pose of view {view.index} is no rigid transform"
                 raise self._corrupt(Topic.VIEW, address, text)
             views.append(msgspec.structs.replace(view, part=self.info.part))
         return views
 
 
-def _is_rigid(view: View) -> bool:
-    T = np.array([n for row in view.base_from_flange for n in row])
+def _is_rigid(told: Matrix4) -> bool:
+    T = np.array([n for row in told for n in row])
     if T.size != 16 or not np.isfinite(T).all():
         return False
     T = T.reshape(4, 4)

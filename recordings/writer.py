@@ -36,6 +36,7 @@ from recordings.schema.messages import (
     SessionInfo,
     Stamps,
     View,
+    without_picture,
 )
 from recordings.schema.topics import Topic, schema_bytes, schema_name
 
@@ -140,9 +141,9 @@ class RecordingWriter:
 
     def view(self, view: View) -> None:
         """The image must have been recorded before: a view never points at nothing."""
-        if view.picture_sequence not in self._images:
+        if view.picture_sequence not in self._images and not without_picture(view):
             raise RecordingError("no-image", path=self.path, view=view.index, image=view.picture_sequence)
-        time_ns = self._time_ns(view.stamps, view.picture_sequence)
+        time_ns = self._time_ns(view.stamps, view.index)
         self._add(Topic.VIEW, encode(view), time_ns)
         if not self._shown_ns:  # imported, say: nothing else tells viewers where the flange is
             T = view.base_from_flange

@@ -58,6 +58,7 @@ def check_board(spec: BoardSpec) -> None:
     possible = all(smallest <= side <= _LARGEST_SIDE for side in (columns, rows))
     limits = {"smallest": smallest, "largest": _LARGEST_SIDE}
     _require(possible, "board-columns-rows", columns=columns, rows=rows, **limits)
+    _require(spec.kind is not BoardKind.UNSEEN, "board-unseen")
     _require(1e-4 <= spec.square_m <= 10.0, "board-square", square_m=spec.square_m)
     if (tolerance := spec.square_tolerance) is not None:
         _require(0 < tolerance <= LARGEST_TOLERANCE, "board-tolerance", square_tolerance=tolerance)
@@ -209,6 +210,8 @@ def ambiguity_text(spec: BoardSpec) -> str:
 
 def describe_board(spec: BoardSpec) -> str:
     """Describe the board for people: 'chessboard 7×6, 25 mm'."""
+    if spec.kind is BoardKind.UNSEEN:
+        return "not seen, poses told"
     if spec.kind in SINGLE_TAGS:
         return f"{spec.kind.value} {spec.tag_id} of {tag_dictionary(spec)}, {spec.square_m * 1000:g} mm"
     text = f"{spec.kind.value} {spec.columns}×{spec.rows}, {spec.square_m * 1000:g} mm"

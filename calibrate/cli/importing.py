@@ -18,7 +18,7 @@ from calibrate.pipeline import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, BagPlan, import_bag
-from recordings.importers.dataset import DATASET_FILE, POSES_FILE, PoseRow, read_dataset
+from recordings.importers.dataset import DATASET_FILE, POSES_FILE, read_dataset
 from recordings.importers.folder import import_folder, write_views
 from recordings.importers.messages import Progress
 from recordings.importers.selection import Wanted
@@ -121,13 +121,10 @@ def _import_found(
 ) -> ImportJson:
     """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
     described = None if told is None else read_dataset(told)[0]
-    believed = believe(look(source, poses), given, described)
+    believed = believe(look(source, poses), given, described, progress)
     dataset = believed.dataset
-    rows = [
-        PoseRow(n, str(path.relative_to(source)), T) for n, (path, T) in enumerate(believed.poses.items(), 1)
-    ]
     content = msgspec.yaml.encode(dataset)
-    done = write_views(source, target, dataset, rows, {DATASET_FILE: content}, progress)
+    done = write_views(source, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
     if target is not None and told is None:
         write_atomically(target.with_suffix("." + DATASET_FILE), content)
     return ImportJson(str(target or ""), done.images, done.size_bytes, found=believed.facts)

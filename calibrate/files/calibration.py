@@ -112,12 +112,15 @@ class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
     distortion: tuple[float, ...]
     distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant"]
     rms_px: float | None
-    found: Literal["from these pictures", "given"]
+    found: Literal["from these pictures", "given", "not known"]
+    """not known: no pictures, and no matrix."""
     sigma: dict[str, float] = {}
 
     @property
     def model(self) -> CameraModel:
-        return CameraModel(self.width, self.height, self.matrix, self.distortion, self.distortion_model)
+        return CameraModel(
+            self.width, self.height, self.matrix or None, self.distortion, self.distortion_model
+        )
 
 
 class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):

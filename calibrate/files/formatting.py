@@ -142,10 +142,10 @@ def _result_table(calibration: Calibration) -> Table:
         spread_deg = quality.board_spread_deg or 0.0
         table.add_row("board spread", f"{quality.board_spread_mm:.3f} mm  {spread_deg:.4f}°")
     lens = calibration.intrinsics
-    fx, cx = lens.matrix[0][0], lens.matrix[0][2]
-    fy, cy = lens.matrix[1][1], lens.matrix[1][2]
-    rms = "" if lens.rms_px is None else f"  RMS {lens.rms_px:.3f} px"
-    table.add_row("intrinsics", f"f {fx:.1f} {fy:.1f}  c {cx:.1f} {cy:.1f} px{rms}  ({lens.found})")
+    if lens.matrix:
+        (fx, _, cx), (_, fy, cy), _ = lens.matrix
+        rms = "" if lens.rms_px is None else f"  RMS {lens.rms_px:.3f} px"
+        table.add_row("intrinsics", f"f {fx:.1f} {fy:.1f}  c {cx:.1f} {cy:.1f} px{rms}  ({lens.found})")
     if shares := error_shares(calibration):
         table.add_row("error comes from", ", ".join(f"{name} {share:.0%}" for name, share in shares.items()))
     table.add_row("board", describe_board(calibration.board))

@@ -370,4 +370,6 @@ def _objections(
             )
     if before is not None and before.mount != calibration.mount:
         found.append(f"It is {calibration.mount}, the installed one {before.mount}.")
+    if not calibration.intrinsics.matrix:
+        found.append("It was made without pictures: no gate judged them, and the lens is not known.")
     return found

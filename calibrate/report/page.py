@@ -107,7 +107,7 @@ def _could_be_better(job: SolvedRecording) -> list[str]:
 def _picture(job: SolvedRecording) -> str:
     """The used view that fits worst, with the board drawn in."""
     robot = job.solution.residual_robot
-    used = [view for view in job.recording.views() if view.index in robot]
+    used = [view for view in job.recording.views() if view.index in robot.keys() & job.loaded.detections]
     if not used:
         return ""
     view = max(used, key=lambda view: robot[view.index][0])
@@ -228,6 +228,9 @@ def _plots(job: SolvedRecording) -> Iterator[str]:
 
 def _lens(job: SolvedRecording) -> Iterator[str]:
     lens = job.calibration.intrinsics
+    if not lens.matrix:
+        yield html.paragraph("Not known: the recording holds no pictures.")
+        return
     origin = "estimated from these images" if job.intrinsics is not None else "fixed, refined with X"
     rms = "" if lens.rms_px is None else f", RMS {lens.rms_px:.3f} px"
     yield html.paragraph(f"{lens.distortion_model}, {lens.width}×{lens.height}, {origin}{rms}.")

@@ -42,7 +42,13 @@ class Convention:
     @property
     def name(self) -> str:
         euler = self.rotation if self.rotation in _FORMS else f"euler-{self.rotation}"
-        signs = {"deg": self.degrees, "mm": self.unit_m == 1e-3, "inverse": self.inverse}
+        signs = {
+            "deg": self.degrees,
+            "mm": self.unit_m == 1e-3,
+            "first": self.rotation_first,
+            "back": self.looks_back,
+            "inverse": self.inverse,
+        }
         return "-".join([euler, *(sign for sign, holds in signs.items() if holds)])
 
     def poses(self, numbers: Array) -> Array:
@@ -98,11 +104,12 @@ def convention(name: str) -> Convention:
     """The convention of a name. Raises ImportSourceError that lists the names."""
     if name in NAMED:
         return NAMED[name]
-    told = re.fullmatch(r"(?:euler-)?(\w+)((?:-(?:deg|rad|mm|m|inverse))*)", name)
+    told = re.fullmatch(r"(?:euler-)?(\w+)((?:-(?:deg|rad|mm|m|first|back|inverse))*)", name)
     if not told or told[1] not in (*_FORMS, *_SEQUENCES):
         raise ImportSourceError("no-convention", name=name, names=", ".join(NAMED))
     signs = told[2].split("-")
-    return Convention(told[1], _MM if "mm" in signs else 1.0, "deg" in signs, "inverse" in signs)
+    unit_m = _MM if "mm" in signs else 1.0
+    return Convention(told[1], unit_m, *(sign in signs for sign in ("deg", "inverse", "first", "back")))
 
 
 def possible(numbers: Array) -> list[tuple[Convention, str]]:
@@ -119,13 +126,23 @@ def possible(numbers: Array) -> list[tuple[Convention, str]]:
         near = f"quaternions of length 1 within {miss:.1g}"
         found = [(Convention(form), near) for form in ("xyzw", "wxyz") if miss < _UNIT_TOLERANCE]
         at = numbers[:, :3]
+        if (first := float(np.abs(np.linalg.norm(numbers[:, :4], axis=1) - 1).max())) < min(
+            miss, _UNIT_TOLERANCE
+        ):
+            near = f"quaternions of length 1 within {first:.1g} first"
+            found = [(Convention(form, rotation_first=True), near) for form in ("xyzw", "wxyz")]
+            at = numbers[:, 4:]
     else:
-        largest, at = float(np.abs(numbers[:, 3:]).max()), numbers[:, :3]
+        behind = _angles_first(numbers)
+        turn, at = (numbers[:, :3], numbers[:, 3:]) if behind else (numbers[:, 3:], numbers[:, :3])
+        largest = float(np.abs(turn).max())
         forms = ("rotvec", "xyz", "ZYX", *(s for s in _SEQUENCES if s not in ("xyz", "ZYX")))
-        units = [unit for unit in (False, True) if unit or largest <= 2 * math.pi + 0.01]
+        unit = largest > 2 * math.pi + 0.01  # in degrees an arm that turns so little shows nothing
         found = [
-            (Convention(form, degrees=unit), f"angles to {largest:.4g} {'°' if unit else 'rad'}")
-            for unit in units
+            (
+                Convention(form, degrees=unit, rotation_first=behind),
+                f"angles to {largest:.4g} {'°' if unit else 'rad'}",
+            )
             for form in forms
             if unit or form != "rotvec" or largest <= math.pi + 0.01
         ]
@@ -135,3 +152,9 @@ def possible(numbers: Array) -> list[tuple[Convention, str]]:
         return []
     told = f"reach {reach:.4g} {'mm' if unit_m == _MM else 'm'}"
     return [(replace(each, unit_m=unit_m), f"{evidence}, {told}") for each, evidence in found]
+
+
+def _angles_first(numbers: Array) -> bool:
+    """Tell whether rows of six begin with angles: those are radians, and positions behind them too large."""
+    first, last = (float(np.abs(numbers[:, part]).max()) for part in (slice(3), slice(3, 6)))
+    return first <= 2 * math.pi + 0.01 and last > 360.0

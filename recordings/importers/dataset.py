@@ -54,8 +54,10 @@ class PosesTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     table: str
     """File and place in it, digits of names as #; as `recordings import` says it."""
     images: str
-    """Folder and name of the images, digits of the name as #."""
+    """Folder and name of the images, digits of the name as #; of pairs the table of the board's poses."""
     convention: str
+    board_convention: str = ""
+    """How poses of the board are read, where they are told instead of images."""
 
 
 class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -94,6 +96,8 @@ class PoseRow:
     """Relative to the folder, as written."""
     base_from_flange: Matrix4
     joints_rad: Joints | None = None
+    camera_from_board: Matrix4 | None = None
+    """Told instead of an image; `image` is the row's name then."""
 
 
 def read_dataset(path: Path) -> tuple[Dataset, bytes]:

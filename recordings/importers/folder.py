@@ -32,6 +32,7 @@ from recordings.importers.dataset import (
 from recordings.importers.messages import Progress
 from recordings.schema.messages import (
     ARM_KINEMATICS_NAME,
+    NO_PICTURE,
     UR_KINEMATICS_NAME,
     CaptureEvent,
     Image,
@@ -88,7 +89,7 @@ def write_views(
     if (camera := dataset.camera) is None:
         raise ImportSourceError("dataset-value", path=folder / DATASET_FILE, key="camera")
     size = camera.width, camera.height
-    for row in rows:
+    for row in (row for row in rows if row.camera_from_board is None):
         _beginning(folder, row, size, _HEADER_BYTES)
     if output is None:
         return Imported(folder, len(rows), 0)
@@ -138,17 +139,19 @@ def _beginning(folder: Path, row: PoseRow, size: tuple[int, int], limit_bytes: i
 def _write_view(
     writer: RecordingWriter, folder: Path, index: int, row: PoseRow, size: tuple[int, int]
 ) -> None:
-    file_format, data, pixels = read_image(folder, row, size)
-    image = Image(pixels, Stamps(), index, index, pixel_format=pixel_format_of(pixels))
-    writer.image(image, encoded=data if file_format in KEPT_FORMATS else encode_png(pixels))
+    if row.camera_from_board is None:
+        file_format, data, pixels = read_image(folder, row, size)
+        image = Image(pixels, Stamps(), index, index, pixel_format=pixel_format_of(pixels))
+        writer.image(image, encoded=data if file_format in KEPT_FORMATS else encode_png(pixels))
     writer.view(
         View(
             index=index,
             name=Path(row.image).stem,
-            picture_sequence=index,
+            picture_sequence=index if row.camera_from_board is None else NO_PICTURE,
             base_from_flange=row.base_from_flange,
             joints_rad=row.joints_rad,
             source_file=row.image,
+            camera_from_board=row.camera_from_board,
         )
     )
 

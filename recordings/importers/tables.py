@@ -11,10 +11,11 @@ import re
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -39,11 +40,14 @@ _COLUMNS = {
     "ZYX": ("a", "b", "c"),
 }
 """Names of columns behind x, y, z, and the rotation that they name."""
-_ROBOT = re.compile(r"robot|arm|tcp|tool|flange|gripper|hand(?!_?eye)|eef|end|ee$|location", re.I)
-_OTHERS = re.compile(
-    r"cam|board|marker|target|obj|eye|chess|tag|detect|joint|angle|result|valid|guess|waiting", re.I
+_ROBOT = re.compile(
+    r"robot|arm|tcp|tool|flange|gripper|hand(?!_?eye)|eef|end|effector|wrist|ee$|location", re.I
 )
-"""Words of tables that tell of the robot's pose, and of something else."""
+_BOARD = re.compile(r"cam|board|marker|target|track|obj|eye|chess|tag|sensor|[rt]vec", re.I)
+_OTHERS = re.compile(r"detect|joint|angle|result|valid|guess|waiting|intrin", re.I)
+"""Words of tables that tell of the robot's pose, of the board's, and of something else."""
+_PART = re.compile(r"(.*?)[_. ]?(q?[xyzw]|r[xyz]|roll|pitch|yaw|[abc]|\d+)")
+"""A name of one number among those of a pose: whose pose, and which number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +66,17 @@ class Table:
     """Numbers in the row's file name and place, its order."""
 
     @property
-    def of_robot(self) -> bool:
-        """Read from its last words that say either."""
-        name = re.sub(r"hand_?eye|(?i:eye_?(in|to|on)_?hand)", "", self.name)
+    def whose(self) -> Literal["robot", "board", "other", ""]:
+        """Read from its last words that say any; empty: none says."""
+        name = re.sub(r"hand_?eye|(?i:(eye|hand)_?(in|to|on)_?(hand|eye))", "", self.name)
         for part in reversed(re.split(r"[ /.]", name)):
-            if re.search("joint|angle", part):
-                return False
-            if _ROBOT.search(part) or _OTHERS.search(part):
-                return bool(_ROBOT.search(part))
-        return True
+            if _OTHERS.search(part):
+                return "other"
+            if _ROBOT.search(part):
+                return "robot"
+            if _BOARD.search(part):
+                return "board"
+        return ""
 
 
 @dataclass
@@ -100,6 +106,7 @@ class _Row:
 def look(source: Path, poses: Path | None = None) -> Lies:
     """Read what lies in `source`; numbers only of `poses`, a file or a folder, where it is given."""
     found, rows = Lies(source), defaultdict[tuple[str, ...], list[_Row]](list)
+    halves = defaultdict[str, dict[str, list[_Row]]](dict)
     words = ["/".join(source.resolve().parts[-3:])]
     files = sorted((p for p in source.rglob("*") if p.is_file()), key=natural)[:_FILES_LIMIT]
     images = defaultdict[str, list[Path]](list)
@@ -118,21 +125,49 @@ def look(source: Path, poses: Path | None = None) -> Lies:
             words.extend(node.keys[-1:])
             if isinstance(node.value, str):
                 words.append(node.value[:60])
-            row = _pose(node.value) if poses is None or path == poses or poses in path.parents else None
-            if row is not None:
+            if poses is not None and path != poses and poses not in path.parents:
+                continue
+            place = (*map(int, re.findall(r"\d+", name)), *node.place)
+            if (row := _pose(node.value)) is not None:
                 numbers, rotation, key = row
                 named = ".".join((*node.keys, key)).strip(".")
-                place = (*map(int, re.findall(r"\d+", name)), *node.place)
                 told[named, rotation, str(len(numbers))].append(_Row(numbers, rotation, node.image, place))
+            elif (half := _half(node)) is not None:
+                whole = re.sub(_HALVES[half[0]], "", f"{_pattern(name)} {'.'.join(node.keys)}", flags=re.I)
+                halves[whole].setdefault(half[0], []).append(_Row(half[1], "", node.image, place))
         for (named, *form), each in told.items():  # files of one row each make a table together
             rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
     found.images = dict(images)
     found.words = " ".join(dict.fromkeys(words))
+    for name, half_rows in halves.items():
+        at, turn = (half_rows.get(half, []) for half in _HALVES)
+        if len(at) == len(turn):
+            joined = [
+                replace(a, numbers=_joined(a.numbers, b.numbers)) for a, b in zip(at, turn, strict=True)
+            ]
+            rows[name, "", str(len(joined[0].numbers))].extend(joined)
     for (name, rotation, _), each in rows.items():
-        if len(each) >= 3:
-            beside = [row.image for row in each], [row.place for row in each]
-            found.tables.append(Table(name, rotation, np.array([row.numbers for row in each]), *beside))
+        for part, some in _two_by_two(each).items():
+            if len(some) >= 3:
+                beside = [row.image for row in some], [row.place for row in some]
+                table = np.array([row.numbers for row in some])
+                found.tables.append(Table(f"{name}{part}", rotation, table, *beside))
     return found
+
+
+def _two_by_two(rows: list[_Row]) -> dict[str, list[_Row]]:
+    """Rows of a list of pairs, the robot's first, are two tables."""
+    last = [row.place[-1] if row.place else 0 for row in rows]
+    if len(rows) > 4 and last == [0, 1] * (len(rows) // 2):
+        return {" robot": rows[::2], " board": rows[1::2]}
+    return {"": rows}
+
+
+def _joined(at: list[float], turn: list[float]) -> list[float]:
+    """One row: position and rotation, or the first three rows of the matrix."""
+    if len(turn) != 9:
+        return at + turn
+    return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])]
 
 
 def natural(path: Path | str) -> list[Any]:
@@ -190,14 +225,17 @@ def _of_text(text: str) -> Any:
         names = [re.sub(r"\W.*", "", name.strip().lower()) for name in header]
         cells = [re.split(r"[,;\t]", line) for line in lines[1:]]
         return [dict(zip(names, map(_value, row), strict=False)) for row in cells]
-    groups = defaultdict[tuple[str, int], list[Any]](list)
+    groups, title = defaultdict[tuple[str, int], list[Any]](list), ""
     for line in lines:
+        if re.fullmatch(r"\s*[A-Za-z]\w*\s*:\s*", line):
+            title = line.strip(" \t:")
+            continue
         image = _IMAGE.search(line)
         rest = line.replace(image[0], "") if image else line
         inside = [_numbers(part) for part in re.findall(r"\[([^\[\]]+)\]", rest)]
         numbers = next((part for part in inside if len(part) in _POSE_SIZES), _numbers(rest))
         said = _NUMBER.sub("", re.sub(r"\[.*?\]", "", rest))
-        label = " ".join(re.findall(r"[A-Za-z]\w*", said))[:40]
+        label = " ".join(re.findall(r"[A-Za-z]\w*", said))[:40] or title
         row = {"image": image[0], "pose": numbers} if image else numbers
         groups[label, len(numbers)].append(row)
     tree: dict[str, Any] = {}
@@ -208,11 +246,21 @@ def _of_text(text: str) -> Any:
         elif count == 1:
             value = [row[0] for row in plain]
         else:
-            value = group
+            value = _without_count(group) if len(plain) == len(group) else group
         while isinstance(value, list) and len(value) == 1:
             value = value[0]
         tree[label if label not in tree else f"{label} {count}"] = value
     return tree.get("") if set(tree) == {""} else tree
+
+
+def _without_count(rows: list[list[float]]) -> list[Any]:
+    """Rows whose first number only counts them, without it; the count stays as the row's place."""
+    if len(rows) < 3 or len(rows[0]) - 1 not in _POSE_SIZES:
+        return rows
+    first = [row[0] for row in rows]
+    if not all(a.is_integer() and a < b for a, b in pairwise([*first, np.inf])):
+        return rows
+    return [{f"{row[0]:.0f}": row[1:]} for row in rows]
 
 
 def _value(text: str) -> Any:
@@ -230,6 +278,8 @@ class _Node:
     keys: tuple[str, ...]
     place: tuple[int, ...]
     image: str
+    inside: bool = False
+    """It is a part of a node that is a pose."""
 
 
 def _nodes(tree: Any, keys: tuple[str, ...], image: str, place: tuple[int, ...] = ()) -> Iterator[_Node]:
@@ -238,14 +288,46 @@ def _nodes(tree: Any, keys: tuple[str, ...], image: str, place: tuple[int, ...] 
     if isinstance(tree, list) and _pose(tree) is not None:
         return
     if isinstance(tree, dict):
+        whole = _pose(tree) is not None
         named = next((v for v in tree.values() if isinstance(v, str) and _IMAGE.fullmatch(v)), image)
+        for stem, parts in _stems(tree):
+            yield _Node(parts, (*keys, stem), place, named)
         for key, value in tree.items():
             digits = tuple(map(int, re.findall(r"\d+", str(key))))
-            yield from _nodes(value, (*keys, _pattern(str(key))), named, (*place, *digits))
+            for node in _nodes(value, (*keys, _pattern(str(key))), named, (*place, *digits)):
+                yield replace(node, inside=node.inside or whole)
     elif isinstance(tree, list):
         for at, value in enumerate(tree):
             if isinstance(value, (dict, list)):
                 yield from _nodes(value, keys, image, (*place, at))
+
+
+def _stems(tree: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Poses whose numbers have a name each that begins alike: tcp_x, tcp_y …; pose1, pose2 …"""
+    groups = defaultdict[str, dict[str, float]](dict)
+    for key, value in tree.items():
+        part = _PART.fullmatch(str(key).lower())
+        if part and part[1] and isinstance(value, (int, float)):
+            groups[part[1]][part[2]] = value
+    for stem, parts in groups.items():
+        value = list(parts.values()) if "".join(parts).isdigit() else parts
+        if _pose(value) is not None:
+            yield stem, value
+
+
+_HALVES = {"position": r"translations?|positions?|tvecs?", "rotation": r"rotations?|orientations?|rvecs?"}
+"""Words that tell lists of one half of each pose, without which both have one name."""
+
+
+def _half(node: _Node) -> tuple[str, list[float]] | None:
+    """(which, numbers) of a position or a rotation that stands alone."""
+    numbers = None if node.inside or not node.keys else _flat(node.value)
+    if numbers is None or not isinstance(node.value, (list, dict)):
+        return None
+    for half, sizes in (("position", (3,)), ("rotation", (3, 4, 9))):
+        if len(numbers) in sizes and re.search(_HALVES[half], node.keys[-1], re.I):
+            return half, numbers
+    return None
 
 
 def _flat(value: Any) -> list[float] | None:
@@ -282,18 +364,24 @@ def _pose(value: Any) -> tuple[list[float], str, str] | None:
             return (flat, rotation, "") if flat is not None else None
     parts: dict[str, list[float]] = {}
     named = ""
-    for part, words, sizes in (("position", _POSITION, (3,)), ("rotation", _ROTATION, (3, 4, 9))):
-        for key, each in told.items():
-            flat = _flat(each)
-            if flat is not None and len(flat) in sizes and any(map(words.fullmatch, key.split("_"))):
+    for key, each in told.items():
+        flat = _flat(each)
+        for part, words, sizes in (("position", _POSITION, (3,)), ("rotation", _ROTATION, (3, 4, 9))):
+            if flat is not None and len(flat) in sizes and words is _half_named(key):
                 named = key if len(key.split("_")) > 1 and part not in parts else named
                 parts.setdefault(part, flat)
     if len(parts) < 2:
         return None
-    at, turn = parts["position"], parts["rotation"]
-    if len(turn) == 9:
-        return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])], "", named
-    return at + turn, "", named
+    return _joined(parts["position"], parts["rotation"]), "", named
+
+
+def _half_named(key: str) -> re.Pattern[str] | None:
+    """Which half of a pose a key names, by its last word that names one."""
+    for word in reversed(key.split("_")):
+        for words in (_POSITION, _ROTATION):
+            if words.fullmatch(word):
+                return words
+    return None
 
 
 def _facts(node: _Node, found: Lies) -> None:

@@ -37,6 +37,8 @@ class BoardKind(StrEnum):
     """One ArUco tag."""
     APRIL_TAG = "april-tag"
     """One AprilTag."""
+    UNSEEN = "unseen"
+    """Of a recording without pictures: the board's poses were told, nothing else of it."""
 
 
 SINGLE_TAGS = (BoardKind.ARUCO, BoardKind.APRIL_TAG)
@@ -229,6 +231,9 @@ class Stillness(msgspec.Struct, frozen=True, omit_defaults=True):
     image_motion_px: float | None = None
 
 
+NO_PICTURE = -1
+
+
 class View(msgspec.Struct, frozen=True, omit_defaults=True):
     """The index entry that makes an image and a robot pose belong together. Written after both."""
 
@@ -236,6 +241,7 @@ class View(msgspec.Struct, frozen=True, omit_defaults=True):
     """Pose number in the plan (from 0)."""
     name: str
     picture_sequence: int
+    """NO_PICTURE where the board's pose was told instead."""
     base_from_flange: Matrix4
     """Flange pose at mid-exposure."""
     joints_rad: Joints | None = None
@@ -249,8 +255,15 @@ class View(msgspec.Struct, frozen=True, omit_defaults=True):
     stillness: Stillness | None = None
     source_file: str = ""
     note: str = ""
+    camera_from_board: Matrix4 | None = None
+    """Where another program saw the board; only of a view without a picture."""
     part: int = 1
     """The part of the session that holds the image; filled in by the reader."""
+
+
+def without_picture(view: View) -> bool:
+    """Tell whether the view needs no picture, as it states the board's pose itself."""
+    return view.picture_sequence == NO_PICTURE and view.camera_from_board is not None
 
 
 class CaptureEvent(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,9 +12,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibrate import imported
-from calibrate.imported import Given, believe
+from calibrate.files import exports
+from calibrate.files.calibration import read_calibration, write_calibration
+from calibrate.files.install import install
+from calibrate.imported import Given, believe, board
 from calibrate.kinematics import MODELS
+from calibrate.pipeline import solve_recording
+from calibrate.report.page import report_page
 from recordings.cli import main
 from recordings.importers.tables import look
 from recordings.reader import open_recording
@@ -50,23 +55,21 @@ def put(
         write(folder, change(images[1]))
         return folder
 
-    look_for = imported._see
-
-    def seen(lies, given, paths):  # type: ignore[no-untyped-def]
-        key = (given.board, json.dumps(lies.facts), len(paths))
+    def seen(lies, given, paths, progress):  # type: ignore[no-untyped-def]
+        key = (given, json.dumps(lies.facts), len(paths))
         if key not in _SEEN:
-            _SEEN[key] = look_for(lies, given, paths)
+            _SEEN[key] = board.see_board(lies, given, paths, progress)
         found = _SEEN[key]
         renamed = {path.name: path for path in paths}
         views = {renamed[path.name]: view for path, view in found.views.items()}
         candidates = {renamed[path.name]: each for path, each in found.candidates.items()}
-        return imported.replace(found, views=views, candidates=candidates)
+        return replace(found, views=views, candidates=candidates)
 
-    monkeypatch.setattr(imported, "_see", seen)
+    monkeypatch.setattr("calibrate.imported.folder.see_board", seen)
     return make
 
 
-_SEEN: dict[object, imported._Seen] = {}
+_SEEN: dict[object, board.Seen] = {}
 
 
 def euler(order: str, unit: float = 1.0, degrees: bool = False) -> Callable[[np.ndarray], np.ndarray]:
@@ -154,11 +157,11 @@ def test_poses_are_read_as_they_are_meant(
     found = believe(look(put(write)))
     assert found.dataset.mount == "eye-in-hand"
     for n, T in enumerate(images[1], 1):
-        (pose,) = (pose for path, pose in found.poses.items() if path.name == f"{n}.png")
-        np.testing.assert_allclose(pose, T, atol=1e-6)
-    board = TURNED.board
-    assert {found.dataset.board.columns, found.dataset.board.rows} == {board.columns, board.rows}
-    assert found.dataset.board.square_m == pytest.approx(board.square_m, rel=0.02)
+        (row,) = (row for row in found.rows if row.image == f"{n}.png")
+        np.testing.assert_allclose(row.base_from_flange, T, atol=1e-6)
+    shown, true = found.dataset.board, TURNED.board
+    assert {shown.columns, shown.rows} == {true.columns, true.rows}
+    assert shown.square_m == pytest.approx(true.square_m, rel=0.02)
 
 
 def unnamed(folder: Path, T: np.ndarray) -> None:
@@ -171,9 +174,9 @@ def test_what_no_motion_can_tell_is_asked(put: Callable[..., Path], images: tupl
     with raises("which-mount", mount="eye-in-hand"):
         believe(lies)
     straight = believe(lies, Given(mount="eye-in-hand"))
-    np.testing.assert_allclose(list(straight.poses.values()), images[1], atol=1e-6)
-    turned = believe(lies, Given(mount="eye-to-hand"))
-    np.testing.assert_allclose(list(turned.poses.values()), np.linalg.inv(images[1]), atol=1e-6)
+    np.testing.assert_allclose([row.base_from_flange for row in straight.rows], images[1], atol=1e-6)
+    turned = np.array([row.base_from_flange for row in believe(lies, Given(mount="eye-to-hand")).rows])
+    np.testing.assert_allclose(turned, np.linalg.inv(images[1]), atol=1e-6)
 
 
 def test_names_that_contradict_the_motion_are_no_answer(put: Callable[..., Path]) -> None:
@@ -216,3 +219,84 @@ def test_what_was_believed_needs_no_flags_again(put: Callable[..., Path], tmp_pa
 def test_a_folder_without_poses_says_what_is_there(put: Callable[..., Path]) -> None:
     with raises("no-pairs", tables="none"):
         believe(look(put(lambda folder, T: None)))
+
+
+def board_pairs(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
+    """As easy_handeye tells its samples."""
+    samples = {}
+    for name, T in (("hand_world_samples", robot), ("camera_marker_samples", board)):
+        rows = [dict(zip("xyzXYZW", row, strict=True)) for row in quaternions(T).tolist()]
+        samples[name] = {
+            "transforms": [
+                {
+                    "translation": {axis: row[axis] for axis in "xyz"},
+                    "rotation": {axis: row[axis.upper()] for axis in "xyzw"},
+                }
+                for row in rows
+            ]
+        }
+    (folder / "samples.yaml").write_text(json.dumps(samples))
+
+
+def in_two_tables(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
+    """Another convention and unit each; one counts its rows."""
+    np.savetxt(folder / "robot.txt", euler("ZYX", 1e3, True)(robot), delimiter=",")
+    rotvec = Rotation.from_matrix(board[:, :3, :3]).as_rotvec()
+    np.savetxt(
+        folder / "marker.csv",
+        np.column_stack([np.arange(len(board)) + 1, board[:, :3, 3], rotvec]),
+        delimiter=",",
+        fmt=["%d", *["%.12f"] * 6],
+    )
+
+
+def moveits(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
+    rows = [
+        {"effector_wrt_world": F.ravel().tolist(), "object_wrt_sensor": C.ravel().tolist()}
+        for F, C in zip(robot, board, strict=True)
+    ]
+    (folder / "poses.yaml").write_text(json.dumps(rows))
+
+
+def in_one_csv(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
+    names = [f"{of}_{n}" for of in ("flange", "board") for n in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    rows = np.column_stack([quaternions(robot), quaternions(board)])
+    np.savetxt(folder / "pairs.csv", rows, delimiter=",", header=",".join(names), comments="")
+
+
+MOVEIT = Path(__file__).parents[3] / "shared/datasets/pose-pairs/moveit50.csv"
+
+
+@pytest.mark.parametrize("write", [board_pairs, in_two_tables, moveits, in_one_csv])
+def test_pairs_of_poses_are_a_recording_without_pictures(
+    write: Callable[[Path, np.ndarray, np.ndarray], None], tmp_path: Path
+) -> None:
+    """Solved; what needs pictures is judged by no gate, and a lens is not invented."""
+    robot, board = TURNED.flange_poses()[0], TURNED.camera_from_board()
+    write(tmp_path, robot, board)
+    rec, file = tmp_path / "pairs.mcap", tmp_path / "pairs.calibration.yaml"
+    told = call(main, "import", tmp_path, "-o", rec, "--mount", "eye-in-hand", "--json")
+    assert told.returncode == 0, told.stderr
+    job = solve_recording(rec)
+    np.testing.assert_allclose(job.solution.matrix, TURNED.X, atol=1e-5)
+    gates = {gate.name for gate in job.gates}
+    assert "cross_validation" in gates and not gates & {"view_rms_px", "coverage", "lens_pull"}
+    assert "no-pictures" in job.calibration.quality.warning_codes
+    write_calibration(job.calibration, file)
+    assert not read_calibration(file).intrinsics.matrix
+    for export in ("opencv", "ros-camera-info"):
+        with raises("no-intrinsics"):
+            exports.export(job.calibration, export)
+    exports.export(job.calibration, "urdf")
+    with raises("objection"):
+        install(file, tmp_path / "root", cell="imported")
+    assert "Not known" in report_page(job)
+
+
+@pytest.mark.skipif(not MOVEIT.is_file(), reason="the pose pairs of MoveIt's own test are not here")
+def test_moveits_own_pairs_give_what_its_test_expects(tmp_path: Path) -> None:
+    (tmp_path / "pairs.csv").write_bytes(MOVEIT.read_bytes())
+    rec = tmp_path / "pairs.mcap"
+    assert call(main, "import", tmp_path, "-o", rec, "--mount", "eye-to-hand").returncode == 0
+    at = solve_recording(rec).solution.matrix[:3, 3]
+    np.testing.assert_allclose(at, [0.659, -0.249, 0.830], rtol=0.01)

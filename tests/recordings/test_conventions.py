@@ -51,8 +51,7 @@ def test_cameras_of_graphics_programs_are_read_as_optical_frames() -> None:
 
 def test_a_name_spells_what_it_means() -> None:
     for known in NAMED.values():
-        if not (known.rotation_first or known.looks_back):
-            assert convention(known.name) == known
+        assert convention(known.name) == known
     for wrong in ("", "euler", "euler-XXY", "zivid-mm", "xyzw-inches"):
         with raises("no-convention"):
             convention(wrong)
@@ -65,5 +64,7 @@ def test_numbers_say_what_they_can() -> None:
     assert possible(np.array([[0.4, 0, 0.3, half, half, half, half]] * 3)) == []
     assert possible(np.concatenate([2 * np.eye(4).ravel()])[None]) == []
     assert all(how.degrees for how, _ in possible(np.array([[400.0, 0, 300, 90, 0, 20]] * 3)))
-    both = {how.degrees for how, _ in possible(np.array([[0.4, 0, 0.3, 1, 0, 2]] * 3))}
-    assert both == {False, True}
+    assert not any(how.degrees for how, _ in possible(np.array([[0.4, 0, 0.3, 1, 0, 2]] * 3)))
+    ahead = {how.name for how, _ in possible(np.array([[half, 0, 0, half, 400.0, 0, 300]] * 3))}
+    assert ahead == {"xyzw-mm-first", "wxyz-mm-first"}
+    assert all(how.rotation_first for how, _ in possible(np.array([[1, 0, 2, 400.0, 0, 300]] * 3)))

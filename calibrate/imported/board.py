@@ -1,0 +1,224 @@
+"""The board in other people's images, whatever it is, or as other programs say that they saw it."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from calibrate.boards.corners import to_grey
+from calibrate.boards.detect import Detection, detect
+from calibrate.boards.grids import seen_size
+from calibrate.boards.model import board_points, check_board, usual_markers
+from calibrate.errors import CalibrationError
+from calibrate.geometry import inverse
+from calibrate.lens.intrinsics import calibrate_intrinsics
+from calibrate.lens.pnp import Candidate, candidate_poses
+from calibrate.views import BoardView, ViewSet
+from recordings.files import read_file
+from recordings.images import IMAGE_LIMIT_BYTES, ImageError, Pixels, decode_image, read_header
+from recordings.importers.conventions import Convention, possible
+from recordings.importers.messages import Progress
+from recordings.importers.tables import Lies, Table
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
+
+FEWEST = 5
+GUESSED_M = 0.02
+"""Side of a square about whose size nothing is told."""
+_VOTERS = 24
+"""Most images, evenly spread, that a reading is judged by."""
+_LARGEST_SIDE_PX = 1000
+"""Images are judged reduced to this size: their corners need not be exact."""
+_TRIED = 6
+"""Images on which a board is tried at a glance; misses in a row after which a thorough search gives up."""
+_ENOUGH = 0.4
+"""Share of the images that show the board at a glance above which the others are left at that."""
+
+Key = Path | int
+"""An image, or the row of a table of board poses."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Where the board was in the camera's frame, by image or by row."""
+
+    board: BoardSpec
+    square_known: bool
+    views: dict[Key, BoardView]
+    candidates: dict[Key, list[Candidate]]
+    camera: CameraModel
+    camera_known: bool
+    looked: int
+    convention: Convention | None = None
+    """How the poses that were told are read; None: images show the board."""
+    told: str = ""
+    """Evidence for it."""
+    in_front: tuple[bool, bool] = (True, True)
+    """Whether the poses, and their inverses, place the board before the camera."""
+
+
+def told_boards(table: Table) -> Iterator[Seen]:
+    """Every reading of a table of board poses; of an inverted one the solution is the other mounting's."""
+    nothing = np.zeros((0, 3)), np.zeros((0, 2))
+    for how, evidence in possible(table.numbers):
+        poses = how.poses(table.numbers)
+        views: dict[Key, BoardView] = {
+            row: BoardView(row, f"row {row + 1}", np.eye(4), *nothing, camera_from_board=T)
+            for row, T in enumerate(poses)
+        }
+        candidates: dict[Key, list[Candidate]] = {row: [Candidate(T, 0)] for row, T in enumerate(poses)}
+        before = [bool(np.mean(each[:, 2, 3] > 0) > 0.9) for each in (poses, inverse(poses))]
+        board, blank = BoardSpec(BoardKind.UNSEEN), CameraModel(0, 0)
+        yield Seen(
+            board, True, views, candidates, blank, False, len(views), how, evidence, (before[0], before[1])
+        )
+
+
+def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: Progress) -> Seen | None:
+    """Find the board in evenly spread images; None: in too few."""
+    places = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _VOTERS)).astype(int))
+    images: dict[Path, Pixels] = {}
+    sizes = set[tuple[int, int]]()
+    for path in (paths[place] for place in places):
+        with suppress(ImageError, OSError):
+            header = read_header(data := read_file(path, IMAGE_LIMIT_BYTES))
+            images[path] = to_grey(decode_image(data, header.width, header.height))
+            sizes.add((header.width, header.height))
+    if len(sizes) != 1:
+        return None
+    ((width, height),) = sizes
+    factor = min(1.0, _LARGEST_SIDE_PX / max(width, height))
+    small = {path: _reduced(image, factor) for path, image in images.items()}
+    boards = [given] if given else _boards(lies.facts, list(small.values()))
+    for board, known in _quickly_seen(boards, list(small.values())[:_TRIED])[:2]:
+        points = board_points(board)
+        found = dict(_search(small, board, known, progress))
+        views: dict[Key, BoardView] = {
+            path: BoardView(
+                n,
+                path.name,
+                np.eye(4),
+                points[found[path].indices],
+                (found[path].pixels + 0.5) / factor - 0.5,
+            )
+            for n, path in enumerate(images)
+            if path in found
+        }
+        if len(views) < FEWEST:
+            continue
+        camera = _camera(lies, CameraModel(width, height), tuple(views.values()))
+        if camera is not None:
+            candidates = {path: candidate_poses(view, camera[0], board) for path, view in views.items()}
+            return Seen(board, known, views, candidates, *camera, len(images))
+    return None
+
+
+def _reduced(image: Pixels, factor: float) -> Pixels:
+    return np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+
+
+def _search(
+    images: dict[Path, Pixels], board: BoardSpec, known: bool, progress: Progress
+) -> Iterator[tuple[Path, Detection]]:
+    """Look at a glance, then, where too few show the board so, thoroughly, up to some misses in a row."""
+    left = dict(images)
+    for thorough in (False, True):
+        missed = 0
+        for n, (path, image) in enumerate(images.items(), 1):
+            enough = len(images) - len(left) > _ENOUGH * len(images)
+            if path not in left or (thorough and (enough or missed > _TRIED)):
+                continue
+            progress(n, len(images), "looking for the board" + " thoroughly" * thorough)
+            seen = detect(image, board, thorough, with_quality=False)
+            missed = 0 if seen.found or (known and len(left) < len(images)) else missed + 1
+            if seen.found:
+                del left[path]
+                yield path, seen
+
+
+def _quickly_seen(boards: Iterable[BoardSpec], images: list[Pixels]) -> list[tuple[BoardSpec, bool]]:
+    """Boards and whether their size is known: as they come where half of a few images show one at a glance,
+    the others by the corners that are seen."""
+    counted: list[tuple[int, int, BoardSpec, bool]] = []
+    for each in boards:
+        known = each.square_m > 0
+        board = each if known else msgspec.structs.replace(each, square_m=GUESSED_M)
+        try:
+            check_board(board)
+        except CalibrationError:
+            continue
+        seen = [detect(image, board, thorough=False, with_quality=False) for image in images]
+        often = 2 * sum(found.found for found in seen) >= len(seen) and known
+        corners = sum(found.corners for found in seen)
+        counted.append((-(10**6) if often else -corners, len(counted), board, known))
+    return [(board, known) for _, _, board, known in sorted(counted, key=lambda c: c[:2])]
+
+
+def _camera(lies: Lies, blank: CameraModel, views: tuple[BoardView, ...]) -> tuple[CameraModel, bool] | None:
+    """(the lens by these images, False); (the one that was told, True) where they do not determine one."""
+    own: CameraModel | None = None
+    with suppress(CalibrationError):
+        own = calibrate_intrinsics(ViewSet("eye-in-hand", views, blank)).camera
+    for K, distortion in lies.cameras[:1] if own is None or len(views[0].pixels) < 12 else ():
+        matrix: Any = tuple(map(tuple, K.tolist()))
+        return msgspec.structs.replace(blank, matrix=matrix, distortion=distortion), True
+    return None if own is None else (own, False)
+
+
+_COLUMN_KEYS = ("columns", "cols", "num_x", "squares_x", "board_width", "width", "nx", "corners_x")
+_ROW_KEYS = ("rows", "num_y", "squares_y", "board_height", "height", "ny", "corners_y")
+_SQUARE = re.compile(r"square|tile|spacing|chessboard_dim|center_dist|tag_size", re.I)
+_MARKER = re.compile(r"(aruco|len|size|side).*marker|marker.*(dim|size|len|side)", re.I)
+
+
+def _boards(facts: dict[str, Any], greys: list[Any]) -> Iterator[BoardSpec]:
+    """Boards that the files describe, likeliest first, then the chessboard that the images show."""
+    text = " ".join(f"{key} {value}" for key, value in facts.items())
+
+    def length(wanted: re.Pattern[str]) -> float:
+        for key, value in facts.items():
+            if wanted.search(key) and isinstance(value, (int, float)) and value > 0:
+                return value / 1000 if "mm" in key or value > 1 else float(value)
+        mm = re.search(rf"(?:{wanted.pattern})\D{{0,20}}?(\d+\.?\d*) ?mm|^\D*(\d+\.?\d*) ?mm\b", text, re.I)
+        return float(mm[mm.lastindex or 1]) / 1000 if mm and wanted is _SQUARE else 0.0
+
+    square_m, marker_m = length(_SQUARE), length(_MARKER)
+    sizes = [
+        (int(v[0]), int(v[1])) for k, v in facts.items() if re.search("pattern|board|size", k) and _two(v)
+    ]
+    columns, rows = (next((facts[k] for k in keys if k in facts), None) for keys in (_COLUMN_KEYS, _ROW_KEYS))
+    if isinstance(columns, int) and isinstance(rows, int):
+        sizes.append((columns, rows))
+    sizes += [(int(a), int(b)) for a, b in re.findall(r"\b(\d{1,2}) ?[x×*] ?(\d{1,2})\b", text)]
+    number = next((v for k, v in facts.items() if "dictionary" in k), None)
+    names = {getattr(cv2.aruco, name): name for name in dir(cv2.aruco) if re.match(r"DICT_\d", name)}
+    dictionary = number if isinstance(number, str) else names.get(number)
+    for size in dict.fromkeys(size for size in sizes if min(size) >= 1 and max(size) < 60):
+        if dictionary and size == (1, 1):
+            for tag in range(4):
+                yield BoardSpec(BoardKind.ARUCO, 1, 1, marker_m, dictionary=dictionary, tag_id=tag)
+        elif dictionary:
+            for legacy in (False, True):
+                marker = marker_m or usual_markers(BoardKind.CHARUCO, square_m)[0]
+                yield BoardSpec(BoardKind.CHARUCO, *size, square_m, marker, dictionary, legacy)
+        elif "circle" in text.lower():
+            kinds = [BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES]
+            yield from (BoardSpec(kind, *size, square_m) for kind in kinds)
+        else:
+            yield BoardSpec(BoardKind.CHESSBOARD, *size, square_m)
+            yield BoardSpec(BoardKind.CHESSBOARD, size[0] - 1, size[1] - 1, square_m)
+    votes = Counter(filter(None, map(seen_size, greys[:10])))
+    for shown in sorted(votes, key=lambda size: -size[0] * size[1])[:5]:
+        yield BoardSpec(BoardKind.CHESSBOARD, *shown, square_m)
+
+
+def _two(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(float(v).is_integer() for v in value)

@@ -1,0 +1,213 @@
+"""Anyone's folder as it is believed: which images or board poses go with which robot poses, read how."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from calibrate.imported.board import FEWEST, GUESSED_M, Key, see_board, told_boards
+from calibrate.imported.mounting import Ask, mounting
+from calibrate.imported.readings import Reading, decide, is_good, readings
+from recordings.errors import ImportSourceError
+from recordings.importers.conventions import Convention, convention
+from recordings.importers.dataset import Dataset, PoseRow, PosesTold
+from recordings.importers.messages import Progress
+from recordings.importers.tables import Lies, Table, natural
+from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount
+
+_MADE = re.compile(r"draw|calibrated|overlay|visual|detect|result|undist|depth|corner|IR\b|axes", re.I)
+"""Names of images that a program painted on, or that another camera took."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user says; None: find it."""
+
+    convention: str | None = None
+    mount: Mount | None = None
+    board: BoardSpec | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """A folder as it is read."""
+
+    dataset: Dataset
+    rows: list[PoseRow]
+    facts: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """What → (what is believed, its evidence), for people."""
+
+
+def believe(
+    lies: Lies,
+    given: Given = Given(),
+    told: Dataset | None = None,
+    progress: Progress = lambda done, total, text: None,
+    ask: Ask | None = None,
+) -> Believed:
+    """Decide how a folder is to be read. ImportSourceError names the nearest reading and the flag.
+
+    `ask`: asks a person for the mounting where nothing else tells it.
+
+    `told`: a description of before, which is taken as it is where it names table and convention.
+    """
+    if told is not None:
+        given = Given(given.convention, given.mount or told.mount, given.board or told.board)
+        if told.poses is not None:
+            return _as_before(lies, told, told.poses)
+    robots = [t for t in lies.tables if t.whose == "robot"] or [t for t in lies.tables if not t.whose]
+    pairings: list[tuple[Table, str, dict[Key, int]]] = [
+        (table, family, pairs)
+        for table in robots
+        for family, paths in lies.images.items()
+        if len(pairs := _pairs(table, paths)) >= FEWEST
+    ]
+    boards = [(robot, board, pairs) for robot, board, pairs in _pairs_of_tables(lies, robots)]
+    if not pairings and not boards:
+        images = [f"{len(paths)} {name}" for name, paths in lies.images.items()]
+        there = [f"{len(table.numbers)} {table.name}" for table in lies.tables]
+        said = [", ".join(each[:8]) or "none" for each in (images, there)]
+        raise ImportSourceError("no-pairs", source=lies.root, images=said[0], tables=said[1])
+    tried: list[Reading] = []
+    families = sorted(
+        {family for _, family, _ in pairings}, key=lambda name: (bool(_MADE.search(name)), name)
+    )
+    for family in families:
+        of_family = [(table, pairs) for table, each, pairs in pairings if each == family]
+        paths = {path for _, pairs in of_family for path in pairs if isinstance(path, Path)}
+        seen = see_board(lies, given.board, sorted(paths, key=natural), progress)
+        if seen is not None:
+            tried += [
+                r
+                for table, pairs in of_family
+                for r in readings(table, family, pairs, [seen], given.convention)
+            ]
+        if any(map(is_good, tried)):
+            break
+    else:
+        for n, (robot, board, pairs) in enumerate(boards):
+            progress(n, len(boards), "comparing tables of poses")
+            tried += readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
+    if not tried and not boards:
+        raise ImportSourceError("no-board-found", source=lies.root, images=", ".join(families))
+    best = decide(lies, tried)
+    pairs = next(
+        p
+        for t, f, p in (*pairings, *((r, b.name, p) for r, b, p in boards))
+        if (t, f) == (best.table, best.family)
+    )
+    return _believed(lies, given, best, pairs, ask)
+
+
+def _as_before(lies: Lies, told: Dataset, poses: PosesTold) -> Believed:
+    tables = {table.name: table for table in lies.tables}
+    table, board, pairs = tables.get(poses.table), tables.get(poses.images), dict[Key, int]()
+    if table is not None and poses.board_convention and board is not None:
+        pairs = _rows_of_both(table, board)
+    elif table is not None:
+        pairs = _pairs(table, lies.images.get(poses.images, []))
+    if not pairs or table is None:
+        raise ImportSourceError("no-pairs", source=lies.root, images=poses.images, tables=poses.table)
+    seen = None if board is None else (board, convention(poses.board_convention))
+    return Believed(told, _rows(lies, table, convention(poses.convention), pairs, seen))
+
+
+def _pairs(table: Table, paths: list[Path]) -> dict[Key, int]:
+    """Image → row: by the names told beside the rows, by the numbers in both names, or by order."""
+    named = {Path(name).name: row for row, name in enumerate(table.images) if name}
+    by_name: dict[Key, int] = {path: named[path.name] for path in paths if path.name in named}
+    if by_name:
+        return by_name
+    ordered = sorted(paths, key=natural)
+    if len(paths) == len(table.numbers):
+        return {path: row for row, path in enumerate(ordered)}
+    if "#" not in table.name:
+        return {}
+    rows = {place[-1]: row for row, place in enumerate(table.places) if place}
+    numbers = {path: int(found[-1]) for path in paths if (found := re.findall(r"\d+", path.stem))}
+    shared: dict[Key, int] = {path: rows[number] for path, number in numbers.items() if number in rows}
+    unique = len(rows) == len(table.numbers) and len(set(numbers.values())) == len(numbers)
+    return shared if unique and len(shared) > 0.8 * max(len(rows), len(paths)) else {}
+
+
+def _pairs_of_tables(lies: Lies, robots: list[Table]) -> Iterator[tuple[Table, Table, dict[Key, int]]]:
+    """Tables that may tell the robot's and the board's poses of the same views."""
+    for robot in robots:
+        for board in lies.tables:
+            if board.whose == "board" and len(pairs := _rows_of_both(robot, board)) >= FEWEST:
+                yield robot, board, pairs
+
+
+def _rows_of_both(robot: Table, board: Table) -> dict[Key, int]:
+    """Row of the board's table → row of the robot's, by order."""
+    return dict(enumerate(range(len(robot.numbers)))) if len(robot.numbers) == len(board.numbers) else {}
+
+
+def _believed(lies: Lies, given: Given, best: Reading, pairs: dict[Key, int], ask: Ask | None) -> Believed:
+    seen = best.seen
+    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, ask)
+    how = replace(best.convention, inverse=best.convention.inverse != inverted)
+    board, square = _board(best)
+    facts = {
+        "images": (f"{len(pairs)} {best.family}", f"board in {len(seen.views)} of {seen.looked} looked at"),
+        "poses": (f"{len(pairs)} rows of {best.table.name}", best.told),
+        "convention": (
+            how.name,
+            f"board stays within {1e3 * best.stays_m:.1f} mm, {np.degrees(best.stays_rad):.2f}°",
+        ),
+        "mount": (mount, why),
+        "board": (f"{board.kind.value} {board.columns}×{board.rows}, {1e3 * board.square_m:g} mm", square),
+        "camera": ("matrix as told" if seen.camera_known else "to be estimated", ""),
+    }
+    camera = seen.camera if seen.camera_known else CameraModel(seen.camera.width, seen.camera.height)
+    saw = None
+    if seen.convention is not None:
+        how_board = replace(seen.convention, inverse=seen.convention.inverse != board_inverted)
+        saw = next(t for t in lies.tables if t.name == best.family), how_board
+        del facts["images"], facts["camera"]
+        facts["board"] = f"{len(pairs)} rows of {best.family}", f"{how_board.name}; {seen.told}"
+    told = PosesTold(best.table.name, best.family, how.name, saw[1].name if saw else "")
+    dataset = Dataset(mount, board, camera, lies.root.resolve().name, poses=told)
+    return Believed(dataset, _rows(lies, best.table, how, pairs, saw), facts)
+
+
+def _board(best: Reading) -> tuple[BoardSpec, str]:
+    """(the board, how its size is known); where nothing tells the squares, the arm's motion does."""
+    board = best.seen.board
+    if best.seen.square_known:
+        return board, "as described"
+    factor = float(best.fit.factors[0])
+    sigma = float(np.sqrt(np.linalg.inv(best.fit.solved.precision)[-2, -2]))
+    square_m = factor * GUESSED_M
+    tolerance = min(0.1, max(3 * sigma / factor, 0.01))
+    near = round(square_m * 2000) / 2000
+    shown = near if abs(near - square_m) < tolerance * square_m else square_m
+    board = msgspec.structs.replace(board, square_m=round(shown, 6), square_tolerance=round(tolerance, 4))
+    return board, f"square by the arm's motion: {1e3 * square_m:.2f} mm"
+
+
+def _rows(
+    lies: Lies, table: Table, how: Convention, pairs: dict[Key, int], saw: tuple[Table, Convention] | None
+) -> list[PoseRow]:
+    """Rows in the order of the robot's table; `saw`: where the board was, instead of images."""
+    keys = sorted(pairs, key=lambda key: pairs[key])
+    flanges = how.poses(table.numbers[[pairs[key] for key in keys]])
+    boards = None if saw is None else saw[1].poses(saw[0].numbers[np.array(keys)])
+    return [
+        PoseRow(
+            n + 1,
+            f"row {key + 1}" if isinstance(key, int) else str(key.relative_to(lies.root)),
+            _matrix(flanges[n]),
+            camera_from_board=None if boards is None else _matrix(boards[n]),
+        )
+        for n, key in enumerate(keys)
+    ]
+
+
+def _matrix(T: np.ndarray) -> Matrix4:
+    return msgspec.convert(T.tolist(), Matrix4)

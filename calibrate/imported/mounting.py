@@ -1,0 +1,73 @@
+"""How the camera is mounted, and which way round poses are: what names say of it.
+
+In hand with poses as told looks like fixed with inverted ones, and a board seen by the camera like a camera
+seen by the board with the other mounting. The motion only joins the three; names decide two, or the user.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from calibrate.imported.readings import Reading
+from recordings.errors import ImportSourceError
+from recordings.importers.tables import Lies
+from recordings.schema.messages import Mount
+
+Ask = Callable[[str], Mount]
+_IN_HAND = re.compile(
+    r"eye_?(in|on)_?hand|hand_?(in|on)_?eye|\beih\b|cam\w*2(gripper|end|ee|tool|flange|hand)"
+    r"|attached on robot|in_hand|inhand|flange2cam|hand_camera|static_camera false",
+    re.I,
+)
+_TO_HAND = re.compile(
+    r"eye_?to_?hand|hand_?(to|out)_?eye|hand_out|eye_?on_?base|cam\w*2base|base2cam"
+    r"|static_camera true|world_cam",
+    re.I,
+)
+_TOOL_IN_BASE = re.compile(
+    r"(end|gripper|ee|tool|tcp|flange|hand)_?(2|to|in)_?base|base_(tcp|ee|tool|flange)|world_end|O_T_EE|t_base_tcp"
+    r"|robot_?(pose|coord|pos)|(tcp|tool|eef|ee|end|gripper|arm|effector)_?(pose|xyz|data|coord)|tool_?pose|\bhand\b"
+    r"|robot_?data",
+    re.I,
+)
+_BASE_IN_TOOL = re.compile(r"base_?(2|to|in)_?(end|gripper|ee|tool|tcp|flange|hand)", re.I)
+_CAMERA_IN_BOARD = re.compile(r"cam\w*?_?(2|to|in|wrt)_?(board|target|marker|obj|chess|pattern|tag)", re.I)
+
+
+def mounting(
+    lies: Lies, given: Mount | None, best: Reading, ask: Ask | None
+) -> tuple[Mount, bool, bool, str]:
+    """(mounting, whether the robot's poses are inverted, whether the board's are, why).
+
+    `ask`: asks a person. Raises ImportSourceError (`which-mount`) where neither names nor a person decide.
+    """
+    name, seen_in = best.table.name, best.seen.in_front
+    straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
+    turned_board = bool(_CAMERA_IN_BOARD.search(best.family)) if all(seen_in) else not seen_in[0]
+    fits = _OTHER[best.mount] if turned_board else best.mount
+    named = _named(f"{name} {best.family}") or _named(
+        f"{lies.words} {' '.join(f'{k} {str(v).lower()}' for k, v in lies.facts.items())}"
+    )
+    by_direction: set[Mount] = {fits if straight else _OTHER[fits]} if straight != inverted else set()
+    mount, why = given, "as told"
+    if mount is None and len(named | by_direction) == 1:
+        (mount,) = named | by_direction
+        why = f"by {'names, and ' if named else ''}the board's motion; {name}"
+    elif mount is None and ask is not None:
+        mount = ask(
+            f"{name} fits as {fits} with poses as they stand, or the other mounting with inverted poses"
+        )
+    if mount is None:
+        raise ImportSourceError("which-mount", source=lies.root, mount=fits, table=name)
+    turn = mount != fits
+    turns_board = turn and best.of_pairs and straight
+    return mount, turn and not turns_board, turned_board != turns_board, why
+
+
+def _named(words: str) -> set[Mount]:
+    ways: dict[Mount, re.Pattern[str]] = {"eye-in-hand": _IN_HAND, "eye-to-hand": _TO_HAND}
+    return {mount for mount, way in ways.items() if way.search(words)}
+
+
+_OTHER: dict[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}

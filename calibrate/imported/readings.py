@@ -1,0 +1,201 @@
+"""Ways to read robot poses, each fitted to where the board was: the evidence decides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibrate.boards.model import board_from_turned
+from calibrate.geometry import Array, inverse, rotation_angle, rotation_log, transform_points
+from calibrate.handeye.axxb.pairs import mount_poses
+from calibrate.handeye.pose_fit import FREE, PoseFit, fit_poses, pose_views
+from calibrate.handeye.readings import clear_gain
+from calibrate.imported.board import FEWEST, Key, Seen
+from calibrate.lens.pnp import choose_candidates
+from calibrate.views import ViewSet
+from recordings.errors import ImportSourceError
+from recordings.importers.conventions import Convention, convention, possible
+from recordings.importers.tables import Lies, Table
+from recordings.schema.messages import Mount
+
+_MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
+_MOST = 12
+"""Most readings of one table that are fitted: those by which the board seems to move least."""
+_STAYS_M, _STAYS_RAD = 0.015, 0.05
+"""Median distance of the board from its place above which no reading is believed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """One way to read a folder, and how well the board agrees."""
+
+    table: Table
+    convention: Convention
+    family: str
+    """Images by folder and name, or the table of the board's poses."""
+    seen: Seen
+    mount: Mount
+    fit: PoseFit
+    stays_m: float
+    stays_rad: float
+    told: str
+    """Evidence by the numbers alone."""
+
+    @property
+    def text(self) -> str:
+        return f"{self.mount}, {self.convention.name}"
+
+    @property
+    def of_pairs(self) -> bool:
+        return self.seen.convention is not None
+
+
+def readings(
+    table: Table, family: str, pairs: dict[Key, int], seens: list[Seen], named: str | None
+) -> Iterator[Reading]:
+    """Yield the best readings that the views can judge; `named`: the convention that the user gives."""
+    likely: list[tuple[float, Convention, str, Array, Seen, list[Key]]] = []
+    for seen in seens:
+        keys = [key for key in seen.views if key in pairs]
+        if len(keys) < FEWEST:
+            continue
+        numbers = table.numbers[[pairs[key] for key in keys]]
+        turns = _turns(seen, keys)
+        told = [(convention(named), "as told")] if named else possible(numbers)
+        spelt = [each for each in told if table.rotation and each[0].rotation == table.rotation]
+        for how, evidence in spelt or told:
+            flange = how.poses(numbers)
+            likely.append((_turn_miss(flange, turns), how, evidence, flange, seen, keys))
+    least = min((each[0] for each in likely), default=0.0)
+    moves = [
+        (_moves(seen, keys, flange, mount), n, mount)
+        for n, (miss, _, _, flange, seen, keys) in enumerate(likely)
+        for mount in _MOUNTS
+        if miss <= 3 * least + 0.05
+    ]
+    for _, n, mount in sorted(moves)[:_MOST]:
+        _, how, evidence, flange, seen, keys = likely[n]
+        fitted = _fitted(seen, keys, flange, mount)
+        if fitted is not None:
+            yield Reading(table, how, family, seen, mount, *fitted, evidence)
+
+
+def _turns(seen: Seen, keys: list[Key]) -> list[tuple[int, int, Array]]:
+    """Angles by which the board may have turned from each view to the three after it."""
+    R = [np.array([each.camera_from_board[:3, :3] for each in seen.candidates[key]]) for key in keys]
+    steps = [(i, i + step) for step in (1, 2, 3) for i in range(len(R) - step)]
+    return [(i, k, rotation_angle(R[i][:, None] @ np.swapaxes(R[k], 1, 2))) for i, k in steps]
+
+
+def _turn_miss(flange: Array, turns: list[tuple[int, int, Array]]) -> float:
+    """Median difference, rad, of the angles by which arm and board turn."""
+    i, k = (np.array([turn[end] for turn in turns]) for end in (0, 1))
+    turned = rotation_angle(np.swapaxes(flange[i, :3, :3], 1, 2) @ flange[k, :3, :3])
+    misses = [np.abs(angles - angle).min() for (_, _, angles), angle in zip(turns, turned, strict=True)]
+    return float(np.median(misses))
+
+
+def _moves(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> float:
+    """How far the board moves, metres, radians at half a metre: median by the X of all pairs of near views.
+
+    Rotation and translation apart: F. Park, B. Martin, "Robot sensor calibration: solving AX = XB on the
+    Euclidean group" (1994).
+    """
+    options = [np.array([each.camera_from_board for each in seen.candidates[key]]) for key in keys]
+    chosen = choose_candidates(options, flange, mount) if max(map(len, options)) > 1 else [0] * len(keys)
+    C, H = np.array([each[k] for each, k in zip(options, chosen, strict=True)]), mount_poses(flange, mount)
+    i, k = np.array([(i, i + step) for step in (1, 2, 3) for i in range(len(H) - step)]).T
+    A, B = inverse(H[k]) @ H[i], C[k] @ inverse(C[i])
+    alpha, beta = rotation_log(A[:, :3, :3]), rotation_log(B[:, :3, :3])
+    U, _, Vt = np.linalg.svd(alpha.T @ beta)
+    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    shift = B[:, :3, 3] @ R.T
+    J, right = A[:, :3, :3] - np.eye(3), shift - A[:, :3, 3]
+    if not seen.square_known:
+        J, right = np.concatenate([J, -shift[..., None]], axis=2), -A[:, :3, 3]
+    t = np.linalg.lstsq(J.reshape(-1, J.shape[2]), right.ravel(), rcond=None)[0]
+    moved = np.linalg.norm(J @ t - right, axis=1) + 0.5 * np.linalg.norm(alpha - beta @ R.T, axis=1)
+    return float(np.median(moved))
+
+
+def _fitted(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> tuple[PoseFit, float, float] | None:
+    options = [seen.candidates[key] for key in keys]
+    chosen = choose_candidates(
+        [np.array([c.camera_from_board for c in each]) for each in options], flange, mount
+    )
+    views = []
+    for key, each, k, F in zip(keys, options, chosen, flange, strict=True):
+        view, found = seen.views[key], each[k]
+        points = view.board_points
+        if found.turn:
+            points = transform_points(inverse(board_from_turned(seen.board, found.turn)), points)
+        views.append(
+            replace(view, base_from_flange=F, board_points=points, camera_from_board=found.camera_from_board)
+        )
+    poses = pose_views(ViewSet(mount, tuple(views), seen.camera), 0.02, 0.003 if seen.square_known else FREE)
+    try:
+        fit = fit_poses(poses)
+    except np.linalg.LinAlgError:
+        return None
+    places = mount_poses(flange, mount) @ fit.X[0] @ poses.boards.at(fit.factors)
+    away = inverse(fit.Y[0]) @ places
+    stays_m = float(np.median(np.linalg.norm(away[:, :3, 3], axis=1)))
+    return fit, stays_m, float(np.median(rotation_angle(away[:, :3, :3])))
+
+
+def is_good(reading: Reading) -> bool:
+    X, factor = reading.fit.X[0], float(reading.fit.factors[0])
+    itself = np.linalg.norm(X[:3, 3]) < 1e-3 and rotation_angle(X[:3, :3]) < 0.01
+    return (
+        reading.stays_m < _STAYS_M
+        and reading.stays_rad < _STAYS_RAD
+        and float((reading.fit.full > 0.5).mean()) > 0.5
+        and not itself
+        and 0.1 < factor < 10
+        and bool(np.linalg.norm(X[:3, 3]) < 20)
+    )
+
+
+def decide(lies: Lies, readings: list[Reading]) -> Reading:
+    good = [reading for reading in readings if is_good(reading)] or readings
+    ranked = sorted(good, key=lambda r: -r.fit.log_evidence)
+    if not ranked:
+        raise ImportSourceError("no-reading", source=lies.root, nearest="none", stays_m=0.0, stays_rad=0.0)
+    best = ranked[0]
+    if not is_good(best):
+        raise ImportSourceError(
+            "no-reading",
+            source=lies.root,
+            nearest=f"{best.table.name}: {best.text}",
+            stays_m=best.stays_m,
+            stays_rad=best.stays_rad,
+        )
+    for other in ranked[1:]:
+        if best.fit.log_evidence - other.fit.log_evidence > clear_gain(len(best.fit.full)):
+            break
+        if other.mount != best.mount or not _same(best, other):
+            raise ImportSourceError(
+                "two-readings",
+                source=lies.root,
+                first=f"{best.table.name}: {best.text}",
+                second=f"{other.table.name}: {other.text}",
+            )
+    return best
+
+
+def _same(one: Reading, other: Reading) -> bool:
+    """Tell whether two readings are the same poses, in other words."""
+    a, b = (reading.convention.poses(reading.table.numbers) for reading in (one, other))
+    boards = [reading.seen.candidates for reading in (one, other) if reading.seen is not one.seen]
+    seen = one.seen.candidates
+    return (
+        a.shape == b.shape
+        and bool(np.abs(a - b).max() < 1e-3)
+        and all(
+            np.abs(seen[key][0].camera_from_board - told[key][0].camera_from_board).max() < 1e-3
+            for told in boards
+            for key in seen.keys() & told.keys()
+        )
+    )

@@ -34,6 +34,7 @@ SHOWN: dict[str, str] = {
     "mistakes": r"^\*\*",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
+    "by_hand": r"^\| (all|ur)",
     "drift": r"^\| (ur|seven joints) ",
     "late_news": r"^\| all",
     "stop_latency": r"^\| both \| (first|bytes).* 200 \||no heartbeat \| rest",

@@ -29,8 +29,9 @@ from station.cell.config import StationConfig, matrix4
 from station.cell.status import EstimateStatus
 from station.plan.visibility import count_in_parts
 
-FEWEST_FOR_ESTIMATE = 4
+FEWEST_FOR_CELL, FEWEST_FOR_ESTIMATE = 3, 4
 FEWEST_FOR_LENS = 6
+"""Views from which a lens that is known roughly is estimated; from three on where nothing is known of it."""
 COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
 
 
@@ -74,16 +75,21 @@ def solve_quickly(
 
     CalibrationError, cv2.error or LinAlgError when the views are degenerate.
     """
-    points = board_points(board)
-    found = tuple(
-        BoardView(v.index, f"p{v.index}", v.base_from_flange, points[v.indices], v.pixels) for v in seen
-    )
-    views = ViewSet(mount, found, camera)
-    if not lens_is_known and len(found) >= FEWEST_FOR_LENS:
+    views = as_views(mount, camera, board, seen)
+    if camera.matrix is None:
+        views = replace(views, camera=calibrate_intrinsics(views).camera)
+    elif not lens_is_known and len(views) >= FEWEST_FOR_LENS:
         with contextlib.suppress(CalibrationError):  # else keep the rough lens
             views = replace(views, camera=calibrate_intrinsics(views).camera)
     views = solve_pnp(views, board)
     return views, *_quick_solution(views)
+
+
+def as_views(mount: Mount, camera: CameraModel, board: BoardSpec, seen: Sequence[CapturedView]) -> ViewSet:
+    """Make the solver's views from captured ones."""
+    points = board_points(board)
+    found = (BoardView(v.index, f"p{v.index}", v.base_from_flange, points[v.indices], v.pixels) for v in seen)
+    return ViewSet(mount, tuple(found), camera)
 
 
 def _quick_solution(views: ViewSet) -> tuple[Array, Array]:

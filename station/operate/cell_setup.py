@@ -14,6 +14,7 @@ from calibrate.boards.detect import Detection, detect
 from calibrate.boards.grids import seen_size
 from calibrate.geometry import Array
 from recordings.schema.messages import BoardSpec, Image, Mount, RobotState
+from station.analysis.found_cell import FoundCell
 from station.cell.errors import RobotError, StationError
 from station.cell.layout import flange_pose
 from station.operate import draft as drafts
@@ -21,7 +22,6 @@ from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellSte
 from station.operate.guided_views import (
     STILL_RAD_S,
     STILL_S,
-    FoundCell,
     find_cell,
     guided_view,
     image_trouble,

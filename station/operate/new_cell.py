@@ -18,7 +18,8 @@ import yaml
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, transform_points
 from recordings.files import ASKED_FOR, write_atomically
-from recordings.schema.messages import BoardKind, BoardSpec
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
+from station.analysis.found_cell import FoundCell
 from station.cell.config import (
     CameraConfig,
     LimitsConfig,
@@ -33,7 +34,7 @@ from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, RefusedError
 from station.cell.layout import guess_from, layout_of
 from station.operate.draft import STEPS, CellStep, Draft
-from station.operate.guided_views import FEWEST_GUIDED, FoundCell, enough, find_cell
+from station.operate.guided_views import FEWEST_GUIDED, enough, find_cell
 
 _ROOM_M = 0.35
 """Margin of the workspace box around the guided views and the board, metres."""
@@ -136,6 +137,12 @@ def table_height_m(draft: Draft, found: FoundCell) -> float:
     return 0.0
 
 
+def _rounded_lens(camera: CameraModel) -> CameraModel:
+    assert camera.matrix is not None
+    rows = tuple(tuple(round(value, 2) for value in row) for row in camera.matrix)
+    return msgspec.structs.replace(camera, matrix=rows, distortion=())
+
+
 def _rounded3(values: Array) -> Vector3:
     return vector3(round(float(v), 3) for v in values)
 
@@ -155,7 +162,7 @@ def made_config(draft: Draft) -> StationConfig:
             driver=draft.camera.driver,  # type: ignore[arg-type]  # as it was found
             device=draft.camera.device,
             exposure_us=round(draft.exposure_us, 1),
-            model=found.camera,
+            model=_rounded_lens(found.views.camera),
             model_is_rough=True,
         ),
         board=draft.board,

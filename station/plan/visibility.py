@@ -45,16 +45,18 @@ _FOCUS = (0.6, 1.6)
 
 def view_range(layout: CellLayout) -> ViewRange:
     """Choose distances at which the board fills the image well, near the working distance."""
-    K = camera_matrix(layout.camera)
-    points = board_points(layout.board)
-    size_m = (points.max(axis=0) - points.min(axis=0))[:2] + layout.board.square_m
-    picture = np.array([layout.camera.width, layout.camera.height])
-    full_m = float((np.diag(K)[:2] * size_m / picture).max())
-    focus = np.array(_FOCUS) * layout.working_distance_m
-    near, far = (float(d) for d in np.clip([full_m / _NEAR_FILL, full_m / _FAR_FILL], *focus))
-    if far < 1.2 * near:
-        near, far = full_m / _NEAR_FILL, full_m / _FAR_FILL
-    return ViewRange(distance_m=(near, far))
+    fills = distances_that_fill(layout.camera, layout.board)
+    near, far = (float(d) for d in np.clip(fills, *(np.array(_FOCUS) * layout.working_distance_m)))
+    return ViewRange(distance_m=fills if far < 1.2 * near else (near, far))
+
+
+def distances_that_fill(camera: CameraModel, board: BoardSpec) -> tuple[float, float]:
+    """Compute the shortest and longest distance (m) at which the board fills the image well."""
+    points = board_points(board)
+    size_m = (points.max(axis=0) - points.min(axis=0))[:2] + board.square_m
+    picture = np.array([camera.width, camera.height])
+    full_m = float((np.diag(camera_matrix(camera))[:2] * size_m / picture).max())
+    return full_m / _NEAR_FILL, full_m / _FAR_FILL
 
 
 def visible(camera: CameraModel, points: Array, border_px: float) -> NDArray[np.bool_]:

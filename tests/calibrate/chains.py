@@ -124,30 +124,57 @@ def _views_of(
     views: int,
     joints: bool,
 ) -> ViewSet:
+    q = in_sight(arm, mount, X, Y, rng, views)
+    return solve_pnp(views_at(arm, mount, X, Y, errors, rng, q, joints))
+
+
+def in_sight(
+    arm: DhArm,
+    mount: Mount,
+    X: Array,
+    Y: Array,
+    rng: np.random.Generator,
+    views: int,
+    reach_rad: float = 0.5,
+) -> Array:
+    """Random joints (views, n) around home from which the whole board is seen well."""
     q = np.zeros((0, len(HOME[arm.name])))
     while len(q) < views:
-        tried = arm.postures(rng, 4000, 0.5)
-        q = np.concatenate([q, tried[_shows(_boards(arm.forward(tried), mount, X, Y))]])
-    q = q[:views]
-    noise = 2e-5 * rng.normal(size=(views, 6))
+        tried = arm.postures(rng, 4000, reach_rad)
+        q = np.concatenate([q, tried[shows(boards(arm.forward(tried), mount, X, Y))]])
+    return q[:views]
+
+
+def views_at(
+    arm: DhArm,
+    mount: Mount,
+    X: Array,
+    Y: Array,
+    errors: Array,
+    rng: np.random.Generator,
+    q: Array,
+    joints: bool = False,
+) -> ViewSet:
+    """What is seen from joints q (m, n), with noise; boards are not placed yet."""
+    noise = 2e-5 * rng.normal(size=(len(q), 6))
     true = arm.forward(q, errors)
     true[:, :3, :3] = rotation_exp(noise[:, 3:]) @ true[:, :3, :3]
     true[:, :3, 3] += noise[:, :3]
     seen = []
-    for i, C in enumerate(_boards(true, mount, X, Y)):
+    for i, C in enumerate(boards(true, mount, X, Y)):
         pixels = project_pixels(CAMERA, transform_points(C, POINTS)) + 0.15 * rng.normal(
             size=(len(POINTS), 2)
         )
         told = arm.forward(q[i : i + 1])[0]
         seen.append(BoardView(i, f"view {i}", told, POINTS, pixels, q[i] if joints else None))
-    return solve_pnp(ViewSet(mount, tuple(seen), CAMERA))
+    return ViewSet(mount, tuple(seen), CAMERA)
 
 
-def _boards(flange: Array, mount: Mount, X: Array, Y: Array) -> Array:
+def boards(flange: Array, mount: Mount, X: Array, Y: Array) -> Array:
     return np.asarray(inverse(flange @ X) @ Y if mount == "eye-in-hand" else inverse(X) @ flange @ Y)
 
 
-def _shows(C: Array) -> Array:
+def shows(C: Array) -> Array:
     """Tell (m,) where all corners are in the picture, 0.3 to 0.8 m away, seen from in front."""
     corners = transform_points(C, POINTS[[0, 8, 54, 62]])
     z = corners[..., 2]

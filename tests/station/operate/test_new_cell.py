@@ -45,8 +45,8 @@ def test_four_views_give_mounting_board_and_lens(done: tuple[Draft, object]) -> 
         off = difference(guess, np.array(true))
         assert np.linalg.norm(off[:3]) < 3 * found.sigma_m
         assert np.linalg.norm(off[3:]) < 3 * found.sigma_rad
-    assert found.camera.matrix is not None
-    assert abs(found.camera.matrix[0][0] / truth.camera.matrix[0][0] - 1) < 0.02
+    matrix = found.views.camera.matrix
+    assert matrix is not None and abs(matrix[0][0] / truth.camera.matrix[0][0] - 1) < 0.02
 
 
 def test_a_wrong_answer_is_told_by_its_step(done: tuple[Draft, object]) -> None:

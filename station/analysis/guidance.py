@@ -1,0 +1,251 @@
+"""Views by hand: which one would help most, the way there, and whether a view is new.
+
+Pure functions. While the camera pose is not known, a view helps by being different; once the views can be
+solved, by the information that it adds to X (`handeye.information`). Candidates are placements of the board
+before the camera near those seen so far: where a person was, he can go again, and no model of the arm is
+needed to know it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate.boards.model import board_points
+from calibrate.errors import CalibrationError
+from calibrate.geometry import Array, pose, rotation_angle, rotation_exp, rotation_log, transform_points
+from calibrate.handeye.information import USUAL_NOISE, prior_information, sigma_of, view_information
+from calibrate.handeye.priors import BoardTolerance
+from calibrate.lens.pnp import candidate_poses, solve_pnp
+from calibrate.projection import camera_matrix, intrinsics_names, project_pixels
+from calibrate.views import ViewSet, implied_flange
+from recordings.schema.messages import BoardSpec, CameraModel, Mount
+from station.analysis.estimation import as_views
+from station.analysis.found_cell import FoundCell, find_cell
+from station.analysis.worker import CapturedView
+from station.plan.choose import Objective
+from station.plan.visibility import distances_that_fill, outline, visible
+
+FEWEST_BY_HAND = 12
+"""Fewest views with which a session by hand is enough."""
+USUAL_FOCAL = 1.3
+"""Focal length over the image's longer side that is assumed while nothing is known of the lens."""
+NEW_RAD, NEW_SHARE = math.radians(10.0), 0.12
+"""Turn of the board, and shift of its middle as a share of its distance, by which a view is new."""
+_OTHER = 2.0
+"""As many times further from a view that was given up."""
+_TILT_RAD, _ROLL_RAD = math.radians(42.0), math.radians(90.0)
+"""Largest tilt of the board, and largest roll against the first view, that are asked for."""
+_FURTHER_RAD, _WIDER = math.radians(40.0), 1.25
+"""Turn from the nearest view so far, and factor on the range of distances, that are within reach."""
+_MIDDLE, _BORDER = 0.8, 0.05
+"""Shares of the image's sides in which the board's middle lies, and of its width that stay free around it."""
+_DRAWN, _WEIGHED = 3000, 150
+"""Placements that are drawn, and, of those that qualify, weighed."""
+_NEAR_RAD, _NEAR_SHARE = math.radians(8.0), 0.08
+"""Turn from the wanted view, and shift as a share of distance or image, that are not worth a word."""
+
+
+@dataclass(frozen=True, eq=False)
+class NextView:
+    """The most useful next view after those so far."""
+
+    mount: Mount
+    board: BoardSpec
+    camera: CameraModel
+    """The lens as far as it is known."""
+    seen: Array
+    """camera_from_board of the views so far, (n, 4, 4)"""
+    camera_from_board: Array
+    """The wanted view, (4, 4)"""
+    found: FoundCell | None = None
+    """The cell by the views so far; None: they are not enough."""
+    sigma_m: float | None = None
+    """Predicted 1σ of X's translation (root of the summed variances) by the views so far."""
+    after_m: float | None = None
+    """The same with the wanted view."""
+
+    @property
+    def outline(self) -> Array:
+        """Corners (4, 2), px, of the board in the wanted view, in order around it."""
+        return project_pixels(self.camera, transform_points(self.camera_from_board, rim(self.board)))
+
+
+@dataclass(frozen=True)
+class Way:
+    """From what the camera sees now to the wanted view."""
+
+    words: str
+    """For a person; empty: this is the wanted view."""
+    new: bool
+    """The view differs from all so far."""
+
+
+def rim(board: BoardSpec) -> Array:
+    """Return the corners (4, 3) of the outermost squares, in order around the board."""
+    return outline(board)[[0, 2, 7, 5]]
+
+
+def next_view(
+    mount: Mount,
+    board: BoardSpec,
+    camera: CameraModel,
+    lens_known: bool,
+    seen: Sequence[CapturedView],
+    given_up: Sequence[Array] = (),
+) -> NextView:
+    """Choose the most useful next view, in some 0.3 s. `camera`: without a matrix its lens is unknown.
+
+    `given_up`: wanted views (4, 4) to which the person did not get; what is near them is not asked for.
+    """
+    points = board_points(board)
+    middle = points.mean(axis=0)
+    if (found := find_cell(mount, board, camera, lens_known, seen)) is None:
+        views = _placed(as_views(mount, _usual_lens(camera), board, seen), board)
+        at, pool = _boards(views), _candidates(views, board, given_up)
+        apart = [_least_difference(C, at, middle) for C in pool]
+        return NextView(mount, board, views.camera, at, pool[int(np.argmax(apart))])
+    views, X, Y = found.views, found.X, found.Y
+    lens, at = views.camera, views.camera_from_board
+    prior = prior_information(lens, lens_known, BoardTolerance.of(board))
+    free = None if lens_known else slice(12, 12 + len(intrinsics_names(lens)))
+    objective = Objective("A", float(np.median(np.linalg.norm(at[:, :3, 3], axis=1))), prior, free)
+    pool = _candidates(views, board, given_up)
+    flange = np.concatenate([views.base_from_flange, implied_flange(mount, X, Y, pool)])
+    each = view_information(mount, lens, flange, X, Y, points, USUAL_NOISE)
+    known, gains = each[: len(at)].sum(axis=0), each[len(at) :]
+    best = int(np.argmin(objective(known + gains)))
+    now_m, after_m = (sigma_of(total, prior)[0] for total in (known, known + gains[best]))
+    return NextView(mount, board, lens, at, pool[best], found, now_m, after_m)
+
+
+def way_to(wanted: NextView, seen: CapturedView) -> Way:
+    """Compare the board as it is seen now with the wanted view."""
+    lens, board = wanted.camera, wanted.board
+    (view,) = as_views(wanted.mount, lens, board, [seen])
+    try:
+        readings = [each.camera_from_board for each in candidate_poses(view, lens, board)]
+    except CalibrationError:
+        return Way("Show the whole board", False)
+    target = wanted.camera_from_board
+    turns = np.array([rotation_log(target[:3, :3] @ C[:3, :3].T) for C in readings])
+    nearest = int(np.argmin(np.linalg.norm(turns, axis=1)))  # of readings that look the same
+    middle = board_points(board).mean(axis=0)
+    new = _least_difference(readings[nearest], wanted.seen, middle) >= 1.0
+    now, then = (transform_points(C, middle) for C in (readings[nearest], target))
+    pixels = project_pixels(lens, np.array([now, then]))
+    shift = (pixels[1] - pixels[0]) / max(lens.width, lens.height)
+    further_m = float(np.linalg.norm(then) - np.linalg.norm(now))
+    if abs(further_m) < _NEAR_SHARE * np.linalg.norm(now):
+        further_m = 0.0
+    return Way(_words(wanted.mount, turns[nearest], further_m, shift), new)
+
+
+def _words(mount: Mount, turn: Array, further_m: float, shift: Array) -> str:
+    """Say how to move. turn: of the board in `camera` (x right, y down, z forward), rad.
+
+    Sides are those of the image. Where the camera moves, it goes around the board to the side that is to
+    come nearer; where the board moves, that edge of it comes nearer.
+    """
+    in_hand, parts = mount == "eye-in-hand", list[str]()
+    what = "camera" if in_hand else "board"
+    sides = [
+        (abs(angle), side[int(angle > 0)])
+        for angle, side in ((turn[0], ("bottom", "top")), (turn[1], ("left", "right")))
+    ]
+    for angle, side in sorted(sides, reverse=True):
+        if angle >= _NEAR_RAD:
+            degrees = f"{5 * round(math.degrees(angle) / 5)}°"
+            parts.append(
+                f"tilt the camera {degrees} around the board to the {side}"
+                if in_hand
+                else f"tilt the board {degrees}, its {side} edge nearer"
+            )
+    if abs(turn[2]) >= _NEAR_RAD:
+        # Seen along z, positive turns are clockwise; a camera turns against its image.
+        clockwise = (turn[2] > 0) != in_hand
+        degrees = f"{5 * round(math.degrees(abs(turn[2])) / 5)}°"
+        parts.append(f"turn the {what} {degrees} {'clockwise' if clockwise else 'anticlockwise'}")
+    if further_m:
+        parts.append(f"{100 * abs(further_m):.0f} cm {'further away' if further_m > 0 else 'closer'}")
+    moves = [
+        side[int(length > 0)]
+        for length, side in zip(shift, (("left", "right"), ("up", "down")), strict=True)
+        if abs(length) >= _NEAR_SHARE
+    ]
+    if moves:
+        parts.append(f"the board further {' and '.join(moves)} in the picture")
+    text = ", ".join(parts)
+    return text[:1].upper() + text[1:]
+
+
+def _usual_lens(camera: CameraModel) -> CameraModel:
+    """Assume a usual lens where none is known."""
+    if camera.matrix is not None:
+        return camera
+    width, height = camera.width, camera.height
+    focal = USUAL_FOCAL * max(width, height)
+    matrix = ((focal, 0.0, (width - 1) / 2), (0.0, focal, (height - 1) / 2), (0.0, 0.0, 1.0))
+    return CameraModel(width, height, matrix, (0.0,) * 5)
+
+
+def _placed(views: ViewSet, board: BoardSpec) -> ViewSet:
+    """Find the board's pose in each image; without views where one has none."""
+    try:
+        return solve_pnp(views, board) if len(views) else views
+    except CalibrationError:
+        return views.select([])
+
+
+def _boards(views: ViewSet) -> Array:
+    """Return camera_from_board of n views that have it, (n, 4, 4)."""
+    return views.camera_from_board if len(views) else np.zeros((0, 4, 4))
+
+
+def _candidates(views: ViewSet, board: BoardSpec, given_up: Sequence[Array]) -> Array:
+    """Draw placements (n, 4, 4) of the whole board in the image: within reach of the views so far, and new.
+
+    Without views: straight on, in the middle.
+    """
+    lens, at = views.camera, _boards(views)
+    middle = board_points(board).mean(axis=0)
+    near_m, far_m = distances_that_fill(lens, board)
+    if not len(at):
+        return pose(np.eye(3), [0.0, 0.0, (near_m + far_m) / 2] - middle)[None]
+    away_m = np.linalg.norm(transform_points(at, middle[None])[:, 0], axis=1)
+    reach_m = away_m.min() / _WIDER, max(min(away_m.max() * _WIDER, far_m), away_m.min())
+    rng, first = np.random.default_rng([len(at), len(given_up)]), at[0]
+    # Rotation about the optical axis that is left when the first view's tilt is removed.
+    roll = np.arctan2(first[1, 0] - first[0, 1], first[0, 0] + first[1, 1])
+    tilt, axis = _TILT_RAD * np.sqrt(rng.uniform(0, 1, _DRAWN)), rng.uniform(-np.pi, np.pi, _DRAWN)
+    tilts, rolls = np.zeros((2, _DRAWN, 3))
+    tilts[:, 0], tilts[:, 1] = tilt * np.cos(axis), tilt * np.sin(axis)
+    rolls[:, 2] = roll + rng.uniform(-_ROLL_RAD, _ROLL_RAD, _DRAWN)
+    R = rotation_exp(tilts) @ rotation_exp(rolls)
+    pixels = (0.5 + _MIDDLE * rng.uniform(-0.5, 0.5, (_DRAWN, 2))) * [lens.width, lens.height]
+    rays = np.concatenate([pixels, np.ones((_DRAWN, 1))], axis=1) @ np.linalg.inv(camera_matrix(lens)).T
+    rays *= rng.uniform(reach_m[0], reach_m[1], (_DRAWN, 1)) / np.linalg.norm(rays, axis=1, keepdims=True)
+    pool = pose(R, rays - R @ middle)
+    pool = pool[visible(lens, transform_points(pool, outline(board)), _BORDER * lens.width)]
+    turn = rotation_angle(np.swapaxes(at[:, None, :3, :3], -1, -2) @ pool[:, :3, :3]).min(axis=0)
+    near = pool[turn < _FURTHER_RAD]
+    tried = np.array(given_up).reshape(-1, 4, 4)
+    new = [
+        C
+        for C in near
+        if _least_difference(C, at, middle) >= 1.0 and _least_difference(C, tried, middle) >= _OTHER
+    ]
+    return np.array(new or near.tolist() or pool)[:_WEIGHED]
+
+
+def _least_difference(C: Array, at: Array, middle: Array) -> float:
+    """Compare a placement of the board with those so far, (n, 4, 4): 1 is new; infinite without any."""
+    if not len(at):
+        return math.inf
+    turn = rotation_angle(np.swapaxes(at[:, :3, :3], -1, -2) @ C[:3, :3]) / NEW_RAD
+    now, before = transform_points(C, middle), transform_points(at, middle[None])[:, 0]
+    shift = np.linalg.norm(before - now, axis=1) / (NEW_SHARE * float(np.linalg.norm(now)))
+    return float(np.hypot(turn, shift).min())

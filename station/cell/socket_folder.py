@@ -46,6 +46,11 @@ def stop_socket(control: Path) -> Path:
     return control.with_suffix(".stop")
 
 
+def post_socket(control: Path) -> Path:
+    """Return the path of the socket to which an arm's pose is posted, beside the control socket."""
+    return control.with_suffix(".post")
+
+
 def motion_page(control: Path) -> Path:
     """Return the path of the file with STOP and motion state (`protocol.stop_client`)."""
     return control.with_suffix(".motion")

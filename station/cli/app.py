@@ -54,6 +54,11 @@ STATION = LazyGroup(
         "status": LazyCommand(
             "station.cli.control:status_command", ("station status", "station status --json")
         ),
+        "post": LazyCommand(
+            "station.cli.post:post_command",
+            ("python tell_pose.py | station post", "station post --typed kuka-abc"),
+            rare=True,
+        ),
         "stop": LazyCommand("station.cli.control:stop_command", ("station stop",)),
         "acknowledge": LazyCommand(
             "station.cli.control:acknowledge_command", ("station acknowledge",), rare=True

@@ -27,7 +27,7 @@ from recordings.schema.stillness import LEAST_SAMPLES
 from station.cell.clock_fit import ClockFit
 from station.cell.config import StationConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
-from station.cell.socket_folder import make_folder, peer_of
+from station.cell.socket_folder import make_folder, peer_of, post_socket
 from station.cell.status import ArmCondition
 from station.devices.clocks import ClockEstimator
 from station.devices.history import HISTORY_S, state_at
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 SOURCES: dict[Source, str] = {"real": "live", "simulated": "simulated", "playback": "playback"}
 """What a program must declare in a cell of each kind."""
-READ_BYTES, PAUSE_S, LINES_READ = 8192, 0.005, 10
+READ_BYTES, PAUSE_S, LINES_READ = 8192, 0.005, 50
 """So much is read at once, then a pause; of what came together only the newest lines are looked at."""
 LINE_BYTES = 2048
 DECLARED_S = 3.0
@@ -51,13 +51,10 @@ JUMP_M_S, JUMP_RAD_S = 2.5, 10.0
 """Ten times the speed to which arms are limited while a person is near (0.25 m/s); more is no motion."""
 ARRIVAL_S = 0.1
 """Posts without a time of their own may have been held up for so long on their way."""
+HELD_UP_S = 0.02
+"""A post that overtakes the others' delay by so much was not held up, and all before it were."""
 CLOCK_STEP_S = 1.0
 """Step of a program's clock against this computer's that is no delay."""
-
-
-def post_socket(control: Path) -> Path:
-    """Return the path of the socket to which poses are posted, beside the control socket."""
-    return control.with_suffix(".post")
 
 
 class PostedArm:
@@ -83,8 +80,8 @@ class PostedArm:
         self._states: deque[RobotState] = deque()
         self._clock: ClockEstimator | None = None
         """None: the posts have no time of their own."""
-        self._period_s = 0.0
-        """Between posts, smoothed."""
+        self._ahead_s = -math.inf
+        """Largest lead of the posts' clock over this computer's."""
         self._wrong: StaleStateError | None = None
         self._wrong_s = self._told_s = 0.0
         self._came = asyncio.Event()
@@ -144,7 +141,7 @@ class PostedArm:
         """The program's clock against the host's, or how late poses by arrival may be."""
         if self._clock is not None:
             return self._clock.fit()
-        return ClockFit(0.0, 0.0, 0.0, 0.0, self._latency_s) if self._states else None
+        return ClockFit(0.0, 0.0, 0.0, 0.0, self._declared.late_s + PAUSE_S) if self._states else None
 
     async def close(self) -> None:
         if self._server is not None:
@@ -162,12 +159,6 @@ class PostedArm:
 
     def _recent_wrong(self) -> StaleStateError | None:
         return self._wrong if time.monotonic() < self._wrong_s + WRONG_S else None
-
-    @property
-    def _latency_s(self) -> float:
-        """How late a pose may be when it is posted: as declared, else a period, in which one is asked for."""
-        declared_s = self._declared.late_s
-        return self._period_s + PAUSE_S if declared_s is None else declared_s
 
     # -- for programs ------------------------------------------------------------------------------------
 
@@ -245,19 +236,22 @@ class PostedArm:
             if step_s < 0 or wrong is not None:
                 self._begin_anew()
             else:
-                self._period_s += 0.05 * (step_s - self._period_s) if self._period_s else step_s
                 wrong = _jump(before.tcp_pose, pose, step_s if post.t is not None else max(step_s, ARRIVAL_S))
         if self._clock is not None:
-            self._clock.latency_s = self._latency_s
+            if (ahead_s := told_s - arrived_ns / 1e9) > self._ahead_s + HELD_UP_S:
+                # All before were held up on their way, and tell no time.
+                self._clock = ClockEstimator(latency_s=self._declared.late_s)
+            self._ahead_s = max(self._ahead_s, ahead_s)
             self._clock.add(told_s, arrived_ns)
         joints = post.joints_rad or ()
         stamps = Stamps(arrived_ns, time.time_ns(), told_s)
         self._states.append(RobotState(stamps, joints, (), joints, pose))
         while self._states[0].stamps.controller_s < told_s - HISTORY_S:
             self._states.popleft()
-        if self._period_s > self._slowest_s:
-            rate = f"{1 / self._period_s:.3g} of at least {1 / self._slowest_s:.0f} poses a second"
-            self._tell(f"{rate}: rest is not seen; post faster, or raise stillness.window_s")
+        span_s = told_s - self._states[0].stamps.controller_s
+        if span_s > max(RESTING_S, self._slowest_s * (len(self._states) - 1)):
+            least = f"{1 / self._slowest_s:.0f} poses a second"
+            self._tell(f"rest is seen from {least} on: post faster, or raise stillness.window_s")
         for callback in self._callbacks:
             callback(self._states[-1])
         self._came.set()
@@ -267,7 +261,7 @@ class PostedArm:
     def _begin_anew(self) -> None:
         """Forget what belongs to another clock."""
         self._states.clear()
-        self._period_s = 0.0
+        self._ahead_s = -math.inf
         if self._clock is not None:
             self._clock = ClockEstimator()
 

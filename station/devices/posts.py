@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -34,8 +34,8 @@ class Declaration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Name of the arm, as configured in `robot.model`; empty: not told."""
     convention: str = ""
     """How a pose is written, by `recordings.importers.conventions`; empty: metres and x y z w, or 4×4."""
-    late_s: float | None = None
-    """How old a pose is at most when it is posted; None: one period of the posts."""
+    late_s: Annotated[float, msgspec.Meta(ge=0)] = 0.01
+    """How old a pose is at most when it is posted: no clock can tell this delay."""
 
 
 class Post(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -293,8 +293,6 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     trigger: TriggerStatus = TriggerStatus()
     detection: DetectionStatus = DetectionStatus()
     recorder: RecorderStatus = RecorderStatus()
-    clock: ClockFit | None = None
-    """The controller's clock against the host's; the camera's: `camera.timing`."""
     session: SessionStatus = SessionStatus()
     estimate: EstimateStatus = EstimateStatus()
     lease: LeaseStatus = LeaseStatus()

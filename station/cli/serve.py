@@ -9,6 +9,7 @@ import logging
 import os
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -83,10 +84,18 @@ def serve_command(
 
         cell = playback_cell(replay)
     else:
-        from station.simulation.launch_cell import SimulationOptions, simulated_cell
+        from station.simulation.cells import cell_config, make_cell
+        from station.simulation.launch_cell import simulated_cell
 
-        options = SimulationOptions(scene, seed, noise, mount, time_scale, gige, hardware_trigger)
-        cell = simulated_cell(options, place / "simulation")
+        truth = make_cell(scene, seed, noise, mount)
+        cell = simulated_cell(
+            truth,
+            partial(cell_config, truth),
+            place / "simulation",
+            time_scale=time_scale,
+            gige=gige,
+            hardware_trigger=hardware_trigger,
+        )
     asyncio.run(serve_cell(cell, place, control, end_with_stdin, real_time))
 
 

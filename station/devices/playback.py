@@ -41,15 +41,7 @@ MOVE_S = 0.2
 """Duration of every played-back move."""
 _SAME_JOINTS_RAD = 0.02
 _STAMP_BOUND_S = 1e-6
-_HOST_CLOCK = ClockFit(
-    reference_s=0.0,
-    offset_ns=0.0,
-    drift=0.0,
-    residual_s=0.0,
-    drift_uncertainty=0.0,
-    latency_s=_STAMP_BOUND_S,
-    span_s=0.0,
-)
+_HOST_CLOCK = ClockFit(0.0, 0.0, _STAMP_BOUND_S)
 """Clock of played-back images: the host's own."""
 CONFIG_NAME = "config.yaml"
 

@@ -141,7 +141,7 @@ class PostedArm:
         """The program's clock against the host's, or how late poses by arrival may be."""
         if self._clock is not None:
             return self._clock.fit()
-        return ClockFit(0.0, 0.0, 0.0, 0.0, self._declared.late_s + PAUSE_S) if self._states else None
+        return ClockFit(0.0, 0.0, self._declared.late_s + PAUSE_S) if self._states else None
 
     async def close(self) -> None:
         if self._server is not None:

@@ -59,7 +59,6 @@ class Monitor:
             camera=self._camera(),
             trigger=self._trigger(),
             recorder=self._recorder(),
-            clock=self._context.cell.robot.clock(),
             loop_lag_ms=round(lag_ms, 1),
             pending=self._pending(),
         )

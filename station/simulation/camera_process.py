@@ -119,8 +119,7 @@ class CameraProcess:
 
     def device_ns(self, host_monotonic_ns: int) -> int:
         """Convert a host time to the camera's clock."""
-        drift_ns = round(host_monotonic_ns * self.truth.camera_clock_drift_ppm * 1e-6)
-        return host_monotonic_ns + drift_ns + self.truth.camera_clock_offset_ns
+        return host_monotonic_ns + self.truth.camera_clock_offset_ns
 
     def preview(self) -> Image:
         return self._frame(time.monotonic_ns(), scaled(self.truth.camera, PREVIEW_SCALE), frame_id=0)

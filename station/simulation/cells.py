@@ -1,7 +1,7 @@
-"""Simulated cells: those of the paper and the blog, and random ones by seed.
+"""Simulated cells: those of the paper and the blog, and others by seed.
 
-Seed 0 is the cell as published. Other seeds draw the camera's orientation (anywhere on SO(3)), the board's
-pose, lens and noise, such that 25 different poses can see the board.
+Seed 0 is the cell as published. Other seeds turn and lean the camera and draw the board's pose, the lens and
+noise. The arm starts where the camera looks at the board.
 """
 
 from __future__ import annotations
@@ -11,21 +11,28 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from calibrate.geometry import Array, pose, project_to_rotation, random_rotation, rotation_exp
+from calibrate.boards.model import board_points
+from calibrate.geometry import Array, inverse, pose, project_to_rotation, rotation_exp
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
-from station.cell.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig, matrix4, vector6
-from station.cell.layout import guess_from
-from station.simulation.placement import (
-    Placement,
-    board_centre,
-    cell_description,
-    place_fixed_camera,
-    place_moving_camera,
+from station.cell.config import (
+    BLOG_BOARD,
+    PAPER_BOARD,
+    CameraConfig,
+    CaptureConfig,
+    LimitsConfig,
+    Plane,
+    PoseGuess,
+    RobotConfig,
+    StationConfig,
+    matrix4,
+    vector6,
 )
+from station.cell.layout import guess_from
 from station.simulation.renderer import scaled
 from station.simulation.truth import CellTruth, NoiseLevel, SceneName
 
+ROBOT = "UR10"
 _PRINTED_X = np.array(
     [
         (1.0000, -0.0032, -0.0026, -0.0013),
@@ -64,8 +71,17 @@ _PUBLISHED = {
     "blog": _PublishedCell(BLOG_BOARD, BLOG_LENS, BLOG_X),
     "paper-binned": _PublishedCell(PAPER_BOARD, scaled(PAPER_LENS, 0.5), PAPER_X),
 }
-_START_DEG = (0.0, -94.0, -90.0, -86.0, 90.0, 0.0)
-"""Start joints: the flange points straight down, half a metre above the table."""
+_START_RAD = {
+    "eye-in-hand": np.deg2rad([0.0, -94.0, -90.0, -86.0, 90.0, 0.0]),
+    "eye-to-hand": np.deg2rad([0.0, -94.0, -90.0, 4.0, 90.0, 0.0]),
+}
+"""Start joints: the flange points straight down, half a metre above the table; or away from the arm."""
+_LEAN_RAD, _JOG_RAD = 0.3, 0.06
+"""How far other seeds lean the camera or turn each joint, at most."""
+FREE_SPACE_BYTES = 200_000_000
+"""Free disk space below which no pose is captured; small, so that demonstrations run anywhere."""
+TABLE = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+"""Table on which the arm stands."""
 _GUESS_M, _GUESS_RAD = 0.004, 0.02
 """1σ per axis of the errors of the configured initial poses"""
 
@@ -96,34 +112,65 @@ def make_cell(
     rng = np.random.default_rng([2026, seed])
     published = _PUBLISHED[scene]
     camera = published.lens if seed == 0 else _other_lens(published.lens, rng)
-    placed = _place(published, camera, seed, mount, rng)
+    place = _before_camera if mount == "eye-to-hand" else _before_board
+    X, Y, start = place(published, seed, rng)
     truth = CellTruth(
         scene=scene,
         seed=seed,
         mount=mount,
-        robot_model="UR10",
+        robot_model=ROBOT,
         board=published.board,
         camera=camera,
-        camera_mount=matrix4(placed.camera_mount),
-        board_place=matrix4(placed.board_place),
-        start_joints_rad=vector6(placed.start_joints_rad),
+        camera_mount=matrix4(X),
+        board_place=matrix4(Y),
+        start_joints_rad=vector6(start),
     )
     return _with_noise(truth, _NOISE[noise], rng)
 
 
-def _place(
-    published: _PublishedCell, camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator
-) -> Placement:
-    if mount == "eye-to-hand":
-        return place_fixed_camera(published.board, camera, rng)
+def board_centre(board: BoardSpec) -> Array:
+    points = board_points(board)
+    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
+
+
+def seen_from(board: BoardSpec, distance_m: float, rotation: Array | None = None) -> Array:
+    """Make camera_from_board with the board's centre on the optical axis."""
+    R = np.eye(3) if rotation is None else rotation
+    return pose(R, np.array([0.0, 0.0, distance_m]) - R @ board_centre(board))
+
+
+def _turned(rng: np.random.Generator, lean_rad: float) -> Array:
+    """Draw a rotation (3, 3): any turn about z, and a lean of at most `lean_rad` about x and y each."""
+    lean = rotation_exp([*rng.uniform(-lean_rad, lean_rad, 2), 0.0])
+    return lean @ rotation_exp([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+
+
+def _before_board(
+    published: _PublishedCell, seed: int, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """Place the board on the table where a camera on the flange looks; return X, Y and start joints."""
+    X, start, height_m = published.X, _START_RAD["eye-in-hand"], 0.0
+    around = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     if seed != 0:
-        return place_moving_camera(published.board, camera, random_rotation(rng), rng)
-    start = np.deg2rad(_START_DEG)
-    base_from_camera = forward(MODELS["UR10"], start) @ published.X
-    axis = base_from_camera[:3, 2]
-    middle = base_from_camera[:3, 3] - axis * base_from_camera[2, 3] / axis[2]
-    level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    return Placement(published.X, pose(level, middle - level @ board_centre(published.board)), start)
+        X = pose(_turned(rng, 0.0), [0.0, 0.0, 0.0]) @ X @ pose(_turned(rng, _LEAN_RAD), [0.0, 0.0, 0.0])
+        start = start + rng.uniform(-_JOG_RAD, _JOG_RAD, 6)
+        height_m, around = rng.uniform(0.0, 0.03), around @ _turned(rng, 0.0)
+    base_from_camera = forward(MODELS[ROBOT], start) @ X
+    axis, eye = base_from_camera[:3, 2], base_from_camera[:3, 3]
+    middle = eye + axis * (height_m - eye[2]) / axis[2]
+    return X, pose(around, middle - around @ board_centre(published.board)), start
+
+
+def _before_camera(
+    published: _PublishedCell, seed: int, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """Place a fixed camera before a board on the flange, which faces away from the arm."""
+    start = _START_RAD["eye-to-hand"] + rng.uniform(-_JOG_RAD, _JOG_RAD, 6)
+    turn = rotation_exp([np.pi, 0.0, 0.0]) @ _turned(rng, 0.1)
+    beside_m = [*rng.uniform(-0.01, 0.01, 2), rng.uniform(0.03, 0.06)]
+    Y = pose(turn, np.array(beside_m) - turn @ board_centre(published.board))
+    view = seen_from(published.board, rng.uniform(0.48, 0.55), _turned(rng, 0.2))
+    return forward(MODELS[ROBOT], start) @ Y @ inverse(view), Y, start
 
 
 def _other_lens(camera: CameraModel, rng: np.random.Generator) -> CameraModel:
@@ -162,8 +209,6 @@ def _with_noise(truth: CellTruth, level: _CellNoise, rng: np.random.Generator) -
         pixel_noise=level.pixel_noise * spread,
         blur_px=level.blur_px * spread,
         camera_clock_offset_ns=int(rng.integers(-(10**12), 10**12)),
-        camera_clock_drift_ppm=float(rng.uniform(-30, 30)),
-        controller_clock_drift_ppm=float(rng.uniform(-15, 15)),
     )
 
 
@@ -191,4 +236,14 @@ def cell_config(truth: CellTruth, host: str = "") -> StationConfig:
         matrix=((focal_px, 0.0, centre[0]), (0.0, focal_px, centre[1]), (0.0, 0.0, 1.0)),
     )
     mount_guess, board_guess = roughly(truth.camera_mount), roughly(truth.board_place)
-    return cell_description(truth.mount, rough_lens, truth.board, mount_guess, board_guess, host)
+    return StationConfig(
+        name="simulated",
+        mount=truth.mount,
+        robot=RobotConfig(model=truth.robot_model, host=host),
+        camera=CameraConfig(driver="rendered", model=rough_lens, model_is_rough=True),
+        board=truth.board,
+        camera_guess=mount_guess,
+        board_guess=board_guess,
+        limits=LimitsConfig(planes=(TABLE,)),
+        capture=CaptureConfig(free_space_bytes=FREE_SPACE_BYTES),
+    )

@@ -7,7 +7,7 @@ in the configuration is ever used.
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -20,7 +20,7 @@ from station.cell.layout import flange_pose, guess_matrix, known_places, layout_
 from station.devices.cell import Cell
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.camera import RenderedCamera
-from station.simulation.launch_cell import TRUTH, start_cell
+from station.simulation.launch_cell import TRUTH, simulated_cell
 from station.simulation.truth import CellTruth, write_truth
 
 FOLDER = "rehearsal"
@@ -42,30 +42,20 @@ def rehearsed_cell(config: StationConfig, path: str, folder: Path, control: Path
     socket. Raises ConfigError where planning lacks something, LimitError where the board cannot be looked at,
     StationError. A posted arm stays one: its program declares that its poses are simulated.
     """
-    from station.devices.ur import UrRobot
-
     truth = truth_within(config, seed)
     if config.robot.driver == "posted":
         return _posted_cell(without_devices(config, ""), path, folder, control, truth)
-    ends = ExitStack()
-    host, attachments = start_cell(truth, folder, ends)
-    simulated = without_devices(config, host)
     about = {
         "configuration": Path(path).name,
         "robot_sigma_mm": 1e3 * REPEATABILITY_M,
         "robot_sigma_deg": float(np.degrees(REPEATABILITY_RAD)),
     }
-    robot = UrRobot(simulated.robot, folder)
-    return Cell(
-        config=simulated,
-        robot=robot,
-        mover=robot,
-        camera=RenderedCamera(truth, host, simulated.camera),
-        source="simulated",
-        config_path=path,
-        attachments=attachments | {ATTACHMENT: json.dumps(about).encode()},
-        ended=ends.close,
-        own_simulator=True,
+    return simulated_cell(
+        truth,
+        partial(without_devices, config),
+        folder,
+        path=path,
+        attachments={ATTACHMENT: json.dumps(about).encode()},
     )
 
 

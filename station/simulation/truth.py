@@ -40,7 +40,6 @@ class CellTruth(ArmTruth, frozen=True, kw_only=True, omit_defaults=True):
     exposure_us: float = 10_000.0
     gain_db: float = 0.0
     camera_clock_offset_ns: int = 0
-    camera_clock_drift_ppm: float = 0.0
 
 
 def write_truth(truth: CellTruth, path: Path) -> None:

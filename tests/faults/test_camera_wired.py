@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from station.devices.cell import Cell
 from station.simulation.camera import RenderedCamera
-from station.simulation.launch_cell import SimulationOptions, simulated_cell
+from station.simulation.cells import cell_config, make_cell
+from station.simulation.launch_cell import simulated_cell
 from tests.codes import raises
 
 pytestmark = pytest.mark.process
@@ -18,7 +20,10 @@ pytestmark = pytest.mark.process
 
 @pytest.fixture
 async def cell(tmp_path: Path) -> AsyncIterator[Cell]:
-    made = await asyncio.to_thread(simulated_cell, SimulationOptions(hardware_trigger=True), tmp_path)
+    truth = make_cell()
+    made = await asyncio.to_thread(
+        simulated_cell, truth, partial(cell_config, truth), tmp_path, hardware_trigger=True
+    )
     assert made.trigger is not None
     assert await made.trigger.open() == "calibration-trigger SIM1"
     await made.camera.open()

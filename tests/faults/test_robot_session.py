@@ -38,7 +38,7 @@ async def cell(
     write_truth(TRUTH, tmp_path / "truth.json")
     running = await asyncio.to_thread(controller, "UR10", truth=tmp_path / "truth.json")
     admin = running.admin()
-    robot = UrRobot(RobotConfig("UR10", running.host, control=control_path), tmp_path / "log")
+    robot = UrRobot(RobotConfig(model="UR10", host=running.host, control=control_path), tmp_path / "log")
     rig = Rig(tmp_path / "root", robot=robot)
     await rig.start()
     await rig.until(S.IDLE)

@@ -36,8 +36,7 @@ async def one(robot: UrRobot, camera: RenderedCamera, admin: AdminClient, truth:
     middle_ns, model = picture.time.host_monotonic_ns, MODELS[truth.robot_model]
     state = robot.at(middle_ns)
     # By the truth of the camera's clock, which no estimate may look at.
-    rate = 1 + truth.camera_clock_drift_ppm * 1e-6
-    start_ns = (picture.stamps.device_ns - truth.camera_clock_offset_ns) / rate
+    start_ns = picture.stamps.device_ns - truth.camera_clock_offset_ns
     true_ns = round(start_ns + picture.exposure_us * 500)
     told = await asyncio.to_thread(admin.ask, "truth", at_monotonic_ns=true_ns)
     flange, joints = forward(model, state.joints_rad), np.asarray(state.joints_rad)
@@ -63,7 +62,7 @@ async def test_the_pose_at_mid_exposure_is_right_while_the_arm_moves(
     truth = make_cell(seed=3)
     write_truth(truth, tmp_path / "truth.json")
     host = (await asyncio.to_thread(controller, truth=tmp_path / "truth.json")).host
-    robot, camera = UrRobot(RobotConfig("UR10", host), tmp_path), RenderedCamera(truth, host)
+    robot, camera = UrRobot(RobotConfig(model="UR10", host=host), tmp_path), RenderedCamera(truth, host)
     jogging = asyncio.create_task(jog(host, truth))
     try:
         await robot.connect()

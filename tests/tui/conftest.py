@@ -19,7 +19,14 @@ from textual.pilot import Pilot
 from textual.widgets import Static
 
 from recordings.schema.messages import CameraIdentity, CameraModel, RobotIdentity
-from station.cell.config import PAPER_BOARD, PoseGuess
+from station.cell.config import (
+    PAPER_BOARD,
+    CameraConfig,
+    LimitsConfig,
+    PoseGuess,
+    RobotConfig,
+    StationConfig,
+)
 from station.cell.status import (
     ArmCondition,
     CameraStatus,
@@ -33,7 +40,7 @@ from station.cell.status import (
 )
 from station.protocol.client import Client
 from station.protocol.verbs import VERBS, Done, Preview, PreviewImage, Verb, Watch
-from station.simulation.placement import cell_description
+from station.simulation.cells import TABLE
 from station.tui.app import StationApp
 from tests.patience import PATIENCE_S
 from tests.recordings.small_recording import make_state
@@ -51,12 +58,17 @@ SUMMARY = MotionPreview(
 )
 
 
-CELL = cell_description(
-    "eye-in-hand",
-    CameraModel(1280, 1024, ((1400.0, 0.0, 640.0), (0.0, 1400.0, 512.0), (0.0, 0.0, 1.0)), (), "plumb_bob"),
-    PAPER_BOARD,
-    PoseGuess((0.0, 0.08, 0.05), (0.0, 0.0, 0.0, 1.0), 0.01, 0.05),
-    PoseGuess((0.6, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.01, 0.05),
+CELL = StationConfig(
+    robot=RobotConfig(),
+    camera=CameraConfig(
+        driver="rendered",
+        model=CameraModel(1280, 1024, ((1400.0, 0.0, 640.0), (0.0, 1400.0, 512.0), (0.0, 0.0, 1.0))),
+        model_is_rough=True,
+    ),
+    board=PAPER_BOARD,
+    camera_guess=PoseGuess((0.0, 0.08, 0.05), (0.0, 0.0, 0.0, 1.0), 0.01, 0.05),
+    board_guess=PoseGuess((0.6, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.01, 0.05),
+    limits=LimitsConfig(planes=(TABLE,)),
 )
 """A UR10 on a table, a camera on its flange, the board before it."""
 

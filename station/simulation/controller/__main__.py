@@ -85,7 +85,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--model", choices=sorted(TABLES), help="default: UR10 (CB3, 125 Hz)")
     add("--host", default="127.0.0.1", help="loopback address to listen on")
-    add("--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors, drift")
+    add("--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors")
     text = "a program that the dashboard can load; it only waits"
     add("--program", dest="programs", action="append", metavar="NAME", help=text)
     text = "answer with another version, for example 5.25.1"

@@ -29,7 +29,6 @@ class Clock:
     """Calls `tick(due_ns, late)` once per cycle, every one of them, in order, none ever skipped."""
 
     def __init__(self, cycle_s: float, tick: Callable[[int, bool], None]) -> None:
-        """cycle_s: in host seconds; differs from the controller's dt by its clock's drift."""
         self._cycle_ns = cycle_s * 1e9
         self._tick = tick
         self._timer: asyncio.TimerHandle | None = None
@@ -74,7 +73,7 @@ class Machine:
         self.host = host
         self.settings = settings
         self.robot = SimulatedRobot(settings, Journal())
-        self.clock = Clock(self.robot.dt_s / (1 + settings.controller_clock_drift_ppm * 1e-6), self._tick)
+        self.clock = Clock(self.robot.dt_s, self._tick)
         self.rtde = RtdeServer(host, self.robot)
         dashboard = dashboard_service(host, self.robot)
         self.services = [self.rtde.service, *script_services(host, self.robot), dashboard]

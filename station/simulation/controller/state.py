@@ -81,7 +81,6 @@ class ArmTruth(msgspec.Struct, frozen=True, kw_only=True):
     factory_theta_rad: Six = ZEROS
     states_factory: bool = True
     """True: port 30001 states the factory-calibrated table; False: the published one."""
-    controller_clock_drift_ppm: float = 0.0
 
 
 class Settings(ArmTruth, frozen=True, kw_only=True):

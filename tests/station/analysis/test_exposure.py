@@ -12,7 +12,7 @@ from calibrate.geometry import Array, transform_points
 from recordings.schema.messages import CameraModel
 from station.analysis.worker import ExposureAdvice, assess
 from station.cell.config import PAPER_BOARD
-from station.simulation.placement import seen_from
+from station.simulation.cells import seen_from
 from station.simulation.renderer import Light, render
 
 CAMERA = CameraModel(320, 256, ((417.0, 0.0, 159.5), (0.0, 417.0, 127.5), (0.0, 0.0, 1.0)))

@@ -12,8 +12,7 @@ from recordings.reader import open_recording
 from station.analysis.estimation import seen_before
 from station.analysis.worker import sight
 from station.cell.config import PAPER_BOARD
-from station.simulation.cells import make_cell
-from station.simulation.placement import seen_from
+from station.simulation.cells import make_cell, seen_from
 from station.simulation.renderer import Light, render, scaled
 
 

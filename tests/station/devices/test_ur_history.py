@@ -14,10 +14,7 @@ from tests.station.devices.test_ur_moves import STATE
 
 HOST_S, WALL_S = 500.0, 9_000.0
 """What the host's two clocks showed when the controller's showed 0."""
-CLOCK = ClockFit(
-    reference_s=10.0, offset_ns=HOST_S * 1e9, drift=0.0, residual_s=0.0, drift_uncertainty=0.0,
-    latency_s=0.0, span_s=10.0,
-)  # fmt: skip
+CLOCK = ClockFit(10.0, HOST_S * 1e9, 0.0)
 AXIS = np.array([0.6, 0.0, 0.8])
 
 

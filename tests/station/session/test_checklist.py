@@ -71,7 +71,7 @@ async def test_clocks_are_ok_only_where_frames_have_a_time(
     cell = rig.session.context.cell
     capture = msgspec.structs.replace(cell.config.capture, time_bound_s=0.02)
     object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
-    fit = ClockFit(0.0, 0.0, 0.0, 0.0, 0.0001, 0.0, 60.0)
+    fit = ClockFit(0.0, 0.0, 0.0001)
     rig.arm.clock = lambda: fit  # type: ignore[method-assign]
     rig.camera.timing = FrameTiming(source, bound_s, fit if clock else None, impossible)
     found = await check(rig, "clocks")

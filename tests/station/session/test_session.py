@@ -60,7 +60,7 @@ async def test_a_recording_tells_of_arm_clocks_and_camera(
 ) -> None:
     rig = await new_rig(source="real")
     table = ArmKinematics("UR10", "controller", (0.1,) * 6, (0.2,) * 6, (0.3,) * 6, (0.4,) * 6)
-    clock = ClockFit(0.0, 0.0, 0.0, 0.0, 0.003, 0.001, 60.0)
+    clock = ClockFit(0.0, 0.0, 0.004)
     rig.arm.kinematics = table
     monkeypatch.setattr(rig.arm, "clock", lambda: clock)
     cell = rig.session.context.cell

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import inverse, is_rigid, rotation_angle, transform_points
+from calibrate.geometry import inverse, is_rigid, transform_points
 from calibrate.kinematics import MODELS, forward
 from station.cell.config import BLOG_BOARD, PAPER_BOARD
-from station.simulation.cells import cell_config, make_cell
-from station.simulation.placement import board_centre
+from station.simulation.cells import board_centre, cell_config, make_cell
 from station.simulation.truth import CellTruth, read_truth, write_truth
 from tests.codes import raises
 
@@ -59,17 +58,10 @@ def test_the_camera_sees_the_board_from_the_start(mount: str, seed: int) -> None
         assert corners[:, 2].min() >= -1e-9, "on or over the table"
 
 
-def test_mounts_of_other_seeds_are_spread_over_all_rotations() -> None:
-    turns = np.array([np.array(make_cell(seed=s).camera_mount)[:3, :3] for s in range(1, 21)])
-    angles = rotation_angle(turns)
-    # Uniform on SO(3): half of the angles lie above 2.2 rad or so; a box of ±π/2 would show none.
-    assert (angles > np.pi / 2).sum() > 10 and angles.max() > 2.8
-    assert turns[:, 2, 2].min() < -0.5, "some look back along the arm"
-
-
 def test_the_same_arguments_give_the_same_cell_and_seeds_differ(tmp_path: Path) -> None:
     assert make_cell(seed=4) == make_cell(seed=4)
-    assert make_cell(seed=4).camera != make_cell(seed=5).camera
+    rolls = [np.arctan2(*np.array(make_cell(seed=s).camera_mount)[[1, 0], 0]) for s in range(1, 13)]
+    assert len({make_cell(seed=s).camera for s in range(1, 13)}) == 12 and np.ptp(rolls) > np.pi
     write_truth(make_cell(seed=4), tmp_path / "truth.json")
     assert read_truth(tmp_path / "truth.json") == make_cell(seed=4)
 

@@ -11,7 +11,7 @@ from calibrate.boards.model import board_points, looks_same_turns
 from calibrate.geometry import Array, pose, rotation_exp
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from station.cell.config import PAPER_BOARD
-from station.simulation.placement import seen_from
+from station.simulation.cells import seen_from
 from station.simulation.renderer import BLACK_LEVEL, Light, render, scaled
 
 CAMERA = CameraModel(

@@ -12,14 +12,16 @@
     print(calibration.validity.state, calibration.validity.since)
     flange_from_camera = calibration.transform.matrix  # (4, 4), metres
 
-In a notebook, from pictures and poses as arrays (`board` is a `recordings.BoardSpec`):
+In a notebook, from a folder of images and poses, or from arrays:
 
-    solved = calibrate.solve(images, base_from_flange, board, "eye-in-hand")
+    solved = calibrate.solve(*calibrate.read_folder("FOLDER"))
+    solved = calibrate.solve(images, poses, "9x6 25", "eye-in-hand", convention="ur-rotvec")
     print(solved.X, solved.covariance(), [gate.text for gate in solved.gates if not gate.passed])
     solved.plot()
 
-Errors are `CalibrationError`s with `code`, `values` and `remedy`. Names are loaded at their first use. The
-solver without files is `calibrate.handeye`. Everything else is private.
+Errors are `CalibrationError`s and `recordings.RecordingError`s with `code`, `values` and `remedy`. Where a
+remedy names an option of the commands, such as `--board`, it is the argument `board` here. Names are loaded
+at their first use. The solver without files is `calibrate.handeye`. Everything else is private.
 """
 
 from importlib import import_module
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from calibrate.files.calibration import Calibration as Calibration
     from calibrate.files.calibration import read_calibration as read_calibration
     from calibrate.files.calibration import write_calibration as write_calibration
+    from calibrate.files.exports import FrameNames as FrameNames
     from calibrate.files.exports import export as export
     from calibrate.files.install import install as install
     from calibrate.files.install import rollback as rollback
@@ -44,8 +47,10 @@ if TYPE_CHECKING:
     from calibrate.gates import GateLimits as GateLimits
     from calibrate.geometry import Transform as Transform
     from calibrate.job import JobOptions as JobOptions
+    from calibrate.job import Solved as Solved
     from calibrate.job import SolvedRecording as SolvedRecording
     from calibrate.pictures import SolvedPictures as SolvedPictures
+    from calibrate.pictures import read_folder as read_folder
     from calibrate.pictures import solve as solve
     from calibrate.pipeline import solve_recording as solve_recording
     from calibrate.results import Gate as Gate
@@ -53,13 +58,13 @@ if TYPE_CHECKING:
 _MODULES = {
     "errors": "CalibrationError",
     "files.calibration": "Calibration read_calibration write_calibration",
-    "files.exports": "export",
+    "files.exports": "FrameNames export",
     "files.install": "install rollback set_validity",
     "files.loader": "InstallationChange InstalledCalibration load_installed watch",
     "files.validity": "Validity ValidityReason ValidityState",
     "geometry": "Transform",
-    "job": "JobOptions SolvedRecording",
-    "pictures": "SolvedPictures solve",
+    "job": "JobOptions Solved SolvedRecording",
+    "pictures": "SolvedPictures read_folder solve",
     "pipeline": "solve_recording",
     "gates": "GateLimits",
     "results": "Gate",

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from functools import cached_property
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import msgspec
+import numpy as np
 
 from calibrate.errors import require_choice
 from calibrate.files.calibration import Calibration
 from calibrate.gates import GateLimits
+from calibrate.geometry import Array
+from calibrate.handeye.reprojection import bent_points
 from calibrate.handeye.solution import Profile, Solution
 from calibrate.lens.intrinsics import Intrinsics, LensModel
+from calibrate.projection import project_at
 from calibrate.recorded_views import LoadedViews
-from calibrate.results import Gate
-from calibrate.views import ViewSet
+from calibrate.results import SHAPE, Gate
+from calibrate.views import ViewSet, board_in_camera, observe_views
 from recordings.reader import Recording
 from recordings.schema.messages import BoardSpec, CameraModel
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -74,12 +83,83 @@ class PreparedViews:
 
 
 @dataclass(frozen=True, eq=False)
-class SolvedRecording(PreparedViews):
+class Solved:
+    """X with its uncertainty, and what every picture says of it."""
+
+    views: ViewSet
+    """Pictures in which the board was found."""
     solution: Solution
-    coverage: float
     gates: tuple[Gate, ...]
-    calibration: Calibration
 
     @property
     def passed(self) -> bool:
         return all(gate.passed for gate in self.gates)
+
+    @property
+    def X(self) -> Array:
+        """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), (4, 4), metres."""
+        return self.solution.matrix
+
+    @property
+    def lens(self) -> CameraModel:
+        """The given lens or the one found, as the fit left it."""
+        return self.solution.camera
+
+    def covariance(
+        self, order: Literal["translation-rotation", "rotation-translation"] = "translation-rotation"
+    ) -> Array:
+        """Return the covariance (6, 6), m and rad, of [δt, δφ], or of [δφ, δt].
+
+        X is Exp(δφ) times the estimate's rotation, and its translation plus δt: both in the axes of X's
+        parent frame. GTSAM and Sophus perturb in the child's.
+        """
+        require_choice("order", order, ("translation-rotation", "rotation-translation"))
+        shift = 3 * (order == "rotation-translation")
+        return np.roll(self.solution.covariance, (shift, shift), (0, 1))
+
+    @cached_property
+    def residuals_px(self) -> dict[int, Array]:
+        """Number of a picture → (k, 2): its corners less where calibration and recorded pose put them."""
+        solution, read = self.solution, {view.index: view for view in self.solution.kept}
+        views = ViewSet(
+            self.views.mount, tuple(read.get(view.index, view) for view in self.views), solution.camera
+        )
+        observed = observe_views(views)
+        shape = np.zeros(len(SHAPE)) if solution.board is None else solution.board.numbers
+        points = bent_points(observed, shape)
+        seen = board_in_camera(views.mount, observed.flange, self.X, solution.board_place.matrix)
+        return {
+            view.index: view.pixels - project_at(solution.camera, seen[i], points[i, : len(view.pixels)])
+            for i, view in enumerate(views)
+        }
+
+    def plot(self) -> Figure:
+        """Draw every residual, magnified, where it is in the image; a picture left out is red.
+
+        Needs matplotlib (the extra `report`).
+        """
+        from matplotlib.figure import Figure
+
+        class Shown(Figure):
+            def _repr_png_(self) -> bytes:
+                """Show it in a notebook, for which a bare Figure has no picture."""
+                self.savefig(file := BytesIO())
+                return file.getvalue()
+
+        used, figure = set(self.solution.used), Shown(layout="constrained")
+        axes = figure.subplots()
+        for view in self.solution.kept + tuple(v for v in self.views if v.index not in used):
+            colour = "tab:blue" if view.index in used else "tab:red"
+            axes.quiver(
+                *view.pixels.T, *self.residuals_px[view.index].T, angles="xy", color=colour, width=2e-3
+            )
+        rms = np.sqrt(np.mean([np.square(self.residuals_px[k]).sum(axis=1).mean() for k in used]))
+        axes.set(xlim=(0, self.lens.width), ylim=(self.lens.height, 0), aspect="equal")
+        axes.set_title(f"Where do the corners miss? {rms:.2f} px rms over {len(used)} pictures")
+        return figure
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedRecording(PreparedViews, Solved):
+    coverage: float
+    calibration: Calibration

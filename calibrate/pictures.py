@@ -6,89 +6,84 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calibrate.boards.detect import detect
-from calibrate.boards.model import board_points, check_board
-from calibrate.errors import BadViewsError, TooFewViewsError, require_choice
+from calibrate.boards.model import board_points, check_board, typed_board
+from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.gates import GateInputs, judge
 from calibrate.geometry import Array
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.handeye.reprojection import bent_points
-from calibrate.handeye.solution import Solution, SolveOptions
+from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
+from calibrate.imported import Given, believe
+from calibrate.job import Solved
 from calibrate.pipeline import picture_coverage, single_threaded_opencv, with_board_poses
-from calibrate.projection import project_at
-from calibrate.results import SHAPE, Gate
-from calibrate.views import BoardView, ViewSet, array_of, board_in_camera, observe_views
+from calibrate.views import BoardView, ViewSet, array_of
+from recordings.errors import ImportSourceError
 from recordings.files import usable_cores
+from recordings.importers import conventions
+from recordings.importers.dataset import DATASET_FILE, POSES_FILE, PoseRow, read_dataset, read_poses
+from recordings.importers.folder import read_image
+from recordings.importers.tables import look
+from recordings.reader import Pictures
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Order = Literal["translation-rotation", "rotation-translation"]
 
 
 @dataclass(frozen=True, eq=False)
-class SolvedPictures:
-    """X with its uncertainty, and what every picture says of it. Pictures are numbered from 0."""
+class SolvedPictures(Solved):
+    """What `solve` makes of pictures, numbered from 0."""
 
-    solution: Solution
-    views: ViewSet
-    """Pictures in which the board was found."""
-    gates: tuple[Gate, ...]
     without_board: dict[int, str]
     """Number of a picture without the board → reason."""
 
-    @property
-    def X(self) -> Array:
-        """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), (4, 4), metres."""
-        return self.solution.matrix
 
-    def covariance(self, order: Order = "translation-rotation") -> Array:
-        """Return the covariance (6, 6), m and rad, of [δt, δφ], or of [δφ, δt].
+def read_folder(
+    folder: Path | str,
+    board: BoardSpec | str | None = None,
+    mount: Mount | None = None,
+    convention: str | None = None,
+    poses: Path | str | None = None,
+) -> Pictures:
+    """Read a folder of images and robot poses as `recordings import` does; nothing is written.
 
-        X is Exp(δφ) times the estimate's rotation, and its translation plus δt: both in the axes of X's
-        parent frame. GTSAM and Sophus perturb in the child's.
-        """
-        require_choice("order", order, ("translation-rotation", "rotation-translation"))
-        shift = 3 * (order == "rotation-translation")
-        return np.roll(self.solution.covariance, (shift, shift), (0, 1))
+    What is not given is found: board and mount by dataset.yaml or by names, the convention of the numbers and
+    the square by the board's motion. poses: the file or folder that holds them, where others may be meant.
+    Raises RecordingError, which names what decides.
+    """
+    folder, known = Path(folder), None
+    if (folder / DATASET_FILE).is_file():
+        known = read_dataset(folder / DATASET_FILE)[0]
+    if known is not None and (folder / POSES_FILE).is_file():
+        rows = read_poses(folder)[0]
+    else:
+        given = Given(convention, mount, None if board is None else _board(board))
+        believed = believe(look(folder, None if poses is None else Path(poses)), given, known)
+        known = believed.dataset
+        rows = [PoseRow(0, str(path.relative_to(folder)), T) for path, T in believed.poses.items()]
+    if (camera := known.camera) is None:
+        raise ImportSourceError("dataset-value", path=folder / DATASET_FILE, key="camera")
+    joints = [row.joints_rad for row in rows]
+    return Pictures(
+        [read_image(folder, row, (camera.width, camera.height))[2] for row in rows],
+        np.array([row.base_from_flange for row in rows]),
+        known.board,
+        known.mount,
+        None if camera.matrix is None else camera,
+        None if None in joints else np.array(joints),
+        known.robot if isinstance(known.robot, str) else known.robot.model,
+    )
 
-    @cached_property
-    def residuals_px(self) -> dict[int, Array]:
-        """Number of a picture → (k, 2): its corners less where calibration and recorded pose put them."""
-        solution, observed = self.solution, observe_views(self.views)
-        shape = np.zeros(len(SHAPE)) if solution.board is None else solution.board.numbers
-        points = bent_points(observed, shape)
-        seen = board_in_camera(
-            self.views.mount, observed.flange, solution.matrix, solution.board_place.matrix
-        )
-        return {
-            view.index: view.pixels - project_at(solution.camera, seen[i], points[i, : len(view.pixels)])
-            for i, view in enumerate(self.views)
-        }
 
-    def plot(self) -> Figure:
-        """Draw every residual, magnified, where it is in the image; a picture left out is red."""
-        from matplotlib.figure import Figure
-
-        used, camera = set(self.solution.used), self.solution.camera
-        figure = Figure(layout="constrained")
-        axes = figure.subplots()
-        for view in self.views:
-            colour = "tab:blue" if view.index in used else "tab:red"
-            axes.quiver(*view.pixels.T, *self.residuals_px[view.index].T, angles="xy", color=colour)
-        rms = np.sqrt(np.mean([np.square(self.residuals_px[k]).sum(axis=1).mean() for k in used]))
-        axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
-        axes.set_title(f"Where do the corners miss? {rms:.2f} px rms over {len(used)} pictures")
-        return figure
+def _board(given: BoardSpec | str) -> BoardSpec:
+    board = typed_board(given) if isinstance(given, str) else given
+    check_board(board)
+    return board
 
 
 class _Seen(NamedTuple):
@@ -120,21 +115,27 @@ def _seen(given: ArrayLike | None, board: BoardSpec) -> _Seen:
 def solve(
     images: Sequence[ArrayLike | None],
     poses: ArrayLike,
-    board: BoardSpec,
+    board: BoardSpec | str,
     mount: Mount,
     camera: CameraModel | None = None,
     joints_rad: ArrayLike | None = None,
     robot_model: str = "unknown",
     options: SolveOptions | None = None,
+    convention: str | None = None,
 ) -> SolvedPictures:
     """Solve n pictures and poses.
 
     images: each (h, w) or (h, w, 3) BGR, or (k, 2) all corners of `board` in the order of its points, or
-    None. poses: base_from_flange (n, 4, 4), metres. camera: a known lens; None: found from these pictures
-    (with corners alone: a CameraModel of the images' size). joints_rad: (n, 5 … 7), which teach the arm's
-    errors; so does a `robot_model` of Universal Robots, such as "UR10e". Raises CalibrationError.
+    None. poses: base_from_flange (n, 4, 4), metres, or numbers (n, k) as `convention` says: ur-rotvec,
+    kuka-abc, xyzw, euler-ZYX-deg-mm … board: also as typed, "7x6 25". camera: a known lens; None: it is found
+    from these pictures (with corners alone: a CameraModel of the images' size). joints_rad: (n, 5 … 7), which
+    teach the arm's errors; so does a `robot_model` of Universal Robots, such as "UR10e".
+    Raises CalibrationError, and RecordingError for an unknown convention.
     """
-    check_board(board)
+    board = _board(board)
+    if convention is not None:
+        rows = array_of(poses, (len(images), -1), "poses")
+        poses = conventions.convention(convention).poses(rows)
     flanges = array_of(poses, (len(images), 4, 4), "poses")
     joints = None if joints_rad is None else array_of(joints_rad, (len(images), -1), "joints_rad")
     with ThreadPoolExecutor(usable_cores()) as pool:
@@ -162,4 +163,4 @@ def solve(
     solution = solve_views(found, options)
     used = found.select([k for k, view in enumerate(found) if view.index in set(solution.used)])
     inputs = GateInputs(picture_coverage(used) if intrinsics is not None else None)
-    return SolvedPictures(solution, found, judge(solution, inputs), without)
+    return SolvedPictures(found, solution, judge(solution, inputs), without)

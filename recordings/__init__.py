@@ -1,6 +1,7 @@
 """Recordings of calibration sessions: write, open, look into, rescue, import and export them.
 
     from pathlib import Path
+    import numpy as np
     from recordings import RecordingError, open_recording
 
     try:
@@ -10,7 +11,10 @@
         raise
     for view, image in recording.images():
         print(view.index, view.base_from_flange, image.pixels.shape, image.stamps.host_monotonic_ns)
-    joints = [state.joints_rad for state in recording.robot_states()]
+    images, base_from_flange, *_ = recording.pictures()
+    robot = recording.robot_samples()
+    at_ns = [view.stamps.host_monotonic_ns for view in recording.views()]
+    joints_rad = [np.interp(at_ns, robot.stamps_ns, joint) for joint in robot.joints_rad.T]
 
 Poses are `base_from_flange`, 4×4 in metres; angles are radians, stamps ns or s as their names end. Errors are
 `RecordingError`s with `code`, `values` and `remedy`. Names are loaded at their first use. The file format is
@@ -32,7 +36,9 @@ if TYPE_CHECKING:
     from recordings.importers.bag import import_bag as import_bag
     from recordings.importers.folder import import_folder as import_folder
     from recordings.info import recording_info as recording_info
+    from recordings.reader import Pictures as Pictures
     from recordings.reader import Recording as Recording
+    from recordings.reader import RobotSamples as RobotSamples
     from recordings.reader import open_recording as open_recording
     from recordings.recorder import Recorder as Recorder
     from recordings.recover import recover_recording as recover_recording
@@ -54,7 +60,7 @@ _MODULES = {
     "importers.bag": "import_bag",
     "importers.folder": "import_folder",
     "info": "recording_info",
-    "reader": "Recording open_recording",
+    "reader": "Pictures Recording RobotSamples open_recording",
     "recorder": "Recorder",
     "recover": "recover_recording",
     "schema.messages": "BoardKind BoardSpec CameraModel Image RobotState SessionInfo Stamps View",

@@ -6,6 +6,10 @@ import hashlib
 from collections.abc import Iterator
 from itertools import chain, pairwise
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from recordings.errors import (
     CorruptRecordingError,
@@ -16,9 +20,46 @@ from recordings.errors import (
     recover_line,
 )
 from recordings.files import PART_SUFFIX
+from recordings.images import Pixels, viewable
 from recordings.manifest import PARTS_LIMIT, Manifest, missing_parts, read_manifest
-from recordings.schema.messages import CaptureEvent, Image, RobotState, SessionInfo, View
+from recordings.schema.messages import (
+    BoardSpec,
+    CameraModel,
+    CaptureEvent,
+    Image,
+    Mount,
+    RobotState,
+    SessionInfo,
+    View,
+)
 from recordings.segment import RecordingSegment
+
+
+class Pictures(NamedTuple):
+    """Images and poses of n views, in the order in which `calibrate.solve` takes them."""
+
+    images: list[Pixels]
+    """n of (h, w) or (h, w, 3) BGR"""
+    base_from_flange: NDArray[np.float64]
+    """(n, 4, 4), metres"""
+    board: BoardSpec
+    mount: Mount
+    camera: CameraModel | None
+    """None: the lens is not known."""
+    joints_rad: NDArray[np.float64] | None
+    """(n, k); None where a view has none."""
+    robot_model: str
+
+
+class RobotSamples(NamedTuple):
+    """What the controller told in a session: m samples."""
+
+    stamps_ns: NDArray[np.int64]
+    """(m,) on the clock of `View.stamps.host_monotonic_ns`"""
+    joints_rad: NDArray[np.float64]
+    """(m, 6)"""
+    tcp_pose: NDArray[np.float64]
+    """(m, 6) base_from_tcp: x y z [m], rotation vector [rad]"""
 
 
 class Recording:
@@ -78,6 +119,28 @@ class Recording:
         """One at a time, in the order of `views`."""
         for view in self.views():
             yield view, self.image(view)
+
+    def pictures(self) -> Pictures:
+        """All views as arrays: `calibrate.solve(*recording.pictures())`."""
+        views, info = self.views(), self.info
+        images = [(image.pixels, image.pixel_format) for image in map(self.image, views)]
+        joints = [view.joints_rad for view in views]
+        return Pictures(
+            [viewable(*image) for image in images],
+            np.array([view.base_from_flange for view in views]),
+            info.board,
+            info.mount,
+            info.camera if info.camera.matrix is not None else None,
+            None if None in joints else np.array(joints),
+            info.robot.model,
+        )
+
+    def robot_samples(self) -> RobotSamples:
+        """All robot states as arrays, to be interpolated at any time."""
+        states = list(self.robot_states())
+        told = np.array([(*state.joints_rad, *state.tcp_pose) for state in states]).reshape(-1, 12)
+        stamps = np.array([state.stamps.host_monotonic_ns for state in states], np.int64)
+        return RobotSamples(stamps, told[:, :6], told[:, 6:])
 
     def robot_states(self) -> Iterator[RobotState]:
         return chain.from_iterable(segment.robot_states() for segment in self.segments)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import calibrate
+import recordings
 from calibrate.boards.detect import detect
 from calibrate.errors import CalibrationError
 from calibrate.job import SolvedRecording
+from calibrate.pictures import read_folder
+from recordings.exporters.export import export_recording
+from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel
 from tests.codes import raises
 
@@ -48,6 +54,45 @@ def test_arrays_give_what_the_recording_gives(given: dict[str, Any], solved: Sol
     assert list(ours.residuals_px) == [view.index for view in ours.views]
     assert all(np.square(miss).sum(axis=1).mean() < 4.0 for miss in ours.residuals_px.values())
     assert len(ours.plot().axes[0].collections) == len(ours.views)
+
+
+def test_a_folder_and_a_recording_are_read_as_arrays(solved: SolvedRecording, tmp_path: Path) -> None:
+    """The same arrays, which are `solve`'s arguments; and what a recording was solved to says as much."""
+    recording = solved.recording
+    export_recording(recording, tmp_path / "folder", "folder")
+    told, read = recording.pictures(), read_folder(tmp_path / "folder")
+    for one, other in zip(told.images, read.images, strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(told.base_from_flange, read.base_from_flange, atol=1e-9)
+    assert (told.joints_rad is None) == (read.joints_rad is None)
+    assert told[2:4] + told[6:] == read[2:4] + read[6:]
+    views = recording.views()
+    assert [view.base_from_flange for view in views] == [
+        tuple(map(tuple, T)) for T in told.base_from_flange.tolist()
+    ]
+    np.testing.assert_array_equal(solved.X, solved.solution.matrix)
+    for index, rms_px in solved.solution.residual_px.items():
+        assert np.sqrt(np.square(solved.residuals_px[index]).sum(axis=1).mean()) < 3 * rms_px + 1
+    assert solved.plot()._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
+
+
+def test_robot_states_as_arrays_are_interpolated_to_the_images() -> None:
+    recording = open_recording(Path(recordings.__file__).parent / "samples" / "paper-640.mcap")
+    robot, views = recording.robot_samples(), recording.views()
+    assert robot.joints_rad.shape == robot.tcp_pose.shape == (len(robot.stamps_ns), 6)
+    at_ns = [view.stamps.host_monotonic_ns for view in views]
+    joints = np.array([np.interp(at_ns, robot.stamps_ns, joint) for joint in robot.joints_rad.T]).T
+    np.testing.assert_allclose(joints, [view.joints_rad for view in views], atol=1e-4)
+
+
+def test_poses_are_read_by_a_convention_and_a_board_as_typed(given: dict[str, Any]) -> None:
+    poses, board = np.array(given["poses"]), given["board"]
+    rows = np.hstack([poses[:, :3, 3] * 1e3, Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX", True)])
+    typed = f"{board.columns}x{board.rows} {1e3 * board.square_m:g}"
+    same = given | {"images": given["images"], "poses": rows, "board": typed, "convention": "kuka-abc"}
+    np.testing.assert_allclose(calibrate.solve(**same).X, calibrate.solve(**given).X, atol=1e-6)
+    with raises("no-convention"):
+        calibrate.solve(**same | {"convention": "kuka"})
 
 
 def test_corners_and_gaps_are_taken(given: dict[str, Any], solved: SolvedRecording) -> None:

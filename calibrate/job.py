@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import msgspec
 import numpy as np
 
-from calibrate.errors import require_choice
+from calibrate.errors import BadViewsError, require_choice
 from calibrate.files.calibration import Calibration
 from calibrate.gates import GateLimits
 from calibrate.geometry import Array
@@ -136,8 +136,10 @@ class Solved:
     def plot(self) -> Figure:
         """Draw every residual, magnified, where it is in the image; a picture left out is red.
 
-        Needs matplotlib (the extra `report`).
+        Needs matplotlib (the extra `report`). Raises BadViewsError for pairs of poses without corners.
         """
+        if not any(len(view.pixels) for view in self.views):
+            raise BadViewsError("no-corners")
         from matplotlib.figure import Figure
 
         class Shown(Figure):

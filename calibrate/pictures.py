@@ -28,7 +28,7 @@ from calibrate.views import BoardView, ViewSet, array_of
 from recordings.errors import ImportSourceError
 from recordings.files import usable_cores
 from recordings.importers import conventions
-from recordings.importers.dataset import DATASET_FILE, POSES_FILE, PoseRow, read_dataset, read_poses
+from recordings.importers.dataset import DATASET_FILE, POSES_FILE, read_dataset, read_poses
 from recordings.importers.folder import read_image
 from recordings.importers.tables import look
 from recordings.reader import Pictures
@@ -64,8 +64,9 @@ def read_folder(
     else:
         given = Given(convention, mount, None if board is None else _board(board))
         believed = believe(look(folder, None if poses is None else Path(poses)), given, known)
-        known = believed.dataset
-        rows = [PoseRow(0, str(path.relative_to(folder)), T) for path, T in believed.poses.items()]
+        known, rows = believed.dataset, believed.rows
+    if any(row.camera_from_board is not None for row in rows):
+        raise ImportSourceError("pairs-only", path=folder)
     if (camera := known.camera) is None:
         raise ImportSourceError("dataset-value", path=folder / DATASET_FILE, key="camera")
     joints = [row.joints_rad for row in rows]

@@ -9,6 +9,7 @@ import textwrap
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import recordings
@@ -23,7 +24,9 @@ def test_the_example_runs(
     lines = (recordings.__doc__ or "").splitlines()[1:]
     names: dict[str, object] = {}
     exec(textwrap.dedent("\n".join(line for line in lines if line.startswith("    ") or not line)), names)
-    assert names["joints"] == [make_state(count).joints_rad for count in range(9)]
+    told = [list(make_state(count).joints_rad) for count in range(9)]
+    assert names["robot"].joints_rad.tolist() == told  # type: ignore[attr-defined]
+    assert np.shape(names["joints_rad"]) == (6, 3)
     assert len(capsys.readouterr().out.splitlines()) == 3
 
 

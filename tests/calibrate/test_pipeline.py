@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,8 @@ from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.job import JobOptions, SolvedRecording
 from calibrate.kinematics import MODELS, forward, inverse_nearest
-from calibrate.pipeline import prepare_views, solve_recording
+from calibrate.pipeline import solve_recording, with_board_poses
+from calibrate.views import ViewSet
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Image, Stamps, View
@@ -36,6 +39,8 @@ from tests.calibrate.sessions import (
     write_session,
 )
 from tests.codes import raises
+
+SolveSet = Callable[[Path], SolvedRecording]
 
 
 def error_mm_deg(X: Array, truth: Array) -> tuple[float, float]:
@@ -88,7 +93,7 @@ def test_another_board_or_lens_can_be_tried_on_the_old_pictures(real_session_fil
 
 
 def test_a_wrong_board_is_refused_with_what_was_seen(tmp_path: Path) -> None:
-    path = write_session(tmp_path / "s.mcap", Scene(views=2))
+    path = write_session(tmp_path / "s.mcap", Scene(views=1))
     with raises("too-few-views", TooFewViewsError, views=0):
         solve_recording(path, JobOptions(board=BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025)))
 
@@ -123,11 +128,23 @@ DATASETS = {
 }
 
 
+@pytest.fixture(scope="module")
+def solved_set(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], SolvedRecording]:
+    """Import and solve a folder of `datasets`, once."""
+
+    @cache
+    def solve(folder: Path) -> SolvedRecording:
+        recording = tmp_path_factory.mktemp("set") / "r.mcap"
+        import_folder(folder, recording)
+        return solve_recording(recording)
+
+    return solve
+
+
 @pytest.mark.parametrize("name", DATASETS)
-def test_other_peoples_recordings_solve(datasets: Path, tmp_path: Path, name: str) -> None:
+def test_other_peoples_recordings_solve(datasets: Path, solved_set: SolveSet, name: str) -> None:
     fewest, spread_mm, truth_mm = DATASETS[name]
-    import_folder(datasets / name, tmp_path / "r.mcap")
-    job = solve_recording(tmp_path / "r.mcap")
+    job = solved_set(datasets / name)
     assert len(job.solution.used) >= fewest
     assert job.solution.board_spread_m is not None
     assert job.solution.board_spread_m * 1e3 < spread_mm
@@ -138,7 +155,7 @@ def test_other_peoples_recordings_solve(datasets: Path, tmp_path: Path, name: st
 
 
 def test_a_slip_of_typing_in_a_real_list_of_poses_is_named_and_costs_one_number(
-    datasets: Path, tmp_path: Path
+    datasets: Path, solved_set: SolveSet, tmp_path: Path
 ) -> None:
     shutil.copytree(datasets / "rendered-truth", tmp_path / "typed", copy_function=shutil.copyfile)
     poses = tmp_path / "typed/poses.csv"
@@ -146,31 +163,35 @@ def test_a_slip_of_typing_in_a_real_list_of_poses_is_named_and_costs_one_number(
     image, x, y, *others = lines[6].split(",")
     lines[6] = ",".join([image, x, str(float(y) + 0.09), *others])
     poses.write_text("\n".join(lines) + "\n")
-    import_folder(tmp_path / "typed", tmp_path / "typed.mcap")
-    import_folder(datasets / "rendered-truth", tmp_path / "right.mcap")
-    typed, right = (solve_recording(tmp_path / f"{name}.mcap").solution for name in ("typed", "right"))
+    typed, right = (
+        solved_set(folder / name).solution
+        for folder, name in ((tmp_path, "typed"), (datasets, "rendered-truth"))
+    )
     (rejected,) = typed.rejected
     assert rejected.index == 5
     assert (rejected.kind, rejected.wrong_number) == ("wrong-number", 1)
     assert error_mm_deg(typed.matrix, right.matrix)[0] < 0.05
 
 
-def test_the_wrong_mount_of_a_real_recording_is_named(datasets: Path, tmp_path: Path) -> None:
+def with_poses(done: SolvedRecording) -> ViewSet:
+    """Before the solver read any board otherwise."""
+    return with_board_poses(done.loaded.views, done.loaded.board)[0]
+
+
+def test_the_wrong_mount_of_a_real_recording_is_named(datasets: Path, solved_set: SolveSet) -> None:
     """An approximate X once made quaternions with w first look likelier."""
-    import_folder(datasets / "charuco-eye-to-hand", tmp_path / "r.mcap")
-    views = replace(prepare_views(tmp_path / "r.mcap").views, mount="eye-in-hand")
+    views = replace(with_poses(solved_set(datasets / "charuco-eye-to-hand")), mount="eye-in-hand")
     poses = pose_views(views, 0.002, 0.003)
     assert explain_recording(poses).reading is Reading.INVERSE_POSES
 
 
-def test_the_colours_decide_the_small_board_in_every_view(datasets: Path, tmp_path: Path) -> None:
-    import_folder(datasets / "rendered-truth-eye-to-hand", tmp_path / "r.mcap")
-    prepared = prepare_views(tmp_path / "r.mcap")
-    assert len(prepared.views) == 29
+def test_the_colours_decide_the_small_board_in_every_view(datasets: Path, solved_set: SolveSet) -> None:
+    views = with_poses(solved_set(datasets / "rendered-truth-eye-to-hand"))
+    assert len(views) == 29
     truth = np.array(
         yaml.safe_load((datasets / "rendered-truth-eye-to-hand/truth.yaml").read_text())["matrix"]
     )
-    places = [np.linalg.inv(v.base_from_flange) @ truth @ v.camera_from_board for v in prepared.views]  # type: ignore[operator]
+    places = [np.linalg.inv(v.base_from_flange) @ truth @ v.camera_from_board for v in views]  # type: ignore[operator]
     turns = [np.degrees(np.linalg.norm(difference(p, places[0])[3:])) for p in places]
     assert max(turns) < 5.0, "a view was read turned by 180°"
 

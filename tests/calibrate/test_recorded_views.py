@@ -17,7 +17,7 @@ from calibrate.kinematics import forward
 from calibrate.pipeline import solve_recording
 from calibrate.recorded_views import arm_of_ros, load_views, without_views
 from calibrate.report.page import report_page
-from recordings.errors import CorruptRecordingError, MissingSegmentError
+from recordings.errors import MissingSegmentError
 from recordings.images import encode_png
 from recordings.manifest import enter_part
 from recordings.reader import Recording, open_recording
@@ -89,24 +89,19 @@ def test_a_wrong_kinematics_file_is_named(source: Recording, tmp_path: Path, rob
         load_views(open_recording(path))
 
 
-def larger(data: bytes) -> bytes:
-    """The header promises 30000×30000."""
-    return data[:16] + (30_000).to_bytes(4, "big") * 2 + data[24:]
-
-
 def test_a_picture_that_cannot_be_decoded_costs_its_own_pose_only(source: Recording, tmp_path: Path) -> None:
     damaged: dict[int, Damage] = {
         3: lambda data: data[: len(data) // 2],
         7: lambda data: data[:5000] + bytes([data[5000] ^ 1]) + data[5001:],
     }
-    path = copied(source, tmp_path / "a.mcap", range(14), damaged=damaged)
-    loaded = load_views(open_recording(path))
-    assert [view.index for view in loaded.views] == [n for n in range(14) if n not in (3, 7)]
+    path = copied(source, tmp_path / "a.mcap", range(8), damaged=damaged)
+    job = solve_recording(path)
+    loaded = job.loaded
+    assert [view.index for view in loaded.views] == [0, 1, 2, 4, 5, 6]
     assert [(view.index, view.kind) for view in loaded.without_board] == [
         (3, "unreadable-picture"),
         (7, "unreadable-picture"),
     ]
-    job = solve_recording(path)
     assert [rejected.index for rejected in job.calibration.views.rejected] == [3, 7]
     assert loaded.without_board[0].reason in report_page(job)
 
@@ -127,29 +122,10 @@ def test_a_board_declared_in_squares_is_named_with_its_inner_corners(
     source: Recording, tmp_path: Path
 ) -> None:
     board = source.info.board
-    few = open_recording(copied(source, tmp_path / "a.mcap", range(4)))
+    few = open_recording(copied(source, tmp_path / "a.mcap", range(2)))
     squares = msgspec.structs.replace(board, columns=board.columns + 1, rows=board.rows + 1)
     with raises("squares-counted", SquaresCountedError, columns=board.columns, rows=board.rows):
         load_views(few, squares)
-
-
-def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recording, tmp_path: Path) -> None:
-    """Fault 36. The writer refuses such bytes, so the header is changed after it looked."""
-    path = copied(source, tmp_path / "a.mcap", range(3))
-    original = encode_png(next(source.images())[1].pixels)
-    recording = open_recording(path)
-    part = recording.segments[0]
-    stored = part.parsed_at
-
-    def lying(*place: object) -> object:
-        message = stored(*place)  # type: ignore[arg-type]
-        if message.data == original:
-            message.data = larger(message.data)
-        return message
-
-    part.parsed_at = lying  # type: ignore[method-assign]
-    with raises("too-few-views", TooFewViewsError, views=2, images=3):
-        load_views(recording)
 
 
 def test_a_sweep_of_an_earlier_version_is_refused_by_name(source: Recording, tmp_path: Path) -> None:
@@ -163,17 +139,9 @@ def test_a_sweep_of_an_earlier_version_is_refused_by_name(source: Recording, tmp
     assert "sweep" in refused.value.remedy
 
 
-def test_a_damaged_container_is_refused_whole(source: Recording, tmp_path: Path) -> None:
-    path = copied(source, tmp_path / "a.mcap", range(6))
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
-    with pytest.raises(CorruptRecordingError):
-        solve_recording(path)
-
-
-def test_a_lost_part_is_never_passed_over(source: Recording, tmp_path: Path) -> None:
-    for part, poses in ((1, range(10)), (2, range(10, 14))):
+def test_a_lost_part_is_never_passed_over(small_session_file: Path, tmp_path: Path) -> None:
+    source = open_recording(small_session_file)
+    for part, poses in ((1, range(4)), (2, range(4, 5))):
         copied(source, tmp_path / f"session-{part}.mcap", poses, part)
         enter_part(tmp_path, source.info.name, part, f"session-{part}.mcap")
     assert solve_recording(tmp_path).calibration.quality.warnings == []
@@ -184,4 +152,4 @@ def test_a_lost_part_is_never_passed_over(source: Recording, tmp_path: Path) -> 
     recover_recording(tmp_path)
     job = solve_recording(tmp_path)
     assert len(job.calibration.quality.warnings) == 1
-    assert len(job.calibration.views.used) == 10
+    assert len(job.calibration.views.used) == 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import msgspec
@@ -49,6 +50,12 @@ def real_file(solved_real: SolvedRecording, tmp_path_factory: pytest.TempPathFac
     path = tmp_path_factory.mktemp("calibration") / "real.yaml"
     write_calibration(solved_real.calibration, path)
     return path
+
+
+@pytest.fixture
+def own_file(real_file: Path, tmp_path: Path) -> Path:
+    """The same, for a test that changes it."""
+    return Path(shutil.copy(real_file, tmp_path / "cell.yaml"))
 
 
 @pytest.fixture

@@ -17,19 +17,10 @@ import pytest
 
 from calibrate.bounds import SolveLimitError, bounded
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import write_calibration
-from calibrate.job import SolvedRecording
 from tests.codes import raises
 from tests.patience import PATIENCE_S
 
 PROGRAM = (sys.executable, "-m", "calibrate.cli", "solve")
-
-
-@pytest.fixture
-def old_file(solved_real: SolvedRecording, tmp_path: Path) -> Path:
-    path = tmp_path / "cell.yaml"
-    write_calibration(solved_real.calibration, path)
-    return path
 
 
 def test_what_takes_too_long_is_ended_with_a_name() -> None:
@@ -96,13 +87,13 @@ def test_other_errors_pass_unchanged() -> None:
 
 @pytest.mark.parametrize(("option", "value"), [("--time-limit-s", "0.05"), ("--memory-limit-mib", "1")])
 def test_the_command_ends_with_1_and_the_old_file_stays(
-    real_session_file: Path, old_file: Path, option: str, value: str
+    real_session_file: Path, own_file: Path, option: str, value: str
 ) -> None:
-    content = old_file.read_bytes()
+    content = own_file.read_bytes()
     done = subprocess.run(
-        [*PROGRAM, str(real_session_file), "-o", str(old_file), option, value], capture_output=True, text=True
+        [*PROGRAM, str(real_session_file), "-o", str(own_file), option, value], capture_output=True, text=True
     )
     assert done.returncode == 1
     assert option in done.stderr, "the remedy names it"
     assert "Traceback" not in done.stderr
-    assert old_file.read_bytes() == content
+    assert own_file.read_bytes() == content

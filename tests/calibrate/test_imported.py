@@ -128,7 +128,11 @@ def opencvs_xml(folder: Path, T: np.ndarray) -> None:
 
 def json_by_image(folder: Path, T: np.ndarray) -> None:
     rows = [
-        {"image": f"{n + 1}.png", "robot_pose": {"position": row[:3], "orientation": row[3:]}}
+        {
+            "robot": "UR10",
+            "image": f"{n + 1}.png",
+            "robot_pose": {"position": row[:3], "orientation": row[3:]},
+        }
         for n, row in enumerate(quaternions(T, 1).tolist())
     ]
     (folder / "samples.json").write_text(json.dumps(rows[::-1]))

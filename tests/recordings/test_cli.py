@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -15,7 +14,6 @@ from recordings.cli import main
 from recordings.info import recording_info
 from recordings.manifest import enter_part
 from recordings.reader import open_recording
-from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
 from tests.command_line import call
@@ -104,22 +102,14 @@ def test_a_full_disk_behind_the_output_is_one_sentence_and_1(
 
 
 @pytest.mark.parametrize(
-    ("content", "read", "code"),
-    [
-        (b"", open_recording, "empty-file"),
-        (b"hello", open_recording, "damaged-recording"),
-        (b"hello", recover_recording, "nothing-to-save"),
-        (b"\x89MCAP0", open_recording, "unfinished-recording"),
-    ],
+    ("content", "code"),
+    [(b"", "empty-file"), (b"hello", "damaged-recording"), (b"\x89MCAP0", "unfinished-recording")],
 )
-def test_a_file_that_is_none_is_named_as_such(
-    tmp_path: Path, content: bytes, read: Callable[[Path], object], code: str
-) -> None:
+def test_a_file_that_is_none_is_named_as_such(tmp_path: Path, content: bytes, code: str) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(content)
     with refused(code):
-        read(path)
-    assert path.read_bytes() == content
+        open_recording(path)
 
 
 def test_the_command_that_is_offered_works_for_any_name(small: Path, tmp_path: Path) -> None:
@@ -148,23 +138,15 @@ def test_a_device_or_a_pipe_is_no_recording() -> None:
 def test_recover_ends_with_3_when_it_had_to_rebuild_and_with_0_when_not(tmp_path: Path) -> None:
     path = write_small(tmp_path / "a.mcap")
     assert run("recover", path).returncode == 0
-    path.write_bytes(path.read_bytes()[:-9000])
-    assert run("info", path).returncode == 1
-    assert run("recover", path).returncode == 3
-    assert (tmp_path / "a.mcap.damaged").exists()
-    assert run("info", path).returncode == 0
-
-
-def test_recover_json_lists_what_was_lost(tmp_path: Path) -> None:
-    path = write_small(tmp_path / "a.mcap")
     data = bytearray(path.read_bytes())
     data[14_000] ^= 1
     path.write_bytes(data)
+    assert run("info", path).returncode == 1
     result = run("recover", path, "--json")
-    assert result.returncode == 3
+    assert result.returncode == 3 and (tmp_path / "a.mcap.damaged").exists()
     (report,) = json.loads(result.stdout)
-    assert report["lost_bytes"] > 0
-    assert report["losses"][0].startswith("bytes ")
+    assert report["lost_bytes"] > 0 and report["losses"][0].startswith("bytes ")
+    assert run("info", path).returncode == 0
 
 
 def test_a_missing_part_is_shown_by_info_and_given_up_by_recover(tmp_path: Path) -> None:

@@ -134,6 +134,14 @@ def test_data_reach_the_system_and_the_disk_without_being_asked(
     recorder.close()
 
 
+def test_what_a_sync_was_asked_for_has_left_the_process(tmp_path: Path) -> None:
+    """Also where no image or view ended the open chunk."""
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.robot_state(make_state(3))
+        writer.sync()
+        assert encode(make_state(3)) in writer.part_path.read_bytes()
+
+
 class SlowSync:
     """A disk that takes its time for every fdatasync: until it is opened; then it may fail."""
 

@@ -43,11 +43,6 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> CellTruth:
     return read_truth(path)
 
 
-def test_it_is_small_and_marked_as_simulated() -> None:
-    assert SAMPLE.stat().st_size <= 6_000_000
-    assert open_recording(SAMPLE).info.source == "simulated"
-
-
 def test_the_default_profile_finds_the_truth_within_its_claim(
     truth: CellTruth, robust: dict[str, Any]
 ) -> None:

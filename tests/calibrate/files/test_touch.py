@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from calibrate.errors import InstallError
-from calibrate.files.calibration import read_calibration, write_calibration
+from calibrate.files.calibration import read_calibration
 from calibrate.files.formatting import summary
 from calibrate.files.install import install, installed_calibration, rollback
 from calibrate.files.touch import Touch, agrees, touch_sigmas, touch_text
@@ -23,13 +23,6 @@ GOOD = Touch(
 BAD = msgspec.structs.replace(GOOD, corner=41, corner_mm=(150.0, 125.0), offset_mm=(2.1, -0.4))
 
 
-@pytest.fixture
-def file(solved_real: SolvedRecording, tmp_path: Path) -> Path:
-    path = tmp_path / "cell.yaml"
-    write_calibration(solved_real.calibration, path)
-    return path
-
-
 def test_a_corner_alarms_beyond_three_sigmas_of_both_together() -> None:
     """0.4 mm predicted and 0.3 mm by hand are 0.5 mm; of two numbers 1 % lies beyond 3.03 sigmas."""
     touch = msgspec.structs.replace(GOOD, sigma_mm=(0.4, 0.4), offset_mm=(0.3, -0.4))
@@ -38,22 +31,22 @@ def test_a_corner_alarms_beyond_three_sigmas_of_both_together() -> None:
     assert agrees(near) and not agrees(far)
 
 
-def test_entries_go_into_a_file_and_stay_when_it_is_installed(file: Path, tmp_path: Path) -> None:
-    before = read_calibration(file)
-    note_in_file(file, [GOOD])
-    note_in_file(file, [GOOD])
-    after = read_calibration(file)
+def test_entries_go_into_a_file_and_stay_when_it_is_installed(own_file: Path, tmp_path: Path) -> None:
+    before = read_calibration(own_file)
+    note_in_file(own_file, [GOOD])
+    note_in_file(own_file, [GOOD])
+    after = read_calibration(own_file)
     assert after.verification == [GOOD, GOOD]
     assert msgspec.structs.replace(after, verification=[]) == before
-    install(file, tmp_path / "s")
+    install(own_file, tmp_path / "s")
     assert installed_calibration(tmp_path / "s").verification == [GOOD, GOOD]
 
 
-def test_entries_for_the_installed_one_make_a_new_generation(file: Path, tmp_path: Path) -> None:
+def test_entries_for_the_installed_one_make_a_new_generation(own_file: Path, tmp_path: Path) -> None:
     root = tmp_path / "s"
     with raises("nothing-installed", InstallError):
         note_installed(root, [GOOD])
-    install(file, root)
+    install(own_file, root)
     note_installed(root, [GOOD])
     assert installed_calibration(root).verification == [GOOD]
     assert [g.number for g in installed_versions(root)] == [1, 2]
@@ -62,11 +55,11 @@ def test_entries_for_the_installed_one_make_a_new_generation(file: Path, tmp_pat
     assert installed_calibration(root).verification == []
 
 
-def test_hands_that_disagree_keep_it_from_being_installed(file: Path, tmp_path: Path) -> None:
-    note_in_file(file, [GOOD, BAD])
+def test_hands_that_disagree_keep_it_from_being_installed(own_file: Path, tmp_path: Path) -> None:
+    note_in_file(own_file, [GOOD, BAD])
     with raises("objection", InstallError, objections=1, gates=0):
-        install(file, tmp_path / "s")
-    made = install(file, tmp_path / "s", override="the board was bent there")
+        install(own_file, tmp_path / "s")
+    made = install(own_file, tmp_path / "s", override="the board was bent there")
     assert made.calibration is not None and made.calibration.override is not None
 
 

@@ -160,7 +160,8 @@ def test_a_check_judges_the_version_that_it_was_made_on(root: Path, make_file: M
 
 
 def test_a_state_may_be_given_by_its_name_and_no_other_one(root: Path) -> None:
-    set_validity(root, D, MOVED)
+    proven = load_installed(root).validity.verified
+    assert set_validity(root, D, MOVED).verified == proven, "a doubt proves nothing"
     assert set_validity(root, "valid", MOVED).state is V  # type: ignore[arg-type]
     assert load_installed(root).validity.verified != installed_calibration(root).created
     with raises("choice", UsageError, given="validd"):

@@ -31,8 +31,8 @@ class CaptureScreen(StationScreen):
             with Vertical(id="live-right"):
                 with Box("Poses", id="progress", below=LEGEND):
                     yield Panel("", progress_lines, id="poses")
-                yield Panel("Expected error of the camera's position (1σ)", error_lines, id="error")
-                title = "Where in the image the board was seen"
+                yield Panel("Expected error of position (1σ)", error_lines, id="error")
+                title = "Where the board was seen"
                 yield Panel(title, coverage_lines, id="coverage", below="images per part")
         yield Stopped(id="stopped")
 

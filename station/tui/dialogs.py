@@ -20,15 +20,13 @@ from calibrate.files.install import reason_problem
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
 from station.tui.frame import Frame, Question
-from station.tui.task import Action, Known
+from station.tui.task import Action
 from station.tui.widgets.cell_drawing import cell_scene, draw
 from station.tui.words import duration, limit_bar, lines
 
 TERMINATE_S = 5.0
 WIDTH, INDENT = 54, 10
 """Width of a fact in letters, and of its name before it."""
-KEYS = "Tab marks the other answer, Enter gives it; Escape: no"
-SIMULATED = "SIMULATED cell: nothing real moves"
 
 
 class Confirm(Question[bool]):
@@ -52,7 +50,6 @@ class Confirm(Question[bool]):
         with Horizontal(id="confirm-buttons"):
             yield Button(self._no, id="no")
             yield Button(self._yes, id="yes", variant="warning")
-        yield Label(KEYS, id="confirm-keys")
 
     def on_mount(self) -> None:
         self.app.clear_notifications()  # they would stand before the words
@@ -83,11 +80,6 @@ class ConfirmMotion(Confirm):
         self.set_interval(1.0, self._count_down)
         self._count_down()
 
-    def show(self, known: Known) -> None:
-        super().show(known)
-        if known.shown.simulated:
-            self.query_one("#motion").border_subtitle = SIMULATED
-
     def _draw(self) -> None:
         pane, status = self.query_one("#motion-scene", Static), self.known.shown
         scene = cell_scene(self.known.configuration, status)
@@ -102,14 +94,15 @@ class ConfirmMotion(Confirm):
             ("this question expires in ", "$dim"), (duration(left_s), "bold $strong"), "  "
         )
         line += limit_bar(left_s, APPROVAL_LIFETIME_S, 24, "$warn", 1.0)
-        self.query_one("#motion-holds", Static).update(line)
+        asked = Content.styled("▲ Is everybody out of the arm's reach?", "bold $warn")
+        self.query_one("#motion-holds", Static).update(lines(asked, line))
         if not left_s:
             self.notify("The question expired: nothing moved. F5 asks again.", severity="warning")
             self.dismiss(False)
 
 
 def motion_text(preview: MotionPreview) -> Content:
-    """List the facts of a motion, one a line; then the question."""
+    """List the facts of a motion, one a line."""
     rows = []
     for name, text in motion_facts(preview):
         style = "bold $warn" if name == "WARNING" else "$foreground"
@@ -118,7 +111,6 @@ def motion_text(preview: MotionPreview) -> Content:
         rows += [Content.styled(" " * INDENT + line, style) for line in more]
     rows += [
         Content(""),
-        Content.styled("▲ Is everybody out of the arm's reach?", "bold $warn"),
         Content("The emergency stop on the pendant is the safety device. F12 stops too."),
     ]
     return lines(*rows)

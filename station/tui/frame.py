@@ -29,7 +29,7 @@ DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
 RAIL_WIDE = 96
 """From this width on each step has a second line."""
 ANSWER = Action(
-    "", "Answer the question", "Enter alone is no; Tab marks the other answer. F12 stops.", look=True
+    "", "Answer the question", "Tab, then Enter: yes. Enter alone or Escape: no. F12 stops.", look=True
 )
 
 

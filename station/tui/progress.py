@@ -18,10 +18,13 @@ CHIPS: dict[str, tuple[str, str]] = {
     "skipped": ("-", "$dim"),
     "failed": ("✗", "bold $bad on $badbg"),
 }
-LEGEND = "✓ saved  ! saved, look  ▶ now  · to come  - skipped  ✗ failed"
+LEGEND = "✓ saved  ! look  ▶ now  · to come  ✗ failed"
 
 
-def pose_line(status: StationStatus) -> Content:
+_WIDE = 46
+
+
+def pose_line(status: StationStatus, width: int = _WIDE) -> Content:
     """Draw the steps of the pose under way; at rest say what comes next."""
     session = status.session
     pose = pose_under_way(status)
@@ -36,7 +39,7 @@ def pose_line(status: StationStatus) -> Content:
             parts.append(Content.styled(f" ▶ {word} ", "bold $strong on $accentbg"))
         else:
             parts.append(mark("done" if i < at else "todo", word))
-    return Content.styled(" ─ ", "$line").join(parts)
+    return Content.styled(" ─ " if width >= _WIDE else " ", "$line").join(parts)
 
 
 def pose_under_way(status: StationStatus) -> PoseStatus | None:
@@ -77,7 +80,7 @@ def progress_lines(known: Known, width: int, height: int) -> Content:
     if status.playback:
         head += Content.styled("   played, no arm moves", "$sim")
     why = "" if pose is None else f"{pose.name}: {pose.why}" if pose.why else pose.name
-    return lines(head, pose_line(status), dim(why), *chips(session, width, max(1, height - 3)))
+    return lines(head, pose_line(status, width), dim(why), *chips(session, width, max(1, height - 3)))
 
 
 def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:

@@ -176,7 +176,9 @@ def pose_lines(calibration: Calibration) -> list[Content]:
         value_mm = (f"{signed(1000 * value):>9}", "bold $strong")
         rows.append(Content.assemble((f"{axis} ", "bold"), value_mm, (f" ± {sigma:.2f} mm", "$dim")))
     quaternion = " ".join(signed(q, 5) for q in result.rotation_xyzw)
-    rows.append(dim(f"rotation ± {calibration.sigma.rotation_deg:.3f}° (1σ)\nx y z w {quaternion}"))
+    sigma = calibration.sigma
+    rows.append(dim(f"position ± {sigma.translation_mm:.2f} mm, rotation ± {sigma.rotation_deg:.3f}° (1σ)"))
+    rows.append(dim(f"x y z w {quaternion}"))
     return [*rows, *map(Content, arm_sentences(calibration))]
 
 

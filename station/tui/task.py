@@ -213,8 +213,9 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
         why = status.reason or "The robot does not answer."
         return Action("1", "See what is missing", why, look=True)
     if state in RUNNING:
-        why = status.pending or status.reason or _progress(status)
-        return Action("", "Watch the arm", f"F12 stops it at once, F6 after this pose. {why}")
+        good = " Good enough already: F7 finishes." if status.estimate.enough else ""
+        why = status.pending or status.reason or f"F12 stops it at once, F6 after this pose.{good}"
+        return Action("", "Watch the arm", why)
     if state is StationState.SEALING:
         return Action("", "Wait", "The recording is being finished.")
     if held and state in _STILL:
@@ -226,13 +227,6 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     if state is StationState.FREE_DRIVE:
         return Action("F2", "Capture an image here", "Guide the arm by the pendant's button; F3 ends it.")
     return None
-
-
-def _progress(status: StationStatus) -> str:
-    estimate = status.estimate
-    if estimate.enough:
-        return f"The goal of {estimate.goal_mm:g} mm is reached: F7 finishes, or take all poses."
-    return estimate.advice
 
 
 def _at_rest(known: Known, status: StationStatus) -> Action:

@@ -18,7 +18,7 @@ from tests.tui.conftest import SUMMARY, FakeLink, app_on, commanded, idle, opene
 async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
     """Both easy answers are no; STOP works in the question, and no notice hides how to answer."""
     link.answers["prepare"] = msgspec.structs.replace(SUMMARY, changes=("0.61 → 0.52 mm " * 6,))
-    async with opened(link, notifications=True) as pilot:
+    async with opened(link, (60, 20), notifications=True) as pilot:
         pilot.app.notify("no session is open", timeout=3600)
         for stops, answer in enumerate(("escape", "enter", ""), start=1):
             await pilot.press("2", "f5")

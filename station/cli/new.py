@@ -13,10 +13,10 @@ import typer
 
 from calibrate.kinematics import MODELS
 from recordings.files import state_root
-from recordings.schema.messages import Image
+from recordings.schema.messages import Image, RobotIdentity, RobotState
 from station.cell.config import CameraConfig, RobotConfig
-from station.cell.errors import RobotError, StationError
-from station.cell.socket_folder import default_socket
+from station.cell.errors import RobotError, StaleStateError, StationError
+from station.cell.socket_folder import default_socket, post_socket
 from station.cli.console import err
 from station.cli.daemon import answers, ensure_daemon, own_daemon, tell_what_goes_on, user_config
 from station.devices.aravis import AravisCamera
@@ -25,7 +25,7 @@ from station.devices.ur_dashboard import STOP, DashboardError
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import identify, open_dashboard, unsupported_model
 from station.devices.webcam import WebcamCamera, discover_webcams
-from station.operate.draft import ArmReader, CameraChoice, CameraReader
+from station.operate.draft import POSTED, ArmReader, CameraChoice, CameraReader
 
 
 class GuidedArm(UrLink):
@@ -43,6 +43,26 @@ class GuidedArm(UrLink):
                 await self.dashboard.ask(STOP)
             except DashboardError as problem:
                 err.print(str(problem))
+
+
+class PostedReader:
+    """`draft.ArmReader` of an arm that is only named: its pose is posted once the cell is open."""
+
+    remote = None
+
+    def __init__(self, name: str) -> None:
+        self.identity = RobotIdentity(model=name)
+
+    def latest(self) -> RobotState:
+        raise StaleStateError("post-nobody", robot=self.identity.model, socket=post_socket(default_socket()))
+
+    def trouble(self) -> str:
+        return ""
+
+    async def stop(self) -> None:
+        """The station cannot stop this arm."""
+
+    async def close(self) -> None: ...
 
 
 _DRIVERS: dict[str, type[AravisCamera | WebcamCamera]] = {"aravis": AravisCamera, "webcam": WebcamCamera}
@@ -85,6 +105,8 @@ class RealHardware:
 
     async def arm(self, host: str) -> ArmReader:
         """`host` may be followed by the model, for a controller that does not tell it."""
+        if host.startswith(POSTED):
+            return PostedReader(host.removeprefix(POSTED).strip())
         address, _, told = host.partition(" ")
         dashboard = await open_dashboard(address)
         found = await identify(dashboard)
@@ -120,7 +142,8 @@ def new_command(
     """Set up a cell in a wizard that only reads.
 
     Robot, camera, board, four views guided by hand, limits; then it writes a configuration. Your hand
-    moves the arm, by the pendant's own Freedrive. Every step can be left and taken up again.
+    moves the arm, by the pendant's own Freedrive. Every step can be left and taken up again. For an arm
+    that is no UR type `posted` and its name: a program will post its pose.
 
     At the end F9 rehearses the whole job in simulation, and Enter opens the cell.
     """

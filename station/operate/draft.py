@@ -14,6 +14,8 @@ from recordings.schema.messages import BoardSpec, Image, Matrix4, Mount, RobotId
 
 _LIMIT_BYTES = 1024 * 1024
 DRAFT_FILE = "new-cell.json"
+POSTED = "posted "
+"""Typed in place of an address, before the name of an arm whose pose a program posts."""
 
 
 class CellStep(StrEnum):
@@ -115,6 +117,11 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
     """Height of the table in `base`; None: derived from the board."""
     written: str = ""
     """Path of the written configuration; empty: not written yet."""
+
+    @property
+    def posted(self) -> str:
+        """Name of an arm that a person moves and a program posts; empty: the station reads the arm itself."""
+        return self.host.partition(POSTED)[2].strip() if self.host.startswith(POSTED) else ""
 
     def without_views(self, **changes: object) -> Draft:
         """Return the draft with changes, and without the views, which they invalidate."""

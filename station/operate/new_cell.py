@@ -71,14 +71,14 @@ def next_step(draft: Draft) -> CellStep:
         return CellStep.MOUNTING
     if draft.board is None:
         return CellStep.BOARD
-    return CellStep.SAVE if enough(draft) else CellStep.VIEWS
+    return CellStep.SAVE if draft.posted or enough(draft) else CellStep.VIEWS
 
 
 def summary(draft: Draft, step: CellStep) -> str:
     """Summarize what a step holds, in a few words; empty: nothing yet."""
     match step:
         case CellStep.ROBOT if draft.robot is not None:
-            return f"{draft.robot.model}, {draft.host}"
+            return draft.posted or f"{draft.robot.model}, {draft.host}"
         case CellStep.CAMERA if draft.camera is not None:
             return draft.camera.name
         case CellStep.MOUNTING if draft.mount is not None:
@@ -149,22 +149,25 @@ def _rounded3(values: Array) -> Vector3:
 
 def made_config(draft: Draft) -> StationConfig:
     """Make the configuration from the draft. RefusedError names the step that is missing."""
-    found = find_cell(draft)
-    if draft.robot is None or draft.camera is None or draft.board is None or draft.mount is None or not found:
+    found, camera = None if draft.posted else find_cell(draft), draft.camera
+    whole = found is not None or draft.posted
+    if draft.robot is None or camera is None or draft.board is None or draft.mount is None or not whole:
         step = next_step(draft)
         raise RefusedError("step-missing", number=STEPS.index(step) + 1, step=step.value)
+    opened = CameraConfig(
+        driver=camera.driver,  # type: ignore[arg-type]  # as it was found
+        device=camera.device,
+        exposure_us=round(draft.exposure_us, 1),
+    )
+    if found is None:  # nothing moves, so nothing is planned
+        robot = RobotConfig(driver="posted", model=draft.posted)
+        return StationConfig(name="cell", mount=draft.mount, robot=robot, camera=opened, board=draft.board)
     Y_m = float(np.hypot(found.sigma_m, found.sigma_rad * float(np.linalg.norm(_seen_at(found, draft)))))
     return StationConfig(
         name="cell",
         mount=draft.mount,
         robot=RobotConfig(model=draft.robot.model, host=draft.host, serial=draft.robot.serial),
-        camera=CameraConfig(
-            driver=draft.camera.driver,  # type: ignore[arg-type]  # as it was found
-            device=draft.camera.device,
-            exposure_us=round(draft.exposure_us, 1),
-            model=_rounded_lens(found.views.camera),
-            model_is_rough=True,
-        ),
+        camera=msgspec.structs.replace(opened, model=_rounded_lens(found.views.camera), model_is_rough=True),
         board=draft.board,
         camera_guess=_guess(found.X, found.sigma_m, found.sigma_rad),
         board_guess=_guess(found.Y, min(Y_m, 2 * found.sigma_m), found.sigma_rad),
@@ -195,7 +198,8 @@ def config_text(config: StationConfig) -> str:
     plain: dict[str, Any] = {"format": config.format, "name": config.name, "mount": config.mount}
     plain |= msgspec.to_builtins(config)
     plain["robot"] = {"model": config.robot.model} | plain["robot"]
-    plain["limits"] = {"speed_m_s": config.limits.speed_m_s} | plain["limits"]
+    if config.robot.driver == "ur":
+        plain["limits"] = {"speed_m_s": config.limits.speed_m_s} | plain["limits"]
     parents = ("flange", "base") if config.mount == "eye-in-hand" else ("base", "flange")
     notes = _NOTES | {
         "camera_guess": f"{parents[0]}_from_camera, from the guided views, 1 sigma below",
@@ -221,5 +225,6 @@ def write_config(draft: Draft, path: Path) -> StationConfig:
         path.replace(path.with_name(path.name + ".before"))
     write_atomically(path, config_text(config).encode(), ASKED_FOR)
     written, _ = load_config(path)
-    layout_of(written)
+    if not draft.posted:
+        layout_of(written)
     return written

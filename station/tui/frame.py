@@ -48,6 +48,10 @@ class StopBlock(Static):
             return Content(STOP_ELSEWHERE[not narrow])
         return Content((STOP_NARROW if narrow else STOP_WIDE)[self.latched])
 
+    def show(self, latched: bool, by_hand: bool) -> None:
+        self.latched, self.by_hand = latched, by_hand
+        self.set_class(by_hand, "-by-hand")
+
     async def on_click(self) -> None:
         if not self.by_hand:
             await self.app.run_action("stop")
@@ -112,10 +116,9 @@ class Frame(Horizontal):
     def show(self, known: Known) -> None:
         for line in self.query(Line):
             line.show(known)
-        stop, live = self.query_one(StopBlock), known.live
-        stop.latched = live is not None and live.state in LATCHED
-        stop.by_hand = live is not None and live.robot.by_hand
-        stop.set_class(stop.by_hand, "-by-hand")
+        live = known.live
+        latched, by_hand = live is not None and live.state in LATCHED, live is not None and live.robot.by_hand
+        self.query_one(StopBlock).show(latched, by_hand)
 
 
 def bar_line(known: Known, title: str, width: int) -> Content:

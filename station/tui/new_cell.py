@@ -27,6 +27,7 @@ from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
 from station.operate.guided_views import enough
+from station.tui.desk import NOT_OURS
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
 from station.tui.new_cell_steps import DRAWINGS, PAGES, about, accept, file_text, live_lines, next_of, typed
 from station.tui.task import Step
@@ -183,6 +184,9 @@ class NewCell(ThemedApp[Ending]):
 
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
+        if self.setup.draft.posted:
+            self.notify(NOT_OURS, severity="error")
+            return
         await self.setup.stop()
         self.notify(
             "STOP was sent to the controller. If the arm moves, press the EMERGENCY STOP.",
@@ -223,10 +227,11 @@ class NewCell(ThemedApp[Ending]):
             elif step is CellStep.SAVE:
                 self.exit("serve")
             else:
-                self.step = STEPS[STEPS.index(step) + 1]
+                after = STEPS[STEPS.index(step) + 1]
+                self.step = CellStep.SAVE if after is CellStep.VIEWS and self.setup.draft.posted else after
 
     def action_rehearse(self) -> None:
-        if self.setup.draft.written:
+        if self.setup.draft.written and not self.setup.draft.posted:
             self.exit("rehearse")
 
     @work(group="view", exclusive=True, exit_on_error=False)
@@ -277,6 +282,7 @@ class NewCell(ThemedApp[Ending]):
         if not self.is_running:
             return
         setup, width = self.setup, self.query_one("#next").size.width
+        self.query_one(StopBlock).show(latched=False, by_hand=bool(setup.draft.posted))
         bar = [
             Content.styled(" New cell ", "bold $accent"),
             Content.styled(" ● READ ONLY ", "$strong on $panel"),

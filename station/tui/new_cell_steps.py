@@ -33,7 +33,8 @@ PAGES = {
     CellStep.ROBOT: Page(
         "Which robot?",
         "Type the controller's address. The pendant shows it: the menu ☰ (top right) → About, or ☰ → "
-        "Settings → System → Network; on a CB3: Setup Robot → Network. The station only reads.",
+        "Settings → System → Network; on a CB3: Setup Robot → Network. The station only reads. Another arm, "
+        "which you move and a program tells: posted and its name, e.g. posted xArm 6.",
         ("#typed",),
         "address of the controller, e.g. 192.168.1.10",
     ),
@@ -76,6 +77,10 @@ REMOTE_OFF = (
 )
 _TINY_M = 0.005
 """Squares below this size are rare: the number may be one of centimetres."""
+POSTED_SAVE = (
+    "You move this arm: no views and no limits are asked for. Enter writes the file below. Then open the "
+    "cell, start the program that posts its pose (docs: Any arm), and press F3."
+)
 WRITTEN = "Written. F9 rehearses the whole job in simulation, Enter opens the cell."
 
 
@@ -84,6 +89,8 @@ def about(setup: CellSetup, step: CellStep) -> str:
     remote = None if setup.arm is None else setup.arm.remote
     if step is CellStep.VIEWS and remote:
         return REMOTE_ON
+    if step is CellStep.SAVE and setup.draft.posted:
+        return POSTED_SAVE
     if step is CellStep.SAVE and setup.draft.written:
         return WRITTEN if remote is not False else f"{WRITTEN} {REMOTE_OFF}"
     return PAGES[step].words
@@ -109,7 +116,8 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
             why = "Numbers of an address go up to 255." if wrong else "then Enter."
             return Action("", "Type the address", why, look=wrong)
         case CellStep.ROBOT:
-            return Action("Enter", "On to the camera", "The arm is read.")
+            why = "You move the arm." if draft.posted else "The arm is read."
+            return Action("Enter", "On to the camera", why)
         case CellStep.CAMERA if setup.camera is None:
             return Action("", "Connect a camera", "This list refreshes every few seconds.")
         case CellStep.CAMERA:
@@ -127,6 +135,8 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
             return Action("Enter", "On to the file", "The views are enough.")
         case _ if not draft.written:
             return Action("Enter", "Write the file", "")
+    if draft.posted:
+        return Action("Enter", "Open this cell", "Then start the program that posts.")
     return Action("Enter", "Open this cell", "Or F9: rehearse it first; nothing real moves.")
 
 

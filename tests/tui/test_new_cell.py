@@ -13,18 +13,20 @@ from textual.pilot import Pilot
 from textual.widgets import Input
 
 from calibrate.geometry import difference
-from recordings.schema.messages import BoardKind, BoardSpec
+from recordings.schema.messages import BoardKind, BoardSpec, Image, Stamps
 from station.cell.config_file import load_config
 from station.cell.layout import guess_matrix
-from station.operate.draft import CellStep, load_draft
+from station.cli.new import RealHardware
+from station.operate.draft import CameraChoice, CameraReader, CellStep, load_draft
 from station.simulation.cells import make_cell
 from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.truth import CellTruth, write_truth
+from station.tui.frame import StopBlock
 from station.tui.new_cell import NewCell
 from tests.conftest import check_allow_list
 from tests.station.operate.guided_views import guided_joints
 from tests.tui.conftest import until
-from tests.tui.new_cell_rig import SimulatedHardware
+from tests.tui.new_cell_rig import CAMERA, SimulatedHardware
 
 pytestmark = pytest.mark.process
 
@@ -116,3 +118,50 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
     assert b"# " in content
     assert person.keys - len(controller.host) <= 11
     assert load_draft(tmp_path).written
+
+
+class GreyReader:
+    """A camera before a grey wall."""
+
+    exposure_us = 10_000.0
+
+    async def glimpse(self) -> Image:
+        return Image(np.full((480, 640), 110, np.uint8), Stamps(), 0, 0)
+
+    async def expose(self, exposure_us: float) -> None: ...
+
+    async def close(self) -> None: ...
+
+
+class NoController(RealHardware):
+    async def cameras(self) -> tuple[CameraChoice, ...]:
+        return (CAMERA,)
+
+    async def camera(self, found: CameraChoice) -> CameraReader:
+        return GreyReader()
+
+
+async def test_an_arm_that_a_program_posts_needs_a_name_a_camera_and_a_board(tmp_path: Path) -> None:
+    app = NewCell(NoController(), tmp_path, tmp_path / "station.yaml")
+    async with app.run_test(size=(120, 36)) as pilot:
+
+        async def at(step: CellStep, *keys: str) -> None:
+            await until(pilot, lambda: app.step is step)
+            for key in keys:
+                await pilot.press(key)
+
+        await at(CellStep.ROBOT, *"posted xArm 6", "enter")
+        await at(CellStep.CAMERA)
+        await until(pilot, lambda: app.setup.camera is not None)
+        await at(CellStep.CAMERA, "enter")
+        await at(CellStep.MOUNTING, "enter")
+        await at(CellStep.BOARD, *"9x6 25", "enter")
+        await until(pilot, lambda: app.setup.draft.board is not None)
+        await at(CellStep.BOARD, "enter")
+        assert "pendant" in str(app.query_one(StopBlock).render())
+        await at(CellStep.SAVE, "enter")
+        await until(pilot, lambda: app.setup.draft.written)
+        await pilot.press("enter")
+    assert app.return_value == "serve"
+    config, _ = load_config(tmp_path / "station.yaml")
+    assert (config.robot.driver, config.robot.model, config.board.columns) == ("posted", "xArm 6", 9)

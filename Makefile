@@ -83,7 +83,7 @@ PREFIX ?= /usr/local
 SYSCONFDIR ?= /etc
 APP := $(PREFIX)/lib/calibration-station
 DOC := $(PREFIX)/share/doc/calibration-station
-UNITS := station.service station-tui@.service calibrate@.service
+UNITS := station.service calibrate@.service
 
 install: install-files  ## install programs, units and users' definitions below PREFIX (/usr/local) and /etc
 	$(PYTHON) -m venv $(VENV_FLAGS) $(DESTDIR)$(APP)
@@ -111,8 +111,8 @@ install-files:  # the part of install that needs no network
 	install -d $(DESTDIR)$(DOC)/schemas && install -m 644 docs/schemas/*.json $(DESTDIR)$(DOC)/schemas
 
 uninstall:  ## stop the services and remove what install put there; configuration and data stay
-	$(if $(DESTDIR),,-systemctl disable --now station.service 'station-tui@.service' 2>/dev/null)
-	$(if $(DESTDIR),,-systemctl stop 'station-tui@*' 'calibrate@*' 2>/dev/null)
+	$(if $(DESTDIR),,-systemctl disable --now station.service 2>/dev/null)
+	$(if $(DESTDIR),,-systemctl stop 'calibrate@*' 2>/dev/null)
 	rm -rf $(DESTDIR)$(APP) $(DESTDIR)$(DOC)
 	rm -f $(addprefix $(DESTDIR)$(PREFIX)/bin/,station calibrate recordings)
 	rm -f $(addsuffix .1,$(addprefix $(DESTDIR)$(PREFIX)/share/man/man1/,station calibrate recordings))

@@ -81,7 +81,6 @@ class Attended:
                 self.approves,
                 show,
                 finish_with_loss=self._headless,
-                headless=not self.interactive,
                 plans_here=self.plans_here if self.interactive else None,
             )
 

@@ -76,9 +76,7 @@ def drift_check_command(
     async def captured() -> tuple[StationStatus, str]:
         async with attended(socket, headless, approve, quiet=headless) as shell:
             standing = await shell.status()
-            started = await start_drift_check(
-                shell.client, standing, shell.approves, poses, headless=not shell.interactive
-            )
+            started = await start_drift_check(shell.client, standing, shell.approves, poses)
             return await shell.watch(started, standing), shell.client.camera
 
     outcome, camera = asyncio.run(captured())

@@ -18,9 +18,7 @@ POSES = 8
 SEED = 0
 
 
-async def start_drift_check(
-    link: Client, status: StationStatus, approve: Approve, poses: int = POSES, headless: bool = False
-) -> str:
+async def start_drift_check(link: Client, status: StationStatus, approve: Approve, poses: int = POSES) -> str:
     """Plan a few poses, ask, start. Returns the plan's SHA-256; empty: not approved, nothing moved.
 
     A loaded plan that was never run is named in the question, and loaded again where nothing was started.
@@ -33,9 +31,7 @@ async def start_drift_check(
     made = await link.call(MakePlan(poses, SEED, lens_known=True), timeout_s=PREPARE_S)
     started = False
     try:
-        started = await prepared_motion(
-            link, Prepare(Purpose.DRIFT_CHECK), approve, changes=changes, headless=headless
-        )
+        started = await prepared_motion(link, Prepare(Purpose.DRIFT_CHECK), approve, changes=changes)
     finally:
         if before is not None and not started:
             await link.call(LoadPlan(before))

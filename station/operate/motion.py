@@ -58,14 +58,12 @@ async def prepared_motion(
     approve: Approve,
     *,
     changes: tuple[str, ...] = (),
-    headless: bool = False,
     plans_here: PlansHere | None = None,
 ) -> bool:
     """Check the whole path, ask a person to approve the motion, and start it. False: not approved.
 
-    `changes`: other effects of the approval. `headless`: no person will be asked later; poses that do not
-    settle are tried once more. `plans_here`: asks whether to plan again if the plan was made from another
-    posture.
+    `changes`: other effects of the approval. `plans_here`: asks whether to plan again if the plan was made
+    from another posture.
     """
     try:
         preview = await link.call(wanted, timeout_s=PREPARE_S)
@@ -80,7 +78,7 @@ async def prepared_motion(
     preview = msgspec.structs.replace(preview, changes=(*changes, *preview.changes))
     if not await approve(preview):
         return False
-    await link.call(Go(preview.token, preview.plan_sha256, headless))
+    await link.call(Go(preview.token, preview.plan_sha256))
     return True
 
 
@@ -106,11 +104,10 @@ async def carry_out(
     watch: Watcher,
     *,
     finish_with_loss: bool = False,
-    headless: bool = False,
     plans_here: PlansHere | None = None,
 ) -> StationStatus:
     """Run a session from its approval until it is finished or paused. RefusedError when refused."""
-    if not await prepared_motion(link, Prepare(purpose), approve, headless=headless, plans_here=plans_here):
+    if not await prepared_motion(link, Prepare(purpose), approve, plans_here=plans_here):
         raise not_approved()
     return await watched(link, watch, finish_with_loss)
 

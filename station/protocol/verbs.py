@@ -254,8 +254,6 @@ class Go(Verb[Done], frozen=True):
     moves = True
     token: str
     plan_sha256: str = ""
-    headless: bool = False
-    """No person will be asked later: poses that do not settle are tried once more."""
 
 
 class Pause(Verb[Done], frozen=True):

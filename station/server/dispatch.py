@@ -107,7 +107,7 @@ class SessionDispatcher:
                 return await session.prepare(client, verb.purpose, verb.stop_test)
             case verbs.Go():
                 approval = await self._approval(caller, verb.plan_sha256)
-                await session.go(client, verb.token, approval, again=verb.headless)
+                await session.go(client, verb.token, approval)
             case verbs.Pause():
                 session.pause(caller.who)
             case verbs.Finish():

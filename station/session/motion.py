@@ -163,8 +163,6 @@ class MotionApproval:
     preview: MotionPreview
     client_id: int
     expires_s: float = 0.0
-    again: bool = False
-    """True: poses that do not settle are tried once more at the end, as no person can be asked."""
     approval: str = ""
     """Who approved it, and how."""
 
@@ -197,12 +195,7 @@ class ApprovalManager:
         self.waiting = None
 
     def redeem(
-        self,
-        token: str,
-        client_id: int,
-        plan_sha256: str,
-        joints_rad: Sequence[float],
-        again: bool = False,
+        self, token: str, client_id: int, plan_sha256: str, joints_rad: Sequence[float]
     ) -> MotionApproval:
         """Return the approval, once. RefusedError when anything changed since the offer, then void."""
         asked, self.waiting = self.waiting, None
@@ -216,7 +209,7 @@ class ApprovalManager:
         if asked.motion.stop_test is None and asked.preview.plan_sha256 != plan_sha256:
             raise RefusedError("plan-changed")
         require_start(joints_rad, asked.start_joints_rad, "since the approval was asked for")
-        return replace(asked, again=again)
+        return asked
 
 
 def require_start(joints_rad: Sequence[float], start_rad: Sequence[float], when: str) -> None:

@@ -54,7 +54,6 @@ class Run:
         self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
         """Numbers of poses that did not settle."""
-        self._tried_again = False
 
     def _cell_geometry(self) -> CellGeometry:
         return with_plan_speeds(cell_geometry(self._context.cell.config), self._queue.plan)
@@ -178,7 +177,7 @@ class Run:
         started_s, taken = time.monotonic(), 0
         todo = list(self._go.motion.poses)
         while not context.requests.halt:
-            todo = [index for index in todo if index in queue.open] or self._once_more()
+            todo = [index for index in todo if index in queue.open]
             if self._wants_rest() or not todo or self._failures >= FAILURES_IN_A_ROW:
                 break
             index = todo.pop(0)
@@ -189,21 +188,6 @@ class Run:
             remaining_s = round((time.monotonic() - started_s) / taken * len(todo), 1)
             elapsed_s = round(context.require_recording().elapsed_s, 1)
             context.store.update_session(elapsed_s=elapsed_s, remaining_s=remaining_s)
-
-    def _once_more(self) -> list[int]:
-        """Return the unsettled poses for a second try, once, if the approval allows it (`again`).
-
-        The approval covers these poses; every path is checked again from where the arm stands.
-        """
-        queue = self._queue
-        found = [index for index in self._unsettled if queue.status(index).state == "failed"]
-        if not self._go.again or self._tried_again or self._wants_rest() or not found:
-            return []
-        self._tried_again, self._unsettled, self._failures = True, [], 0
-        for index in found:
-            queue.mark(index, "planned", "did not settle: tried once more")
-        self._context.store.event("retrying", f"retrying unsettled {_numbers(found)}", poses=len(found))
-        return found
 
     def _wants_rest(self) -> bool:
         return bool(self._context.requests.pause_by) or self._context.requests.finish

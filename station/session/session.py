@@ -186,10 +186,10 @@ class Session:
         self.store.update(go=msgspec.structs.replace(preview, token=""))
         return preview
 
-    async def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
+    async def go(self, client_id: int, token: str, approval: str = "") -> None:
         """Start the offered motion, which a person approved. RefusedError when anything changed.
 
-        `approval`: who approved and how, for log and recording. `again`: see MotionApproval.
+        `approval`: who approved and how, for log and recording.
         """
         context = self.context
         self.permit(verbs.Go, client_id)
@@ -200,7 +200,7 @@ class Session:
             raise RefusedError("still-ending", what="freedrive")
         plan_sha256 = context.queue.sha256 if context.queue else ""
         try:
-            go = self.approvals.redeem(token, client_id, plan_sha256, joints, again)
+            go = self.approvals.redeem(token, client_id, plan_sha256, joints)
             go = replace(go, approval=approval or f"motion approved by {self.store.status.lease.holder}")
         finally:
             self.store.update(go=None)

@@ -38,8 +38,7 @@ def _cgroup2() -> Path:
 class Machine:
     """Boots at once; `end` switches it off. Raises CannotBootError."""
 
-    def __init__(self, folder: Path, console: str) -> None:
-        """`console`: the terminal here that is /dev/tty1 there."""
+    def __init__(self, folder: Path) -> None:
         if os.geteuid() != 0 or not shutil.which("systemd-nspawn"):
             raise CannotBootError("starting units for real needs root and systemd-nspawn")
         if not sys.base_prefix.startswith("/usr"):
@@ -47,7 +46,7 @@ class Machine:
         self.root, self._log = folder / "root", folder / "boot.log"
         self._group = _cgroup2() / f"station-test-{os.getpid()}"
         self._furnish()
-        self._boot(console)
+        self._boot()
 
     def _furnish(self) -> None:
         """Empty folders, this machine's users, and the station as `make install` would leave it."""
@@ -75,13 +74,13 @@ class Machine:
             (programs / name).write_text(words)
             (programs / name).chmod(0o755)
 
-    def _boot(self, console: str) -> None:
+    def _boot(self) -> None:
         self._group.mkdir()
         enter = f'echo $$ > {self._group}/cgroup.procs && exec "$@"'
         command = ["systemd-nspawn", "--quiet", "--directory", str(self.root), "--machine", self._group.name]
         command += ["--register=no", "--keep-unit", "--console=pipe", "--bind-ro=/usr"]
         command += [f"--bind-ro={REPOSITORY}:{CHECKOUT}", f"--bind-ro={sys.prefix}:{VENV}"]
-        command += [f"--bind={console}:/dev/tty1", "--boot"]
+        command += ["--boot"]
         with self._log.open("wb") as words:
             self._nspawn = subprocess.Popen(
                 ["sh", "-c", enter, "sh", *command, "--", "--unit=basic.target"],

@@ -1,16 +1,10 @@
-"""The units under a running systemd: ready, watched, stopped in order, solved, and shown on a console."""
+"""The units under a running systemd: ready, watched, stopped in order, and solved."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import fcntl
-import os
-import pty
 import shutil
 import signal
-import struct
-import termios
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
@@ -22,53 +16,19 @@ from recordings.reader import open_recording
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.client import Client
-from station.tui.words import STATE_WORDS
 from tests.patience import until
 from tests.system.conftest import SystemRig, go, status_when
 from tests.system.machine import CHECKOUT, VENV, CannotBootError, Machine
-from tests.tui.terminal import KEYS, Glass
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(240)]
 SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 SOCKET = "/run/station/control.sock"
 
 
-class Console:
-    """A terminal that is the container's tty1: what stands on it, and its keys."""
-
-    def __init__(self) -> None:
-        self._master, self._slave = pty.openpty()
-        fcntl.ioctl(self._slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-        os.set_blocking(self._master, False)
-        self.name = os.ttyname(self._slave)
-        self._glass = Glass(80, 24)
-
-    def text(self) -> str:
-        # EIO: systemd hangs a console up before it hands it over.
-        with contextlib.suppress(OSError):
-            while data := os.read(self._master, 65536):
-                self._glass.write(data)
-        return self._glass.text
-
-    def press(self, key: str) -> None:
-        os.write(self._master, KEYS[key].encode())
-
-    def close(self) -> None:
-        os.close(self._master)
-        os.close(self._slave)
-
-
 @pytest.fixture(scope="module")
-def console() -> Iterator[Console]:
-    made = Console()
-    yield made
-    made.close()
-
-
-@pytest.fixture(scope="module")
-def machine(tmp_path_factory: pytest.TempPathFactory, console: Console) -> Iterator[Machine]:
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     try:
-        made = Machine(tmp_path_factory.mktemp("machine"), console.name)
+        made = Machine(tmp_path_factory.mktemp("machine"))
     except CannotBootError as why:
         pytest.skip(str(why))
     try:
@@ -122,28 +82,6 @@ async def test_stopping_the_service_stops_the_arm_seals_and_ends(
     assert not list(folder.glob("*.part"))
     assert len(open_recording(folder).views()) >= 1
     await rig.stays_at_rest()
-
-
-async def test_the_screen_comes_up_on_a_console_and_its_stop_key_reaches_the_daemon(
-    station: Machine, rig: SystemRig, console: Console
-) -> None:
-    station.run("systemctl", "start", "station-tui@tty1")
-    connected = STATE_WORDS[S.IDLE]
-    await until(lambda: all(word in console.text() for word in ("STOP", "F12", connected)))
-    async with await client_of(station) as anna:
-        await status_when(anna, lambda s: s.state is S.IDLE)
-        console.press("f12")
-        status = await status_when(anna, lambda s: s.state is S.STOPPED)
-        assert "STOP by station-screen on tty1" in status.reason
-    await until(lambda: "STOPPED" in console.text())
-    screen = station.show("station-tui@tty1", "MainPID")
-    as_screen = (
-        f"nsenter -t {screen} -m setpriv --reuid station-screen --regid station-operator --clear-groups"
-    )
-    for place in ("sessions", "calibrations"):  # where solving and installing write
-        station.run(*as_screen.split(), "test", "-w", f"/var/lib/station/{place}")
-    station.run("systemctl", "stop", "station-tui@tty1")
-    assert station.show("station-tui@tty1", "Result") == "success"
 
 
 async def test_a_hung_daemon_is_killed_and_the_next_one_waits_for_a_person(

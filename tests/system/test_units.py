@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-UNITS = {"station.service": 2.0, "calibrate@.service": 1.0, "station-tui@.service": 2.0}
+UNITS = {"station.service": 2.0, "calibrate@.service": 1.0}
 needs_systemd = pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="no systemd-analyze here")
 
 

@@ -111,7 +111,7 @@ class Solved:
         """Return the covariance (6, 6), m and rad, of [δt, δφ], or of [δφ, δt].
 
         X is Exp(δφ) times the estimate's rotation, and its translation plus δt: both in the axes of X's
-        parent frame. GTSAM and Sophus perturb in the child's.
+        parent frame, as in ROS's PoseWithCovariance. GTSAM and Sophus perturb in the child's.
         """
         require_choice("order", order, ("translation-rotation", "rotation-translation"))
         shift = 3 * (order == "rotation-translation")

@@ -328,7 +328,7 @@ def install_line(source: Source, path: Path, root: Path | None = None, override:
     kind = _CELL_OF[source]
     words = ["calibrate", "install"]
     words += [] if kind == "real" else ["--cell", kind]
-    words += [] if kind == "real" and root is None else ["--root", str(root or "FOLDER")]
+    words += [] if kind == "real" and root is None else ["--root", str(root or "ROOT")]
     words += ["--override", override] if override else []
     return shlex.join([*words, str(path)])
 

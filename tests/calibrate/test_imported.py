@@ -104,6 +104,12 @@ def matrices_in_blocks(folder: Path, T: np.ndarray) -> None:
             file.write("\n")
 
 
+def one_matrix_each(folder: Path, T: np.ndarray) -> None:
+    """As a simulator's plugin writes them beside its images: the TCP in base, rows of text."""
+    for n, each in enumerate(T, 1):
+        np.savetxt(folder / f"tcp_pose{n:05d}.txt", each)
+
+
 def one_yaml_each(folder: Path, T: np.ndarray) -> None:
     (folder / "tcp_pose").mkdir()
     for n, row in enumerate(quaternions(T), 1):
@@ -148,6 +154,7 @@ def arrays(folder: Path, T: np.ndarray) -> None:
         kuka,
         rotation_vectors,
         matrices_in_blocks,
+        one_matrix_each,
         one_yaml_each,
         opencvs_yaml,
         opencvs_xml,

@@ -134,5 +134,5 @@ def commented_yaml(calibration: Calibration, frames: FrameNames, plain: dict[str
 
 def how_to_attach(frames: FrameNames) -> str:
     """Say in a comment how these frames and those of a camera's driver become one tree."""
-    how = " For the frames of a camera's driver: export --attach camera_link --driver-tf FILE."
+    how = " To place a camera driver's own frames: options attach and driver-tf of calibrate export."
     return "" if frames.attach else how

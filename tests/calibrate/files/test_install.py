@@ -42,7 +42,7 @@ def test_the_next_step_of_a_solve_is_one_that_works() -> None:
     again = install_line("simulated", Path("c.yaml"), Path("/r"), "REASON")
     assert again == "calibrate install --cell simulated --root /r --override REASON c.yaml"
     assert install_line("playback", Path("c.yaml")) == (
-        "calibrate install --cell simulated --root FOLDER c.yaml"
+        "calibrate install --cell simulated --root ROOT c.yaml"
     )
 
 

@@ -92,7 +92,7 @@ def annotate(
 def _marks(
     calibration: Calibration, camera: CameraModel, camera_from_board: Array, seen: Detection | None, bad: bool
 ) -> tuple[list[Marks], float | None]:
-    """Detected corners, and from each a line towards its predicted place, longer than it is."""
+    """Draw corners, and from each a magnified line towards where it is predicted; return the rms, too."""
     if seen is None or not seen.found:
         return [], None
     best: Array | None = None

@@ -64,7 +64,7 @@ def _followed(change: InstallationChange, camera: str) -> Followed:
 
 
 def _end_with_the_reader() -> None:
-    """A closed pipe is told by the next line only, and that may be months away."""
+    """End when the reader closes the pipe: a write would notice that only at the next change."""
     poll = select.poll()
     poll.register(sys.stdout.fileno(), 0)
     poll.poll()

@@ -60,7 +60,7 @@ def metrics_text(root: Path | None, now: datetime | None = None) -> str:
 
 
 def _samples(root: Path | None, camera: str, now: datetime) -> Iterator[tuple[str, str, float]]:
-    """(name, labels, value); names of cameras need no escapes."""
+    """Yield name, labels, value. Names of cameras have no letters that need escapes."""
     folder, labels = readable_folder(root, camera), f'camera="{camera}"'
     number, path = current_version(folder)
     validity = current_validity(folder, now)

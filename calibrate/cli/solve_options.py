@@ -62,7 +62,7 @@ MemoryLimit = Annotated[int, typer.Option(min=0, max=2**30, help="Memory limit, 
 def takes(
     build: Callable[..., object], parameter: str = "options"
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The command offers `build`'s options instead of its `parameter`, and gets what they make."""
+    """Decorate a command: the options of `build` replace its `parameter`, which gets what `build` returns."""
     offered = inspect.signature(build, eval_str=True).parameters
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -58,7 +58,7 @@ _CELL_OF: dict[Source, Cell] = {
 WORSE_TIMES = 1.5
 """Ratio of predicted errors above which a new calibration counts as worse, not different by chance."""
 REASON_LETTERS = 5
-"""Fewest different letters that count as a reason in words, in any script; fewer may be one key held."""
+"""Fewest different letters of a reason, in any script: fewer may be a key that was held down."""
 
 
 def installed_calibration(root: Path | None = None, camera: str = MAIN_CAMERA) -> Calibration:
@@ -83,8 +83,8 @@ def install(
 ) -> InstalledVersion:
     """Make the calibration file `path` the current one of its camera.
 
-    `cell`: what kind of cell this root belongs to; a real one takes nothing simulated, played back or
-    imported, and no override changes that. `camera`: its name in the cell; empty: as in the file.
+    `cell`: kind of cell that this root belongs to; a real one refuses what is simulated, played back or
+    imported, whatever the override. `camera`: its name in the cell; empty: as in the file.
     `override`: a person's reason to install although a gate failed or robot or camera differ; it goes into
     the file. `robot_serial`, `camera_serial`: of the cell's own configuration, when known. `max_age_days`:
     age of the last proof from which it is in doubt; None: the rule of the one before, 0: no rule.

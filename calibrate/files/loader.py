@@ -171,9 +171,9 @@ def watch(
 
     `first`: begin with what is installed now, so that nothing is missed between loading and watching.
 
-    Reads two small files every `poll_s` seconds, which works on any file system. Also yields when
-    the last proof grows too old by the cell's rule. `stop_s`: seconds after which it ends; None: never.
-    Nothing is refused, simulated ones neither: check `.installed.source` and `.installed.validity`.
+    Reads two small files every `poll_s` seconds, which works on any file system. Also yields when the last
+    proof grows older than the cell allows. `stop_s`: seconds after which it ends; None: never. It refuses
+    nothing: check `.installed.source` (simulated?) and `.installed.validity`.
     """
     folder = calibrations_folder(root, camera)
     ends_s = None if stop_s is None else time.monotonic() + stop_s

@@ -83,10 +83,10 @@ class Validity:
     ) -> Validity:
         """Return the validity after a check of kind `kind` on views taken at `when`.
 
-        A failure puts it in doubt, a pass makes it valid, where the check `proves` it: a pass by its power, a
-        failure by telling the camera's shift from other errors. Else a failure makes it unverified, and a
-        pass makes it valid only after a doubt of the same kind of check; another doubt becomes unverified.
-        Views from before the last proof change nothing, and no check restores a withdrawn version.
+        `proves`: a pass had enough power, or a failure could tell a camera's shift from other errors. Then a
+        failure puts it in doubt and a pass makes it valid. Otherwise a failure makes it unverified, unless it
+        is in doubt already. A pass then ends a doubt of the same kind of check; any other doubt becomes
+        unverified. Views from before the last proof change nothing. No check restores a withdrawn version.
         """
         proven = parse_time(self.verified)
         if self.state is ValidityState.WITHDRAWN or (proven is not None and when < proven):

@@ -1,4 +1,4 @@
-"""The few HTML pieces that every section is made of; all text is escaped here."""
+"""HTML pieces of the report; all text is escaped here."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def stamp(text: str) -> str:
 
 
 def folded(title: str, parts: Iterable[str], *, printed: bool = False) -> str:
-    """A section that opens by a click; empty without parts. `printed`: on paper open, others gone."""
+    """Make a section that a click opens; "" without parts. `printed`: paper shows it, too."""
     inside = "\n".join(part for part in parts if part)
     if not inside:
         return ""

@@ -38,7 +38,7 @@ _REMEDIES_SHOWN = 3
 _DRAWN_IN = (255, 140, 20)
 """Colour of what the calibration predicts: blue, green, red."""
 _AHEAD_PX = 1e6
-"""Rejected and suspect views stand before all others, however far off those are."""
+"""More than any residual: sorts rejected and suspect views before all others."""
 
 
 def report_page(job: SolvedRecording) -> str:
@@ -68,7 +68,7 @@ def _verdict(job: SolvedRecording) -> Iterator[str]:
 
 
 def _first_facts(job: SolvedRecording) -> str:
-    """The one figure, what was calibrated and when, and what could be better."""
+    """Make the first screen: predicted error, what was calibrated and when, what could be better."""
     calibration, info = job.calibration, job.recording.info
     figure = figures(calibration)["error"]
     cell = strict_yaml.load_plain(job.recording.attachments().get("config.yaml", b"{}"))

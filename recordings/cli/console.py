@@ -30,7 +30,7 @@ def print_json(value: object) -> None:
 
 
 def plain_console(**settings: Any) -> Console:
-    """A console without markup and emoji: brackets of a name are its own, colours come from styles alone."""
+    """Make a console without markup and emoji, so that brackets in a name are printed as they are."""
     console = Console(**{"highlight": False, "markup": False, "emoji": False, **settings})
     console.push_render_hook(_Hook())
     return console
@@ -38,7 +38,7 @@ def plain_console(**settings: Any) -> Console:
 
 @contextmanager
 def progress_bar(label: str, console: Console) -> Iterator[Callable[[int, int, str], None]]:
-    """A bar that is gone at the end; called with done, total and what is done."""
+    """Show a bar until the end. Yields a function to call with done, total and a text."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     texts = TextColumn(label), TextColumn("{task.description}", markup=False)

@@ -99,27 +99,27 @@ class LazyGroup(TyperGroup):
         self._lazy, self._gone = commands, gone
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command's line in the group's help."""
+        """Return a stub, which holds the command's line in the group's help."""
         stub = super().get_command(ctx, cmd_name)
         if stub is not None and stub.help is None:
             stub.help = self._lazy[cmd_name].first_line()
         return stub
 
     def get_help_option(self, ctx: Any) -> Any:
-        """Known to all, so not listed."""
+        """Hide `--help` in the list of options: everybody knows it."""
         option = super().get_help_option(ctx)
         if option is not None:
             option.hidden = True
         return option
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """The commands that people use; with `--all` every one."""
+        """Print the help with the usual commands; with `--all`, with the rare ones too."""
         for name, command in self._lazy.items():
             self.commands[name].hidden = command.rare and not ctx.params.get("every")
         super().format_help(ctx, formatter)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The loaded command in place of its line in the group's help."""
+        """Load the command that is asked for: the group itself holds a stub with its line of help."""
         _refuse_gone(args[0], self._gone)
         name, _, rest = super().resolve_command(ctx, args)
         if name is None:
@@ -157,7 +157,7 @@ def _options(
 
 
 def _group_options() -> list[Any]:
-    """`--version`, `--all` and a shell's completion, which no help lists: it fits on one screen."""
+    """Make `--version`, `--all` and completion, hidden so that the help fits on one screen."""
     app = typer.Typer()
     app.callback()(_options)
     options: list[Any] = list(get_command(app).params)
@@ -172,7 +172,7 @@ def _refuse_gone(word: str, gone: Mapping[str, str]) -> None:
 
 
 def run(name: str, group: LazyGroup) -> None:
-    """Call a command line; what a person, a file or a device can cause ends in one line and an exit code."""
+    """Call a command line. An error that a person, file or device causes prints one line, no traceback."""
     print_what_it_can()
     if f"_{name.upper()}_COMPLETE" in os.environ:
         from typer import completion
@@ -199,12 +199,12 @@ def run(name: str, group: LazyGroup) -> None:
 
 
 def print_what_it_can() -> None:
-    """Letters that the terminal's encoding lacks (°, σ, ✓ in Latin-1) become question marks, not an error."""
+    """Print ? for letters that the terminal's encoding lacks (°, σ, ✓ in Latin-1), instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 
 def examples(*commands: str) -> str:
-    """The end of a command's help (`epilog`): commands as a person types them, a remark behind `#`."""
+    """Make the end of a command's help: commands as a person types them, a remark behind `#`."""
     return "Examples:\n" + "\n".join(f"- `{command}`" for command in commands)

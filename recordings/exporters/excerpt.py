@@ -15,13 +15,13 @@ from recordings.writer import RecordingWriter, derived_recording
 
 _NS = 1_000_000_000
 _SHOWN = (Topic.FIXED_TRANSFORM, Topic.BOARD_TRANSFORM, Topic.ANNOTATIONS)
-"""For viewers only, small, and made by nothing else that is kept."""
+"""Topics for viewers that are copied: small, and nothing in an excerpt could make them again."""
 
 
 def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> Path:
-    """Writes `output` (.mcap), raw images as lossless PNG; it solves like the whole. RecordingError.
+    """Write `output` (.mcap), which solves like the whole recording. Raises RecordingError.
 
-    Robot states stay when they lie within `window_s` of a view by the host's monotonic clock.
+    Raw images become lossless PNG. Robot states within `window_s` of a view's stamp are kept.
     """
     views = recording.views()
     kept_ns = sorted(view.stamps.host_monotonic_ns for view in views)
@@ -45,9 +45,10 @@ def copied(
     replaced: Collection[str] = (),
     keeps: Callable[[RobotState], bool] = lambda state: True,
 ) -> Iterator[tuple[View, Image]]:
-    """Write all that was recorded: the views that count, numbered anew, each of which is yielded after it.
+    """Copy a recording's content, retaken views left out. Yields each view and image once it is written.
 
-    `replaced`: attachments to leave out. What viewers are shown beside it is the caller's.
+    `replaced`: attachments to leave out. `keeps`: which robot states to copy. Topics for viewers are left to
+    the caller.
     """
     kinds = recording.media_types()
     for name, content in recording.attachments().items():

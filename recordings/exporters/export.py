@@ -26,7 +26,7 @@ _EXTENSIONS = {"png": "png", "jpeg": "jpg"}
 
 
 def export_recording(recording: Recording, output: Path, target: Target) -> Path:
-    """Write `output` (an excerpt is a file, all else a folder), which must not exist; all of it or nothing.
+    """Write `output`, which must not exist: a file for an excerpt, else a folder. All of it or nothing.
 
     Raises RecordingError.
     """
@@ -44,7 +44,7 @@ def export_recording(recording: Recording, output: Path, target: Target) -> Path
 
 @contextmanager
 def _new_folder(output: Path) -> Iterator[Path]:
-    """Appears under its name when it is complete."""
+    """Make a folder that gets its name only when it is complete."""
     if output.exists() or output.is_symlink():
         raise exists_error(output)
     temporary = output.with_name(output.name + ".part")
@@ -81,7 +81,7 @@ def _write_folder(recording: Recording, folder: Path) -> None:
 
 
 def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
-    """The stored file where it shows the picture, else a lossless PNG; returns the pose's row."""
+    """Write the image as stored, a raw or Bayer one as PNG; return its row of poses.csv."""
     image = recording.image(view)
     stored = recording.stored_image(view)
     if stored is None or mosaic_encoding(image.pixel_format):
@@ -94,7 +94,7 @@ def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
 
 
 def _write_tables(recording: Recording, folder: Path) -> None:
-    """One CSV per kind of message, raw values in SI units, images only as their facts."""
+    """Write a CSV for each kind of message, raw values in SI units; of images their stamps and settings."""
     segments = recording.segments
     tables: dict[str, Callable[[], Iterator[msgspec.Struct]]] = {
         "robot_states": recording.robot_states,
@@ -110,7 +110,7 @@ def _write_tables(recording: Recording, folder: Path) -> None:
 
 
 def _flat(value: Any, column: str = "") -> Iterator[tuple[str, Any]]:
-    """(column, value) of every number and text: `stamps.host_wall_ns`, `joints_rad.1` of the base's joint."""
+    """Yield column and value of every number and text: `stamps.host_wall_ns`, `joints_rad.1` (base)."""
     if isinstance(value, msgspec.Struct):
         inside: Iterable[tuple[object, Any]] = zip(value.__struct_fields__, astuple(value), strict=True)
     elif isinstance(value, tuple):

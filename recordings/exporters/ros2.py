@@ -31,7 +31,7 @@ from recordings.segment import RecordingSegment
 FRAME_PERIOD_NS = 10_000_000
 _NS = 1_000_000_000
 _LAST_S = 2**31 - 1
-"""That builtin_interfaces/Time can hold."""
+"""Latest second that builtin_interfaces/Time can hold."""
 _BAG_VERSION: Literal[8] = 8
 _DISTORTION_COUNT = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 
@@ -43,7 +43,7 @@ class _Entry(NamedTuple):
 
 
 def write_ros2(recording: Recording, folder: Path) -> None:
-    """Fills the folder with `NAME.mcap` and `metadata.yaml`. Wall time is the bag's time. RecordingError."""
+    """Write `NAME.mcap` and `metadata.yaml` into the folder, stamped by wall time. Raises RecordingError."""
     messages = _Messages()
     from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -83,7 +83,7 @@ def _entries(messages: _Messages, recording: Recording, segment: RecordingSegmen
 
 
 def _mid_exposure_ns(view: View | None, facts: PictureFacts, recorded_ns: int) -> int:
-    """By the view, else by the frame's own time; when it was recorded where there is neither."""
+    """Return the view's stamp, else the frame's own time, else when the frame was recorded."""
     if view is not None and view.stamps.host_wall_ns:
         return view.stamps.host_wall_ns
     stamps = facts.stamps

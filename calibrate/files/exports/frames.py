@@ -23,9 +23,9 @@ _TURNED = {
     "base_link": ("base", pose(np.diag([-1, -1, 1]), [0, 0, 0])),
     "flange": ("tool0", pose([[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0, 0, 0])),
 }
-"""Frames of ROS that are not the controller's → (the one that is, how it stands in them on a UR).
+"""Frame of ROS → (the controller's frame beside it, parent_from_child between them on a UR).
 
-Of ur_description. Other makers turn them otherwise.
+From ur_description. Other makers turn them otherwise.
 """
 
 
@@ -40,9 +40,10 @@ class ExportError(CalibrationError):
 class FrameNames:
     """Names of the frames in an exported file, and what is known of where they stand.
 
-    As ROS names them, `base` and `tool0` are the controller's own frames, and any other name is taken for
-    theirs. But `base_link` and `flange` (perhaps with a prefix) are turned against them: known of a UR, else
-    by `fixed`. No camera driver uses the default names of the camera's frames, so none gets two parents.
+    ROS calls the controller's own frames `base` and `tool0`. Another name here renames them, except
+    `base_link` and `flange` (also with a prefix): those are turned against them, as is known of a UR, and of
+    other arms from `fixed`. No camera driver uses the default names of the camera's frames, so none of its
+    frames gets a second parent.
     """
 
     base: str = "base"
@@ -78,9 +79,9 @@ class FrameNames:
         return name if name[:1].isalpha() else f"camera{name}"
 
     def place(self, calibration: Calibration, X: Array) -> Array:
-        """Compute parent_from_camera (4, 4) of X (4, 4), in which the parent is the controller's frame.
+        """Compute the camera (4, 4) in the named parent from X (4, 4), the camera in the controller's frame.
 
-        Raises ExportError for a frame that is turned against it, nobody says how.
+        Raises ExportError where the parent is turned against that frame and nobody says how.
         """
         parent = self.parent(calibration)
         own = "tool0" if calibration.mount == "eye-in-hand" else "base"

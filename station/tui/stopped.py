@@ -9,7 +9,7 @@ from station.cell.status import StationStatus
 from station.protocol.states import LATCHED
 from station.tui.progress import pose_under_way
 from station.tui.task import Known
-from station.tui.words import UNKNOWN, lines, mark
+from station.tui.words import UNKNOWN, lines, mark, sentence
 
 STOPPED_BY = {
     "protective-stop": "The robot stopped itself (protective stop): it probably touched something.",
@@ -52,7 +52,7 @@ def stopped_text(status: StationStatus) -> Content:
     if robot.connected and not robot.by_hand and status.cause in ("stop", *STOPPED_BY):
         rests = " The arm stands still." if robot.still else " The arm is told to stop."
     return lines(
-        Content.styled(f"{STOPPED_BY.get(status.cause, status.reason)}{rests}", "bold $strong"),
+        Content.styled(f"{STOPPED_BY.get(status.cause, sentence(status.reason))}{rests}", "bold $strong"),
         Content(""),
         Content(saved),
         Content(""),

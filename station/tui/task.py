@@ -11,7 +11,7 @@ from station.operate.ending import Way, after_solve
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Check
 from station.tui.installed import Kept, Result
-from station.tui.words import Mark, duration, many
+from station.tui.words import Mark, duration, many, sentence
 
 STEPS = ("connect", "plan", "capture", "result")
 DIGITS = {mode: str(place) for place, mode in enumerate((*STEPS, "sessions", "log"), start=1)}
@@ -207,7 +207,7 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     """Choose the action where the arm works or is held; None at rest."""
     state, held = status.state, status.robot.condition.held
     if state in LATCHED:
-        why = f"{status.reason} Look at the cell first; F8 moves nothing.".strip()
+        why = f"{sentence(status.reason)} Look at the cell first; F8 moves nothing.".strip()
         return Action("F8", "Acknowledge", why, look=True)
     if state is StationState.DISCONNECTED:
         why = status.reason or "The robot does not answer."
@@ -219,10 +219,10 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     if state is StationState.SEALING:
         return Action("", "Wait", "The recording is being finished.")
     if held and state in _STILL:
-        return Action("", "At the pendant", held, look=True)
+        return Action("", "At the pendant", sentence(held), look=True)
     if state is StationState.PAUSED:
         saved = f"{status.session.captured} of {len(status.session.poses)} are saved; F7 finishes with these."
-        why = " ".join(words for words in (status.reason, saved) if words)
+        why = " ".join(words for words in (sentence(status.reason), saved) if words)
         return Action("F5", "Continue", why, look=bool(status.reason))
     if state is StationState.FREE_DRIVE:
         return Action("F2", "Capture an image here", "Guide the arm by the pendant's button; F3 ends it.")

@@ -39,6 +39,11 @@ def shortened(text: str, cells: int, parts: bool = False) -> str:
     return whole if whole and parts else f"{whole or text[: cells - 1]}…"
 
 
+def sentence(text: str) -> str:
+    """Begin with a capital letter: reasons of errors also stand within others' sentences."""
+    return text[:1].upper() + text[1:]
+
+
 def mark(kind: Mark, text: str = "") -> Content:
     sign, colour = MARKS[kind]
     return Content.styled(f"{sign} {text}" if text else sign, colour)

@@ -94,13 +94,13 @@ class Recording:
         return hashlib.sha256("".join(segment.sha256 for segment in self.segments).encode()).hexdigest()
 
     def views(self) -> list[View]:
-        """The latest attempt of every pose, in the order of their index."""
+        """The latest attempt of every pose that was not taken back, in the order of their index."""
         latest: dict[int, View] = {}
         for view in chain.from_iterable(segment.views for segment in self.segments):
             before = latest.get(view.index)
             if before is None or (view.part, view.attempt) >= (before.part, before.attempt):
                 latest[view.index] = view
-        return [latest[index] for index in sorted(latest)]
+        return [latest[index] for index in sorted(latest) if not latest[index].taken_back]
 
     def image(self, view: View) -> Image:
         """The view's image; its array is read-only."""

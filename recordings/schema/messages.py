@@ -248,6 +248,8 @@ class View(msgspec.Struct, frozen=True, omit_defaults=True):
     """Joints at mid-exposure; None where no joints are known (imported)."""
     attempt: int = 1
     """A retake of the same pose supersedes lower attempts."""
+    taken_back: bool = False
+    """A person took the pose back: no attempt counts."""
     stamps: Stamps = Stamps()
     """Clocks at mid-exposure."""
     time_bound_s: float | None = None
@@ -262,8 +264,9 @@ class View(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def without_picture(view: View) -> bool:
-    """Tell whether the view needs no picture, as it states the board's pose itself."""
-    return view.picture_sequence == NO_PICTURE and view.camera_from_board is not None
+    """Tell whether the view needs no picture: it states the board's pose itself, or was taken back."""
+    told = view.taken_back or view.camera_from_board is not None
+    return view.picture_sequence == NO_PICTURE and told
 
 
 class CaptureEvent(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -134,7 +134,7 @@ def way_to(wanted: NextView, seen: CapturedView) -> Way:
     turns = np.array([rotation_log(target[:3, :3] @ C[:3, :3].T) for C in readings])
     nearest = int(np.argmin(np.linalg.norm(turns, axis=1)))  # of readings that look the same
     middle = board_points(board).mean(axis=0)
-    new = _least_difference(readings[nearest], wanted.seen, middle) >= 1.0
+    new = min(_least_difference(C, wanted.seen, middle) for C in readings) >= 1.0
     now, then = (transform_points(C, middle) for C in (readings[nearest], target))
     pixels = project_pixels(lens, np.array([now, then]))
     shift = (pixels[1] - pixels[0]) / max(lens.width, lens.height)
@@ -178,7 +178,7 @@ def _words(mount: Mount, turn: Array, further_m: float, shift: Array) -> str:
     ]
     if moves:
         parts.append(f"the board further {' and '.join(moves)} in the picture")
-    text = ", ".join(parts)
+    text = ", ".join(parts[:3])
     return text[:1].upper() + text[1:]
 
 

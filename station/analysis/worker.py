@@ -105,9 +105,10 @@ def sight(
         full = camera.width / image.shape[1]  # previews may be smaller than the camera's images
         pixels = (found.pixels + 0.5) * full - 0.5
         distance_m, tilt_rad = _distance_and_tilt(pixels, board_points(board)[found.indices], camera)
-    advice = ""
+    cause = advice = ""
     if exposure is not None:
-        advice = assess(image, found.pixels if found.found else None, *exposure).text
+        light = assess(image, found.pixels if found.found else None, *exposure)
+        cause, advice = light.cause, light.text
     status = DetectionStatus(
         found=found.found,
         reason=found.reason,
@@ -118,6 +119,7 @@ def sight(
         coverage=round(float(found.coverage), 4),
         tilt_rad=tilt_rad,
         distance_m=distance_m,
+        cause=cause,
         advice=advice,
     )
     return BoardDetection(status, found.indices, found.pixels)

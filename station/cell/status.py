@@ -170,6 +170,8 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     coverage: float = 0.0
     tilt_rad: float | None = None
     distance_m: float | None = None
+    cause: str = ""
+    """over-exposed, under-exposed or blurred; empty: none."""
     advice: str = ""
     """What is wrong with light or focus, and what to set; empty: nothing."""
 
@@ -206,6 +208,29 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     advice: str = ""
     image_views: tuple[tuple[int, ...], ...] = ()
     """Images that show the board in each part of the image, rows from the top."""
+
+
+class GuidanceStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Help for the person who moves the arm by hand; empty in all other states."""
+
+    outline: tuple[tuple[float, float], ...] = ()
+    """Corners of the board in the wanted view, in order, as shares of the image's sides."""
+    words: str = ""
+    """How to get there; empty: there, or no board is seen."""
+    still: float = 0.0
+    """How still arm and image are, 0…1; 1: a view may be taken."""
+    moves: str = ""
+    """What still moves; empty: nothing."""
+    new: bool = False
+    """The view differs from all that were taken."""
+    after_mm: float | None = None
+    """Expected error after the wanted view; now: `EstimateStatus.sigma_translation_mm`."""
+    cause: str = ""
+    """What is probably wrong with the cell: other-mounting, square-size or moved; empty: nothing."""
+    warning: str = ""
+    """The cause for people, and its remedy."""
+    enough: bool = False
+    """The goal is reached with views enough."""
 
 
 class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -295,6 +320,7 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     recorder: RecorderStatus = RecorderStatus()
     session: SessionStatus = SessionStatus()
     estimate: EstimateStatus = EstimateStatus()
+    guidance: GuidanceStatus = GuidanceStatus()
     lease: LeaseStatus = LeaseStatus()
     go: MotionPreview | None = None
     """Motion that waits for a person's approval."""

@@ -25,6 +25,8 @@ JOGGED_RAD = 0.01
 
 _DEG = math.degrees(1.0)
 POLL_S = 0.02
+_DECADES = 3.0
+"""Powers of ten over a limit at which nothing is still."""
 KEPT_SAMPLES = 4096
 
 
@@ -108,6 +110,18 @@ class StillnessMonitor:
             for value, limit, scale, what, unit, digits in checks
             if value is not None and value > limit
         )
+
+    def rest(self, found: Stillness) -> float:
+        """Rate how still everything is, 0…1, by powers of ten over the limits; 1: settled."""
+        limits, over = self._limits, 1.0
+        for value, limit in (
+            (found.max_joint_speed_rad_s, limits.joint_speed_rad_s),
+            (found.position_scatter_m, limits.position_m),
+            (found.rotation_scatter_rad, limits.rotation_rad),
+            (found.image_motion_px, limits.image_motion_px),
+        ):
+            over = max(over, (value or 0.0) / limit)
+        return max(0.0, 1.0 - math.log10(over) / _DECADES)
 
     @property
     def at_rest(self) -> bool:

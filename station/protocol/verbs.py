@@ -278,9 +278,9 @@ class Retake(Verb[Done], frozen=True):
 
 
 class Skip(Verb[Done], frozen=True):
-    """Leave a pose out."""
+    """Leave a pose out; in freedrive: take back its image."""
 
-    states = RUNNING | RESTING
+    states = RUNNING | RESTING | {S.FREE_DRIVE}
     index: int
 
 

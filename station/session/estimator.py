@@ -46,7 +46,7 @@ class Estimator:
                 context.store.update(estimate=EstimateStatus())
                 continue
             camera = config.camera.model
-            if camera is None or camera.matrix is None:
+            if camera is None:
                 continue
             queue = context.queue
             try:

@@ -5,6 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 
+import numpy as np
+
+from recordings.schema.messages import NO_PICTURE, View
+from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StaleStateError
 from station.cell.pose_plan import Plan, PlannedPose
 from station.cell.status import StationState
@@ -88,14 +92,35 @@ class FreedriveCapture:
         async with self._taking:
             pass
 
-    async def record(self) -> int:
-        """Take an image now; return its pose number. RefusedError while one is being taken."""
+    async def take_back(self, index: int) -> None:
+        """Let an image count no more, in the recording too. RefusedError, RecordingError."""
+        if self.taking:
+            raise RefusedError("still-ending", what="the last image")
+        context, queue, recording = self._context, self._context.require_queue(), self._context.recording
+        async with self._taking:
+            queue.take_back(index)
+            view = context.seen.pop(index, None)
+            flange = matrix4(np.eye(4) if view is None else view.base_from_flange)
+            attempt, name = queue.start_attempt(index), queue.pose(index).name
+            if recording is not None:
+                recording.require_open().view(
+                    View(index, name, NO_PICTURE, flange, attempt=attempt, taken_back=True)
+                )
+                await recording.sync()
+                await recording.save_state(queue)
+            context.show_poses(index)
+
+    async def record(self, asked: bool = True) -> int:
+        """Take an image now; return its pose number. RefusedError while one is being taken.
+
+        `asked`: by a person; otherwise a pose without an image leaves no trace.
+        """
         if self._taking.locked():
             raise RefusedError("still-ending", what="the last image")
         async with self._taking:
-            return await self._record()
+            return await self._record(asked)
 
-    async def _record(self) -> int:
+    async def _record(self, asked: bool) -> int:
         context = self._context
         queue, store = context.require_queue(), context.store
         joints = (await fresh(context.cell.robot)).joints_rad
@@ -106,14 +131,18 @@ class FreedriveCapture:
         try:
             await take_pose(context, index, attempt)
         except (PoseFailedError, NotStillError, StaleStateError) as error:  # late states: no move to stop
-            queue.mark(index, "failed", error)
-            store.problem(error, "warning", index)
+            if asked:
+                queue.mark(index, "failed", error)
+            else:
+                queue.drop_last()
+            if asked or not isinstance(error, NotStillError):
+                store.problem(error, "warning", index)
         except Exception as error:
             failed(context, error)
             return index
         if not context.requests.halt and store.state is not StationState.FAULT:
             store.enter(StationState.FREE_DRIVE, _GUIDE)
-        context.show_poses(index)
+        context.show_poses(min(index, len(queue.statuses) - 1) if queue.statuses else None)
         if context.requests.pause_by:
             context.requests.pause_by = ""
             self.end()

@@ -16,6 +16,7 @@ ENDED: frozenset[PoseState] = frozenset({"done", "skipped", "failed"})
 POSE_LIMIT = 2000
 TAKE_AGAIN = "to be captured again"
 STILL_COUNTS = "; its image counts until then"
+TAKEN_BACK = "taken back by the operator"
 NOT_AGAIN = "not captured again: its image counts"
 
 
@@ -116,6 +117,17 @@ class PoseQueue:
         if state in BUSY or state == "done":
             raise _refused("pose-busy" if state in BUSY else "pose-taken", index)
         self.mark(index, "skipped", "skipped by the operator")
+
+    def take_back(self, index: int) -> None:
+        """Let the image of a pose that is done count no more. RefusedError where there is none."""
+        if not self.status(index).counts:
+            raise _refused("pose-not-taken", index)
+        self._change(index, state="skipped", reason=TAKEN_BACK, kept=False)
+
+    def drop_last(self) -> None:
+        """Remove the last pose, of which there is no image."""
+        self.plan = msgspec.structs.replace(self.plan, poses=self.plan.poses[:-1])
+        del self._statuses[-1]
 
     def add(self, pose: PlannedPose) -> int:
         """Add a pose at the end; return its number."""

@@ -33,6 +33,7 @@ from station.session.context import RunRequests, SessionContext, StatusStore
 from station.session.device_connector import DeviceConnector
 from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
+from station.session.hand_guide import HandGuide
 from station.session.motion import ApprovalManager, MotionApproval, previewed, session_motion
 from station.session.previews import Previewer
 from station.session.queue import PoseQueue
@@ -68,6 +69,7 @@ class Session:
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context)
         self._estimator = Estimator(self.context)
+        self._guide = HandGuide(self.context, self.previews, self.freedrive)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._notes: tuple[str, ...] = ()
@@ -84,7 +86,7 @@ class Session:
             show_interrupted(self.context, *found)
         if self.context.cell.plan is not None and self.context.queue is None:
             self._replace_plan(self.context.cell.plan)
-        loops = (self.supervisor.run(), self.devices.run(), self._estimator.run())
+        loops = (self.supervisor.run(), self.devices.run(), self._estimator.run(), self._guide.run())
         self._tasks = [asyncio.create_task(loop) for loop in loops]
 
     async def close(self) -> None:
@@ -318,6 +320,9 @@ class Session:
         self.permit(type(verb), client_id)
         context = self.context
         queue = context.loaded()
+        if self.store.state is StationState.FREE_DRIVE:
+            await self.freedrive.take_back(verb.index)
+            return
         change = queue.retake if isinstance(verb, verbs.Retake) else queue.skip
         change(verb.index)
         self._void()

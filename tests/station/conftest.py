@@ -27,8 +27,8 @@ def small_plan() -> Plan:
 async def new_rig(tmp_path: Path, small_plan: Plan) -> AsyncIterator[NewRig]:
     rigs: list[Rig] = []
 
-    async def make(*, with_plan: bool = True, source: Any = "simulated") -> Rig:
-        rig = Rig(tmp_path / "root", source)
+    async def make(*, with_plan: bool = True, source: Any = "simulated", guides: bool = False) -> Rig:
+        rig = Rig(tmp_path / "root", source, guides=guides)
         rigs.append(rig)
         await rig.start()
         if with_plan:

@@ -267,9 +267,17 @@ class Rig:
     """A started session and its devices. Client 1 is the operator, 2 somebody else."""
 
     def __init__(
-        self, root: Path, source: Any = "simulated", robot: Any = None, by_hand: bool = False
+        self,
+        root: Path,
+        source: Any = "simulated",
+        robot: Any = None,
+        by_hand: bool = False,
+        guides: bool = False,
     ) -> None:
-        """`robot`: in place of the arm in memory. `by_hand`: a person moves it, not the station."""
+        """`robot`: in place of the arm in memory. `by_hand`: a person moves it, not the station.
+
+        `guides`: views are taken by themselves in freedrive.
+        """
         self.arm, self.camera, self.worker = ArmInMemory(), CameraInMemory(), WorkerInThisProcess()
         robot = robot or self.arm
         if source == "playback":
@@ -278,6 +286,8 @@ class Rig:
         cell = Cell(memory_config(), robot, self.camera, source, mover, attachments={"truth.json": b"{}"})
         self.session = Session(cell, root)
         self.session.context.workers = self.worker  # type: ignore[assignment]
+        if not guides:
+            self.session._guide.run = asyncio.Event().wait  # type: ignore[method-assign,assignment]
         self.states: list[StationState] = []
         self.session.store.watch(self._note)
 

@@ -43,9 +43,9 @@ class WorkerThatSees(WorkerInThisProcess):
         board = inverse(flange @ np.array(TRUTH.camera_mount)) @ np.array(TRUTH.board_place)
         points = board_points(TRUTH.board)
         pixels = project(TRUTH.camera, transform_points(board, points)).pixels
-        return BoardDetection(
-            self.sees.status, np.arange(len(points)), pixels + self.noise.normal(0, 0.1, pixels.shape)
-        )
+        pixels += self.noise.normal(0, 0.1, pixels.shape)
+        scale = args[0].shape[1] / TRUTH.camera.width  # glimpses are smaller
+        return BoardDetection(self.sees.status, np.arange(len(points)), (pixels + 0.5) * scale - 0.5)
 
 
 @pytest.fixture(scope="module")

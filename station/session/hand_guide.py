@@ -1,0 +1,126 @@
+"""Guidance in freedrive: what would help most, how still everything is; views are taken by themselves."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+
+import numpy as np
+
+from recordings.errors import CodedError
+from recordings.schema.messages import CameraModel, Image
+from station.analysis.guidance import FEWEST_BY_HAND, NextView, Way, next_view, way_to
+from station.analysis.worker import BoardDetection, CapturedView
+from station.cell.status import GuidanceStatus, StationState
+from station.session.context import SessionContext
+from station.session.freedrive import FreedriveCapture
+from station.session.previews import PREVIEW_PERIOD_S, Previewer
+
+GIVE_UP_S = 5.0
+"""Rest at a place that is not new after which another view is asked for."""
+_CHOOSE_S = 20.0
+
+log = logging.getLogger(__name__)
+
+
+class HandGuide:
+    """Task that guides a person in freedrive. It never moves the arm; `take_pose` judges what it takes."""
+
+    def __init__(self, context: SessionContext, previews: Previewer, freedrive: FreedriveCapture) -> None:
+        self._context, self._previews, self._freedrive = context, previews, freedrive
+        self._wanted: NextView | None = None
+        self._known: tuple[int, ...] | None = None
+        """Numbers of the views by which it was chosen."""
+        self._given_up = list[np.ndarray]()
+        self._before: tuple[int, BoardDetection] | None = None
+        self._motion_px: float | None = None
+        """Of the board between the last two previews; None: it was not seen in both."""
+        self._moved_s, self._failed = 0.0, False
+        """When something moved last; whether an image failed since: no other is tried at the same place."""
+
+    async def run(self) -> None:
+        store = self._context.store
+        while True:
+            await asyncio.sleep(PREVIEW_PERIOD_S)
+            if store.state is not StationState.FREE_DRIVE or self._freedrive.taking:
+                if store.state in (StationState.IDLE, StationState.PAUSED):
+                    store.update(guidance=GuidanceStatus())
+                continue
+            try:
+                await self._guide()
+            except CodedError as error:  # a lost image, a late state: the next look may see more
+                log.debug("no guidance: %s", error)
+            except Exception:  # capture by hand goes on without it
+                log.exception("the guidance failed")
+
+    async def _guide(self) -> None:
+        context, store = self._context, self._context.store
+        if (looked := await self._previews.look()) is None:
+            return
+        number, image, seen = looked
+        wanted, way = await self._next(image), Way("", False)
+        if seen.status.found:
+            scale = wanted.camera.width / image.pixels.shape[1]
+            view = CapturedView(-1, np.eye(4), seen.indices, (seen.pixels + 0.5) * scale - 0.5)
+            way = await context.workers.call(way_to, wanted, view, timeout_s=_CHOOSE_S)
+        found = context.stillness.measure(self._motion(number, seen))
+        moves = "too few robot states" if found is None else context.stillness.unrest(found)
+        still = 0.0 if found is None else context.stillness.rest(found)
+        if moves or self._motion_px is None:
+            self._moved_s, self._failed = time.monotonic(), False
+        if store.state is not StationState.FREE_DRIVE:
+            return
+        size = np.array([wanted.camera.width, wanted.camera.height])
+        error_m, goal_m = wanted.sigma_m, context.cell.config.capture.goal_m
+        store.update(
+            guidance=GuidanceStatus(
+                outline=tuple((float(x), float(y)) for x, y in ((wanted.outline + 0.5) / size).round(3)),
+                words=way.words,
+                still=round(still, 2),
+                moves=moves,
+                new=way.new,
+                after_mm=None if wanted.after_m is None else round(1000 * wanted.after_m, 3),
+                cause="" if wanted.found is None else wanted.found.cause,
+                warning="" if wanted.found is None else wanted.found.warning,
+                enough=len(context.seen) >= FEWEST_BY_HAND and error_m is not None and error_m <= goal_m,
+            )
+        )
+        if moves or self._motion_px is None or seen.status.cause == "blurred" or self._failed:
+            return
+        if way.new:
+            self._failed = await self._freedrive.record(asked=False) not in context.seen
+        elif seen.status.found and time.monotonic() - self._moved_s > GIVE_UP_S:
+            self._given_up.append(wanted.camera_from_board)
+            self._known, self._moved_s = None, time.monotonic()
+
+    async def _next(self, image: Image) -> NextView:
+        """Choose the wanted view anew when the views have changed."""
+        context, config = self._context, self._context.cell.config
+        if self._wanted is None or tuple(context.seen) != self._known:
+            if self._known is not None:
+                self._given_up.clear()
+            height, width = image.pixels.shape[:2]
+            camera, known = config.camera.model or CameraModel(width, height), tuple(context.seen)
+            self._wanted = await context.workers.call(
+                next_view,
+                config.mount,
+                config.board,
+                context.cell.camera_model or camera,
+                context.cell.camera_model is not None,
+                list(context.seen.values()),
+                list(self._given_up),
+                timeout_s=_CHOOSE_S,
+            )
+            self._known = known
+        return self._wanted
+
+    def _motion(self, number: int, seen: BoardDetection) -> float | None:
+        """Measure how far the board moved in the image since the preview before, px."""
+        before, self._before = self._before, (number, seen)
+        if before is None or before[0] != number:
+            self._motion_px = None
+            if before is not None and seen.status.found and np.array_equal(before[1].indices, seen.indices):
+                shift = np.linalg.norm(seen.pixels - before[1].pixels, axis=1)
+                self._motion_px = float(np.median(shift))
+        return self._motion_px

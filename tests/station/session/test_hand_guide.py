@@ -1,0 +1,86 @@
+"""In freedrive views are taken by themselves: of what is new and at rest, and one key takes one back."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from station.cell.config import vector6
+from station.cell.status import StationState as S
+from station.protocol.verbs import Skip
+from tests.codes import raises
+from tests.patience import until
+from tests.station.operate.guided_views import guided_joints
+from tests.station.session.test_estimator import WorkerThatSees
+from tests.station.session_rig import TRUTH, NewRig, Rig, sealed
+
+
+@pytest.fixture
+async def guided(new_rig: NewRig) -> Rig:
+    rig = await new_rig(with_plan=False, guides=True)
+    rig.session.context.workers = WorkerThatSees(rig)  # type: ignore[assignment]
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    rig.arm.rest()
+    await rig.session.switch_free_drive(1, True)
+    return rig
+
+
+def lead(rig: Rig, joints: Any) -> None:
+    rig.arm.joints = vector6(joints)
+    rig.arm.rest()
+
+
+def captured(rig: Rig) -> int:
+    return rig.session.store.status.session.captured
+
+
+async def test_views_are_taken_by_themselves_and_taken_back(guided: Rig) -> None:
+    rig = guided
+    stops = guided_joints(TRUTH)
+    for count, joints in enumerate(stops, start=1):
+        lead(rig, joints)
+        await until(lambda count=count: captured(rig) == count and rig.state is S.FREE_DRIVE)
+    store = rig.session.store
+    await until(lambda: store.status.estimate.views == len(stops) and not store.status.guidance.new)
+    shown = store.status
+    assert len(shown.guidance.outline) == 4 and not shown.guidance.cause
+    assert shown.guidance.after_mm < shown.estimate.sigma_translation_mm
+    assert shown.guidance.still == 1.0 and not shown.guidance.enough
+    await rig.session.edit(1, Skip(len(stops) - 1))
+    assert captured(rig) == len(stops) - 1
+    with raises("pose-not-taken"):
+        await rig.session.edit(1, Skip(len(stops) - 1))
+    await until(lambda: captured(rig) == len(stops))  # it stands there, and the view is new again
+    await rig.session.edit(1, Skip(0))
+    await rig.session.finish(1)
+    kept = [view.index for view in sealed(rig).views()]
+    assert kept == [1, 2, 3, len(stops)], "the view that was taken back last is in the way of none"
+    assert not [asked for asked in rig.arm.log if asked not in ("close",)], "the station moved nothing"
+
+
+async def test_nothing_is_taken_of_what_moves(guided: Rig) -> None:
+    rig = guided
+    await until(lambda: captured(rig) == 1)
+    rig.camera.jumps = 3  # the arm rests, the picture does not
+    lead(rig, guided_joints(TRUTH)[1])
+    await until(lambda: S.SETTLING in rig.states[-1:] or rig.camera.glimpses > 20)
+    await until(lambda: rig.state is S.FREE_DRIVE)
+    assert captured(rig) == 1 and rig.pose_states == ["done"]
+    rig.camera.jumps = 0
+
+
+async def test_stop_in_a_view_that_is_taken_by_itself_is_latched(
+    guided: Rig, held_camera: asyncio.Event
+) -> None:
+    rig = guided
+    await rig.until(S.CAPTURING)
+    await rig.session.stop("bert")
+    assert rig.state is S.STOPPED
+    held_camera.set()
+    await until(lambda: not rig.session.freedrive.taking)
+    for _ in range(20):
+        await asyncio.sleep(0.02)
+        assert rig.state is S.STOPPED

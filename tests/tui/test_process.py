@@ -14,18 +14,18 @@ import pytest
 from calibrate.files.install import installed_calibration
 from recordings.reader import open_recording
 from station.cell.pose_plan import Plan
-from station.plan.planner import make_plan
 from station.simulation.cells import cell_config
 from station.simulation.launch import SimulatedController
 from station.simulation.truth import write_truth
 from tests.patience import until
+from tests.station.quick_plan import quick_plan
 from tests.system.conftest import TRUTH, SystemRig, short_folder, short_plan
 from tests.tui.terminal import ScreenProcess
 
 __all__ = ["short_folder", "short_plan"]
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(600)]
-POSES = 14
+POSES = 11
 ENOUGH = 9
 """Views that the gates ask for, and one more."""
 
@@ -109,8 +109,7 @@ async def captured_at_least(screen: ScreenProcess, count: int) -> None:
 
 async def test_run_stop_resume_finish_solve_install(desk_with: MakeDesk) -> None:
     desk = await desk_with(3.0)
-    plan = make_plan(cell_config(TRUTH), start_joints_rad=TRUTH.start_joints_rad, seed=5, count=POSES)
-    await desk.load(plan)
+    await desk.load(quick_plan(cell_config(TRUTH), TRUTH, seed=5, count=POSES))
     screen = desk.screen()
     await shows(screen, "● IDLE +SIMULATED")
     await go(screen)

@@ -88,7 +88,11 @@ async def install_until_a_reason_is_asked_for(pilot: Pilot[None], calibration: P
 
 
 async def test_who_overrules_gives_a_reason(link: FakeLink, calibration: Path) -> None:
-    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+    async with opened(link, notifications=True) as pilot:
+        await install_until_a_reason_is_asked_for(pilot, calibration)
+        await pilot.press("escape")
+        await until(pilot, lambda: "Nothing was installed" in said(pilot))
+        assert not installed_versions(calibration.parents[2])
         await install_until_a_reason_is_asked_for(pilot, calibration)
         shown = " ".join(str(part.render()) for part in pilot.app.screen.query(Static))
         assert "corner 0" in shown
@@ -103,14 +107,6 @@ async def test_who_overrules_gives_a_reason(link: FakeLink, calibration: Path) -
         await until(pilot, lambda: "Installed" in said(pilot))
     override = installed_calibration(calibration.parents[2]).override
     assert override is not None and override.reason == "measured with the tape"
-
-
-async def test_who_does_not_installs_nothing(link: FakeLink, calibration: Path) -> None:
-    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await install_until_a_reason_is_asked_for(pilot, calibration)
-        await pilot.press("escape")
-        await until(pilot, lambda: "Nothing was installed" in said(pilot))
-    assert not installed_versions(calibration.parents[2])
 
 
 async def test_going_back_names_both_and_asks(link: FakeLink, calibration: Path) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
-import pytest
-from textual.widgets import Static
 
 from station.cell.errors import RefusedError
 from station.cell.status import StationState
@@ -40,27 +38,23 @@ async def test_run_asks_and_only_yes_carries_the_token(link: FakeLink) -> None:
         await until(pilot, lambda: pilot.app.current_mode == "capture")  # where the work is watched
 
 
-async def test_a_refusal_is_said_and_nothing_moves(link: FakeLink) -> None:
+async def test_a_key_sends_its_wish_at_once_and_a_refusal_is_said(link: FakeLink) -> None:
+    wishes = {"f6": ["pause"], "f8": ["acknowledge"], "f3": ["free_drive"], "f2": ["record"], "f12": ["stop"]}
     link.refuse["prepare"] = RefusedError("control-held", holder="anna on tty1")
     async with opened(link, notifications=True) as pilot:
-        await pilot.press("f5")
-        await until(pilot, lambda: "anna on tty1" in said(pilot))
-        assert link.verbs == ["prepare"]
-
-
-async def test_a_key_sends_its_wish_at_once(link: FakeLink) -> None:
-    wishes = {"f6": ["pause"], "f8": ["acknowledge"], "f3": ["free_drive"], "f2": ["record"], "f12": ["stop"]}
-    async with opened(link) as pilot:
         for key, wish in wishes.items():
             link.asked.clear()
             await pilot.press(key)
-            await until(pilot, lambda wish=wish: link.verbs == wish)  # type: ignore[misc]
+            await until(pilot, lambda wish=wish: link.verbs == wish)
+        link.asked.clear()
+        await pilot.press("f5")
+        await until(pilot, lambda: "anna on tty1" in said(pilot))
+        assert link.verbs == ["prepare"], "nothing moves"
 
 
 async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
     link.show(idle(StationState.PAUSED))
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "PAUSED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("f7")
         await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         assert link.verbs == []
@@ -97,29 +91,23 @@ async def test_the_palette_names_the_screen_s_own_keys_too_and_stop_works_in_it(
         await until(pilot, lambda: "stop" in link.verbs)
 
 
-@pytest.mark.parametrize("key", ["ctrl+q", "f4"])
-async def test_what_ends_control_asks_while_the_arm_works_by_it(link: FakeLink, key: str) -> None:
-    async with opened(link) as pilot:
-        link.show(commanded(StationState.MOVING, 7))
-        await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
-        await pilot.press(key)
-        await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
-        assert "decelerates" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
-        await pilot.press("escape")
-        await pilot.pause()
-        assert verbs.Release() not in link.asked
-
-
-@pytest.mark.parametrize("state", [StationState.MOVING, StationState.PAUSED])
-async def test_who_only_watches_is_told_that_closing_changes_nothing(
-    link: FakeLink, state: StationState
+async def test_what_ends_control_asks_and_who_only_watches_is_told_that_it_changes_nothing(
+    link: FakeLink,
 ) -> None:
-    link.show(commanded(state, 8))
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: state.value.upper() in text_of(pilot.app, "#bar"))
-        await pilot.press("ctrl+q")
-        await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
-        assert "stay as they are" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
+    cases = [(StationState.MOVING, 7, key, "decelerates") for key in ("ctrl+q", "f4")]
+    cases += [
+        (state, 8, "ctrl+q", "stay as they are") for state in (StationState.MOVING, StationState.PAUSED)
+    ]
+    async with opened(link) as pilot:
+        for state, holder, key, words in cases:
+            link.show(shown := commanded(state, holder))
+            await until(pilot, lambda shown=shown: pilot.app.known.status == shown)
+            await pilot.press(key)
+            await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
+            assert words in text_of(pilot.app, "#confirm-body")
+            await pilot.press("escape")
+            await until(pilot, lambda: not pilot.app.screen.query("#confirm-body"))
+        assert verbs.Release() not in link.asked
 
 
 async def test_control_is_let_go_of_by_its_holder_alone(link: FakeLink) -> None:
@@ -136,7 +124,7 @@ async def test_control_is_let_go_of_by_its_holder_alone(link: FakeLink) -> None:
 
 
 async def test_many_resizes_leave_a_working_screen(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
+    async with opened(link) as pilot:
         for i in range(0, 100, 25):
             await pilot.resize_terminal(60 + i, 20 + i % 40)
         await pilot.resize_terminal(80, 24)

@@ -87,11 +87,13 @@ def test_other_errors_pass_unchanged() -> None:
 
 @pytest.mark.parametrize(("option", "value"), [("--time-limit-s", "0.05"), ("--memory-limit-mib", "1")])
 def test_the_command_ends_with_1_and_the_old_file_stays(
-    real_session_file: Path, own_file: Path, option: str, value: str
+    small_session_file: Path, own_file: Path, option: str, value: str
 ) -> None:
     content = own_file.read_bytes()
     done = subprocess.run(
-        [*PROGRAM, str(real_session_file), "-o", str(own_file), option, value], capture_output=True, text=True
+        [*PROGRAM, str(small_session_file), "-o", str(own_file), option, value],
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 1
     assert option in done.stderr, "the remedy names it"

@@ -84,10 +84,12 @@ def test_a_wrong_square_size_is_found_and_said(real_session_file: Path, solved_r
     assert abs(right.solution.board.scale) < 4 * right.solution.board.sigma[0]
 
 
-def test_another_board_or_lens_can_be_tried_on_the_old_pictures(real_session_file: Path) -> None:
+def test_another_board_or_lens_can_be_tried_on_the_old_pictures(
+    real_session_file: Path, small_session_file: Path
+) -> None:
     found = solve_recording(real_session_file, JobOptions(find_intrinsics=True))
     assert found.intrinsics is not None
-    given = solve_recording(real_session_file, JobOptions(camera=CAMERA))
+    given = solve_recording(small_session_file, JobOptions(camera=CAMERA))
     assert given.intrinsics is None
     assert given.calibration.provenance.options["camera"]["width"] == CAMERA.width
 
@@ -196,9 +198,9 @@ def test_the_colours_decide_the_small_board_in_every_view(datasets: Path, solved
     assert max(turns) < 5.0, "a view was read turned by 180°"
 
 
-def test_options_leave_a_trace_and_threads_do_not(real_session_file: Path) -> None:
+def test_options_leave_a_trace_and_threads_do_not(small_session_file: Path) -> None:
     options = JobOptions(working_distance_m=0.3, threads=1)
-    job = solve_recording(real_session_file, replace(options, seed=4))
+    job = solve_recording(small_session_file, replace(options, seed=4))
     assert job.calibration.provenance.options == {"working_distance_m": 0.3}
     assert job.calibration.provenance.seed == 4
 

@@ -6,15 +6,12 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from calibrate.errors import InstallError
 from calibrate.files.calibration import read_calibration
-from calibrate.files.formatting import summary
 from calibrate.files.install import install, installed_calibration, rollback
-from calibrate.files.touch import Touch, agrees, touch_sigmas, touch_text
+from calibrate.files.touch import Touch, agrees, touch_sigmas
 from calibrate.files.versions import installed_versions, note_in_file, note_installed, read_log
-from calibrate.job import SolvedRecording
 from tests.codes import raises
 
 GOOD = Touch(
@@ -61,11 +58,3 @@ def test_hands_that_disagree_keep_it_from_being_installed(own_file: Path, tmp_pa
         install(own_file, tmp_path / "s")
     made = install(own_file, tmp_path / "s", override="the board was bent there")
     assert made.calibration is not None and made.calibration.override is not None
-
-
-def test_they_are_shown_in_the_terminal(solved_real: SolvedRecording) -> None:
-    calibration = msgspec.structs.replace(solved_real.calibration, verification=[GOOD, BAD])
-    console = Console(record=True, width=150)
-    console.print(summary(calibration))
-    text = console.export_text()
-    assert touch_text(GOOD) in text and touch_text(BAD) in text

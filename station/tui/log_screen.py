@@ -37,7 +37,7 @@ class LogScreen(StationScreen):
         self._last: Event | None = None
 
     def body(self) -> ComposeResult:
-        yield RichLog(id="log", wrap=True, max_lines=2000)
+        yield RichLog(id="log", wrap=True, max_lines=2000, min_width=0)
 
     def show(self, known: Known) -> None:
         super().show(known)
@@ -46,5 +46,7 @@ class LogScreen(StationScreen):
         start = events.index(self._last) + 1 if self._last in events else 0
         log = self.query_one("#log", RichLog)
         for event in events[start:]:
-            log.write(rich_text(event_text(event), self.app.theme_variables))
+            line = rich_text(event_text(event), self.app.theme_variables)
+            line.no_wrap = False
+            log.write(line)
             self._last = event

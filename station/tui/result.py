@@ -30,7 +30,7 @@ from station.tui.jobs import install_result, undo_install
 from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.touch_corners import run_touch_test
-from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, shortened, signed
+from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, sentence, shortened, signed
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 5, Enter shows older ones."
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
@@ -59,7 +59,7 @@ def verdict_lines(result: Result) -> Content:
     rows = [Content.styled(f"{SIGNS[result.verdict]} {result.verdict}, {state}\n{said}", "bold")]
     if result.installed and (validity := result.state.validity) is not None:
         doubted = validity.state is not ValidityState.VALID
-        rows.append(Content.styled(validity_text(validity), "bold $warn" if doubted else ""))
+        rows.append(Content.styled(sentence(validity_text(validity)), "bold $warn" if doubted else ""))
     rows += map(Content, _to_do(result, calibration))
     if before:
         last = result.state.log[-1]

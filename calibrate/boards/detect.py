@@ -68,23 +68,26 @@ class Detection:
         return len(self.indices)
 
 
-def detect(image: Pixels, spec: BoardSpec, thorough: bool = True, with_quality: bool = True) -> Detection:
+def detect(
+    image: Pixels, spec: BoardSpec, thorough: bool = True, with_quality: bool = True, exhaustive: bool = True
+) -> Detection:
     """Find the board to sub-pixel accuracy.
 
     image: (h, w) uint8 or uint16, or (h, w, 3) BGR. `thorough=False` leaves out the slow attempts and the
-    search for the reason (previews), `with_quality=False` the sharpness and the saturation. Raises BoardError
-    for an impossible board; an image without a board is an answer, not an error.
+    search for the reason (previews), `exhaustive=False` the slowest and that search, `with_quality=False` the
+    sharpness and the saturation. Raises BoardError for an impossible board; an image without a board is an
+    answer, not an error.
     """
     check_board(spec)
     grey = to_grey(image)
     expected = len(board_points(spec))
-    indices, pixels = _find(grey, spec, thorough)
+    indices, pixels = _find(grey, spec, thorough, exhaustive)
     height, width = grey.shape
     fewest = min(FEWEST_POINTS, expected)
     whole = len(indices) == expected
     found = whole or (len(indices) >= fewest and fixes_a_plane(board_points(spec)[indices]))
     cause: Cause
-    cause, reason = ("", "") if found else _reason(grey, spec, len(indices), fewest, thorough)
+    cause, reason = ("", "") if found else _reason(grey, spec, len(indices), fewest, thorough and exhaustive)
     if not found:
         indices, pixels = indices[:0], pixels[:0]
     sharpness, saturated = _picture_quality(grey, pixels) if with_quality else (np.nan, np.nan)
@@ -93,7 +96,9 @@ def detect(image: Pixels, spec: BoardSpec, thorough: bool = True, with_quality: 
     return Detection(cause, reason, indices, pixels, expected, width, height, sharpness, saturated, share)
 
 
-def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp], Array]:
+def _find(
+    grey: Grey, spec: BoardSpec, thorough: bool, exhaustive: bool = True
+) -> tuple[NDArray[np.intp], Array]:
     if spec.kind is BoardKind.CHARUCO:
         return find_charuco(grey, spec, thorough)
     if spec.kind is BoardKind.APRIL_GRID:
@@ -101,7 +106,7 @@ def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp]
     if spec.kind in SINGLE_TAGS:
         return find_tag(grey, spec, thorough)
     if spec.kind is BoardKind.CHESSBOARD:
-        pixels = find_chessboard(grey, spec, thorough)
+        pixels = find_chessboard(grey, spec, thorough, exhaustive)
     else:
         pixels = find_circles(grey, spec)
     if pixels is None:

@@ -34,13 +34,16 @@ _SMALL_SIDE_PX = 800
 _PREVIEW_SIDE_PX = 640
 
 
-def find_chessboard(grey: Grey, spec: BoardSpec, thorough: bool = True) -> Array | None:
+def find_chessboard(
+    grey: Grey, spec: BoardSpec, thorough: bool = True, exhaustive: bool = True
+) -> Array | None:
     """Find all inner corners in board order, (rows·columns, 2) pixels, or None.
 
     The colours of the squares decide the orientation where they can; otherwise the order is one of the turns
-    after which the board looks the same. `thorough=False` makes one quick attempt on a smaller image.
+    after which the board looks the same. `thorough=False` makes one quick attempt on a smaller image,
+    `exhaustive=False` leaves out the attempts that take longer than all others.
     """
-    for found in _attempts(grey, (spec.columns, spec.rows), thorough):
+    for found in _attempts(grey, (spec.columns, spec.rows), thorough, exhaustive):
         if found is None:
             continue
         grid = right_handed(found.reshape(spec.rows, spec.columns, 2).astype(float))
@@ -54,7 +57,7 @@ def find_chessboard(grey: Grey, spec: BoardSpec, thorough: bool = True) -> Array
     return None
 
 
-def _attempts(grey: Grey, size: tuple[int, int], thorough: bool) -> Iterator[Array | None]:
+def _attempts(grey: Grey, size: tuple[int, int], thorough: bool, exhaustive: bool) -> Iterator[Array | None]:
     largest = max(grey.shape)
     if not thorough:
         yield _scaled(grey, min(1.0, _PREVIEW_SIDE_PX / largest), lambda small: _classic(small, size))
@@ -63,6 +66,8 @@ def _attempts(grey: Grey, size: tuple[int, int], thorough: bool) -> Iterator[Arr
         yield _scaled(grey, 0.5, lambda small: _classic(small, size))  # a third of the time
     yield _classic(grey, size)
     yield _sector(grey, size, 0)
+    if not exhaustive:
+        return
     equalised = equalise(grey)
     yield _classic(equalised, size)
     yield _sector(equalised, size, cv2.CALIB_CB_EXHAUSTIVE)

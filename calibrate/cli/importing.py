@@ -70,6 +70,9 @@ def import_command(
     still_deg: Annotated[
         float, typer.Option(help="The same in degrees.", show_default="0.003")
     ] = math.degrees(ROTATION_RAD),
+    every_image: Annotated[
+        bool, typer.Option("--every-image", help="Take every image of a bag, whether the arm stood or not.")
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be taken; write nothing.")
     ] = False,
@@ -96,7 +99,7 @@ def import_command(
             facts = _import_found(source, target, told, poses, given, progress)
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
-            limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg))
+            limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
             plan = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
             facts = ImportJson(str(target or ""), plan.stops, plan.bytes_written, plan)
     if as_json:
@@ -153,6 +156,9 @@ def _print_import(facts: ImportJson) -> None:
         print(plain_text(f"joints    {bag.joints_from or 'none of an arm of five to seven'}"))
         passed = ", ".join(f"{count} {reason}" for reason, count in bag.passed_over.items() if count)
         print(plain_text(f"stops     {bag.stops}" + (f"; images passed over: {passed}" if passed else "")))
+        if wider := bag.wider:
+            flags = f"--still-mm {wider['still_mm']:.2g} --still-deg {wider['still_deg']:.2g}"
+            print(f"          {flags} gives {wider['stops']:.0f} stops")
         if bag.other_topics:
             print(plain_text(f"not used  {', '.join(bag.other_topics)}"))
     if not facts.recording:

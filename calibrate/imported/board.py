@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,18 @@ import cv2
 import msgspec
 import numpy as np
 
-from calibrate.boards.corners import to_grey
+from calibrate.boards.corners import Grey, to_grey
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.grids import seen_size
-from calibrate.boards.model import board_points, check_board, usual_markers
+from calibrate.boards.markers import marker_detector
+from calibrate.boards.model import board_points, usual_markers
 from calibrate.errors import CalibrationError
 from calibrate.geometry import inverse
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import Candidate, candidate_poses
 from calibrate.views import BoardView, ViewSet
 from recordings.files import read_file
-from recordings.images import IMAGE_LIMIT_BYTES, ImageError, Pixels, decode_image, read_header
+from recordings.images import IMAGE_LIMIT_BYTES, ImageError, decode_image, read_header
 from recordings.importers.conventions import Convention, possible
 from recordings.importers.messages import Progress
 from recordings.importers.tables import Lies, Table
@@ -85,7 +87,7 @@ def told_boards(table: Table) -> Iterator[Seen]:
 def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: Progress) -> Seen | None:
     """Find the board in evenly spread images; None: in too few."""
     places = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _VOTERS)).astype(int))
-    images: dict[Path, Pixels] = {}
+    images: dict[Path, Grey] = {}
     sizes = set[tuple[int, int]]()
     for path in (paths[place] for place in places):
         with suppress(ImageError, OSError):
@@ -97,8 +99,9 @@ def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: 
     ((width, height),) = sizes
     factor = min(1.0, _LARGEST_SIDE_PX / max(width, height))
     small = {path: _reduced(image, factor) for path, image in images.items()}
-    boards = [given] if given else _boards(lies.facts, list(small.values()))
-    for board, known in _quickly_seen(boards, list(small.values())[:_TRIED])[:2]:
+    greys = list(small.values())
+    boards = [(given, None)] if given else chain(_described(lies.facts), _shown(greys))
+    for board, known in _likely(boards, greys[:_TRIED], progress)[:2]:
         points = board_points(board)
         found = dict(_search(small, board, known, progress))
         views: dict[Key, BoardView] = {
@@ -121,44 +124,54 @@ def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: 
     return None
 
 
-def _reduced(image: Pixels, factor: float) -> Pixels:
+def _reduced(image: Grey, factor: float) -> Grey:
     return np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
 
 
 def _search(
-    images: dict[Path, Pixels], board: BoardSpec, known: bool, progress: Progress
+    images: dict[Path, Grey], board: BoardSpec, known: bool, progress: Progress
 ) -> Iterator[tuple[Path, Detection]]:
-    """Look at a glance, then, where too few show the board so, thoroughly, up to some misses in a row."""
+    """Look at a glance, then, where too few show the board so, harder, up to some misses in a row."""
     left = dict(images)
-    for thorough in (False, True):
+    for harder in (False, True):
         missed = 0
         for n, (path, image) in enumerate(images.items(), 1):
             enough = len(images) - len(left) > _ENOUGH * len(images)
-            if path not in left or (thorough and (enough or missed > _TRIED)):
+            if path not in left or (harder and (enough or missed > _TRIED)):
                 continue
-            progress(n, len(images), "looking for the board" + " thoroughly" * thorough)
-            seen = detect(image, board, thorough, with_quality=False)
+            progress(n, len(images), f"looking for a {board.kind.value} {board.columns}×{board.rows}")
+            seen = detect(image, board, harder, with_quality=False, exhaustive=False)
             missed = 0 if seen.found or (known and len(left) < len(images)) else missed + 1
             if seen.found:
                 del left[path]
                 yield path, seen
 
 
-def _quickly_seen(boards: Iterable[BoardSpec], images: list[Pixels]) -> list[tuple[BoardSpec, bool]]:
+def _likely(
+    boards: Iterable[tuple[BoardSpec, Grey | None]], images: list[Grey], progress: Progress
+) -> list[tuple[BoardSpec, bool]]:
     """Boards and whether their size is known: as they come where half of a few images show one at a glance,
-    the others by the corners that are seen."""
+    the others by the corners that are seen. One that an image suggested must first be found in that one."""
     counted: list[tuple[int, int, BoardSpec, bool]] = []
-    for each in boards:
+    for n, (each, shown) in enumerate(boards):
         known = each.square_m > 0
         board = each if known else msgspec.structs.replace(each, square_m=GUESSED_M)
+        progress(n, n + 1, f"trying a {board.kind.value} {board.columns}×{board.rows}")
+        part = any(
+            shown is not None and not knew and board.columns <= larger.columns and board.rows <= larger.rows
+            for _, _, larger, knew in counted
+        )  # of a board that one image shows whole
         try:
-            check_board(board)
+            if part or (shown is not None and not detect(shown, board, True, False, False).found):
+                continue
+            seen = [detect(image, board, False, with_quality=False) for image in images]
         except CalibrationError:
             continue
-        seen = [detect(image, board, thorough=False, with_quality=False) for image in images]
         often = 2 * sum(found.found for found in seen) >= len(seen) and known
         corners = sum(found.corners for found in seen)
-        counted.append((-(10**6) if often else -corners, len(counted), board, known))
+        counted.append((-(10**6) if often else -corners, n, board, known))
+        if often:
+            break
     return [(board, known) for _, _, board, known in sorted(counted, key=lambda c: c[:2])]
 
 
@@ -179,8 +192,8 @@ _SQUARE = re.compile(r"square|tile|spacing|chessboard_dim|center_dist|tag_size",
 _MARKER = re.compile(r"(aruco|len|size|side).*marker|marker.*(dim|size|len|side)", re.I)
 
 
-def _boards(facts: dict[str, Any], greys: list[Any]) -> Iterator[BoardSpec]:
-    """Boards that the files describe, likeliest first, then the chessboard that the images show."""
+def _described(facts: dict[str, Any]) -> Iterator[tuple[BoardSpec, None]]:
+    """Boards that the files describe, likeliest first."""
     text = " ".join(f"{key} {value}" for key, value in facts.items())
 
     def length(wanted: re.Pattern[str]) -> float:
@@ -204,20 +217,42 @@ def _boards(facts: dict[str, Any], greys: list[Any]) -> Iterator[BoardSpec]:
     for size in dict.fromkeys(size for size in sizes if min(size) >= 1 and max(size) < 60):
         if dictionary and size == (1, 1):
             for tag in range(4):
-                yield BoardSpec(BoardKind.ARUCO, 1, 1, marker_m, dictionary=dictionary, tag_id=tag)
+                yield BoardSpec(BoardKind.ARUCO, 1, 1, marker_m, dictionary=dictionary, tag_id=tag), None
         elif dictionary:
             for legacy in (False, True):
                 marker = marker_m or usual_markers(BoardKind.CHARUCO, square_m)[0]
-                yield BoardSpec(BoardKind.CHARUCO, *size, square_m, marker, dictionary, legacy)
+                yield BoardSpec(BoardKind.CHARUCO, *size, square_m, marker, dictionary, legacy), None
         elif "circle" in text.lower():
             kinds = [BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES]
-            yield from (BoardSpec(kind, *size, square_m) for kind in kinds)
+            yield from ((BoardSpec(kind, *size, square_m), None) for kind in kinds)
         else:
-            yield BoardSpec(BoardKind.CHESSBOARD, *size, square_m)
-            yield BoardSpec(BoardKind.CHESSBOARD, size[0] - 1, size[1] - 1, square_m)
-    votes = Counter(filter(None, map(seen_size, greys[:10])))
-    for shown in sorted(votes, key=lambda size: -size[0] * size[1])[:5]:
-        yield BoardSpec(BoardKind.CHESSBOARD, *shown, square_m)
+            for less in (0, 1):  # squares may have been counted
+                yield BoardSpec(BoardKind.CHESSBOARD, size[0] - less, size[1] - less, square_m), None
+
+
+def _shown(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
+    """Boards of unknown size that images suggest: a tag that most of a few show, chessboards."""
+    few = greys[:: max(1, len(greys) // _TRIED)]
+    for dictionary in _DICTIONARIES:
+        detector = marker_detector(dictionary, 1)
+        ids = [detector.detectMarkers(grey)[1] for grey in few]
+        tags = Counter(int(tag) for seen in ids if seen is not None for tag in np.unique(seen))
+        for tag, count in tags.most_common(1):
+            if 2 * count > len(few) and len(tags) < _TRIED:
+                kind = BoardKind.APRIL_TAG if "APRIL" in dictionary else BoardKind.ARUCO
+                grey = next(g for g, seen in zip(few, ids, strict=True) if seen is not None and tag in seen)
+                yield BoardSpec(kind, dictionary=dictionary, tag_id=tag), grey
+    sizes = {size: grey for grey in greys[:: max(1, len(greys) // (2 * _TRIED))] if (size := seen_size(grey))}
+    if sizes:  # one image may show a part only: the largest sides of all
+        whole = max(side for side, _ in sizes), max(side for _, side in sizes)
+        sizes.setdefault(whole, sizes[max(sizes, key=lambda size: size[0] * size[1])])
+    for size in sorted(sizes, key=lambda size: -size[0] * size[1])[: _TRIED + 2]:
+        yield BoardSpec(BoardKind.CHESSBOARD, *size), sizes[size]
+
+
+_DICTIONARIES = [
+    f"DICT_{name}" for name in ["4X4_1000", "5X5_1000", "6X6_1000", "ARUCO_ORIGINAL", "APRILTAG_36H11"]
+]
 
 
 def _two(value: Any) -> bool:

@@ -21,13 +21,14 @@ from recordings.schema.definitions import PictureFacts
 from recordings.schema.messages import CameraModel, Matrix4, View
 from recordings.schema.topics import Topic
 from recordings.schema.viewing import (
-    CAMERA_FRAME,
     base_from_flange,
     joint_names,
     quaternion_xyzw,
 )
 from recordings.segment import RecordingSegment
 
+FLANGE_FRAME, OPTICAL_FRAME = "tool0", "camera_optical_frame"
+"""As ROS names them; `calibrate export` uses the same for the flange."""
 FRAME_PERIOD_NS = 10_000_000
 _NS = 1_000_000_000
 _LAST_S = 2**31 - 1
@@ -108,7 +109,7 @@ def _arm(messages: _Messages, segment: RecordingSegment) -> Iterator[_Entry]:
         if not 0 <= time_ns - shown_ns < FRAME_PERIOD_NS and np.isfinite(state.tcp_pose).all():
             shown_ns = time_ns
             T = base_from_flange(state.tcp_pose, segment.info.robot.tcp_offset)
-            yield _Entry(time_ns, "/tf", messages.frames("base", "flange", T, time_ns))
+            yield _Entry(time_ns, "/tf", messages.frames("base", FLANGE_FRAME, T, time_ns))
 
 
 def _images(
@@ -120,7 +121,9 @@ def _images(
 ) -> Iterator[_Entry]:
     for sequence, time_ns in sorted(times.items(), key=lambda item: item[1]):
         if view := counted.get(sequence):
-            yield _Entry(time_ns, "/tf", messages.frames("base", "flange", view.base_from_flange, time_ns))
+            yield _Entry(
+                time_ns, "/tf", messages.frames("base", FLANGE_FRAME, view.base_from_flange, time_ns)
+            )
         yield _Entry(time_ns, "/camera/camera_info", messages.camera_info(segment.info.camera, time_ns))
         yield _image(messages, segment, sequence, facts[sequence].pixel_format, time_ns)
 
@@ -128,7 +131,7 @@ def _images(
 def _image(
     messages: _Messages, segment: RecordingSegment, sequence: int, pixel_format: str, time_ns: int
 ) -> _Entry:
-    header = messages.header(time_ns, CAMERA_FRAME)
+    header = messages.header(time_ns, OPTICAL_FRAME)
     stored = segment.stored_image(sequence)
     if stored is not None:
         file_format, file = stored[0], np.frombuffer(stored[1], np.uint8)
@@ -176,7 +179,7 @@ class _Messages:
         D = [*camera.distortion, *[0.0] * count][:count] if camera.matrix else []
         return self.make(
             "sensor_msgs/msg/CameraInfo",
-            self.header(time_ns, CAMERA_FRAME),
+            self.header(time_ns, OPTICAL_FRAME),
             camera.height,
             camera.width,
             camera.distortion_model,

@@ -122,7 +122,8 @@ def _beginning(folder: Path, row: PoseRow, size: tuple[int, int], limit_bytes: i
     try:
         if path.exists() and not path.is_file():  # a pipe would never be read to its end
             raise ImportSourceError("unreadable", **place, reason="not a file")
-        if not Path(os.path.realpath(path)).is_relative_to(folder.resolve()):
+        told, parent = os.path.normpath(row.image), os.path.realpath(path.parent)  # a folder may be a link
+        if told.startswith(("..", "/")) or not Path(os.path.realpath(path)).is_relative_to(parent):
             raise ImportSourceError("outside", **place)
         data = read_beginning(path, limit_bytes)
         header = read_header(data)

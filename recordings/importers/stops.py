@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ class StandstillLimits:
 
     position_m: float = POSITION_M
     rotation_rad: float = ROTATION_RAD
+    every_image: bool = False
+    """Each image is a view, whether the arm stood or not: a bag of one pose an image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +40,7 @@ class Standstill:
     """Index of the image on its topic."""
     stamp_ns: int
     base_from_flange: Array
-    stillness: Stillness
+    stillness: Stillness | None
     bound_s: float
     """Time between the image and the arm's nearest report."""
 
@@ -68,24 +70,53 @@ def find_stops(
             passed["no pose near"] += 1
             continue
         still = _stillness(track, stamps, speeds, time_ns, window_s)
-        if (
-            still is None
-            or still.max_joint_speed_rad_s > JOINT_SPEED_RAD_S
-            or still.position_scatter_m > limits.position_m
-            or still.rotation_scatter_rad > limits.rotation_rad
-        ):
+        if not (limits.every_image or _motion(still, limits) <= 1.0):
             passed["moving"] += 1
             moved = True
             continue
         T = track.at(np.array([time_ns]))[0]
         stop = Standstill(place, time_ns, T, still, bound_s)
-        if stops and not moved and _same(stops[-1].base_from_flange, T):
+        if stops and not (moved or limits.every_image) and _same(stops[-1].base_from_flange, T):
             passed["same stop"] += 1
             stops[-1] = stop
         else:
             stops.append(stop)
         moved = False
     return stops, passed
+
+
+def _motion(still: Stillness | None, limits: StandstillLimits) -> float:
+    """Motion as a multiple of the limits; infinite where it is not known."""
+    if still is None or still.max_joint_speed_rad_s > JOINT_SPEED_RAD_S:
+        return np.inf
+    shares = still.position_scatter_m / limits.position_m, still.rotation_scatter_rad / limits.rotation_rad
+    return max(shares)
+
+
+def proposed_limits(
+    track: Track,
+    images_ns: NDArray[np.int64],
+    speeds: tuple[NDArray[np.int64], Array] | None,
+    limits: StandstillLimits,
+    pair_within_s: float,
+) -> tuple[StandstillLimits, int] | None:
+    """Limits by which this arm stands more often, and how often; None: these are as good.
+
+    An arm at rest reports with about the same noise everywhere, and one that moves with far more: the widest
+    gap between images, by the logarithm of their motion, lies between the two.
+    """
+    views, _ = find_stops(track, images_ns, speeds, replace(limits, every_image=True), pair_within_s)
+    motion = np.sort([_motion(view.stillness, limits) for view in views])
+    motion = motion[np.isfinite(motion) & (motion > 0)]
+    if len(motion) < 3:
+        return None
+    widest = int(np.argmax(np.diff(np.log(motion)))) if motion[-1] > 2 * motion[0] else len(motion) - 1
+    factor = float(f"{1.3 * motion[widest]:.1g}")
+    wider = replace(limits, position_m=factor * limits.position_m, rotation_rad=factor * limits.rotation_rad)
+    now, then = (
+        len(find_stops(track, images_ns, speeds, each, pair_within_s)[0]) for each in (limits, wider)
+    )
+    return (wider, then) if factor > 1 and then > now else None
 
 
 def _stillness(

@@ -7,13 +7,14 @@ files that differ by digits only, are the rows of one table.
 from __future__ import annotations
 
 import json
+import os
 import re
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from io import BytesIO
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -44,7 +45,7 @@ _ROBOT = re.compile(
     r"robot|arm|tcp|tool|flange|gripper|hand(?!_?eye)|eef|end|effector|wrist|ee$|location", re.I
 )
 _BOARD = re.compile(r"cam|board|marker|target|track|obj|eye|chess|tag|sensor|[rt]vec", re.I)
-_OTHERS = re.compile(r"detect|joint|angle|result|valid|guess|waiting|intrin", re.I)
+_OTHERS = re.compile(r"detect|joint|result|valid|guess|waiting|intrin", re.I)
 """Words of tables that tell of the robot's pose, of the board's, and of something else."""
 _PART = re.compile(r"(.*?)[_. ]?(q?[xyzw]|r[xyz]|roll|pitch|yaw|[abc]|\d+)")
 """A name of one number among those of a pose: whose pose, and which number."""
@@ -108,7 +109,7 @@ def look(source: Path, poses: Path | None = None) -> Lies:
     found, rows = Lies(source), defaultdict[tuple[str, ...], list[_Row]](list)
     halves = defaultdict[str, dict[str, list[_Row]]](dict)
     words = ["/".join(source.resolve().parts[-3:])]
-    files = sorted((p for p in source.rglob("*") if p.is_file()), key=natural)[:_FILES_LIMIT]
+    files = sorted(islice(_files(source), _FILES_LIMIT), key=natural)
     images = defaultdict[str, list[Path]](list)
     for path in files if poses is None or poses.is_relative_to(source) else [*files, poses]:
         if path.suffix.lower() in IMAGE_SUFFIXES:
@@ -168,6 +169,15 @@ def _joined(at: list[float], turn: list[float]) -> list[float]:
     if len(turn) != 9:
         return at + turn
     return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])]
+
+
+def _files(source: Path) -> Iterator[Path]:
+    """All files, also below folders that are links; each folder once."""
+    been = set[str]()
+    for folder, below, names in os.walk(source, followlinks=True):
+        below[:] = sorted(name for name in below if os.path.realpath(Path(folder, name)) not in been)
+        been.update(os.path.realpath(Path(folder, name)) for name in below)
+        yield from (path for name in sorted(names) if (path := Path(folder, name)).is_file())
 
 
 def natural(path: Path | str) -> list[Any]:

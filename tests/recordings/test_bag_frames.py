@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from recordings.errors import ImportSourceError
 from recordings.importers.frames import FrameTree
 from recordings.importers.messages import FrameMessage
-from recordings.importers.stops import StandstillLimits, find_stops
+from recordings.importers.stops import StandstillLimits, find_stops, proposed_limits
 
 
 def frame(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> FrameMessage:
@@ -78,3 +78,21 @@ def test_an_arm_that_drifts_slowly_does_not_stand() -> None:
     track = tree.track("base", "flange")
     assert find_stops(track, images, None, StandstillLimits(), 0.05)[0] == []
     assert len(find_stops(track, images, None, StandstillLimits(position_m=0.001), 0.05)[0]) == 1
+
+
+def test_limits_come_from_an_arm_that_reports_with_more_noise() -> None:
+    """0.03 mm (1σ) at ten stops: nothing stands by the usual limits, and by the proposed ones all ten do."""
+    tree, rng = FrameTree(), np.random.default_rng(1)
+    for n in range(2000):
+        stop, share = divmod(n, 200)
+        T = np.eye(4)
+        T[:3, 3] = rng.normal(scale=30e-6, size=3)
+        T[0, 3] += 0.05 * (stop + min(1.0, share / 100))  # moves for one second, stands for one
+        tree.add([frame(n * 10_000_000, "base", "flange", T)])
+    seen = tree.track("base", "flange"), np.arange(250, 20_000, 500) * 1_000_000, None
+    assert find_stops(*seen, StandstillLimits(), 0.05)[0] == []
+    proposed = proposed_limits(*seen, StandstillLimits(), 0.05)
+    assert proposed is not None and proposed[1] == 10
+    assert len(find_stops(*seen, proposed[0], 0.05)[0]) == 10
+    assert proposed_limits(*seen, proposed[0], 0.05) is None
+    assert len(find_stops(*seen, StandstillLimits(every_image=True), 0.05)[0]) == len(seen[1])

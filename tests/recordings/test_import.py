@@ -16,6 +16,7 @@ from recordings.cli import main
 from recordings.exporters.export import export_recording
 from recordings.importers.conventions import NAMED
 from recordings.importers.folder import import_folder
+from recordings.importers.tables import look
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind
 from tests.command_line import call
@@ -52,6 +53,12 @@ def test_a_good_folder_becomes_a_recording(folder: Path, tmp_path: Path) -> None
     assert stored == ("png", (folder / "images/0.png").read_bytes())
     assert set(recording.attachments()) == {"dataset.yaml", "poses.csv", "kinematics.yaml"}
     assert done.images == 3
+
+
+def test_a_folder_of_images_may_be_a_link(folder: Path, tmp_path: Path) -> None:
+    (folder / "images").rename(tmp_path / "elsewhere")
+    (folder / "images").symlink_to(tmp_path / "elsewhere")
+    assert import_folder(folder, tmp_path / "out.mcap").images == len(look(folder).images["images/#.png"])
 
 
 def test_other_formats_and_colour_are_stored_without_loss(folder: Path, tmp_path: Path) -> None:

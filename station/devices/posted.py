@@ -41,6 +41,8 @@ SOURCES: dict[Source, str] = {"real": "live", "simulated": "simulated", "playbac
 READ_BYTES, PAUSE_S, LINES_READ = 8192, 0.005, 50
 """So much is read at once, then a pause; of what came together only the newest lines are looked at."""
 LINE_BYTES = 2048
+STATES_KEPT = 20_000
+"""Of `HISTORY_S` at most, whatever times are posted."""
 DECLARED_S = 3.0
 """Longest wait for a program's first line, in which it keeps others away."""
 WRONG_S = 1.0
@@ -77,7 +79,7 @@ class PostedArm:
         self._declared = Declaration("live")
         self._written: Convention | None = None
         self._callbacks: list[Callable[[RobotState], None]] = []
-        self._states: deque[RobotState] = deque()
+        self._states: deque[RobotState] = deque(maxlen=STATES_KEPT)
         self._clock: ClockEstimator | None = None
         """None: the posts have no time of their own."""
         self._ahead_s = -math.inf

@@ -11,6 +11,7 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from station.analysis.estimation import running_estimate, seen_before
+from station.analysis.odd_view import odd_view
 from station.analysis.pool import WorkerError
 from station.cell.status import EstimateStatus
 from station.plan.next_pose import next_best_text
@@ -45,6 +46,8 @@ class Estimator:
             if not self._known:
                 context.store.update(estimate=EstimateStatus())
                 continue
+            if context.cell.mover is None:
+                await self._ask_about_newest()
             camera = config.camera.model
             if camera is None:
                 continue
@@ -63,6 +66,23 @@ class Estimator:
             if (recording := context.recording) is not None:
                 with contextlib.suppress(RecordingError):  # a full disk is reported by the run
                     recording.show_frames(estimate.camera_pose, estimate.board_pose, stamps_now())
+
+    async def _ask_about_newest(self) -> None:
+        """Report a told pose that cannot be, by all views of an arm that a person moves."""
+        context, config = self._context, self._context.cell.config
+        if (recording := context.recording) is None or recording.camera is None:
+            return
+        camera, seen = config.camera.model or recording.camera, list(context.seen.values())
+        known = context.cell.camera_model is not None
+        try:
+            odd = await context.workers.call(
+                odd_view, config.mount, config.board, camera, known, seen, timeout_s=_ESTIMATE_S
+            )
+        except WorkerError as error:
+            context.store.problem(error, said="the newest view is not compared with the others: {}")
+            return
+        if odd is not None:
+            context.store.problem(odd, "warning", seen[-1].index)
 
     async def _estimate(self) -> EstimateStatus:
         """Estimate from the images so far, with advice on the next pose where one more would help."""

@@ -103,6 +103,8 @@ class SessionRecording:
         self.segment = segments + 1
         self.folder = folder or new_session_folder(root, cell.config.name)
         self.recorder: Recorder | None = None
+        self.camera: CameraModel | None = None
+        """Intrinsics with which the newest file began, or only the images' size; None: none was opened."""
         self._sequence = 0
         self._saving = asyncio.Lock()
         self._closing: threading.Thread | None = None
@@ -183,6 +185,7 @@ class SessionRecording:
         for name, content in self._cell.attachments.items():
             recorder.attach(name, "application/json", content)
         recorder.camera_model(info.camera)
+        self.camera = info.camera
         self.recorder = recorder
         camera, board = (
             None if guess is None else matrix4(guess_matrix(guess))

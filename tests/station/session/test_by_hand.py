@@ -9,11 +9,13 @@ import msgspec
 import pytest
 
 from recordings.schema.messages import RobotState
+from station.cell.errors import StationError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState
 from station.protocol import verbs
 from station.protocol.verbs import Verb
 from tests.codes import raises
+from tests.patience import until
 from tests.station.session_rig import ArmInMemory, Rig, sealed
 
 MOVES: list[type[Verb[object]]] = [verbs.LoadPlan, verbs.MakePlan, verbs.Prepare, verbs.Go, verbs.Retake]
@@ -79,3 +81,16 @@ async def test_an_arm_without_speeds_that_creeps_is_not_captured(rig: Rig) -> No
     assert not states.at_rest
     with raises("not-settled"):
         states.require_rest(rig.arm._state())
+
+
+async def test_a_pose_that_cannot_be_is_asked_about_with_its_view(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def odd(*of: object) -> StationError:
+        return StationError("odd-view", others=5, x=0.0, y=0.0, z=90.0, turn=0.1)
+
+    monkeypatch.setattr("station.session.estimator.odd_view", odd)
+    await rig.session.switch_free_drive(1, True)
+    await rig.session.record(1)
+    await until(lambda: rig.told("odd-view"))
+    assert rig.told("odd-view")[0].pose_index == 0

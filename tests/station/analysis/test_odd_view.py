@@ -1,0 +1,72 @@
+"""Views by hand against each other: a wrong number, and a wrong way of reading all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.boards.model import board_points
+from calibrate.geometry import Array, inverse, perturb, transform_points
+from calibrate.projection import project_pixels
+from calibrate.views import board_in_camera
+from recordings.schema.messages import Mount
+from station.analysis.odd_view import FEWEST, odd_view
+from station.analysis.worker import CapturedView
+from station.simulation.cells import cell_config, make_cell
+from tests.station.quick_plan import quick_plan
+
+POSE_NOISE, PIXEL_NOISE = 1e-4, 0.1
+
+
+def w_first(T: Array) -> Array:
+    """The pose of a program that writes w x y z, read as x y z w."""
+    from scipy.spatial.transform import Rotation
+
+    changed = T.copy()
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    changed[:3, :3] = Rotation.from_quat([w, x, y, z]).as_matrix()
+    return changed
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_what_cannot_be_is_named_and_what_can_is_not(mount: Mount) -> None:
+    truth = make_cell("paper-binned", seed=3, mount=mount)
+    blank = msgspec.structs.replace(truth.camera, matrix=None, distortion=())
+    places = quick_plan(cell_config(truth), truth, seed=3, count=FEWEST + 1).poses
+    flanges = [np.array(place.base_from_flange) for place in places]
+    points, rng = board_points(truth.board), np.random.default_rng(2)
+    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
+    seen = [
+        CapturedView(
+            index,
+            perturb(flange, rng.normal(0, POSE_NOISE, 6)),
+            np.arange(len(points)),
+            project_pixels(truth.camera, transform_points(board_in_camera(mount, flange, X, Y), points))
+            + rng.normal(0, PIXEL_NOISE, (len(points), 2)),
+        )
+        for index, flange in enumerate(flanges)
+    ]
+
+    def told(count: int, change: Callable[[Array], Array], at: slice) -> str:
+        views = seen[:count]
+        for view in views[at]:
+            views[view.index] = replace(view, base_from_flange=change(view.base_from_flange))
+        found = odd_view(mount, truth.board, blank, False, views)
+        return "" if found is None else found.code
+
+    def typed_wrongly(T: Array) -> Array:
+        changed = T.copy()
+        changed[2, 3] += 0.09  # 310 for 400 mm
+        return changed
+
+    everything = slice(None)
+    for count in (FEWEST, FEWEST + 1):
+        assert told(count, lambda T: T, everything) == ""
+        assert told(count, typed_wrongly, slice(count - 1, None)) == "odd-view"
+        assert told(count, w_first, everything) == "poses-misread"
+        assert told(count, inverse, everything) == "poses-misread"
+    assert told(FEWEST - 1, w_first, everything) == ""

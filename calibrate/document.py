@@ -202,6 +202,7 @@ def _quality(
             arm.log_bayes,
             arm.size_mm,
             [ArmErrorValue(name, value, sigma) for name, (value, sigma) in arm.errors.items()],
+            arm.size_mrad,
         ),
         warnings=[remark.text for remark in remarks],
         warning_codes=[remark.code for remark in remarks],

@@ -27,6 +27,8 @@ from calibrate.views import ViewSet
 
 EARLIER, MOST_EARLIER = 60, 300
 """Fewest and most earlier pictures."""
+MOST_PICTURES = 1000
+"""Newest pictures of a folder that are looked at; not every one shows the tag."""
 NEWEST = (3, 5, 10, 20, 30)
 """Numbers of newest pictures that are tested, each for itself."""
 FALSE_ALARM = 1e-6

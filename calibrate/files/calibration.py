@@ -150,7 +150,10 @@ class Arm(msgspec.Struct, frozen=True):
     """True when the evidence for systematic errors of the arm is clear."""
     log_bayes: float
     size_mm: float
+    """1σ of the links' shifts."""
     table: list[ArmErrorValue]
+    size_mrad: float = 0.0
+    """1σ of the links' turns; 0 in older files, whose `size_mm` is both."""
 
 
 class DhTable(msgspec.Struct, frozen=True):

@@ -20,14 +20,13 @@ from calibrate.handeye.axxb.pairs import Pairs
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.corner_modes import STUDENT
 from calibrate.handeye.linear import MAX_STEPS, Fit, Linear
-from calibrate.handeye.mixture import weights_of
-from calibrate.handeye.noise_scales import ROBOT_PRIOR_COUNT, WIDE, Scales
+from calibrate.handeye.noise_scales import WIDE, Scales
 from calibrate.handeye.priors import KnownBefore, Priors
 from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.views import Observations, ViewSet
 
 REJECTED = 0.05
-"""Weight at or below which a view is rejected."""
+"""Probability, of noise up to three times the usual, at or below which a view is rejected."""
 FULL = 0.35
 """Probability of the class of ordinary noise above which a view counts fully."""
 _SETTLED = 0.01
@@ -53,6 +52,8 @@ class Estimate:
     scales: Scales
     chances: Array
     """(n, K) probability of each noise class, per view."""
+    weight: Array
+    """(n,) 1: the view counts fully, 0: not at all."""
     covariance: Array
     """(G, G) posterior of the shared unknowns, in the order of `Layout`."""
     robot: Array
@@ -71,19 +72,14 @@ class Estimate:
     mean_of: MeanParts = field(default_factory=MeanParts)
 
     @property
-    def weight(self) -> Array:
-        """Weight (n,) of each view: 1 counts fully, 0 not at all."""
-        return weights_of(self.chances)
-
-    @property
     def used(self) -> NDArray[np.bool_]:
         """Mask (n,) of the views that are not rejected."""
-        return np.asarray(self.weight > REJECTED)
+        return np.asarray(self.chances[:, :2].sum(axis=1) > REJECTED)
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom of the noise estimate: 3n - 6 of n views that count, and its prior's."""
-        return max(3.0 * float(self.chances[:, 0].sum()) - 6.0 + ROBOT_PRIOR_COUNT, 1.0)
+        """Degrees of freedom of the noise estimate: 3n - 6 of n views that count."""
+        return max(3.0 * float(self.chances[:, 0].sum()) - 6.0, 1.0)
 
     @property
     def threshold(self) -> float:
@@ -134,6 +130,7 @@ def estimate(
         state=state,
         scales=scales,
         chances=solved.chances,
+        weight=linear.weights(solved.chances, scales),
         covariance=covariance,
         robot=solved.residual,
         robot_covariance=linear.predicted(scales, covariance),

@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from dataclasses import replace
 
 import numpy as np
-from scipy import special
 
 from calibrate.errors import PosesDisagreeError
 from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.arm import arm_postures, flex_motion
+from calibrate.handeye.arm_fit import estimate_with_arm_errors
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.cell_state import CellState
-from calibrate.handeye.estimate import (
-    CellFit,
-    Estimate,
-    MeanParts,
-    corner_weights,
-    estimate,
-    is_settled,
-)
-from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
+from calibrate.handeye.estimate import CellFit, Estimate, estimate
 from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.pose_fit import BoardPoses, agreed_start, pose_distances
 from calibrate.handeye.priors import Priors
-from calibrate.handeye.uncertainty import inverse_of
 from calibrate.results import SHAPE
 from calibrate.views import BoardView, Observations, Places, ViewSet, observe_views
 
@@ -76,92 +66,6 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
     return CellFit(
         views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified, failure, joints_note
     )
-
-
-_SIZES = np.array([0.03, 0.06, 0.12, 0.25, 0.5, 1.0])
-"""1σ of the errors of the arm's links, mm and mrad: no arm is exactly as its controller computes it."""
-_NONE = 1e-6
-"""1σ, mm and mrad, that stands for none: no error of the links, or a rigid bracket."""
-_BENDS = np.array([_NONE, 0.1, 0.4, 1.6])
-"""1σ of a bracket's compliance, mrad; a rigid bracket has probability ½."""
-_BENDS_BEFOREHAND = np.array([3.0, 1.0, 1.0, 1.0]) / 6
-_ROUNDS = 3
-"""Rounds for each pair of sizes; its neighbour's noise is a good start."""
-_WORTH_SOLVING = 1e-3
-"""Probability below which a pair of sizes is dropped after the first step."""
-
-
-def estimate_with_arm_errors(
-    observed: Observations, plain: Estimate, priors: Priors, link_errors: int
-) -> tuple[Estimate, float]:
-    """Estimate again with systematic errors of arm and bracket, starting from the estimate without them.
-
-    The first `link_errors` errors are those of the arm's links, the others a bracket's. How large each of
-    the two is, is not fitted but averaged over: one solution for each pair of sizes, weighed by its evidence.
-    So the uncertainty grows little for an arm without errors, and enough for one with errors.
-
-    The second value is the log evidence of errors of any size against none; above 3 they are worth saying.
-    Raises LinAlgError where it fails.
-    """
-    columns = observed.by_arm_errors.shape[2]
-    by_links = _SIZES if link_errors else [_NONE]
-    # The first pair, no errors at all, has probability 0 and is for comparison only.
-    pairs = np.array([(_NONE, _NONE), *itertools.product(by_links, _BENDS)])
-    sigma = np.repeat(pairs, [link_errors, columns - link_errors], axis=1)
-    beforehand = np.append(0.0, np.tile(_BENDS_BEFOREHAND, len(by_links)) / len(by_links))
-    state = replace(plain.state, arm_errors=np.zeros(columns))
-    scales, weights = plain.scales, plain.corner_weights
-    chances, log_bayes = beforehand, 0.0
-    kept = np.arange(len(chances))
-    converged, steps = False, 0
-    while steps < MAX_STEPS and not converged:
-        if steps == 1:
-            kept = kept[chances > _WORTH_SOLVING]
-        linear = Linear.at(observed, state, weights)
-        solutions: list[LinearSolution] = []
-        for i in kept:  # neighbours have nearly the same noise
-            start = solutions[-1].scales if solutions else scales
-            solutions.append(linear.solve(priors.linearise(state, sigma[i]), start, "robot", _ROUNDS))
-        log_evidence = np.array([solution.log_evidence for solution in solutions])
-        log_all = special.logsumexp(log_evidence, b=beforehand[kept])
-        chances = beforehand[kept] * np.exp(log_evidence - log_all)
-        step = chances @ np.array([s.step for s in solutions])
-        by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
-        covariances = [linear.covariance(solution) for solution in solutions]
-        spread = np.array([
-            own + np.outer(solution.step - step, solution.step - step)
-            for own, solution in zip(covariances, solutions, strict=True)
-        ])  # fmt: skip
-        covariance = np.einsum("s,sij->ij", chances, spread)
-        before, state = state, state.moved(step, by_view)
-        weights = corner_weights(observed, state, scales.sigma_px)
-        if steps == 0:
-            log_bayes = float(log_all - log_evidence[0])
-        converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
-    best = solutions[int(chances.argmax())]
-    with_errors = replace(
-        plain,
-        state=state,
-        scales=replace(best.scales, arm_error_sigma=chances @ sigma[kept]),
-        chances=np.einsum("s,snk->nk", chances, [s.chances for s in solutions]),
-        covariance=covariance,
-        robot=linear.m + linear.J @ step,
-        robot_covariance=linear.predicted(best.scales, covariance),
-        board_poses=linear.seen_boards(before.C),
-        corner_weights=weights,
-        noise_parts=chances
-        @ [linear.noise_parts(s, own) for s, own in zip(solutions, covariances, strict=True)],
-        log_evidence=float(log_all),
-        steps=steps,
-        converged=converged,
-        mean_of=MeanParts(chances, _against(spread[:, :6, :6], covariance[:6, :6])),
-    )
-    return with_errors, log_bayes
-
-
-def _against(spread: Array, mean: Array) -> Array:
-    """Compute the ratios (s,) of covariances (s, q, q) to their mean (q, q)."""
-    return np.asarray(np.einsum("ij,sji->s", np.linalg.inv(mean), spread) / len(mean))
 
 
 def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Estimate:

@@ -15,7 +15,7 @@ import numpy as np
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic, flange_derivatives, flange_residuals
 from calibrate.handeye.corner_modes import INFORMATION, CornerModes
-from calibrate.handeye.mixture import class_chances, expected
+from calibrate.handeye.mixture import class_chances, expected, weights_of
 from calibrate.handeye.noise_scales import WIDE, Scales, first_scales, update_corners, update_robot
 from calibrate.handeye.reprojection import linearise_corners
 from calibrate.handeye.uncertainty import information_lost, inverse_of
@@ -134,6 +134,10 @@ class Linear:
         """Compute the covariances (n, K, 6, 6) of m for each class, and their inverses."""
         S = scales.tau_px**2 * self.B[:, None] + scales.classes[:, :, None] * np.eye(6)
         return S, np.asarray(np.linalg.inv(S), dtype=float)
+
+    def weights(self, chances: Array, scales: Scales) -> Array:
+        """Compute how much each view (n,) counts, as `weights_of`."""
+        return weights_of(chances, *self.noise(scales))
 
     def board_step(self, solved: LinearSolution) -> Array:
         """Compute the step (n, 6) of the board poses that belongs to the step of the shared unknowns."""

@@ -15,9 +15,9 @@ from calibrate.geometry import Array
 from calibrate.handeye.mixture import GAIN, SHARE_COUNTS, class_variances
 
 WIDE = 3.0
-ROBOT_PRIOR_COUNT = 1.0
-"""Weight of the prior of the robot's noise, in squares of one component."""
-_ROBOT_PRIOR = np.array([1e-4, np.radians(0.02)])
+_USUAL_ROBOT = np.array([1e-4, np.radians(0.02)])
+"""Robot noise, metres and radians, about which half-Cauchy's prior stands: it does not pull a scale down to
+it or up to it, only keeps it from 0 and from infinity."""
 MODE_COUNT = 4.0
 """Weight, in residuals, of the prior that τ is about λ or larger."""
 
@@ -60,10 +60,10 @@ def update_robot(scales: Scales, chances: Array, z: Array, P: Array) -> Scales:
     square, ordinary = scales.robot**2, chances[:, :-1] * GAIN**2
     found = np.einsum("nk,nki->i", ordinary, z[:, :-1] ** 2)
     predicted = np.einsum("nk,nkii->i", ordinary, P[:, :-1].clip(0.0))
-    up = found.reshape(2, 3).sum(axis=1) + ROBOT_PRIOR_COUNT * _ROBOT_PRIOR**2 / square**2
-    down = predicted.reshape(2, 3).sum(axis=1) + ROBOT_PRIOR_COUNT / square
+    up = found.reshape(2, 3).sum(axis=1) + 1 / square
+    down = predicted.reshape(2, 3).sum(axis=1) + 2 / (square + _USUAL_ROBOT**2)
     total = chances.sum(axis=0) + SHARE_COUNTS
-    robot = np.sqrt(square * up / np.maximum(down, 1e-300))
+    robot = np.sqrt(square * up / down)
     return replace(scales, robot=robot, shares=total / total.sum())
 
 

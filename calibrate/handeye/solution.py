@@ -155,7 +155,9 @@ class ArmErrors:
     log_bayes: float
     """Log evidence for systematic errors of any size against none."""
     size_mm: float
-    """1σ of the errors, mm and mrad."""
+    """1σ of the links' shifts; 0 where only a bracket is modelled."""
+    size_mrad: float
+    """1σ of the links' turns, or of a bracket's bend."""
     errors: dict[str, tuple[float, float]]
     """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
     uncorrected: UncorrectedArm | None = None

@@ -227,7 +227,8 @@ def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: flo
     errors = dict(
         zip(names, zip(fit.estimate.state.arm_errors.tolist(), sigma.tolist(), strict=True), strict=True)
     )
-    found = ArmErrors(fit.log_bayes, float(fit.estimate.scales.arm_error_sigma[0]), errors)
+    size = fit.estimate.scales.arm_error_sigma
+    found = ArmErrors(fit.log_bayes, 0.0 if fit.arm is None else float(size[0]), float(size[3]), errors)
     if fit.arm is None:
         return found
     missed = held_out_elsewhere(fit, fit.arm.joints_rad) if found.detected and options.folds else None
@@ -265,8 +266,8 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
     suspects = ", ".join(f"{index + 1} (P(outlier) {p:.2f})" for index, p in solution.suspects.items())
     offered = arm is not None and arm.result is not None and arm.result.offered
     systematic = (
-        f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm or mrad in the arm's "
-        "kinematics, or a bracket that bends. "
+        f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm, "
+        f"{arm.size_mrad if arm else 0.0:.2f} mrad in the arm's links, or a bracket that bends. "
     ) + ("Use the corrected arm." if offered else "Have the arm calibrated, and stiffen the bracket.")
     as_recorded = session.reading is Reading.AS_RECORDED
     said = (

@@ -58,13 +58,16 @@ class Imported:
 
 
 def import_folder(
-    folder: Path, output: Path | None, progress: Progress = lambda done, total, text: None
+    folder: Path,
+    output: Path | None,
+    progress: Progress = lambda done, total, text: None,
+    newest: int | None = None,
 ) -> Imported:
     """Reads `dataset.yaml`, `poses.csv` and the images, writes `output` (.mcap), which must not exist.
 
-    `output` None: checks everything and writes nothing. PNG and JPEG files keep their bytes. Everything is
-    checked before the file is begun, and nothing is left behind when an image turns out bad. Raises
-    ImportSourceError or RecordingError.
+    `output` None: checks everything and writes nothing. `newest`: only the last so many rows; None: all.
+    PNG and JPEG files keep their bytes. Everything is checked before the file is begun, and nothing is left
+    behind when an image turns out bad. Raises ImportSourceError or RecordingError.
     """
     if not folder.is_dir():
         raise ImportSourceError("no-folder", path=folder)
@@ -74,7 +77,7 @@ def import_folder(
     for name in _OF_ARM:
         if (folder / name).exists():
             beside[name] = read_small_file(folder / name, strict_yaml.LIMIT_BYTES)
-    return write_views(folder, output, dataset, rows, beside, progress)
+    return write_views(folder, output, dataset, rows[-newest:] if newest else rows, beside, progress)
 
 
 def write_views(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calibrate.check import drift
-from calibrate.handeye import arm, corner_modes, fit, linear, mixture, noise_scales, priors, readings
+from calibrate.handeye import arm, arm_fit, corner_modes, linear, mixture, noise_scales, priors, readings
 from calibrate.handeye.axxb import certificate, paper
 from calibrate.handeye.axxb.pairs import MAX_PAIRS
 
@@ -31,19 +31,15 @@ PAGE = (Path(__file__).parents[3] / "docs/contributor/solver.md").read_text()
         (corner_modes.STUDENT, 8.0, "corner weight = (8 + 2) / (8 + r²/σ²)"),
         (mixture.GAIN, [1, 3, 10], "g = 1, 3, 10"),
         ([mixture.GARBAGE_M, mixture.GARBAGE_RAD], [0.3, 1.0], "garbage: 0.3 m, 1 rad"),
-        (noise_scales.ROBOT_PRIOR_COUNT, 1.0, "ν = 3 Σ p_i1 − 6 + 1"),
+        (noise_scales._USUAL_ROBOT, [1e-4, np.radians(0.02)], "s₀ = 0.1 mm, 0.02°"),
         (priors.BoardTolerance().square, 0.003, "`square_tolerance` (0.3 %)"),
         (priors.BoardTolerance().flatness_m, 0.001, "`flatness_m` (1 mm)"),
         (priors._KNOWN_SHARE, 0.002, "0.2 % of focal length and width"),
         (priors.ASPECT_SIGMA, 0.001, "pixels square to 0.1 %"),
         (linear.MAX_STEPS, 15, "At most 15 linearisations"),
         (len(arm.FLEX), 9, "and 9 numbers of a bracket's compliance"),
-        (fit._SIZES[[0, -1]], [0.03, 1.0], "over six sizes from 0.03 to 1 mm and mrad"),
-        (
-            [fit._BENDS_BEFOREHAND[0], fit._BENDS[-1]],
-            [0.5, 1.6],
-            "a rigid bracket counts one half, others up to 1.6 mrad",
-        ),
+        (arm_fit.SIZES[[0, -1]], [0.03, 3.84], "eight sizes from 0.03 to 3.84 mm and mrad"),
+        ([arm_fit.RIGID, arm_fit.BENDS[-1]], [0.5, 1.6], "a rigid bracket counts one half, others up to 1.6"),
         (readings._CLEAR, 10.0, "10 + ln n more"),
         (drift.FALSE_ALARM, 0.05, "F⁻¹(0.95; 6, ν)"),
         ([drift.SHIFT_M, np.degrees(drift.TURN_RAD)], [0.5e-3, 0.1], "d = 0.5 mm or 0.1°"),

@@ -1,0 +1,163 @@
+"""The estimate with systematic errors of the arm's links and of a bracket, averaged over their sizes.
+
+How large the links' shifts, their turns and a bracket's bends are is not known before, and not fitted: each
+combination of sizes gives an estimate of its own, and they are averaged by their evidence (Bayesian model
+averaging). So an arm without errors costs little, and the region of one with errors is wide enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy import special
+
+from calibrate.geometry import Array
+from calibrate.handeye.cell_state import CellState
+from calibrate.handeye.estimate import Estimate, MeanParts, corner_weights, is_settled
+from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
+from calibrate.handeye.noise_scales import Scales
+from calibrate.handeye.priors import Priors
+from calibrate.handeye.uncertainty import inverse_of
+from calibrate.views import Observations
+
+SIZES = 0.03 * 2.0 ** np.arange(8)
+"""1σ of the shifts (mm) and turns (mrad) of the arm's links: no arm is exactly as its controller computes."""
+BENDS = np.array([0.0, 0.1, 0.4, 1.6])
+"""1σ of a bracket's compliance, mrad."""
+RIGID = 0.5
+"""Probability that a bracket does not bend; other sizes share the rest alike."""
+_NONE = 1e-6
+"""1σ, mm and mrad, that stands for none: a prior cannot be infinitely narrow."""
+_ROUNDS = 3
+"""Rounds for each combination of sizes; its neighbour's noise is a good start."""
+_LEAST = float(np.log(1e-2))
+"""Log probability, against the likeliest, below which a combination of sizes is left out."""
+
+Sizes = tuple[int, int, int]
+"""Places in `SIZES` of the links' shifts and turns, and in `BENDS`."""
+
+
+class _Sizes:
+    """All combinations of sizes, and the prior of the errors for each."""
+
+    def __init__(self, links: int, bends: int) -> None:
+        """Take the numbers of errors of the links (shift and turn in turn, 3 each) and of the bracket."""
+        self.kinds = np.repeat([*np.tile([0, 1], links // 6), 2], [*np.full(links // 3, 3), bends])
+        self.shape = (len(SIZES), len(SIZES), len(BENDS)) if links else (1, 1, len(BENDS))
+
+    def sigma(self, one: Sizes) -> Array:
+        """1σ (q,) of each error, mm and mrad."""
+        shift, turn, bend = one
+        sizes = np.array([SIZES[shift], SIZES[turn], BENDS[bend]])
+        return np.asarray(np.maximum(sizes[self.kinds], _NONE))
+
+    def log_chance(self, one: Sizes) -> float:
+        """Log probability of a combination."""
+        bend = RIGID if BENDS[one[2]] == 0 else (1 - RIGID) / (len(BENDS) - 1)
+        return float(np.log(bend / (self.shape[0] * self.shape[1])))
+
+    @property
+    def alike(self) -> list[Sizes]:
+        """The combinations of a rigid bracket with shifts as large, in mm, as turns in mrad."""
+        return [(size, size, 0) for size in range(self.shape[0])]
+
+    def beside(self, one: Sizes) -> list[Sizes]:
+        """Return the combinations in which one size is the next smaller or larger."""
+        steps = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)]) + one
+        inside = ((steps >= 0) & (steps < self.shape)).all(axis=1)
+        return [(a, b, c) for a, b, c in steps[inside].tolist()]
+
+
+def estimate_with_arm_errors(
+    observed: Observations, plain: Estimate, priors: Priors, link_errors: int
+) -> tuple[Estimate, float]:
+    """Estimate again with systematic errors of arm and bracket, starting from the estimate without them.
+
+    The first `link_errors` errors are those of the arm's links, the others a bracket's. The second value is
+    the log evidence of errors of any size against none; above 3 they are worth saying. Raises LinAlgError
+    where it fails.
+    """
+    columns = observed.by_arm_errors.shape[2]
+    sizes = _Sizes(link_errors, columns - link_errors)
+    state = replace(plain.state, arm_errors=np.zeros(columns))
+    weights, log_bayes, kept = plain.corner_weights, 0.0, dict[Sizes, LinearSolution]()
+    converged, steps = False, 0
+    while steps < MAX_STEPS and not converged:
+        linear = Linear.at(observed, state, weights)
+        solve = partial(_solve, linear, priors, state)
+        if steps == 0:
+            kept = _explore(sizes, solve, plain.scales)
+        else:
+            kept = {one: solve(sizes.sigma(one), before.scales) for one, before in kept.items()}
+        solutions = list(kept.values())
+        log_joint = np.array([sizes.log_chance(one) + found.log_evidence for one, found in kept.items()])
+        log_all = float(special.logsumexp(log_joint))
+        chances = np.exp(log_joint - log_all)
+        if steps == 0:
+            log_bayes = log_all - solve(_NONE, plain.scales).log_evidence
+        step = chances @ np.array([s.step for s in solutions])
+        by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
+        covariances = [linear.covariance(solution) for solution in solutions]
+        spread = np.array([
+            own + np.outer(solution.step - step, solution.step - step)
+            for own, solution in zip(covariances, solutions, strict=True)
+        ])  # fmt: skip
+        covariance = np.einsum("s,sij->ij", chances, spread)
+        before, state = state, state.moved(step, by_view)
+        best = solutions[int(chances.argmax())]
+        weights = corner_weights(observed, state, best.scales.sigma_px)
+        converged, steps = is_settled(step, inverse_of(covariance)), steps + 1
+    sigma = chances @ np.array([sizes.sigma(one) for one in kept])
+    classes = np.einsum("s,snk->nk", chances, [s.chances for s in solutions])
+    with_errors = replace(
+        plain,
+        state=state,
+        scales=replace(best.scales, arm_error_sigma=sigma),
+        chances=classes,
+        weight=linear.weights(classes, best.scales),
+        covariance=covariance,
+        robot=linear.m + linear.J @ step,
+        robot_covariance=linear.predicted(best.scales, covariance),
+        board_poses=linear.seen_boards(before.C),
+        corner_weights=weights,
+        noise_parts=chances
+        @ [linear.noise_parts(s, own) for s, own in zip(solutions, covariances, strict=True)],
+        log_evidence=log_all,
+        steps=steps,
+        converged=converged,
+        mean_of=MeanParts(chances, _against(spread[:, :6, :6], covariance[:6, :6])),
+    )
+    return with_errors, log_bayes
+
+
+def _solve(
+    linear: Linear, priors: Priors, state: CellState, sigma: Array | float, start: Scales
+) -> LinearSolution:
+    return linear.solve(priors.linearise(state, sigma), start, "robot", _ROUNDS)
+
+
+def _explore(
+    sizes: _Sizes, solve: Callable[[Array, Scales], LinearSolution], scales: Scales
+) -> dict[Sizes, LinearSolution]:
+    """Solve every combination that is worth it: from shifts as large as turns on to their neighbours."""
+    found: dict[Sizes, LinearSolution] = {}
+    chance: dict[Sizes, float] = {}
+    ahead = [(one, scales) for one in sizes.alike]
+    while ahead:
+        one, start = ahead.pop(0)
+        if one in found:
+            continue
+        found[one] = solve(sizes.sigma(one), start)
+        chance[one] = sizes.log_chance(one) + found[one].log_evidence
+        if chance[one] > max(chance.values()) + _LEAST:
+            ahead += [(other, found[one].scales) for other in sizes.beside(one)]
+    least = max(chance.values()) + _LEAST
+    return {one: solution for one, solution in found.items() if chance[one] > least}
+
+
+def _against(spread: Array, mean: Array) -> Array:
+    """Compute the ratios (s,) of covariances (s, q, q) to their mean (q, q)."""
+    return np.asarray(np.einsum("ij,sji->s", np.linalg.inv(mean), spread) / len(mean))

@@ -149,15 +149,24 @@ class Solved:
                 return file.getvalue()
 
         used, figure = set(self.solution.used), Shown(layout="constrained")
+        read = {view.index: view for view in (*self.views, *self.solution.kept)}
+        pixels = np.concatenate([read[index].pixels for index in self.residuals_px])
+        missed = np.concatenate(list(self.residuals_px.values()))
+        good = np.concatenate([[index in used] * len(miss) for index, miss in self.residuals_px.items()])
+        rms = float(np.sqrt(np.square(missed[good]).sum(axis=1).mean()))
+        longer = float(f"{self.lens.width / 40 / rms:.1g}")
         axes = figure.subplots()
-        for view in self.solution.kept + tuple(v for v in self.views if v.index not in used):
-            colour = "tab:blue" if view.index in used else "tab:red"
-            axes.quiver(
-                *view.pixels.T, *self.residuals_px[view.index].T, angles="xy", color=colour, width=2e-3
-            )
-        rms = np.sqrt(np.mean([np.square(self.residuals_px[k]).sum(axis=1).mean() for k in used]))
+        axes.quiver(
+            *pixels.T,
+            *missed.T * longer,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            width=1.5e-3,
+            color=np.where(good, "tab:blue", "tab:red"),
+        )
         axes.set(xlim=(0, self.lens.width), ylim=(self.lens.height, 0), aspect="equal")
-        axes.set_title(f"Where do the corners miss? {rms:.2f} px rms over {len(used)} pictures")
+        axes.set_title(f"{rms:.2f} px rms over {len(used)} pictures, drawn {longer:g} times as long")
         return figure
 
 

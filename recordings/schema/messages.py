@@ -248,8 +248,6 @@ class View(msgspec.Struct, frozen=True, omit_defaults=True):
     """Joints at mid-exposure; None where no joints are known (imported)."""
     attempt: int = 1
     """A retake of the same pose supersedes lower attempts."""
-    taken_back: bool = False
-    """A person took the pose back: no attempt counts."""
     stamps: Stamps = Stamps()
     """Clocks at mid-exposure."""
     time_bound_s: float | None = None
@@ -259,6 +257,8 @@ class View(msgspec.Struct, frozen=True, omit_defaults=True):
     note: str = ""
     camera_from_board: Matrix4 | None = None
     """Where another program saw the board; only of a view without a picture."""
+    taken_back: bool = False
+    """A person took the pose back: no attempt counts."""
     part: int = 1
     """The part of the session that holds the image; filled in by the reader."""
 

@@ -42,7 +42,7 @@ FROZEN = {
     ClockReading: "asked_monotonic_ns answered_monotonic_ns device_ns host_wall_ns synchronized",
     View: (
         "index name picture_sequence base_from_flange joints_rad attempt stamps time_bound_s stillness "
-        "source_file note"
+        "source_file note camera_from_board taken_back"
     ),
     CaptureEvent: "stamps kind pose_index detail level",
 }

@@ -20,6 +20,7 @@ from pathlib import Path
 import msgspec
 
 from recordings.cli.console import open_in_browser
+from station.cell.status import StationState
 from station.protocol.verbs import PreviewImage
 from station.tui.capture_panels import quality_line
 from station.tui.frame import bar_line
@@ -54,7 +55,10 @@ class Live(msgspec.Struct, frozen=True):
     look: bool
     seen: str
     """What is found in the picture."""
-    still: bool
+    still: float
+    """0…1; 1: arm and image rest."""
+    outline: tuple[tuple[float, float], ...]
+    """The board in the view that would help most, as shares of the image's sides; empty: none is wanted."""
     saved: int
     """Views saved so far: the page sounds when it grows."""
     old: bool
@@ -70,7 +74,8 @@ def live_of(known: Known, picture: PreviewImage) -> Live:
         action.why,
         action.look,
         quality_line(status).plain,
-        status.robot.still,
+        status.guidance.still if status.state is StationState.FREE_DRIVE else float(status.robot.still),
+        status.guidance.outline,
         status.session.captured,
         known.old,
         picture,

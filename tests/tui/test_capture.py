@@ -80,7 +80,7 @@ def test_the_card_says_that_the_arm_stands_only_where_it_is_known(cause: str) ->
 
     assert status.robot.connected
     rests = said(still=True)
-    assert ("why it stopped" in rests) is (cause != "protective-stop")
+    assert ("hy it stopped" in rests) is (cause != "protective-stop")
     assert (said(still=False) == rests) is (cause == "stale-state")
     assert (said(still=True, state=None) == rests) is (cause == "stale-state")
 

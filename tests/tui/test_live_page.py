@@ -15,8 +15,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
+from station.cell.status import GuidanceStatus, StationState
 from station.tui.app import StationApp
 from station.tui.live_page import BROWSERS, LivePage
 from tests.tui.conftest import FakeLink, idle, in_session, opened, said, until
@@ -180,5 +182,9 @@ async def test_chromium_shows_picture_next_action_and_what_is_saved(
             await shows("document.querySelector('#next b')?.textContent", "F5  Start the capture")
             await shows("document.querySelector('svg')?.getAttribute('viewBox')", "0 0 128 96")
             await shows("document.querySelector('.cross')?.getAttribute('d').split('M').length", 3)
-            link.show(in_session(idle(), captured=4))
+            guidance = GuidanceStatus(outline=((0.25, 0.25), (0.5, 0.25), (0.5, 0.5)), still=0.4)
+            by_hand = msgspec.structs.replace(idle(StationState.FREE_DRIVE), guidance=guidance)
+            link.show(in_session(by_hand, captured=4))
+            await shows("document.querySelector('#outline')?.getAttribute('points')", "32,24 64,24 64,48")
+            await shows("document.querySelector('#still')?.textContent", "▶ moves")
             await shows("document.querySelector('#saved')?.textContent", "4")

@@ -20,8 +20,8 @@ from station.analysis.estimation import solve_quickly
 from station.analysis.worker import CapturedView
 from station.cell.errors import StationError
 
-FEWEST = 5
-"""Views by which one more can be judged: five leave a wrong one room to be explained by another lens."""
+FEWEST = 6
+"""Views from which one is judged: by five, a rough lens still hides a wrong one, or makes one."""
 _FOCAL_SIGMA = 0.02
 """1σ, relative, of the focal length that so few views give."""
 _ORDINARY = 0.05

@@ -42,15 +42,19 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
     try:
         state = robot.latest()
     except RobotError as error:
-        remedy = "check that it is on, its network cable, and robot.host"
+        told = context.cell.mover is None  # its error says it all
+        remedy = "" if told else "check that it is on, its network cable, and robot.host"
         return [Check("robot", "failed", troubles.get("robot", str(error)), remedy)]
     identity, condition = robot.identity, robot.condition(state)
+    if (mover := context.cell.mover) is None:
+        return [
+            Check("robot", "ok", f"{identity.model} {identity.serial}: its pose is posted"),
+            Check("control", "skipped", "a person moves this arm: STOP is on its own pendant"),
+        ]
     checks = [
         Check("robot", "ok", f"{identity.model} {identity.serial} at {host}, {condition.mode}"),
         Check("safety", "failed" if condition.held else "ok", condition.safety, condition.held),
     ]
-    if (mover := context.cell.mover) is None:
-        return [checks[0], Check("control", "skipped", "a person moves this arm: STOP is on its own pendant")]
     if mover.remote is False:
         checks.append(Check("remote control", "failed", "local", "switch the pendant to Remote (top right)"))
     else:
@@ -75,7 +79,7 @@ def _computer_check(context: SessionContext) -> Check:
     if in_real_time():
         return Check("computer", "ok", "real-time scheduling: other programs do not hold up the arm")
     text = "no real-time scheduling: another program can hold up the heartbeat, and the arm stops"
-    if context.cell.source != "real":
+    if context.cell.source != "real" or context.cell.mover is None:
         return Check("computer", "skipped", text)
     return Check(
         "computer", "warning", text, f"run it as the service station, or grant it: {GRANT_REAL_TIME}"

@@ -137,6 +137,8 @@ def _connect(known: Known, status: StationStatus) -> Step:
 
 def _plan(status: StationStatus) -> Step:
     poses = status.session.poses
+    if status.robot.by_hand:
+        return Step("plan", "done", "by hand")
     if not poses:
         return Step("plan", "todo", "no plan yet")
     return Step("plan", "done", many(len(poses), "pose"), str(len(poses)))
@@ -149,7 +151,7 @@ def _capture(status: StationStatus) -> Step:
     if state in (StationState.STOPPED, StationState.FAULT):
         return Step("capture", "stopped", f"{state.value} at {count}", brief)
     if not session.poses:
-        return Step("capture", "todo", "after plan")
+        return Step("capture", "todo", "not begun" if status.robot.by_hand else "after plan")
     if session.recording:
         return Step("capture", "done", f"{count} saved", brief)
     if state in RUNNING:
@@ -188,9 +190,13 @@ def next_action(known: Known) -> Action:
     if known.busy and not latched:
         why = " ".join(words for words in (known.busy, status.reason) if words)
         return Action("", "Wait", why, look=bool(status.reason))
-    if (action := _by_state(known, status)) is not None:
-        return action
-    return _at_rest(known, status)
+    action = _by_state(known, status) or _at_rest(known, status)
+    if status.robot.by_hand and action.key in ("F5", "n"):
+        why = " ".join(
+            words for words in (sentence(status.reason), "You move the arm, it is only read.") if words
+        )
+        return Action("F3", "Take views by hand", why, look=action.look)
+    return action
 
 
 def _without_daemon(known: Known) -> Action:

@@ -191,6 +191,17 @@ async def test_stop_stands_whole_on_every_screen_and_question(
             await pilot.app.pop_screen()
 
 
+@pytest.mark.parametrize("state", [StationState.IDLE, StationState.PAUSED])
+@pytest.mark.parametrize("session", [{}, {"captured": 3}])
+def test_no_step_asks_a_person_who_moves_the_arm_to_let_it_move(
+    state: StationState, session: dict[str, object]
+) -> None:
+    status = resting(state, **session)
+    by_hand = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, by_hand=True))
+    assert next_action(Known(by_hand)).key == "F3"
+    assert next_action(Known(status)).key in ("F5", "n")
+
+
 @pytest.mark.parametrize("size", SIZES)
 async def test_the_screens_have_no_stop_for_an_arm_that_a_person_moves(
     link: FakeLink, size: tuple[int, int]

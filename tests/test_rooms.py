@@ -102,11 +102,11 @@ READ_DIRECTLY = {
     "station/protocol/stop_client.py",  # the page, by a program that loads little
     # the kernel's files
     "station/cell/process.py", "station/server/approval.py", "station/devices/discovery.py",
-    "station/devices/aravis_device.py",
+    "station/devices/aravis_device.py", "station/devices/posted.py",
     # files of the package
     "station/cli/control.py", "station/simulation/controller/kinematics.py", "calibrate/report/html.py",
+    "station/tui/live_page.py",
     "station/simulation/controller/__main__.py",  # stands alone
-    "station/simulation/launch_cell.py",  # what it has just written
 }  # fmt: skip
 _READERS = {"read_text", "read_bytes", "imread", "memmap", "loadtxt", "genfromtxt", "fromfile"}
 

@@ -7,9 +7,9 @@ from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
-from recordings.files import MAIN_CAMERA
 from recordings.schema import stillness
 from recordings.schema.messages import (
+    MAIN_CAMERA,
     BoardKind,
     BoardSpec,
     CameraModel,

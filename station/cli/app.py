@@ -26,6 +26,7 @@ STATION = LazyGroup(
                 "station serve --simulate --mount eye-to-hand --noise mid",
                 "station serve --replay session.mcap",
             ),
+            gone={"--hardware-trigger": "A simulated camera is triggered by software."},
         ),
         "plan": LazyCommand(
             "station.cli.plan:plan_command",

@@ -42,9 +42,6 @@ def serve_command(
     noise: Noise = "low",
     mount: Mounting = "eye-in-hand",
     gige: GigE = False,
-    hardware_trigger: Annotated[
-        bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera")
-    ] = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
 ) -> None:
@@ -94,7 +91,6 @@ def serve_command(
             place / "simulation",
             time_scale=time_scale,
             gige=gige,
-            hardware_trigger=hardware_trigger,
         )
     asyncio.run(serve_cell(cell, place, control, end_with_stdin, real_time))
 

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -15,7 +16,9 @@ from station.cell.config import SPEED_CAP_M_S, StationConfig
 from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan
 from station.devices.base import Arm, Camera, Mover
-from station.devices.serial_trigger import SerialTrigger
+
+if TYPE_CHECKING:
+    from station.devices.serial_trigger import SerialTrigger
 
 
 @dataclass(frozen=True)

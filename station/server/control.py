@@ -13,6 +13,7 @@ import socket
 from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -30,7 +31,9 @@ from station.protocol.messages import (
 )
 from station.protocol.verbs import VERBS
 from station.server.approval import Peer
-from station.server.dispatch import SessionDispatcher
+
+if TYPE_CHECKING:
+    from station.server.dispatch import SessionDispatcher
 
 log = logging.getLogger(__name__)
 UNSENT_LIMIT_BYTES = 4 * 1024 * 1024

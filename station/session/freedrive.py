@@ -17,8 +17,8 @@ from station.devices.base import fresh
 from station.protocol.verbs import Freedrive, Record
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
+from station.session.ending import failed
 from station.session.queue import PoseQueue
-from station.session.run import failed
 
 log = logging.getLogger(__name__)
 

@@ -31,6 +31,7 @@ from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import RunRequests, SessionContext, StatusStore
 from station.session.device_connector import DeviceConnector
+from station.session.ending import close_or_seal, unmark_busy
 from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
 from station.session.hand_guide import HandGuide
@@ -38,7 +39,7 @@ from station.session.motion import ApprovalManager, MotionApproval, previewed, s
 from station.session.previews import Previewer
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
-from station.session.run import Run, close_or_seal, unmark_busy
+from station.session.run import Run
 from station.session.stop_move import stop_motion
 from station.session.supervisor import SessionSupervisor
 from station.session.threads import DISK

@@ -18,8 +18,7 @@ from station.cell.config import CameraConfig
 from station.cell.errors import CameraError, RobotError
 from station.cell.status import CameraCounts, FrameTiming
 from station.devices.base import DeviceThread
-from station.devices.frames import FrameClock, FrameCounter, TriggerPulse
-from station.devices.serial_trigger import SerialTrigger
+from station.devices.frames import FrameClock, FrameCounter
 from station.simulation.launch import ChildProcess
 from station.simulation.truth import CellTruth
 
@@ -36,23 +35,18 @@ class RenderedCamera:
         truth: CellTruth,
         controller_host: str,
         config: CameraConfig | None = None,
-        trigger: SerialTrigger | None = None,
         flange: Callable[[], Array] | None = None,
     ) -> None:
-        """`trigger`: the box that fires it, whose pulses reach `pulse`; None: triggered by software.
-
-        `flange`: returns base_from_flange (4, 4) of a posted arm; None: the controller is asked for it.
-        """
+        """`flange`: returns base_from_flange (4, 4) of a posted arm; None: the controller is asked for it."""
         self._flange = flange
         self._truth = truth
-        self._trigger = trigger
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._host = controller_host
         self._exposure_us = truth.exposure_us if config is None else config.exposure_us
         self._gain_db = truth.gain_db if config is None else config.gain_db
         self._process: subprocess.Popen[bytes] | None = None
         self._thread = DeviceThread("rendered camera")
-        self._frames: asyncio.Queue[Image | BaseException] = asyncio.Queue()
+        self._surplus = 0
+        """Frames that came with the last one although one was asked for."""
         self._asking = asyncio.Lock()
         self._clock = FrameClock()
         self.counter = FrameCounter()
@@ -73,15 +67,9 @@ class RenderedCamera:
     def counts(self) -> CameraCounts:
         return self.counter.counts()
 
-    def pulse(self) -> None:
-        """Deliver an edge on the trigger line; from any thread. Ignored while the camera is not open."""
-        if self._loop is not None and self._process is not None:
-            self._loop.call_soon_threadsafe(self._expose)
-
     async def open(self) -> CameraIdentity:
         """Start the process and read its clock a few times."""
-        self._loop = asyncio.get_running_loop()
-        self._frames = asyncio.Queue()
+        self._surplus = 0
         self.counter.restart()
         try:
             async with self._asking:  # so that images are taken only after the clock was read
@@ -101,27 +89,20 @@ class RenderedCamera:
         async with self._asking:
             await self._place()
             await self._read_clock()
-            if surplus := self._frames.qsize():
-                self._frames = asyncio.Queue()
+            if surplus := self._surplus:
+                self._surplus = 0
                 raise self.counter.surplus(surplus)
-            pulse: TriggerPulse | None = None
             asked_ns = time.monotonic_ns()
-            if self._trigger is None:
-                self._expose()
-            else:
-                pulse = await self._trigger.fire()
-            count = None if pulse is None else pulse.count
-            try:
-                frame = await asyncio.wait_for(self._frames.get(), timeout_s)
-            except TimeoutError:
-                self.counter.lost(count)
-                raise CameraError("no-image", limit_s=timeout_s) from None
-            if isinstance(frame, BaseException):
-                raise frame
-            sequence = self.counter.accept(frame.frame_id, count)
+            frames = await self._call("trigger", timeout_s=timeout_s)
+            if not frames:
+                await asyncio.sleep(timeout_s)
+                self.counter.lost()
+                raise CameraError("no-image", limit_s=timeout_s)
+            frame, self._surplus = frames[0], len(frames) - 1
+            sequence = self.counter.accept(frame.frame_id)
             self._check_settings(frame)
-            told = msgspec.structs.replace(_dated(frame), sequence=sequence, trigger_count=count)
-            return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
+            told = msgspec.structs.replace(_dated(frame), sequence=sequence)
+            return self._clock.timed(told, asked_ns=asked_ns)
 
     async def settings(self) -> dict[str, object]:
         return {
@@ -168,16 +149,6 @@ class RenderedCamera:
         asked_ns = time.monotonic_ns()
         device_ns = await self._call("clock")
         self._clock.readings.add(ClockReading(asked_ns, time.monotonic_ns(), device_ns, time.time_ns()))
-
-    def _expose(self) -> None:
-        """Trigger; the frames, none or several, arrive in `_frames`."""
-
-        def arrived(asked: asyncio.Future[list[Image]]) -> None:
-            error = asked.exception()
-            for frame in [error] if error is not None else asked.result():
-                self._frames.put_nowait(frame)
-
-        self._thread.run(lambda: self._ask("trigger")).add_done_callback(arrived)
 
     async def _call(self, *request: object, timeout_s: float = _ANSWER_S) -> Any:
         try:

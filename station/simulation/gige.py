@@ -47,7 +47,7 @@ PIXEL_FORMATS = {
 OWN_MEMORY = 0xA000
 """First register that Aravis does not use itself."""
 FAKE_TRIGGER_SOURCE, FAKE_TRIGGER_SOFTWARE = 0x304, 1
-"""The only trigger source of Aravis's fake camera; pulses on a line are written to TriggerSoftware, too."""
+"""The only trigger source of Aravis's fake camera."""
 GAIN_STEPS_PER_DB = 10
 _LATCH_POLL_S = 0.001
 _FILL = ctypes.CFUNCTYPE(
@@ -217,8 +217,6 @@ def serve(
         match name:
             case "packet-loss":
                 camera.set_packet_loss(float(value))
-            case "pulse":
-                camera.set_register(ADDRESSES["TriggerSoftware"], 1)
             case "register":
                 camera.set_register(*value)
             case _:

@@ -68,9 +68,8 @@ def _posted_cell(config: StationConfig, path: str, folder: Path, control: Path, 
         return flange_pose(arm.latest(), arm.identity.tcp_offset)
 
     folder.mkdir(parents=True, exist_ok=True)
-    write_truth(truth, folder / TRUTH)
+    attachments = {TRUTH: write_truth(truth, folder / TRUTH)}
     camera = RenderedCamera(truth, "", config.camera, flange=flange)
-    attachments = {TRUTH: (folder / TRUTH).read_bytes()}
     return Cell(config, arm, camera, "simulated", config_path=path, attachments=attachments)
 
 

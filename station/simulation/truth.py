@@ -42,8 +42,11 @@ class CellTruth(ArmTruth, frozen=True, kw_only=True, omit_defaults=True):
     camera_clock_offset_ns: int = 0
 
 
-def write_truth(truth: CellTruth, path: Path) -> None:
-    path.write_bytes(msgspec.json.encode(truth))
+def write_truth(truth: CellTruth, path: Path) -> bytes:
+    """Write a truth file; return its content."""
+    content = msgspec.json.encode(truth)
+    path.write_bytes(content)
+    return content
 
 
 def read_truth(path: Path) -> CellTruth:

@@ -25,9 +25,9 @@ from station.devices.webcam import WebcamCamera
 from station.simulation.camera import RenderedCamera
 from station.simulation.cells import make_cell
 from station.simulation.launch import SimulatedController
-from station.simulation.trigger import SimulatedTriggerBox
 from tests.gige_vision.camera import EmulatedCamera
 from tests.station.devices.test_playback import record
+from tests.trigger_box import SimulatedTriggerBox
 
 SIZE = (320, 240)
 VideoCapture = cv2.VideoCapture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -14,7 +13,7 @@ import pytest
 from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
-from station.devices.frames import TriggerPulse, frames_between
+from station.devices.frames import frames_between
 from station.simulation.launch import SimulatedGige
 from tests.codes import raises
 from tests.numbered_gige import numbered_picture, start_numbered
@@ -52,13 +51,6 @@ class Opened:
 
 def number_of(picture: Image) -> int:
     return int.from_bytes(picture.pixels.reshape(-1)[:8].tobytes(), "little")
-
-
-@pytest.mark.parametrize("device", ["", "KJ0042", "127.0.0.1", "MER-131-75GM"])
-async def test_a_camera_is_found_by_serial_address_or_name(server: SimulatedGige, device: str) -> None:
-    async with Opened(CameraConfig(device=device)) as camera:
-        assert camera.identity.serial == "KJ0042" and camera.identity.model == "MER-131-75GM"
-        assert camera.identity.vendor == "Daheng Imaging" and camera.identity.driver == "aravis"
 
 
 async def test_an_unknown_camera_is_refused_with_what_was_found(server: SimulatedGige) -> None:
@@ -114,36 +106,6 @@ async def test_one_trigger_gives_one_picture_to_the_bit_over_the_wrap_of_the_ids
     assert [p.sequence for p in pictures] == list(range(140))
     assert [number_of(p) for p in pictures] == list(range(140))
     assert all(np.array_equal(p.pixels, numbered_picture(n, 1280, 1024)) for n, p in enumerate(pictures))
-
-
-class Box:
-    """A trigger box whose pulses reach the simulated camera's line; it can forget or add some."""
-
-    def __init__(self, server: SimulatedGige) -> None:
-        self.server = server
-        self.count = 100
-        self.wired = True
-
-    async def fire(self) -> TriggerPulse:
-        self.count += 1
-        if self.wired:
-            self.server.inject("pulse")
-        return TriggerPulse(self.count, time.monotonic_ns())
-
-
-async def test_hardware_trigger_pairs_by_the_boxs_count(server: SimulatedGige) -> None:
-    box = Box(server)
-    async with Opened(CameraConfig(device="127.0.0.1", trigger="hardware"), box) as camera:
-        assert [(await camera.capture()).trigger_count for _ in range(3)] == [101, 102, 103]
-        box.count += 1  # a pulse that nobody asked for
-        with raises("pulse-count"):
-            await camera.capture()
-        assert (await camera.capture()).trigger_count == 106
-        box.wired = False
-        with raises("no-image"):
-            await camera.capture(timeout_s=0.3)
-        box.wired = True
-        assert number_of(await camera.capture()) == 5
 
 
 def test_hardware_trigger_needs_a_box() -> None:

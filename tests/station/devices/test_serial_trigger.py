@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from station.cell.config import TriggerConfig
 from station.devices import serial_trigger
 from station.devices.serial_trigger import SerialTrigger, checksum, frame, unframe
-from station.simulation.trigger import SimulatedTriggerBox
 from tests.codes import raises
+from tests.trigger_box import SimulatedTriggerBox
 
 
 @pytest.fixture(autouse=True)

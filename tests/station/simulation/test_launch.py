@@ -64,20 +64,6 @@ def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe(number: signal.
         parent.stdout.close()
 
 
-def test_a_stopped_child_is_ended_by_force() -> None:
-    running = start_controller("UR10")
-    os.kill(running.process.pid, signal.SIGSTOP)
-    running.stop(timeout_s=0.3)
-    assert running.process.returncode == -signal.SIGKILL
-
-
-def test_its_standard_error_goes_where_it_is_told(tmp_path: Path) -> None:
-    log = tmp_path / "controller.log"
-    with start_controller("UR10", log=log) as first, raises("simulation-not-started"):
-        start_controller("UR10", host=first.host, log=log)
-    assert "cannot listen" in log.read_text()
-
-
 def test_it_starts_without_the_numeric_libraries() -> None:
     code = (
         "import sys, station.simulation.controller.__main__;"

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from station.simulation.controller.script_functions import PURE
 from station.simulation.controller.urscript import (
-    LOOPS_PER_CYCLE,
     List,
     Pose,
     ScriptRun,
@@ -75,27 +74,6 @@ def said(text: str) -> list[Any]:
 def test_a_value(expression: str, value: Any) -> None:
     found = said(f"say({expression})")[0]
     assert found == value and type(found) is type(value)
-
-
-NUMBERS = st.one_of(
-    st.integers(0, 1000), st.floats(0, 1000, allow_subnormal=False).map(lambda x: round(x, 3))
-)
-ARITHMETIC = st.recursive(
-    NUMBERS.map(str),
-    lambda inner: st.one_of(
-        st.tuples(inner, st.sampled_from("+-*"), inner).map(" ".join),
-        inner.map("({})".format),
-        inner.map("-{}".format),
-    ),
-)
-
-
-@given(ARITHMETIC, st.sampled_from(["<", "<=", ">", ">=", "==", "!="]), ARITHMETIC)
-def test_arithmetic_is_as_everywhere(left: str, sign: str, right: str) -> None:
-    assert said(f"say({left}); say({left} {sign} {right})") == [
-        eval(left),
-        eval(f"({left}) {sign} ({right})"),
-    ]
 
 
 PIECES = [
@@ -246,13 +224,6 @@ end
     assert tape.play() == ["short", "joined"] and tape.killed == 1
 
 
-def test_the_end_of_the_program_is_the_end_of_its_threads() -> None:
-    tape = Tape("def p():\n thread t():\n wait(1000)\n end\n h = run t()\n sync()\nend")
-    tape.play()
-    tape.run.end()
-    assert tape.killed == 1
-
-
 @pytest.mark.parametrize(
     "where", ["halt", "stop_it()", "x = 1 + stop_it()", "h = run ender()\n sync()\n sync()"]
 )
@@ -308,9 +279,3 @@ def test_a_text_that_is_no_program(text: str) -> None:
 def test_what_stops_a_program(text: str) -> None:
     with pytest.raises(ScriptRuntimeError):
         said(text)
-
-
-def test_a_loop_that_waits_is_none_that_never_ends() -> None:
-    tape = Tape("while True:\n x = 1\n sync()\nend")
-    for _ in range(3 * LOOPS_PER_CYCLE // 2):
-        assert tape.run.step()

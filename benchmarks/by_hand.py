@@ -28,9 +28,10 @@ from calibrate.projection import camera_matrix, distortion, project_pixels
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from recordings.schema.stillness import WINDOW_S, scatter
-from station.analysis.guidance import FEWEST_BY_HAND, NextView, next_view, rim, way_to
+from station.analysis.guidance import NextView, next_view, rim, way_to
 from station.analysis.worker import CapturedView
 from station.cell.config import CaptureConfig, StillnessConfig
+from station.cell.status import FEWEST_BY_HAND
 from tests.calibrate.chains import CAMERA, HOME, POINTS, ArmCell, arm_cell, boards, in_sight, shows, views_at
 
 SESSIONS = 17

@@ -29,8 +29,6 @@ from station.analysis.worker import CapturedView
 from station.plan.choose import Objective
 from station.plan.visibility import distances_that_fill, outline, visible
 
-FEWEST_BY_HAND = 12
-"""Fewest views with which a session by hand is enough."""
 USUAL_FOCAL = 1.3
 """Focal length over the image's longer side that is assumed while nothing is known of the lens."""
 NEW_RAD, NEW_SHARE = math.radians(10.0), 0.12
@@ -152,23 +150,22 @@ def _words(mount: Mount, turn: Array, further_m: float, shift: Array) -> str:
     """
     in_hand, parts = mount == "eye-in-hand", list[str]()
     what = "camera" if in_hand else "board"
+    names = (("down", "up"), ("left", "right")) if in_hand else (("bottom", "top"), ("left", "right"))
     sides = [
-        (abs(angle), side[int(angle > 0)])
-        for angle, side in ((turn[0], ("bottom", "top")), (turn[1], ("left", "right")))
+        (abs(angle), _degrees(angle), side[int(angle > 0)])
+        for angle, side in zip(turn[:2], names, strict=True)
+        if abs(angle) >= _NEAR_RAD
     ]
-    for angle, side in sorted(sides, reverse=True):
-        if angle >= _NEAR_RAD:
-            degrees = f"{5 * round(math.degrees(angle) / 5)}°"
-            parts.append(
-                f"tilt the camera {degrees} around the board to the {side}"
-                if in_hand
-                else f"tilt the board {degrees}, its {side} edge nearer"
-            )
+    if sides:
+        told = " and ".join(f"{degrees} {side}" for _, degrees, side in sorted(sides, reverse=True))
+        parts.append(
+            f"tilt the camera {told} around the board" if in_hand else f"tilt the board, {told} edge nearer"
+        )
     if abs(turn[2]) >= _NEAR_RAD:
         # Seen along z, positive turns are clockwise; a camera turns against its image.
         clockwise = (turn[2] > 0) != in_hand
-        degrees = f"{5 * round(math.degrees(abs(turn[2])) / 5)}°"
-        parts.append(f"turn the {what} {degrees} {'clockwise' if clockwise else 'anticlockwise'}")
+        way = "clockwise" if clockwise else "anticlockwise"
+        parts.append(f"turn the {what} {_degrees(turn[2])} {way}")
     if further_m:
         parts.append(f"{100 * abs(further_m):.0f} cm {'further away' if further_m > 0 else 'closer'}")
     moves = [
@@ -180,6 +177,10 @@ def _words(mount: Mount, turn: Array, further_m: float, shift: Array) -> str:
         parts.append(f"the board further {' and '.join(moves)} in the picture")
     text = ", ".join(parts[:3])
     return text[:1].upper() + text[1:]
+
+
+def _degrees(angle_rad: float) -> str:
+    return f"{5 * round(abs(math.degrees(angle_rad)) / 5)}°"
 
 
 def _usual_lens(camera: CameraModel) -> CameraModel:

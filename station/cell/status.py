@@ -210,6 +210,10 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Images that show the board in each part of the image, rows from the top."""
 
 
+FEWEST_BY_HAND = 12
+"""Fewest views with which a session by hand is enough."""
+
+
 class GuidanceStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Help for the person who moves the arm by hand; empty in all other states."""
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from recordings.errors import CodedError
 from recordings.schema.messages import CameraModel, Image
-from station.analysis.guidance import FEWEST_BY_HAND, NextView, Way, next_view, way_to
+from station.analysis.estimation import FEWEST_FOR_LENS
+from station.analysis.guidance import NextView, Way, next_view, way_to
 from station.analysis.worker import BoardDetection, CapturedView
-from station.cell.status import GuidanceStatus, StationState
+from station.cell.status import FEWEST_BY_HAND, GuidanceStatus, StationState
 from station.session.context import SessionContext
 from station.session.freedrive import FreedriveCapture
 from station.session.previews import PREVIEW_PERIOD_S, Previewer
@@ -37,7 +38,7 @@ class HandGuide:
         self._motion_px: float | None = None
         """Of the board between the last two previews; None: it was not seen in both."""
         self._moved_s, self._failed = 0.0, False
-        """When something moved last; whether an image failed since: no other is tried at the same place."""
+        """When something moved last; whether an image failed or was taken back since: no other is tried."""
 
     async def run(self) -> None:
         store = self._context.store
@@ -60,6 +61,8 @@ class HandGuide:
             return
         number, image, seen = looked
         wanted, way = await self._next(image), Way("", False)
+        # With fewer the lens is rough, and its error would pass for one of board or mounting.
+        cell = wanted.found if len(wanted.seen) >= FEWEST_FOR_LENS else None
         if seen.status.found:
             scale = wanted.camera.width / image.pixels.shape[1]
             view = CapturedView(-1, np.eye(4), seen.indices, (seen.pixels + 0.5) * scale - 0.5)
@@ -81,8 +84,8 @@ class HandGuide:
                 moves=moves,
                 new=way.new,
                 after_mm=None if wanted.after_m is None else round(1000 * wanted.after_m, 3),
-                cause="" if wanted.found is None else wanted.found.cause,
-                warning="" if wanted.found is None else wanted.found.warning,
+                cause="" if cell is None else cell.cause,
+                warning="" if cell is None else cell.warning,
                 enough=len(context.seen) >= FEWEST_BY_HAND and error_m is not None and error_m <= goal_m,
             )
         )
@@ -100,6 +103,7 @@ class HandGuide:
         if self._wanted is None or tuple(context.seen) != self._known:
             if self._known is not None:
                 self._given_up.clear()
+                self._failed = len(context.seen) < len(self._known)  # taken back: not again from here
             height, width = image.pixels.shape[:2]
             camera, known = config.camera.model or CameraModel(width, height), tuple(context.seen)
             self._wanted = await context.workers.call(

@@ -158,6 +158,8 @@ class StationApp(KnowingApp):
         self.known = replace(self.known, status=status, gone="")
         if before is None or before.session.calibration != status.session.calibration:
             self.action_look_at_disk()
+        elif status.guidance.outline and status.session.captured > before.session.captured:
+            self.bell()
         elif before.session.name and not status.session.name:
             self.result_path = ""  # another session begins: what was looked at is no part of it
         if not self._greeted:

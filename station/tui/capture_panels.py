@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from textual.content import Content
 
-from station.cell.status import StationStatus
+from station.cell.status import FEWEST_BY_HAND, StationStatus
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
-from station.tui.words import UNKNOWN, degrees, dim, facts, lines, mark, mm
+from station.tui.words import UNKNOWN, degrees, dim, facts, limit_bar, lines, mark, mm
 
 BURNT = 0.01
 """Share of saturated pixels above which the image counts as too bright."""
@@ -35,6 +35,32 @@ def quality_line(status: StationStatus) -> Content:
     parts.append(facts(("fills", f"{100 * seen.coverage:.0f} %", "")))
     line = Content("  ").join(parts)
     return line + Content.styled(f"   {seen.advice}", "$warn") if seen.advice else line
+
+
+def hand_lines(known: Known, width: int, height: int) -> Content:
+    """Say how still everything is, what the last view was worth, and what the wanted one would be."""
+    status = known.shown
+    seen, guidance = status.session, status.guidance
+    cells = max(6, width - 14)
+    still = guidance.still >= 1.0
+    bar = limit_bar(guidance.still, 1.0, cells, "$ok" if still else "$warn", at=1.0)
+    errors = [p.estimated_sigma_mm for p in seen.poses if p.counts]
+    now, before = (errors[-1] if errors else None), (errors[-2] if errors[1:] else None)
+    worth = [("view", str(seen.captured), f"of {FEWEST_BY_HAND} or more")]
+    if now is not None:
+        worth.append(("now", f"± {now:.2f}", "mm" if before is None else f"mm, before ± {before:.2f}"))
+    if guidance.after_mm is not None and (now is None or guidance.after_mm < now):
+        worth.append(("with the next", f"± {guidance.after_mm:.2f}", "mm"))
+    rows = [
+        dim("still ") + bar + dim(f" {100 * guidance.still:.0f} %"),
+        dim(guidance.moves or "nothing moves"),
+    ]
+    rows += [facts(each) for each in worth]
+    if guidance.warning:
+        rows.insert(0, mark("look", guidance.warning))
+    elif guidance.enough:
+        rows.insert(0, mark("done", "Enough: press F7 to finish"))
+    return lines(*rows[:height])
 
 
 def error_lines(known: Known, width: int, height: int) -> Content:

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from textual.app import ComposeResult
-from textual.containers import Horizontal, Vertical
+from typing import ClassVar
 
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical
+from textual.content import Content
+
+from station.cell.status import StationState
+from station.protocol import verbs
 from station.protocol.states import LATCHED, RUNNING
-from station.tui.capture_panels import coverage_lines, error_lines, quality_line
+from station.tui.capture_panels import coverage_lines, error_lines, hand_lines, quality_line
+from station.tui.desk import KnowingApp
 from station.tui.frame import Line
 from station.tui.log_screen import newest_events
 from station.tui.progress import LEGEND, progress_lines
@@ -16,10 +23,18 @@ from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
 
 
+def _progress(known: Known, width: int, height: int) -> Content:
+    draw = hand_lines if known.shown.guidance.outline else progress_lines
+    return draw(known, width, height)
+
+
 class CaptureScreen(StationScreen):
     """The camera's picture as large as it can be; progress, error and coverage beside it."""
 
     MODE, TIP = "capture", "The running capture"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("backspace", "take_back", "Take back", tooltip="By hand: take the last view back"),
+    ]
 
     def body(self) -> ComposeResult:
         with Horizontal(id="live"):
@@ -30,11 +45,19 @@ class CaptureScreen(StationScreen):
                 yield Panel("What happened", newest_events, id="events", below="6 all")
             with Vertical(id="live-right"):
                 with Box("Poses", id="progress", below=LEGEND):
-                    yield Panel("", progress_lines, id="poses")
+                    yield Panel("", _progress, id="poses")
                 yield Panel("Expected error of position (1σ)", error_lines, id="error")
                 title = "Where the board was seen"
                 yield Panel(title, coverage_lines, id="coverage", below="images per part")
         yield Stopped(id="stopped")
+
+    def action_take_back(self) -> None:
+        """Take back the last view that counts; only by hand."""
+        assert isinstance(self.app, KnowingApp)
+        status = self.app.known.shown
+        counting = [pose.index for pose in status.session.poses if pose.counts]
+        if status.state is StationState.FREE_DRIVE and counting:
+            self.ask(verbs.Skip(counting[-1]))
 
     def show(self, known: Known) -> None:
         super().show(known)
@@ -44,8 +67,10 @@ class CaptureScreen(StationScreen):
         if status is None:
             return
         session = status.session
-        title = "Poses"
-        if session.current is not None and status.state in RUNNING:
+        by_hand = bool(status.guidance.outline)
+        self.query_one(PreviewPane).wanted = status.guidance.outline
+        title = "By hand" if by_hand else "Poses"
+        if not by_hand and session.current is not None and status.state in RUNNING:
             title = f"Pose {session.current + 1} of {len(session.poses)}"
         self.query_one("#progress").border_title = f"{title}: OLD" if known.old else title
         self.query_one("#picture").border_title = (

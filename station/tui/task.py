@@ -218,6 +218,8 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     if state is StationState.DISCONNECTED:
         why = status.reason or "The robot does not answer."
         return Action("1", "See what is missing", why, look=True)
+    if status.guidance.outline and state in (*RUNNING, StationState.FREE_DRIVE):
+        return _by_hand(status)
     if state in RUNNING:
         good = " Good enough already: F7 finishes." if status.estimate.enough else ""
         why = status.pending or status.reason or f"F12 stops it at once, F6 after this pose.{good}"
@@ -233,6 +235,18 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
     if state is StationState.FREE_DRIVE:
         return Action("F2", "Capture an image here", "Guide the arm by the pendant's button; F3 ends it.")
     return None
+
+
+def _by_hand(status: StationStatus) -> Action:
+    guidance, seen = status.guidance, status.detection
+    if status.state in RUNNING:
+        return Action("", "Hold still", "The view is being taken.")
+    if guidance.enough:
+        return Action("F7", "Enough: finish", f"{many(status.session.captured, 'view')} are saved.")
+    if not seen.found:
+        return Action("", "Show the whole board", seen.reason)
+    why = guidance.warning or "The outline in the picture shows it. A new view is taken when all is still."
+    return Action("", guidance.words or "Hold still", why, look=bool(guidance.warning))
 
 
 def _at_rest(known: Known, status: StationStatus) -> Action:

@@ -36,11 +36,16 @@ LEVELS = 20
 """Shades a terminal image is drawn with: fewer styles to send, and no eye sees more in half blocks."""
 GREYS = 16
 """Shades of a sharp image: its bytes grow with them."""
-_CORNER = -1
-"""A cell that shows a corner in place of shades."""
-CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_rgb(0, 0, 0), bold=True))
-"""A corner: a sign and not only a colour."""
+_CORNER, _WANTED = -1, -2
+"""Cells that show a corner, or the outline of the wanted view, in place of shades."""
+_BLACK = Color.from_rgb(0, 0, 0)
+SIGNS = {
+    _CORNER: Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=_BLACK, bold=True)),
+    _WANTED: Segment("o", Style(color=Color.from_rgb(255, 200, 0), bgcolor=_BLACK, bold=True)),
+}
+"""Signs, and not only colours."""
 OLD = "OLD IMAGE"
+Outline = tuple[tuple[float, float], ...]
 SMALLEST = (16, 16)
 """Pixels to ask for while no image is drawn: the daemon still looks for the board."""
 FEW_SHADES = " ░▒▓█"
@@ -83,6 +88,8 @@ class PreviewPane(Widget):
     """The widget for sharp images; None: half blocks only."""
     old: reactive[bool] = reactive(False)
     """The image is out of date; written across it."""
+    wanted: reactive[Outline] = reactive(())
+    """Corners of the board in the wanted view, in order, as shares of the image's sides; drawn as a line."""
     calm: reactive[bool] = reactive(True)
     """The arm rests. While it works nothing that takes long to draw may make STOP wait."""
 
@@ -141,12 +148,20 @@ class PreviewPane(Widget):
         for place in np.rint(self._corners * (width, height)).astype(int).tolist():
             cv2.drawMarker(coloured, place, (0, 0, 0), cv2.MARKER_CROSS, 9, 3)
             cv2.drawMarker(coloured, place, (0, 230, 0), cv2.MARKER_CROSS, 7, 1)
+        self._outline(coloured, (0, 0, 0), 5)
+        self._outline(coloured, (255, 200, 0), 2)
         across, down = self._cell()
         scale = min(self.size.width * across / width, self.size.height * down / height)
         child: Any = self.children[0]
         child.image = Image.fromarray(coloured)
         child.styles.width, child.display = max(1, int(width * scale) // across), True
         self._next_s = time.monotonic() + SHARP_S
+
+    def _outline(self, image: cv2.typing.MatLike, colour: tuple[int, ...], thickness: int = 1) -> None:
+        """Draw the wanted view's outline into an image."""
+        if self.wanted:
+            places = np.rint(np.array(self.wanted) * image.shape[1::-1]).astype(np.int32)
+            cv2.polylines(image, [places], True, colour, thickness)
 
     def soften(self) -> None:
         """Show half blocks: a sharp image would hide what is drawn over it."""
@@ -155,6 +170,9 @@ class PreviewPane(Widget):
 
     def watch_old(self) -> None:
         self.soften()
+
+    def watch_wanted(self) -> None:
+        self._rows_size = Size(0, 0)
 
     def watch_calm(self) -> None:
         self.soften()
@@ -196,6 +214,10 @@ class PreviewPane(Widget):
         dark = np.tile(_BAYER, (rows // 8 + 1, columns // 4 + 1))[: rows // 2, :columns]
         dithered = small.reshape(shades.shape).mean(axis=1) / 255 * (len(FEW_SHADES) - 1) + dark
         cells = (shades[:, 0] * LEVELS + shades[:, 1] if few is None else dithered.astype(int)).tolist()
+        lined = np.zeros((rows // 2, columns), np.uint8)
+        self._outline(lined, (1,))
+        for row, column in np.argwhere(lined).tolist():
+            cells[row][column] = _WANTED
         for x, y in self._corners:
             row, column = int(y * rows) // 2, int(x * columns)
             if 0 <= row < rows // 2 and 0 <= column < columns:
@@ -210,8 +232,8 @@ def _runs(line: list[int], few: Style | None) -> list[Segment]:
     runs: list[Segment] = []
     for cell, alike in groupby(line):
         count = len(list(alike))
-        if cell == _CORNER:
-            runs += [CORNER] * count
+        if cell in SIGNS:
+            runs += [SIGNS[cell]] * count
         elif few is not None:
             runs.append(Segment(FEW_SHADES[cell] * count, few))
         else:

@@ -10,8 +10,9 @@ from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, t
 from calibrate.projection import project_pixels
 from calibrate.views import implied_flange
 from recordings.schema.messages import CameraModel, Mount
-from station.analysis.guidance import FEWEST_BY_HAND, NextView, next_view, rim, way_to
+from station.analysis.guidance import NextView, next_view, rim, way_to
 from station.analysis.worker import CapturedView
+from station.cell.status import FEWEST_BY_HAND
 from station.simulation.cells import make_cell
 
 MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
@@ -93,6 +94,8 @@ def test_sides_are_those_of_the_image(
     camera = (STRAIGHT @ inverse(wanted.camera_from_board))[:3, 3]
     assert (camera[edge] > 0) == (side in ("right", "bottom"))
     words = way_to(wanted, seen(STRAIGHT)).words
+    if mount == "eye-in-hand":
+        side = {"top": "up", "bottom": "down"}.get(side, side)
     assert side in words and "25°" in words and ("camera" in words) == (mount == "eye-in-hand")
     assert not way_to(wanted, seen(wanted.camera_from_board)).words
 

@@ -53,7 +53,14 @@ async def test_views_are_taken_by_themselves_and_taken_back(guided: Rig) -> None
     assert captured(rig) == len(stops) - 1
     with raises("pose-not-taken"):
         await rig.session.edit(1, Skip(len(stops) - 1))
-    await until(lambda: captured(rig) == len(stops))  # it stands there, and the view is new again
+    await until(lambda: rig.session.store.status.guidance.new)
+    glimpses = rig.camera.glimpses
+    await until(lambda: rig.camera.glimpses > glimpses + 5)
+    assert captured(rig) == len(stops) - 1, "it was not wanted from there"
+    lead(rig, stops[0])
+    await until(lambda: not rig.session.store.status.guidance.new)
+    lead(rig, stops[-1])
+    await until(lambda: captured(rig) == len(stops) and rig.state is S.FREE_DRIVE)
     await rig.session.edit(1, Skip(0))
     await rig.session.finish(1)
     kept = [view.index for view in sealed(rig).views()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
@@ -107,6 +108,8 @@ def test_every_entry_is_used_and_has_only_what_is_known(package: str) -> None:
     }
     table = error_table(package)
     assert not table.keys() - said
+    assert all(re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", code) for code in table)
+    assert not {"failed", "recording", "calibration", "station"} & table.keys()
     assert all({"text"} <= entry.keys() <= {"text", "remedy", "values"} for entry in table.values())
 
 

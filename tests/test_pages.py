@@ -69,13 +69,6 @@ def test_the_page_of_benchmarks_is_fresh_and_short() -> None:
     assert len(page.split()) < 3500
 
 
-def test_every_error_has_a_code_of_its_own_kind() -> None:
-    codes = re.findall(r"^#### `(.+)`$", (ROOT / "docs/reference/errors.md").read_text(), re.MULTILINE)
-    assert codes
-    assert all(re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", code) for code in codes)
-    assert not {"failed", "recording", "calibration", "station"} & set(codes)
-
-
 @pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
 def test_a_manual_page_names_every_command(program: str) -> None:
     page = runpy.run_path(str(ROOT / "docs" / "man.py"))["page"](program)

@@ -65,7 +65,7 @@ class ConfirmMotion(Confirm):
 
     def __init__(self, preview: MotionPreview) -> None:
         super().__init__("The arm will move", "", yes="Start motion", no="Do not move")
-        self._preview = preview
+        self._preview, self._drawn = preview, False
         self._until_s = time.monotonic() + APPROVAL_LIFETIME_S
 
     def body(self) -> ComposeResult:
@@ -76,19 +76,21 @@ class ConfirmMotion(Confirm):
         yield from self.buttons()
 
     def on_mount(self) -> None:
-        self.call_after_refresh(self._draw)
         self.set_interval(1.0, self._count_down)
         self._count_down()
 
     def _draw(self) -> None:
+        """Draw the first move, once: the pane has its size after the screen's first layout."""
         pane, status = self.query_one("#motion-scene", Static), self.known.shown
         scene = cell_scene(self.known.configuration, status)
-        if scene is not None and pane.display and pane.size.width > 20:
+        if scene is not None and pane.display and pane.size.width > 20 and not self._drawn:
+            self._drawn = True
             poses = status.session.poses
             first = next((place for place, pose in enumerate(poses) if pose.state == "planned"), None)
             pane.update(draw(scene, status, first, *pane.size))
 
     def _count_down(self) -> None:
+        self.call_after_refresh(self._draw)
         left_s = max(0.0, self._until_s - time.monotonic())
         line = Content.assemble(
             ("this question expires in ", "$dim"), (duration(left_s), "bold $strong"), "  "

@@ -42,7 +42,7 @@ from calibrate.projection import intrinsics_names, intrinsics_vector, project_pi
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import Mount
 from station.cell.pose_plan import Criterion
-from station.plan.choose import TABLE_MM, Objective, choose
+from station.plan.choose import LINK_ERROR_MM, Objective, choose
 
 ARM = MODELS["UR10e"]
 CHAIN = chain_of(ARM)
@@ -156,7 +156,7 @@ def planned(
     noise = MeasurementNoise(CORNER_PX, ROBOT_M, ROBOT_RAD)
     gains = view_information(truth.mount, LENS, flange, truth.X, truth.Y, POINTS, noise, motion)
     board = BoardTolerance(truth.told.board, _BENT_M)
-    prior = prior_information(LENS, True, board, TABLE_MM, LensPrior.given(LENS, lens_sigma(truth.told)))
+    prior = prior_information(LENS, True, board, LINK_ERROR_MM, LensPrior.given(LENS, lens_sigma(truth.told)))
     room_q = sample_workspace(ARM, pool)
     room = Workspace.of(truth.mount, forward(ARM, room_q), CHAIN.by_links(room_q), truth.X, truth.Y, _AHEAD_M)
     objective = Objective(criterion, _AHEAD_M, prior, None, room.among(len(prior)))

@@ -7,6 +7,7 @@ which one explains all views. This comes before any single view is called wrong.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -62,7 +63,7 @@ def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
             if reading is Reading.SQUARE_SIZE and abs(abs(np.log(factor)) - np.log(1000.0)) < _NEAR:
                 reading = Reading.MILLIMETRES
             best = Explanation(reading, float(gain), at, factor)
-    return best
+    return replace(best, at=0, order=_ORDERS[best.at]) if best.reading is Reading.EULER_ORDER else best
 
 
 def clear_gain(views: int) -> float:
@@ -80,9 +81,11 @@ def _fit(views: PoseViews, seed: int) -> PoseFit | None:
 def _readings(
     views: PoseViews, as_recorded: PoseFit | None
 ) -> Iterator[tuple[Reading, PoseViews, int, float]]:
-    """Yield each reading, its views, `Explanation.at`, and the log evidence to subtract for it."""
+    """Yield each reading, its views, `Explanation.at` (place in `_ORDERS`), log evidence to subtract."""
     for reading, change in _CONVENTIONS.items():
         yield reading, replace(views, flange=change(views.flange)), 0, 0.0
+    for place, (read, meant) in enumerate(_ORDERS):
+        yield Reading.EULER_ORDER, replace(views, flange=_reordered(views.flange, read, meant)), place, 0.0
     yield Reading.MIRRORED, replace(views, boards=_mirrored(views.boards)), 0, 0.0
     for shift in (*range(-_LARGEST_SHIFT, 0), *range(1, _LARGEST_SHIFT + 1)):
         if len(views) - abs(shift) >= _FEWEST_PER_PART + 2:
@@ -170,6 +173,22 @@ def _vectors(R: Array) -> Array:
     return rotation_exp(np.where(shorter[:, None], angles, other))
 
 
+_ORDERS = [
+    *itertools.product(["xyz"], ["XYZ", "ZYX", "zyx", "ZYZ"]),
+    *itertools.product(["XYZ"], ["xyz", "ZYX", "ZYZ"]),
+]
+"""Orders of three angles: read as, and meant. Others come to the same: `ZYX` read for `xyz` turns every pose
+as `xyz` read for `ZYX` does."""
+
+
+def _reordered(poses: Array, read: str, meant: str) -> Array:
+    def turned(R: Array) -> Array:
+        angles = Rotation.from_matrix(R).as_euler(read)
+        return np.asarray(Rotation.from_euler(meant, angles).as_matrix())
+
+    return _rotations(turned)(poses)
+
+
 _CONVENTIONS: dict[Reading, Callable[[Array], Array]] = {
     Reading.INVERSE_POSES: inverse,
     Reading.QUATERNION_ORDER: _rotations(_w_first),
@@ -191,6 +210,8 @@ _TEXTS = {
     Reading.ROTATION_VECTOR_AS_ANGLES: "Rotation vectors were read as roll, pitch, yaw." + _INPUT,
     Reading.ANGLES_AS_ROTATION_VECTOR: "Roll, pitch, yaw were read as rotation vectors." + _INPUT,
     Reading.INVERSE_ROTATIONS: "The views agree with inverted rotations and the given positions." + _INPUT,
+    Reading.EULER_ORDER: "Angles in the order {order[1]} were read as {order[0]} (capitals: about moved "
+    "axes), or the like. Import the original numbers again.",
     Reading.SHIFTED: "Each image belongs to the robot pose {rows} {later}. "
     "Move the poses by that many rows and import again.",
     Reading.MIRRORED: "The images are mirrored. Switch the camera's flip or reverse x off and record again.",
@@ -216,6 +237,7 @@ def explain_text(session: Explanation, views: ViewSet) -> str:
     first = views.views[0 if session.reading is Reading.SHIFTED else session.at]
     return _TEXTS[session.reading].format(
         factor=session.factor,
+        order=session.order,
         rows=abs(session.at),
         later="later" if session.at > 0 else "earlier",
         in_mm="robot positions" if session.factor > 1 else "square sizes",

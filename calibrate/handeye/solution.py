@@ -184,6 +184,7 @@ class Reading(Enum):
     ROTATION_VECTOR_AS_ANGLES = "rotation-vector-as-angles"
     ANGLES_AS_ROTATION_VECTOR = "angles-as-rotation-vector"
     INVERSE_ROTATIONS = "inverse-rotations"
+    EULER_ORDER = "euler-order"
     SHIFTED = "shifted-pictures"
     MIRRORED = "mirrored-pictures"
     SQUARE_SIZE = "square-size"
@@ -205,6 +206,8 @@ class Explanation:
     """Index of the first view after a change; for shifted images, by how many poses."""
     factor: float = 1.0
     """True over configured size of the squares, or focal length, of the later part where it changed."""
+    order: tuple[str, str] = ("", "")
+    """Orders of angles, as scipy writes them: by which they were read, by which they should have been."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ _WAYS = {
     Reading.INVERSE_POSES: "inverted, or with the other mounting",
     Reading.INVERSE_ROTATIONS: "with inverted rotations",
     Reading.ROTATION_VECTOR_AS_ANGLES: "with roll, pitch, yaw as rotation vectors",
+    Reading.EULER_ORDER: "with angles in another order",
     Reading.ANGLES_AS_ROTATION_VECTOR: "with rotation vectors as roll, pitch, yaw",
     Reading.MIRRORED: "with mirrored images",
     Reading.MILLIMETRES: "in another unit of length",

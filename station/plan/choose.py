@@ -24,14 +24,14 @@ from calibrate.projection import intrinsics_names
 from station.cell.layout import CellLayout
 from station.cell.pose_plan import Criterion
 
-WITH_TABLE = ("arm", "all")
+WITH_LINKS = ("arm", "all")
 Aim = Literal["camera", "arm", "both"]
 CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm", "both": "all"}
 """Aim of a plan, as users name it → criterion."""
 _LENS_SHARE = 0.02
 """Weight of the lens in criterion A, so that the views cover the image."""
-TABLE_MM = 0.3
-"""1σ of the errors of an arm's table that is assumed in planning, mm and mrad."""
+LINK_ERROR_MM = 0.3
+"""1σ of the errors of an arm's links, assumed in planning, mm and mrad."""
 _ENOUGH_TO_RANK, _SHORTLIST = 8, 60
 """From so many known views on, further ones are ranked by their first-order effect; so many are then
 evaluated exactly."""
@@ -90,7 +90,7 @@ def informations(
     joints_rad: Array | None = None,
     noise: MeasurementNoise = USUAL_NOISE,
 ) -> Array:
-    """Compute the information (n, p, p) of each pose; with joints (n, 6) also about the arm's table."""
+    """Compute the information (n, p, p) of each pose; with joints (n, 6) also about the arm's links."""
     points, motion = board_points(layout.board), None
     if joints_rad is not None:
         motion = chain_of(layout.geometry.model).by_links(joints_rad)
@@ -104,13 +104,13 @@ def objective_for(
 ) -> Objective:
     """Make the objective of a criterion.
 
-    `joints_rad`: (n, 6) postures that stand for the workspace, needed by the criteria with the arm's table.
+    `joints_rad`: (n, 6) postures that stand for the workspace, needed by the criteria with the arm's links.
     """
-    table_mm = TABLE_MM if criterion in WITH_TABLE else 0.0
-    prior = prior_information(layout.camera, not free_intrinsics, BoardTolerance.of(layout.board), table_mm)
+    link_mm = LINK_ERROR_MM if criterion in WITH_LINKS else 0.0
+    prior = prior_information(layout.camera, not free_intrinsics, BoardTolerance.of(layout.board), link_mm)
     lens = slice(12, 12 + len(intrinsics_names(layout.camera))) if free_intrinsics else None
     K = None
-    if joints_rad is not None and table_mm:
+    if joints_rad is not None and link_mm:
         chain, room = chain_of(layout.geometry.model), sample_workspace(layout.geometry.model, joints_rad)
         over = Workspace.of(
             layout.mount,

@@ -122,6 +122,13 @@ NUMBERS = {
 }
 
 
+def read_as(order, meant):
+    """Poses whose angles mean `meant` and were read in another order."""
+    return rotations(
+        lambda R: Rotation.from_euler(order, Rotation.from_matrix(R).as_euler(meant)).as_matrix()
+    )
+
+
 def explained(views):
     return explain_recording(pose_views(views, 0.002, 0.003))
 
@@ -165,6 +172,22 @@ def test_a_misread_recording_is_refused_or_closes_the_session_gate(reading, moun
     assert solution.session.reading is reading
     assert reading.value in {remark.code for remark in solution.warnings}
     assert "session" in [gate.name for gate in judge(solution, GateInputs()) if not gate.passed]
+
+
+@pytest.mark.parametrize(
+    ("order", "meant", "said"),
+    [
+        ("xyz", "ZYX", ("xyz", "ZYX")),
+        ("xyz", "XYZ", ("xyz", "XYZ")),
+        ("ZYX", "xyz", ("xyz", "ZYX")),
+        ("ZYX", "XYZ", ("xyz", "zyx")),
+        ("XYZ", "xyz", ("XYZ", "xyz")),
+        ("xyz", "ZYZ", ("xyz", "ZYZ")),
+    ],
+)
+def test_a_wrong_order_of_angles_is_named(order, meant, said):
+    found = explained(read_as(order, meant)(cell("eye-in-hand")))
+    assert found.reading is Reading.EULER_ORDER and found.at == 0 and found.order == said
 
 
 def test_a_board_given_in_millimetres_is_told_from_robot_poses_that_are():

@@ -57,6 +57,8 @@ def read_folder(
     Raises RecordingError, which names what decides.
     """
     folder, known = Path(folder), None
+    if not folder.is_dir():
+        raise ImportSourceError("no-folder", path=folder)
     if (folder / DATASET_FILE).is_file():
         known = read_dataset(folder / DATASET_FILE)[0]
     if known is not None and (folder / POSES_FILE).is_file():
@@ -135,8 +137,13 @@ def solve(
     """
     board = _board(board)
     if convention is not None:
-        rows = array_of(poses, (len(images), -1), "poses")
-        poses = conventions.convention(convention).poses(rows)
+        rows, how = array_of(poses, (len(images), -1), "poses"), conventions.convention(convention)
+        try:
+            poses = how.poses(rows)
+        except ValueError:
+            raise BadViewsError(
+                "shape", what="poses", given=str(rows.shape), wanted=f"numbers as {convention} has them"
+            ) from None
     flanges = array_of(poses, (len(images), 4, 4), "poses")
     joints = None if joints_rad is None else array_of(joints_rad, (len(images), -1), "joints_rad")
     with ThreadPoolExecutor(usable_cores()) as pool:

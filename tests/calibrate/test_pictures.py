@@ -94,6 +94,8 @@ def test_poses_are_read_by_a_convention_and_a_board_as_typed(given: dict[str, An
     np.testing.assert_allclose(calibrate.solve(**same).X, calibrate.solve(**given).X, atol=1e-6)
     with raises("no-convention"):
         calibrate.solve(**same | {"convention": "kuka"})
+    with raises("shape", what="poses"):
+        calibrate.solve(**same | {"convention": "easy-handeye"})
 
 
 def test_corners_and_gaps_are_taken(given: dict[str, Any], solved: SolvedRecording) -> None:

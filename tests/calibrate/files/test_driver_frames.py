@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 from calibrate.files.calibration import Calibration, FramePose
@@ -24,28 +25,20 @@ OPTICAL = (-np.pi / 2, 0, -np.pi / 2)
 Frames = dict[str, tuple[str, tuple[float, ...], tuple[float, ...]]]
 """Child → parent, xyz, rpy."""
 DRIVERS: dict[str, tuple[str, str, Frames]] = {
-    "realsense d435": (
-        "camera_link",
-        "camera_color_optical_frame",
-        {
-            "camera_depth_frame": ("camera_link", (0, 0, 0), (0, 0, 0)),
-            "camera_depth_optical_frame": ("camera_depth_frame", (0, 0, 0), OPTICAL),
-            "camera_color_frame": ("camera_link", (0, 0.015, 0), (0, 0, 0)),
-            "camera_color_optical_frame": ("camera_color_frame", (0, 0, 0), OPTICAL),
-        },
-    ),
-    "zed 2": (
-        "zed_camera_link",
-        "zed_left_camera_optical_frame",
-        {
-            "zed_camera_center": ("zed_camera_link", (0, 0, 0.015), (0, 0.05, 0)),
-            "zed_left_camera_frame": ("zed_camera_center", (-0.01, 0.06, 0), (0, 0, 0)),
-            "zed_left_camera_optical_frame": ("zed_left_camera_frame", (0, 0, 0), OPTICAL),
-            "zed_right_camera_frame": ("zed_camera_center", (-0.01, -0.06, 0), (0, 0, 0)),
-            "zed_right_camera_optical_frame": ("zed_right_camera_frame", (0, 0, 0), OPTICAL),
-        },
-    ),
-}
+    "realsense d435": ("camera_link", "camera_color_optical_frame", {
+        "camera_depth_frame": ("camera_link", (0, 0, 0), (0, 0, 0)),
+        "camera_depth_optical_frame": ("camera_depth_frame", (0, 0, 0), OPTICAL),
+        "camera_color_frame": ("camera_link", (0, 0.015, 0), (0, 0, 0)),
+        "camera_color_optical_frame": ("camera_color_frame", (0, 0, 0), OPTICAL),
+    }),
+    "zed 2": ("zed_camera_link", "zed_left_camera_optical_frame", {
+        "zed_camera_center": ("zed_camera_link", (0, 0, 0.015), (0, 0.05, 0)),
+        "zed_left_camera_frame": ("zed_camera_center", (-0.01, 0.06, 0), (0, 0, 0)),
+        "zed_left_camera_optical_frame": ("zed_left_camera_frame", (0, 0, 0), OPTICAL),
+        "zed_right_camera_frame": ("zed_camera_center", (-0.01, -0.06, 0), (0, 0, 0)),
+        "zed_right_camera_optical_frame": ("zed_right_camera_frame", (0, 0, 0), OPTICAL),
+    }),
+}  # fmt: skip
 """The topmost frame, the calibrated lens, and the frames, as the drivers' descriptions have them."""
 
 
@@ -63,40 +56,37 @@ def matrix(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Array:
 
 
 def as_urdf(frames: Frames) -> str:
-    links = {*frames, *(parent for parent, _, _ in frames.values())}
-    return "<robot name='driver'>" + "".join(f"<link name='{name}'/>" for name in sorted(links)) + "".join(
+    joints = "".join(
         f"<joint name='{child}_joint' type='fixed'><parent link='{parent}'/><child link='{child}'/>"
-        f"<origin xyz='{' '.join(map(str, xyz))}' rpy='{' '.join(map(repr, rpy))}'/></joint>"
+        f"<origin xyz='{' '.join(map(repr, xyz))}' rpy='{' '.join(map(repr, rpy))}'/></joint>"
         for child, (parent, xyz, rpy) in frames.items()
-    ) + "</robot>"  # fmt: skip
+    )
+    names = sorted({*frames, *(parent for parent, _, _ in frames.values())})
+    return f"<robot name='driver'>{''.join(f'<link name={name!r}/>' for name in names)}{joints}</robot>"
 
 
 def as_launch(frames: Frames) -> str:
-    nodes = "".join(
-        "Node(package='tf2_ros', executable='static_transform_publisher', arguments=["
-        f"'--frame-id', '{parent}', '--child-frame-id', '{child}', "
-        + ", ".join(
-            f"'--{name}', '{value!r}'"
-            for name, value in zip(("x", "y", "z", "roll", "pitch", "yaw"), (*xyz, *rpy), strict=True)
-        )
-        + "]),\n"
-        for child, (parent, xyz, rpy) in frames.items()
-    )
-    return f"LaunchDescription([{nodes}])"
+    options = ("--x", "--y", "--z", "--roll", "--pitch", "--yaw")
+    nodes = []
+    for child, (parent, xyz, rpy) in frames.items():
+        numbers = [word for pair in zip(options, map(repr, (*xyz, *rpy)), strict=True) for word in pair]
+        words = ["--frame-id", parent, "--child-frame-id", child, *numbers]
+        nodes.append(f"Node(executable='static_transform_publisher', arguments={words})")
+    return f"LaunchDescription([{', '.join(nodes)}])"
 
 
 def as_echo(frames: Frames) -> str:
-    """Two messages, as `ros2 topic echo` divides them."""
-    told = []
+    """A message for each frame, as `ros2 topic echo` divides them."""
+    messages = []
     for child, (parent, xyz, rpy) in frames.items():
-        q = Rotation.from_euler("xyz", rpy).as_quat().tolist()
-        told.append(
-            "- header:\n    stamp: {sec: 1, nanosec: 2}\n"
-            f"    frame_id: {parent}\n  child_frame_id: {child}\n  transform:\n    translation: "
-            f"{{x: {xyz[0]!r}, y: {xyz[1]!r}, z: {xyz[2]!r}}}\n    rotation: "
-            f"{{x: {q[0]!r}, y: {q[1]!r}, z: {q[2]!r}, w: {q[3]!r}}}\n"
-        )
-    return f"transforms:\n{told[0]}---\ntransforms:\n{''.join(told[1:])}---\n"
+        turn = Rotation.from_euler("xyz", rpy).as_quat().tolist()
+        moved = {
+            "translation": dict(zip("xyz", xyz, strict=True)),
+            "rotation": dict(zip("xyzw", turn, strict=True)),
+        }
+        header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": parent}
+        messages.append({"transforms": [{"header": header, "child_frame_id": child, "transform": moved}]})
+    return "".join(f"{yaml.safe_dump(message)}---\n" for message in messages)
 
 
 def as_bag(frames: Frames, folder: Path) -> None:

@@ -138,19 +138,6 @@ async def at_rest(made: Rig, fault: Fault, late_s: float) -> tuple[str, str]:
     return said, cause.code if cause else "–"
 
 
-async def between_moves(made: Rig, fault: Fault, late_s: float) -> str:
-    """What ended control, which the next move says; 'goes on': nothing did. One approval makes it go on."""
-    await made.start()
-    await fault(made, late_s)
-    await asyncio.sleep(0.5)
-    try:
-        await made.robot.move(made.robot.newest().state.joints_rad, 0.5, 1.0)
-    except RobotError as error:
-        await asyncio.sleep(0.5)
-        return error.code
-    return "goes on"
-
-
 async def moving(made: Rig, fault: Fault, late_s: float) -> tuple[str, float]:
     """What ended the move, '' for nothing, and when the arm rested after its news ended, seconds."""
     await made.start()
@@ -184,7 +171,7 @@ async def _run() -> str:
     count = trials(TRIALS)
     rows = [f"{count} trials a row, UR10e simulated on loopback, heartbeat every {1000 * BEAT_S:.0f} ms.", ""]
     with tempfile.TemporaryDirectory() as folder:
-        for table in (_at_rest, _between_moves, _in_motion):
+        for table in (_at_rest, _in_motion):
             rows += [*await table(Path(folder), count), ""]
     return "\n".join(rows[:-1])
 
@@ -201,17 +188,6 @@ async def _at_rest(folder: Path, count: int) -> list[str]:
             told += count if late_s > TOLD_S else 0
             rows.append(f"| {1000 * late_s:.0f} ms | {who} | {_told(said)} | {_told(named)} |")
     return [*rows, f"| all | | {faults} faults | {right} of {told} right above 120 ms |"]
-
-
-async def _between_moves(folder: Path, count: int) -> list[str]:
-    rows = ["| between two moves, late by | who | the next move |", "|-|-|-|"]
-    wrong = 0
-    for late_s, who, fault, cause in _trials(CONTROL_FAULTS):
-        async with rig(folder) as made:
-            named = Counter([await between_moves(made, fault, late_s) for _ in range(count)])
-        wrong += count - named["goes on"] - (named[cause] if late_s > TOLD_S else 0)
-        rows.append(f"| {1000 * late_s:.0f} ms | {who} | {_told(named)} |")
-    return [*rows, f"| all | | {wrong} stopped without need or with another cause |"]
 
 
 async def _in_motion(folder: Path, count: int) -> list[str]:

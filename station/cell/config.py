@@ -92,7 +92,7 @@ class CameraConfig(Section, frozen=True):
     GONE: ClassVar = frozenset(
         {
             "playback_pace", "ptp", "time_offset", "gain", "packet_delay_us", "invert_trigger_line",
-            "exposure_line",
+            "exposure_line", "frame_rate_hz",
         }
     )  # fmt: skip
 
@@ -103,8 +103,6 @@ class CameraConfig(Section, frozen=True):
     """aravis: serial, IP address or name. webcam: its number or device file. playback: the recording."""
     trigger: Literal["software", "hardware"] = "software"
     pixel_format: str = "Mono8"
-    frame_rate_hz: float | None = None
-    """Frame rate of a webcam; None: its own"""
     exposure_us: Positive = 10_000.0
     gain_db: float = 0.0
     """Gain; only 0, for the smallest one, where the camera does not state it in dB"""
@@ -193,12 +191,11 @@ class StillnessConfig(Section, frozen=True):
 
 
 class CaptureConfig(Section, frozen=True):
-    GONE: ClassVar = frozenset({"lossless_png"})
+    GONE: ClassVar = frozenset({"lossless_png", "retries"})
     time_bound_s: Positive = 0.02
     """Largest bound of the image time for which a pose is accepted. At the stillness limit of 2 mrad/s it is
     0.04 mm at one metre."""
     free_space_bytes: Annotated[int, msgspec.Meta(ge=0)] = 2_000_000_000
-    retries: Annotated[int, msgspec.Meta(ge=0)] = 2
     goal_m: Positive = 0.0005
     """Expected error of X (1σ of its translation) below which the session is complete enough."""
 

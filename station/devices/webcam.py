@@ -116,8 +116,6 @@ class WebcamCamera:
         if wanted is not None:
             video.set(cv2.CAP_PROP_FRAME_WIDTH, wanted[0])
             video.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted[1])
-        if config.frame_rate_hz is not None:
-            video.set(cv2.CAP_PROP_FPS, config.frame_rate_hz)
         video.set(cv2.CAP_PROP_AUTOFOCUS, 0)
         if "focus" in self._fixed:  # opened again: the focus must be that of the images before
             video.set(cv2.CAP_PROP_FOCUS, self._fixed["focus"])

@@ -23,6 +23,7 @@ from station.session.context import SessionContext
 from station.session.recording import to_the_end
 
 SATURATED_LIMIT = 0.05
+TRIES = 3
 GAPS_S = (0.0, 0.0, 0.03)
 """Pauses before the images for motion; unequal between them, so that no vibration's period fits both."""
 WORKER_TIMEOUT_S = 5.0
@@ -75,12 +76,11 @@ def _phase(context: SessionContext, index: int, state: StationState, pose_state:
 
 
 async def take_image(context: SessionContext, index: int | None = None) -> Image:
-    """Take an image, for pose `index` or none. PoseFailedError after the configured number of tries."""
-    tries = 1 + context.cell.config.capture.retries
+    """Take an image, for pose `index` or none. PoseFailedError after `TRIES`."""
     camera = context.cell.camera
-    for number in range(1, tries + 1):
+    for number in range(1, TRIES + 1):
         try:
-            if number == tries > 1:  # before the last try open the camera again
+            if number == TRIES:  # before the last try open the camera again
                 await camera.close()
                 await camera.open()
             if number > 1:  # some cameras lose the first frame after a pause, such as the time-out just now
@@ -89,8 +89,8 @@ async def take_image(context: SessionContext, index: int | None = None) -> Image
             return await camera.capture()
         except CameraError as error:
             last = error
-            context.store.problem(error, "warning", index, f"image {number} of at most {tries}: {{}}")
-    raise PoseFailedError("no-good-image", tries=tries, reason=str(last))
+            context.store.problem(error, "warning", index, f"image {number} of at most {TRIES}: {{}}")
+    raise PoseFailedError("no-good-image", tries=TRIES, reason=str(last))
 
 
 async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState, float]:

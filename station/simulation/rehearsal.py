@@ -80,7 +80,7 @@ def without_devices(config: StationConfig, host: str) -> StationConfig:
     """
     robot = msgspec.structs.replace(config.robot, host=host, serial="", kinematics=None)
     camera = msgspec.structs.replace(
-        config.camera, driver="rendered", device="", trigger="software", frame_rate_hz=None, region=None
+        config.camera, driver="rendered", device="", trigger="software", region=None
     )
     return msgspec.structs.replace(config, robot=robot, camera=camera, trigger=None)
 

@@ -27,7 +27,10 @@ def test_a_plan_is_made_shown_and_saved(made):
     result, file = made
     assert result.returncode == 0, result.stderr
     assert "12 poses" in result.stdout and "check: passed" in result.stdout
-    assert len(load_plan(file).poses) == 12
+    plan = load_plan(file)
+    assert len(plan.poses) == 12
+    rows = [line for line in result.stdout.splitlines() if line.startswith(tuple(p.name for p in plan.poses))]
+    assert len(rows) == 12 and all(pose.why in row for pose, row in zip(plan.poses, rows, strict=True))
 
 
 def test_json_is_one_object_and_nothing_else(made):

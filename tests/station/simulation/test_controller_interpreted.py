@@ -6,7 +6,6 @@ from math import nan
 
 import pytest
 
-from station.simulation.controller.kinematics import forward
 from station.simulation.controller.urscript_parser import NOT_SUPPORTED
 
 GOAL = "[0.4, -1.5, 1.5, -1.5, -1.5, 0.1]"
@@ -59,32 +58,6 @@ def test_joint_speeds_and_goals_are_followed(started) -> None:
     assert made.robot.arm.command[0] == pytest.approx(0.25, abs=0.02)
     assert made.robot.arm.command[5] == pytest.approx(0.4 * 1.0, abs=0.01)
     assert not made.robot.arm.moving
-
-
-def test_speeds_are_published(started) -> None:
-    made = started("  movej([2.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0], a=5.0, v=0.5)")
-    made.run(1.0)
-    radius = sum(x * x for x in made.robot.outputs.vector("actual_TCP_pose")[:2]) ** 0.5
-    speed = made.robot.outputs.vector("actual_TCP_speed")
-    assert (speed[0] ** 2 + speed[1] ** 2) ** 0.5 == pytest.approx(0.5 * radius, rel=1e-2)
-    assert speed[2:] == pytest.approx((0.0, 0.0, 0.0, 0.5), abs=1e-3)
-    assert made.robot.outputs.vector("target_qd")[0] == pytest.approx(0.5)
-
-
-def test_kinematics_use_the_active_tool(started) -> None:
-    made = started(
-        "  set_tcp(p[0.01, 0.02, 0.1, 0.0, 0.3, 0.0])\n  sync()\n  sync()\n"
-        "  here = get_actual_tcp_pose()\n  q = get_inverse_kin(here)\n"
-        "  write_output_float_register(0, q[1] - get_actual_joint_positions()[1])\n"
-        "  write_output_float_register(1, pose_dist(here, get_forward_kin()))\n"
-        "  if get_inverse_kin_has_solution(p[3, 0, 0, 0, 0, 0]):\n    halt\n  end\n  sleep(1)"
-    )
-    made.run(0.1)
-    assert made.output("output_double_register_0") == pytest.approx(0, abs=1e-9)
-    assert made.output("output_double_register_1") == pytest.approx(0, abs=1e-12)
-    assert made.plays
-    flange = forward(made.robot.table, made.robot.arm.actual)
-    assert pose(made)[2] != pytest.approx(flange[11], abs=0.01)
 
 
 # -- stops and errors -----------------------------------------------------------------------------------
@@ -204,18 +177,6 @@ def test_the_watchdog_counts_silence_of_its_register_and_of_no_other(started) ->
 
 
 # -- registers, sockets, states -------------------------------------------------------------------------
-
-
-def test_registers(stepped) -> None:
-    made = stepped()
-    made.robot.inputs.set("input_int_register_30", 7)
-    made.robot.inputs.set("input_double_register_31", 0.25)
-    made.start(
-        "  write_output_integer_register(40, read_input_integer_register(30) * 2)\n"
-        "  write_output_float_register(41, read_input_float_register(31))\n  sync()"
-    )
-    made.run(0.02)
-    assert made.output("output_int_register_40") == 14 and made.output("output_double_register_41") == 0.25
 
 
 def test_payload_and_tool_are_states(started) -> None:

@@ -37,7 +37,7 @@ from station.tui.desk import SILENT_S, Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion
 from station.tui.installed import Marks, marks, read_result, read_sessions, state_root
 from station.tui.jobs import check_drift, solve_session
-from station.tui.live_page import SIDE_PX, LivePage, live_of
+from station.tui.live_page import SIDE_PX, LivePage, news_of
 from station.tui.log_screen import LogScreen
 from station.tui.plan_screen import PlanScreen
 from station.tui.result import ResultScreen
@@ -144,7 +144,7 @@ class StationApp(KnowingApp):
             if page.watched:
                 with contextlib.suppress(OSError, StationError):
                     picture = await self.desk.client.call(verbs.Preview(SIDE_PX, SIDE_PX), timeout_s=SILENT_S)
-                page.publish(live_of(self.known, picture))
+                page.publish(news_of(self.known, picture))
 
     async def on_unmount(self) -> None:
         if self._live_page is not None:

@@ -24,8 +24,6 @@ STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
 STOP_NARROW = "STOP F12", "STOPPED"
 STOP_ELSEWHERE = "STOP on\nits own\npendant", "STOP is on the arm's\nown pendant"
 """In place of STOP where a person moves the arm, which the station cannot stop."""
-DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
-"""How the bar names the way in which the arm is controlled."""
 RAIL_WIDE = 96
 """From this width on each step has a second line."""
 ANSWER = Action(
@@ -177,8 +175,6 @@ def _robot_parts(status: StationStatus) -> Iterator[Content]:
         yield dim(f"  {size(status.recorder.free_bytes)} free")
     if robot.remote is not None:
         yield dim(f"  {'remote' if robot.remote else 'LOCAL'}")
-    if robot.control_path:
-        yield dim(f"  {DRIVEN_BY[robot.control_path]}")
     if status.lease.holder:
         yield dim(f"  control: {status.lease.holder}")
     if status.session.elapsed_s:

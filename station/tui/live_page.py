@@ -45,67 +45,52 @@ OWN_SCRIPT = (
 )
 
 
-class Live(msgspec.Struct, frozen=True):
-    """What the page shows: the sentences of the screen, its picture and what is saved."""
-
-    bar: str
-    next: str
-    why: str
-    """Why, or how; a person should look when `look`."""
-    look: bool
-    seen: str
-    """What is found in the picture."""
-    still: float
-    """0…1; 1: arm and image rest."""
-    outline: tuple[tuple[float, float], ...]
-    """The board in the view that would help most, as shares of the image's sides; empty: none is wanted."""
-    saved: int
-    """Views saved so far: the page sounds when it grows."""
-    old: bool
-    picture: PreviewImage
-
-
-def live_of(known: Known, picture: PreviewImage) -> Live:
-    """Say what the screens say, in the same words."""
+def news_of(known: Known, picture: PreviewImage) -> dict[str, object]:
+    """Say what the screens say, in the same words, as the page's script reads it."""
     status, action = known.shown, next_action(known)
-    return Live(
-        bar_line(known, "Live", 1000).plain.strip(),
-        f"{action.key}  {action.label}".strip(),
-        action.why,
-        action.look,
-        quality_line(status).plain,
-        status.guidance.still if status.state is StationState.FREE_DRIVE else float(status.robot.still),
-        status.guidance.outline,
-        status.session.captured,
-        known.old,
-        picture,
-    )
+    by_hand = status.state is StationState.FREE_DRIVE
+    return {
+        "bar": bar_line(known, "Live", 1000).plain.strip(),
+        "next": f"{action.key}  {action.label}".strip(),
+        "why": action.why,
+        "look": action.look,
+        "seen": quality_line(status).plain,
+        "still": status.guidance.still if by_hand else float(status.robot.still),
+        "outline": status.guidance.outline,
+        "saved": status.session.captured,
+        "old": known.old,
+        "picture": picture,
+    }
 
 
-class LivePage:
+class LivePage(socketserver.ThreadingTCPServer):
     """Serves the page from a thread while the screen lives; `close` ends it.
 
     The token that lets a browser read is in the address's fragment, which browsers send to nobody.
     """
 
+    daemon_threads = True
+
     def __init__(self) -> None:
+        super().__init__((LOOPBACK, 0), _Reader)
+        self.places = threading.BoundedSemaphore(BROWSERS)
         self._news = threading.Condition()
         self._body, self._asked_s = b"{}", -WATCHED_S
-        self._token = secrets.token_urlsafe(16)
         self._door: Path | None = None
-        self._server = _Server(self)
-        self.port = int(self._server.server_address[1])
-        self.address = f"http://{LOOPBACK}:{self.port}/#{self._token}"
-        threading.Thread(target=self._server.serve_forever, name="live-page", daemon=True).start()
+        token = secrets.token_urlsafe(16)
+        self.password = f"Bearer {token}"
+        self.port = int(self.server_address[1])
+        self.address = f"http://{LOOPBACK}:{self.port}/#{token}"
+        threading.Thread(target=self.serve_forever, name="live-page", daemon=True).start()
 
     @property
     def watched(self) -> bool:
         """A browser asked within the last seconds."""
         return time.monotonic() - self._asked_s < WATCHED_S
 
-    def publish(self, live: Live) -> None:
+    def publish(self, news: dict[str, object]) -> None:
         """Give waiting browsers this, and those that ask from now on."""
-        body = msgspec.json.encode(live)
+        body = msgspec.json.encode(news)
         with self._news:
             self._body = body
             self._news.notify_all()
@@ -116,9 +101,6 @@ class LivePage:
         with self._news:
             self._news.wait(NEWS_S)
             return self._body
-
-    def knows(self, token: str) -> bool:
-        return hmac.compare_digest(token.encode(), f"Bearer {self._token}".encode())
 
     def open(self) -> str:
         """Open it in this computer's browser; return what to tell the person.
@@ -139,21 +121,13 @@ class LivePage:
         return f"No desktop was found here. The live picture: {self.address}"
 
     def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+        self.shutdown()
+        self.server_close()
         if self._door is not None:
             self._door.unlink(missing_ok=True)
 
-
-class _Server(socketserver.ThreadingTCPServer):
-    daemon_threads = True
-
-    def __init__(self, page: LivePage) -> None:
-        self.page, self._places = page, threading.BoundedSemaphore(BROWSERS)
-        super().__init__((LOOPBACK, 0), _Reader)
-
     def process_request(self, request: socket.socket | tuple[bytes, socket.socket], address: object) -> None:
-        if self._places.acquire(blocking=False):
+        if self.places.acquire(blocking=False):
             super().process_request(request, address)
         else:
             self.shutdown_request(request)
@@ -165,7 +139,7 @@ class _Server(socketserver.ThreadingTCPServer):
         try:
             super().process_request_thread(request, address)
         finally:
-            self._places.release()
+            self.places.release()
 
     def handle_error(self, request: object, address: object) -> None:
         """A browser that went away is no error."""
@@ -174,18 +148,19 @@ class _Server(socketserver.ThreadingTCPServer):
 class _Reader(BaseHTTPRequestHandler):
     """One browser's connection: the page, and with the token the news."""
 
-    server: _Server
+    server: LivePage
     protocol_version, timeout = "HTTP/1.1", STALLED_S
 
     def do_GET(self) -> None:
-        page, own = self.server.page, [f"{host}:{self.server.page.port}" for host in (LOOPBACK, "localhost")]
+        page, told = self.server, self.headers.get("Authorization", "")
+        own = [f"{host}:{page.port}" for host in (LOOPBACK, "localhost")]
         origin = self.headers.get("Origin")
         # Another site's page may make a browser ask here, under a name of its own for this address.
         if self.headers.get("Host") not in own or origin not in (None, *(f"http://{host}" for host in own)):
             self._refuse(403)
         elif self.path == "/":
             self._answer("text/html; charset=utf-8", PAGE)
-        elif self.path == "/news" and page.knows(self.headers.get("Authorization", "")):
+        elif self.path == "/news" and hmac.compare_digest(told.encode(), page.password.encode()):
             self._answer("application/json", page.newest())
         else:
             self._refuse(403 if self.path == "/news" else 404)

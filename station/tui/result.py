@@ -144,12 +144,11 @@ def _row(
 
 
 def evidence(result: Result, calibration: Calibration) -> Content:
-    """Write what installing changes, the camera's pose, the views, and what was installed so far."""
+    """Write what installing changes, the camera's pose, and the views."""
     sections = {
         "Change": change_lines(result, calibration),
         "Camera pose": pose_lines(calibration),
         "Views": view_lines(calibration),
-        "Installed so far": log_lines(result),
     }
     return Content("\n\n").join(
         lines(Content.styled(title, "bold $accent"), *rows) for title, rows in sections.items()
@@ -189,19 +188,6 @@ def view_lines(calibration: Calibration) -> list[Content]:
         rows.append(Content(f"{folds.rms_mm:.2f} mm over folds, claimed {folds.claimed_mm:.2f} mm"))
     rejected = (f"view {view.index + 1} rejected: {view.reason}" for view in calibration.views.rejected)
     return [*rows, Content(noise_text(calibration)), *(mark("look", text) for text in rejected)]
-
-
-def log_lines(result: Result) -> list[Content]:
-    return [
-        Content.assemble(
-            (f"{local(entry.wall)}  ", "$dim"),
-            (f"{entry.action} ", "bold $strong"),
-            f"version {entry.generation}  ",
-            (f"{entry.who}  {entry.change}", "$dim"),
-            (f"  “{entry.reason}”" if entry.reason else "", "$warn"),
-        )
-        for entry in reversed(result.state.log)
-    ] or [dim("Nothing was installed yet.")]
 
 
 class ResultScreen(StationScreen):

@@ -125,10 +125,10 @@ async def test_slow_readers_and_a_thousand_requests_reach_neither_the_daemon_nor
         await pilot.press("f12")
         await until(pilot, lambda: "stop" in link.verbs)
         assert link.verbs == ["stop"]
-        assert page._server._places._value == 0, "no reader was let in beyond the bound"
+        assert page.places._value == 0, "no reader was let in beyond the bound"
         for reader in slow:
             reader.close()
-        await until(pilot, lambda: page._server._places._value)  # and then another is served
+        await until(pilot, lambda: page.places._value)  # and then another is served
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from tests.command_line import call
 from tests.test_examples import PROGRAMS, commands_in, parse
 
 ROOT = Path(__file__).parents[1]
-NEEDS_A_CELL = tuple(f"station {name}" for name in ("serve", "capture", "drift-check"))
+NEEDS_A_CELL = tuple(f"station {name}" for name in ("serve", "capture", "drift-check", "post"))
 """Run against a simulated cell by tests/system and tests/station/cli."""
 
 

@@ -71,6 +71,12 @@ class NextView:
         """Corners (4, 2), px, of the board in the wanted view, in order around it."""
         return project_pixels(self.camera, transform_points(self.camera_from_board, rim(self.board)))
 
+    @property
+    def drawn(self) -> tuple[tuple[float, float], ...]:
+        """The outline as shares of the image's sides."""
+        shares = (self.outline + 0.5) / [self.camera.width, self.camera.height]
+        return tuple((float(x), float(y)) for x, y in shares.round(3))
+
 
 @dataclass(frozen=True)
 class Way:

@@ -12,20 +12,21 @@ import numpy as np
 from calibrate.boards.corners import to_grey
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.grids import seen_size
-from calibrate.geometry import Array
-from recordings.schema.messages import BoardSpec, Image, Mount, RobotState
+from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotState
 from station.analysis.found_cell import FoundCell
+from station.analysis.guidance import NextView, Way, next_view, way_to
+from station.analysis.worker import CapturedView
 from station.cell.errors import RobotError, StationError
-from station.cell.layout import flange_pose
 from station.operate import draft as drafts
 from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep, Draft, Hardware
 from station.operate.guided_views import (
+    STILL_PX,
     STILL_RAD_S,
     STILL_S,
+    captured,
     find_cell,
     guided_view,
     image_trouble,
-    what_is_missing,
 )
 
 GREY_WANTED = 110.0
@@ -53,6 +54,11 @@ class CellSetup:
         """Time at which the newest image was requested, and the board in it."""
         self.counts: tuple[int, int] | None = None
         """Inner corners of a chessboard in the image, counted while no board is known."""
+        self.wanted: NextView | None = None
+        """View that would help most after those so far; None: not chosen yet."""
+        self._wanted_for: Draft | None = None
+        self.way = Way("", False)
+        """From the newest image to it."""
         self.trouble = ""
         """What is wrong with the newest image; empty: nothing."""
 
@@ -64,13 +70,6 @@ class CellSetup:
     @property
     def rests(self) -> bool:
         return time.monotonic() > self._moved_s + STILL_S
-
-    @property
-    def flange(self) -> Array | None:
-        """base_from_flange now, (4, 4); None: not known."""
-        if self.state is None or self.arm is None:
-            return None
-        return flange_pose(self.state, self.arm.identity.tcp_offset)
 
     def keep(self, draft: Draft) -> None:
         """Set and save the draft. StationError when it cannot be saved; it is then kept in memory."""
@@ -137,13 +136,30 @@ class CellSetup:
             self.counts = seen_size(to_grey(image.pixels))
         if board is None or step not in _LOOKED_FOR:
             return None
-        found = detect(image.pixels, board, step is CellStep.BOARD and self.seen is None)
+        found, before = detect(image.pixels, board, step is CellStep.BOARD and self.seen is None), self.seen
+        if before is not None and np.array_equal(before[1].indices, found.indices) and found.found:
+            shift_px = np.linalg.norm(found.pixels - before[1].pixels, axis=1)
+            self._moved_s = begun_s if np.median(shift_px) > STILL_PX else self._moved_s
+        if step is CellStep.VIEWS:
+            self._guide(found)
         self.seen, self.trouble = (begun_s, found), image_trouble(image, found)[1]
         return found
 
+    def _guide(self, found: Detection) -> None:
+        """Choose the wanted view, anew when the views have changed, and the way to it."""
+        draft = self.draft
+        if draft.mount is None or draft.board is None:
+            return
+        if self.wanted is None or self._wanted_for is not draft:
+            blank = CameraModel(draft.width, draft.height)
+            self.wanted = next_view(draft.mount, draft.board, blank, False, captured(draft.views))
+            self._wanted_for = draft
+        view = CapturedView(-1, np.eye(4), found.indices, found.pixels)
+        self.way = way_to(self.wanted, view) if found.found else Way("Show the whole board", False)
+
     def new_view(self) -> bool:
         """True when the newest image shows the board from a useful new pose, with the arm at rest."""
-        return not self._not_takable() and what_is_missing(self.draft, self.flange).new
+        return not self._not_takable() and self._wanted_for is self.draft and self.way.new
 
     def _not_takable(self) -> str:
         if self.seen is None or not self.seen[1].found:

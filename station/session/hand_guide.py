@@ -74,11 +74,10 @@ class HandGuide:
             self._moved_s, self._failed = time.monotonic(), False
         if store.state is not StationState.FREE_DRIVE:
             return
-        size = np.array([wanted.camera.width, wanted.camera.height])
         error_m, goal_m = wanted.sigma_m, context.cell.config.capture.goal_m
         store.update(
             guidance=GuidanceStatus(
-                outline=tuple((float(x), float(y)) for x, y in ((wanted.outline + 0.5) / size).round(3)),
+                outline=wanted.drawn,
                 words=way.words,
                 still=round(still, 2),
                 moves=moves,

@@ -159,6 +159,8 @@ class NewCell(ThemedApp[Ending]):
         if pane.display:
             self._pictures += 1
             corners = np.zeros((0, 2)) if found is None else found.pixels
+            wanted = self.setup.wanted if self.step is CellStep.VIEWS else None
+            pane.wanted = () if wanted is None else wanted.drawn
             pane.show(preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures))
         if step is self.step is CellStep.VIEWS and self.setup.new_view():
             self._add_view()

@@ -15,7 +15,7 @@ from station.cell.errors import StationError
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import CellStep
-from station.operate.guided_views import FEWEST_GUIDED, TURN_RAD, enough, what_is_missing
+from station.operate.guided_views import FEWEST_GUIDED, enough
 from station.tui.task import Action
 from station.tui.words import mark
 
@@ -55,8 +55,8 @@ PAGES = {
     ),
     CellStep.VIEWS: Page(
         "Guide the arm to four views of the board",
-        "Hold the pendant's Freedrive button (on the back) and guide the arm. Each view is taken by itself "
-        "when the arm rests and the view is new.",
+        "Hold the pendant's Freedrive button (on the back) and bring the found corners (+) into the outline "
+        "(o). Each view is taken by itself when arm and picture rest and the view is new.",
         ("#picture",),
     ),
     CellStep.SAVE: Page(
@@ -129,10 +129,9 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
         case CellStep.BOARD:
             return Action("Enter", "This board", "Lay it so that the camera sees it.")
         case CellStep.VIEWS:
-            missing = what_is_missing(draft, setup.flange).text
-            if missing:
-                return Action("", "Guide the arm", f"{missing}.")
-            return Action("Enter", "On to the file", "The views are enough.")
+            if enough(draft):
+                return Action("Enter", "On to the file", "The views are enough.")
+            return Action("", setup.way.words or "Hold still", "The outline in the picture shows it.")
         case _ if not draft.written:
             return Action("Enter", "Write the file", "")
     if draft.posted:
@@ -161,11 +160,10 @@ def live_lines(setup: CellSetup, step: CellStep) -> list[str]:
         case CellStep.BOARD:
             return _board_lines(setup)
         case CellStep.VIEWS:
-            views, missing = len(setup.draft.views), what_is_missing(setup.draft, setup.flange)
+            views = len(setup.draft.views)
             taken = "✓" * views + "○" * max(0, FEWEST_GUIDED - views)
-            turn = f"turn {math.degrees(missing.turn_rad):.0f}° of {math.degrees(TURN_RAD):.0f}°"
-            rests = "rests" if setup.rests else "moves"
-            lines = [setup.arm_words(), *_board_lines(setup), f"views {taken}   {turn}   {rests}"]
+            lines = [setup.arm_words(), *_board_lines(setup)]
+            lines.append(f"views {taken}   {'rests' if setup.rests else 'moves'}")
             if found is not None:
                 x, y, z = 1000 * found.X[:3, 3]
                 sigma = f"± {1000 * found.sigma_m:.0f} mm, {math.degrees(found.sigma_rad):.1f}°"

@@ -64,16 +64,6 @@ def test_a_wrong_answer_is_told_by_its_step(done: tuple[Draft, object]) -> None:
     assert shifted is not None and shifted.scale == 1.0 and shifted.warning and not shifted.other_fits
 
 
-def test_a_view_from_where_one_was_taken_is_none(done: tuple[Draft, object]) -> None:
-    draft, _ = done
-    first = np.array(draft.views[0].base_from_flange)
-    assert guided_views.what_is_missing(msgspec.structs.replace(draft, views=()), first).new
-    one = msgspec.structs.replace(draft, views=draft.views[:1])
-    assert not guided_views.what_is_missing(one, first).new
-    assert guided_views.what_is_missing(one, np.array(draft.views[1].base_from_flange)).new
-    assert not guided_views.what_is_missing(draft, first).text
-
-
 def test_turns_about_one_axis_are_not_enough(done: tuple[Draft, object]) -> None:
     draft, _ = done
     again = tuple(draft.views[k] for k in (0, 1, 0, 1))

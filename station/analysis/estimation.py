@@ -36,11 +36,13 @@ COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
 
 
 def running_estimate(
-    config: StationConfig, lens_is_known: bool, seen: Sequence[CapturedView]
+    config: StationConfig, camera: CameraModel, lens_is_known: bool, seen: Sequence[CapturedView]
 ) -> EstimateStatus:
-    """Estimate from the views so far; with too few views or too little motion only advice, no numbers."""
-    camera, goal_m = config.camera.model, config.capture.goal_m
-    assert camera is not None
+    """Estimate from the views so far; with too few views or too little motion only advice, no numbers.
+
+    `camera`: without a matrix nothing is known of its lens.
+    """
+    goal_m = config.capture.goal_m
     shown = [count_in_parts(camera, view.pixels, COVERAGE_ROWS, COVERAGE_COLUMNS) > 0 for view in seen]
     blank = EstimateStatus(
         len(seen),

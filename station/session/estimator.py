@@ -1,4 +1,4 @@
-"""Running estimate: camera and board pose by the images so far, and the most useful next pose."""
+"""Running estimate: camera and board pose by the images so far."""
 
 from __future__ import annotations
 
@@ -6,15 +6,11 @@ import asyncio
 import contextlib
 import logging
 
-import msgspec
-import numpy as np
-
 from recordings.errors import RecordingError
 from station.analysis.estimation import running_estimate, seen_before
 from station.analysis.odd_view import odd_view
 from station.analysis.pool import WorkerError
 from station.cell.status import EstimateStatus
-from station.plan.next_pose import next_best_text
 from station.session.context import SessionContext
 from station.session.recording import stamps_now
 from station.session.threads import DISK
@@ -48,12 +44,19 @@ class Estimator:
                 continue
             if context.cell.mover is None:
                 await self._ask_about_newest()
-            camera = config.camera.model
-            if camera is None:
+            recorded = None if context.recording is None else context.recording.camera
+            if (camera := config.camera.model or recorded) is None:
                 continue
             queue = context.queue
             try:
-                estimate = await self._estimate()
+                estimate = await context.workers.call(
+                    running_estimate,
+                    config,
+                    camera,
+                    context.cell.camera_model is not None,
+                    list(context.seen.values()),
+                    timeout_s=_ESTIMATE_S,
+                )
             except Exception as error:  # the capture does not depend on it, so it must not end
                 if not isinstance(error, WorkerError):
                     log.exception("the running estimate failed")
@@ -83,19 +86,6 @@ class Estimator:
             return
         if odd is not None:
             context.store.problem(odd, "warning", seen[-1].index)
-
-    async def _estimate(self) -> EstimateStatus:
-        """Estimate from the images so far, with advice on the next pose where one more would help."""
-        context, config = self._context, self._context.cell.config
-        seen = list(context.seen.values())
-        known = context.cell.camera_model is not None
-        estimate = await context.workers.call(running_estimate, config, known, seen, timeout_s=_ESTIMATE_S)
-        joints = context.store.status.robot.joints_rad
-        if joints is None or estimate.sigma_translation_mm is None or estimate.enough:
-            return estimate
-        flange = np.array([view.base_from_flange for view in seen])
-        text = await context.workers.call(next_best_text, config, flange, joints, timeout_s=_ESTIMATE_S)
-        return msgspec.structs.replace(estimate, advice=text or estimate.advice)
 
 
 async def look_back(context: SessionContext) -> None:

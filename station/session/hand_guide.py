@@ -104,7 +104,9 @@ class HandGuide:
                 self._given_up.clear()
                 self._failed = len(context.seen) < len(self._known)  # taken back: not again from here
             height, width = image.pixels.shape[:2]
-            camera, known = config.camera.model or CameraModel(width, height), tuple(context.seen)
+            recorded = context.recording.camera if context.recording is not None else None
+            camera = config.camera.model or recorded or CameraModel(width, height)
+            known = tuple(context.seen)
             self._wanted = await context.workers.call(
                 next_view,
                 config.mount,

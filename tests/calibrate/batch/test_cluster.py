@@ -59,26 +59,6 @@ def dask_cluster(folder: Path, workers: int, tls: list[str] | None = None) -> It
 
 @needs_distributed
 @pytest.mark.process
-def test_a_killed_worker_loses_nothing_and_the_bits_are_those_of_one_process(
-    recordings: list[Path], tmp_path: Path
-) -> None:
-    alone = run_batch(recordings, tmp_path / "alone", workers=in_this_process)
-    with dask_cluster(tmp_path, workers=2) as (address, pids):
-
-        def kill_one(done: int, total: int, result: BatchResult) -> None:
-            if done == 1:
-                os.kill(pids[1], signal.SIGKILL)
-
-        workers = cluster_workers(address)
-        spread = run_batch(recordings, tmp_path / "dask", progress=kill_one, workers=workers)
-    assert [result.error for result in spread] == [""] * 3
-    assert [r.content_sha256 for r in spread] == [r.content_sha256 for r in alone]
-    for result in spread:
-        assert (tmp_path / "dask" / result.calibration).is_file()
-
-
-@needs_distributed
-@pytest.mark.process
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl to make certificates with")
 def test_over_tls_and_without_the_key_nobody_answers(recordings: list[Path], tmp_path: Path) -> None:
     cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
@@ -99,11 +79,14 @@ def test_over_tls_and_without_the_key_nobody_answers(recordings: list[Path], tmp
 
 @needs_distributed
 @pytest.mark.process
-def test_a_client_stays_open_and_a_lost_scheduler_is_said(recordings: list[Path], tmp_path: Path) -> None:
-    """A batch that is killed leaves the cluster idle; what was finished before a loss is kept."""
+def test_no_killed_client_worker_or_scheduler_costs_what_was_finished(
+    recordings: list[Path], tmp_path: Path
+) -> None:
+    """A batch that is killed leaves the cluster idle; whoever solves, the bits are those of one process."""
     distributed = pytest.importorskip("distributed")
     out, asked = tmp_path / "out", Counted()
-    with dask_cluster(tmp_path, workers=1) as (address, pids):
+    alone = run_batch(recordings, tmp_path / "alone", workers=in_this_process)
+    with dask_cluster(tmp_path, workers=2) as (address, (scheduler, worker, _)):
         with distributed.Client(address) as client:
             assert run_batch(recordings[:1], tmp_path / "client", workers=dask_workers(client))[0].solved
             command = ["batch", *map(str, recordings), "-o", "killed", "--scheduler", address]
@@ -113,9 +96,22 @@ def test_a_client_stays_open_and_a_lost_scheduler_is_said(recordings: list[Path]
             assert other.wait(PATIENCE_S) == -signal.SIGKILL
             wait_until(lambda: not any(client.processing().values()))
             assert client.status == "running"
+
+        def solve(folder: Path, killed: int) -> list[BatchResult]:
+            """One is killed at the first result."""
+
+            def kill(done: int, total: int, result: BatchResult) -> None:
+                if done == 1:
+                    os.kill(killed, signal.SIGKILL)
+
+            return run_batch(recordings, folder, progress=kill, workers=cluster_workers(address))
+
+        spread = solve(tmp_path / "dask", worker)
         with raises("cluster-lost", BatchError):
-            workers = cluster_workers(address)
-            run_batch(recordings, out, progress=lambda *_: os.kill(pids[0], signal.SIGKILL), workers=workers)
+            solve(out, scheduler)
+    assert [result.error for result in spread] == [""] * 3
+    assert [r.content_sha256 for r in spread] == [r.content_sha256 for r in alone]
+    assert all((tmp_path / "dask" / result.calibration).is_file() for result in spread)
     kept = {result.recording for result in read_results(out) if result.solved}
     assert kept and all(result.solved for result in run_batch(recordings, out, workers=asked))
     assert not set(asked.asked) & kept

@@ -26,10 +26,14 @@ from tests.calibrate.sessions import Scene, shifted, write_session
 from tests.codes import raises
 
 
-def test_solve_json_says_what_the_file_holds(small_session_file: Path, tmp_path: Path) -> None:
+def test_solve_json_says_what_the_file_holds(
+    small_session_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CALIBRATE_PROGRESS", "lines")  # as the screen asks for them
     done = run("solve", small_session_file, "-o", tmp_path / "c.yaml", "--json", cwd=tmp_path)
     assert done.returncode in (0, 4), done.stderr
     assert done.stdout.count("\n") == 1
+    assert "5 of 5" in done.stderr
     answer = json.loads(done.stdout)
     assert [view["index"] for view in answer["views"]["weights"]] == answer["views"]["used"]
     assert answer["verdict"] == ("pass" if all(gate["passed"] for gate in answer["gates"]) else "fail")

@@ -23,7 +23,8 @@ from station.cli.console import Socket, err
 from station.devices.posts import read_post
 
 PERIOD_S = 0.02
-"""Of a typed pose, which stands until the next."""
+STANDS_S = 3.0
+"""A typed pose is posted for so long: after it the arm may already be on its way to the next place."""
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 
 
@@ -40,8 +41,8 @@ def post_command(
 
     Alone it hands on lines from standard input: first {"source": "live"}, then {"base_from_flange": [x, y, z,
     qx, qy, qz, qw], "t": seconds, "joints_rad": [...]} each, in metres and radians. With --typed it asks for
-    the numbers on the pendant; the arm counts as standing there until the next are typed. Labels and commas
-    between the numbers do no harm.
+    the numbers on the pendant: type them when the arm stands; for 3 s it counts as standing there. Labels and
+    commas between the numbers do no harm.
 
     Exit codes: 0 the input ended; 1 the station refused the poses, or is gone.
     """
@@ -90,7 +91,7 @@ def _typed_lines(name: str, source: str) -> Iterator[bytes]:
                     continue
                 numbers, began_s = found, time.monotonic()
                 err.print("stands at x {:.1f}, y {:.1f}, z {:.1f} mm".format(*(1000 * m for m in pose[:3])))
-        if numbers:
+        if numbers and time.monotonic() < began_s + STANDS_S:
             yield _line(numbers, time.monotonic() - began_s)
 
 

@@ -105,8 +105,9 @@ def _converted(numbers: Sequence[float], written: Convention) -> Vector6:
         if written.rotation in ("xyzw", "wxyz"):
             _by_quaternion([0.0, 0.0, 0.0, *turned])
         matrix = written.poses(np.array([numbers]))[0]
-    except (ValueError, IndexError) as error:
-        raise StaleStateError("post-unreadable", reason=f"not of the convention: {error}") from None
+    except (ValueError, IndexError):
+        reason = f"{len(numbers)} numbers are none as {written.name}"
+        raise StaleStateError("post-unreadable", reason=reason) from None
     if not np.isfinite(matrix).all():
         raise StaleStateError("post-unreadable", reason="a number is not finite")
     return pose_vector(matrix)

@@ -38,54 +38,36 @@ class Estimator:
         while True:
             await self._woken.wait()
             self._woken.clear()
-            self._known = tuple(context.seen)
+            self._known, seen = tuple(context.seen), list(context.seen.values())
             if not self._known:
                 context.store.update(estimate=EstimateStatus())
                 continue
-            if context.cell.mover is None:
-                await self._ask_about_newest()
             recorded = None if context.recording is None else context.recording.camera
             if (camera := config.camera.model or recorded) is None:
                 continue
-            queue = context.queue
+            queue, known, odd = context.queue, context.cell.camera_model is not None, None
             try:
                 estimate = await context.workers.call(
-                    running_estimate,
-                    config,
-                    camera,
-                    context.cell.camera_model is not None,
-                    list(context.seen.values()),
-                    timeout_s=_ESTIMATE_S,
+                    running_estimate, config, camera, known, seen, timeout_s=_ESTIMATE_S
                 )
+                if context.cell.mover is None:  # its pose is told by people and their programs
+                    odd = await context.workers.call(
+                        odd_view, config.mount, config.board, camera, known, seen, timeout_s=_ESTIMATE_S
+                    )
             except Exception as error:  # the capture does not depend on it, so it must not end
                 if not isinstance(error, WorkerError):
                     log.exception("the running estimate failed")
                 context.store.problem(error, said="no running estimate: {}")
                 continue
             context.store.update(estimate=estimate)
+            if odd is not None:
+                context.store.problem(odd, "warning", seen[-1].index)
             if queue is not None and queue is context.queue:
                 queue.note_estimate(self._known[-1], estimate.sigma_translation_mm)
                 context.store.update_session(poses=queue.statuses)
             if (recording := context.recording) is not None:
                 with contextlib.suppress(RecordingError):  # a full disk is reported by the run
                     recording.show_frames(estimate.camera_pose, estimate.board_pose, stamps_now())
-
-    async def _ask_about_newest(self) -> None:
-        """Report a told pose that cannot be, by all views of an arm that a person moves."""
-        context, config = self._context, self._context.cell.config
-        if (recording := context.recording) is None or recording.camera is None:
-            return
-        camera, seen = config.camera.model or recording.camera, list(context.seen.values())
-        known = context.cell.camera_model is not None
-        try:
-            odd = await context.workers.call(
-                odd_view, config.mount, config.board, camera, known, seen, timeout_s=_ESTIMATE_S
-            )
-        except WorkerError as error:
-            context.store.problem(error, said="the newest view is not compared with the others: {}")
-            return
-        if odd is not None:
-            context.store.problem(odd, "warning", seen[-1].index)
 
 
 async def look_back(context: SessionContext) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import resource
+import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -95,6 +97,13 @@ def trouble(arm: PostedArm) -> str:
     return ""
 
 
+def now(arm: PostedArm, seen: Callable[[RobotState], object]) -> bool:
+    """True when the arm has news of which `seen` holds; late ones are waited for on a busy computer."""
+    with contextlib.suppress(RobotError):
+        return (state := arm.news()) is not None and bool(seen(state))
+    return False
+
+
 async def test_a_posted_arm_is_there_with_its_first_pose_and_its_states_carry_poses_exactly(
     arm: PostedArm,
 ) -> None:
@@ -110,7 +119,6 @@ async def test_a_posted_arm_is_there_with_its_first_pose_and_its_states_carry_po
     for state in states:
         assert np.abs(flange_pose(state, arm.identity.tcp_offset) - exact).max() < 1e-14
     assert [len(state.joints_rad) for state in states] == [7, 0]
-    assert arm.latest() is states[-1]
 
 
 async def test_rest_and_the_state_of_a_moment_are_found_without_joints(arm: PostedArm) -> None:
@@ -121,14 +129,14 @@ async def test_rest_and_the_state_of_a_moment_are_found_without_joints(arm: Post
     await until(lambda: still.at_rest)
     seen_ns = time.monotonic_ns()
     await poster.rest(10)
-    await until(lambda: arm.latest().stamps.host_monotonic_ns > seen_ns + 50_000_000)
+    await until(lambda: now(arm, lambda s: s.stamps.host_monotonic_ns > seen_ns + 50_000_000))
     clock = arm.clock()
     assert clock is not None and clock.bound_s < 0.1
     found = arm.at(seen_ns)
-    assert found.tcp_pose == arm.latest().tcp_pose and abs(found.stamps.host_monotonic_ns - seen_ns) < 1
+    assert found.tcp_pose[:3] == tuple(POSE[:3]) and abs(found.stamps.host_monotonic_ns - seen_ns) < 1
     poster.t = 5.0  # the program's clock begins anew: a rest from before counts no more
     poster.post()
-    await until(lambda: arm.latest().stamps.controller_s < 10)
+    await until(lambda: now(arm, lambda s: s.stamps.controller_s < 10))
     assert not still.at_rest
 
 
@@ -142,16 +150,18 @@ async def test_poses_without_a_time_are_of_their_arrival_within_a_stated_bound(a
     assert clock is not None and clock.bound_s == 0.015 + PAUSE_S
     now_ns = time.monotonic_ns()
     poster.say({"base_from_flange": POSE})
-    await until(lambda: arm.latest().stamps.host_monotonic_ns > now_ns)
-    assert arm.at(now_ns).tcp_pose == arm.latest().tcp_pose
+    await until(lambda: now(arm, lambda s: s.stamps.host_monotonic_ns > now_ns))
+    assert arm.at(now_ns).tcp_pose[:3] == tuple(POSE[:3])
 
 
 async def test_poses_are_read_in_the_convention_that_was_declared(arm: PostedArm) -> None:
     poster = await Poster.at(arm, LIVE | {"convention": "abb-quaternion"})
+    states: list[RobotState] = []
+    arm.subscribe(states.append)
     poster.post([400.0, -200.0, 300.0, POSE[6], *POSE[3:6]])
-    await until(lambda: trouble(arm) == "")
+    await until(lambda: states)
     exact = pose_from_quaternion(POSE[:3], POSE[3:])
-    assert np.abs(flange_pose(arm.latest(), arm.identity.tcp_offset) - exact).max() < 1e-12
+    assert np.abs(flange_pose(states[0], arm.identity.tcp_offset) - exact).max() < 1e-12
 
 
 WRONG = {
@@ -217,7 +227,7 @@ async def test_the_first_program_has_the_arm_until_it_ends(arm: PostedArm) -> No
     assert await second.refused() == "post-refused"
     assert "has the arm" in arm.notice
     await first.rest(3)
-    assert arm.latest().tcp_pose[:3] == tuple(POSE[:3])
+    await until(lambda: now(arm, lambda s: s.tcp_pose[:3] == tuple(POSE[:3])))
     first.writer.close()
     await until(lambda: trouble(arm) == "post-nobody")
     third = await Poster.at(arm)
@@ -269,3 +279,19 @@ async def test_a_thousand_poses_a_second_are_kept(arm: PostedArm) -> None:
         await asyncio.sleep(0.005)
     await until(lambda: bool(states) and states[-1].stamps.controller_s >= poster.t - 0.0005)
     assert len(states) > 250 and trouble(arm) == ""
+
+
+async def test_typed_numbers_count_for_a_while_only_as_the_arm_then_moves_on(arm: PostedArm) -> None:
+    states: list[RobotState] = []
+    arm.subscribe(states.append)
+    words = ["post", "--typed", "kuka-abc", "--socket", str(arm.path.with_suffix(".sock"))]
+    typing = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "station.cli", *words, stdin=asyncio.subprocess.PIPE
+    )
+    assert typing.stdin is not None
+    typing.stdin.write(b"1 2 3\nX 400.0, Y -200.0, Z 300.0, A 0, B 0, C 0\n")
+    await until(lambda: states)
+    assert states[0].tcp_pose == pytest.approx((0.4, -0.2, 0.3, 0.0, 0.0, 0.0))
+    await until(lambda: trouble(arm) == "post-silent")
+    typing.stdin.close()
+    assert await typing.wait() == 0

@@ -22,7 +22,7 @@ from station.devices.posted import PostedArm
 from station.session import Session
 from tests.command_line import call
 from tests.patience import until
-from tests.station.devices.test_posted import Poster
+from tests.station.devices.test_posted import Poster, now
 from tests.station.session_rig import CameraInMemory, WorkerInThisProcess, memory_config
 
 SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
@@ -51,6 +51,7 @@ async def test_the_same_stops_give_the_same_calibration(tmp_path: Path) -> None:
     arm, camera = PostedArm(config, "playback", tmp_path / "control.sock"), RecordedCamera()
     session = Session(Cell(config, arm, camera, "playback"), tmp_path / "root")
     camera.blind, session.context.workers = True, WorkerInThisProcess()  # type: ignore[assignment]
+    session._guide.run = asyncio.Event().wait  # type: ignore[method-assign,assignment]
     store = session.store
     await session.start()
     await until(lambda: arm.path.exists())
@@ -74,7 +75,7 @@ async def test_the_same_stops_give_the_same_calibration(tmp_path: Path) -> None:
         place = np.array(stop.base_from_flange)[:3, 3]
         await until(
             lambda place=place: (
-                np.allclose(arm.latest().tcp_pose[:3], place, atol=1e-9)  # type: ignore[misc]
+                now(arm, lambda s: np.allclose(s.tcp_pose[:3], place, atol=1e-9))  # type: ignore[misc]
                 and session.context.stillness.at_rest
                 and arm.clock() is not None
             )

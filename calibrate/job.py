@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -20,7 +20,7 @@ from calibrate.lens.intrinsics import Intrinsics, LensModel
 from calibrate.projection import project_at
 from calibrate.recorded_views import LoadedViews
 from calibrate.results import SHAPE, Gate
-from calibrate.views import ViewSet, board_in_camera, observe_views
+from calibrate.views import BoardView, ViewSet, board_in_camera, observe_views
 from recordings.reader import Recording
 from recordings.schema.messages import BoardSpec, CameraModel
 
@@ -120,18 +120,21 @@ class Solved:
     @cached_property
     def residuals_px(self) -> dict[int, Array]:
         """Number of a picture → (k, 2): its corners less where calibration and recorded pose put them."""
-        solution, read = self.solution, {view.index: view for view in self.solution.kept}
-        views = ViewSet(
-            self.views.mount, tuple(read.get(view.index, view) for view in self.views), solution.camera
-        )
-        observed = observe_views(views)
+        solution, mount = self.solution, self.views.mount
+        observed = observe_views(replace(self.views, views=self._as_read))
         shape = np.zeros(len(SHAPE)) if solution.board is None else solution.board.numbers
         points = bent_points(observed, shape)
-        seen = board_in_camera(views.mount, observed.flange, self.X, solution.board_place.matrix)
+        seen = board_in_camera(mount, observed.flange, self.X, solution.board_place.matrix)
         return {
             view.index: view.pixels - project_at(solution.camera, seen[i], points[i, : len(view.pixels)])
-            for i, view in enumerate(views)
+            for i, view in enumerate(self._as_read)
         }
+
+    @property
+    def _as_read(self) -> tuple[BoardView, ...]:
+        """The views with boards that look the same turned as the solver turned them."""
+        kept = {view.index: view for view in self.solution.kept}
+        return tuple(kept.get(view.index, view) for view in self.views)
 
     def plot(self) -> Figure:
         """Draw every residual, magnified, where it is in the image; a picture left out is red.
@@ -149,8 +152,7 @@ class Solved:
                 return file.getvalue()
 
         used, figure = set(self.solution.used), Shown(layout="constrained")
-        read = {view.index: view for view in (*self.views, *self.solution.kept)}
-        pixels = np.concatenate([read[index].pixels for index in self.residuals_px])
+        pixels = np.concatenate([view.pixels for view in self._as_read])
         missed = np.concatenate(list(self.residuals_px.values()))
         good = np.concatenate([[index in used] * len(miss) for index, miss in self.residuals_px.items()])
         rms = float(np.sqrt(np.square(missed[good]).sum(axis=1).mean()))

@@ -34,17 +34,6 @@ COMMANDS = {
             "calibrate export --to ros-launch -o camera.launch.py  # of what is installed",
             "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
         ),
-        gone={
-            **dict.fromkeys(("json", "arm-json"), "Use `calibrate show --json`."),
-            "arm-urdf": "Give ur-kinematics to ur_description, which makes the URDF.",
-            **dict.fromkeys(("ros-static-transform", "easy-handeye2"), "Use ros-launch, which sends it."),
-            "ur-tool": "`calibrate show` prints position and RPY, as the pendant takes them.",
-            "ros-launch-follow": "Use ros-launch. `calibrate follow` prints every change.",
-            **dict.fromkeys(("xacro", "mjcf"), "Use urdf."),
-            **dict.fromkeys(
-                ("kalibr", "nerfstudio", "matlab"), "Use opencv: it holds transform and intrinsics."
-            ),
-        },
     ),
     "install": LazyCommand(
         f"{_FILES}:install",

@@ -62,7 +62,7 @@ def detection_progress() -> Iterator[LoadProgress | None]:
 
 def _progress_line(done: int, total: int, name: str) -> None:
     if done == total or done % 5 == 0:
-        print(f"1 of 5: finding the board in image {done} of {total}", file=sys.stderr, flush=True)
+        print(f"finding the board: image {done} of {total}", file=sys.stderr, flush=True)
 
 
 @contextmanager

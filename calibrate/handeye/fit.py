@@ -39,13 +39,13 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = all_pairs(H, C)
     require_motion(pairs)
-    STAGES.info("2 of 5: the best start, from all pairs of views")
+    STAGES.info("1 of 4: the best start, from all pairs of views")
     certified = solve_global(pairs)
     start = agreed_start(H, BoardPoses.known(C), seed, certified.X)
     views, turned = set_boards_right(views, start.X, start.Y)
     observed, C = observe_views(views), views.camera_from_board
     state = CellState(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
-    STAGES.info("3 of 5: camera, board and lens together")
+    STAGES.info("2 of 4: camera, board and lens together")
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
     log_bayes, plain, failure = None, found, ""
@@ -54,7 +54,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
         flex = flex_motion(views.base_from_flange, held)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
-        STAGES.info("4 of 5: errors of the arm")
+        STAGES.info("3 of 4: errors of the arm")
         modelled = replace(observed, by_arm_errors=np.concatenate([links, flex], axis=2))
         try:
             found, log_bayes = estimate_with_arm_errors(modelled, found, priors, links.shape[2])

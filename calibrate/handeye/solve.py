@@ -138,7 +138,7 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
     seen = fit.observed.has_pixels
     lens_finding = judge_lens(fit, distance) if given and seen else None
     board_finding = judge_board(fit, distance) if seen else None
-    STAGES.info("5 of 5: proof on views left out")
+    STAGES.info("4 of 4: proof on views left out")
     folds = cross_validate(fit, options.seed) if options.folds else None
     holdout = _holdout(fit) if options.holdout else None
     weight = found.weight

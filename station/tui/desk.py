@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import TypeVar
 
@@ -136,9 +136,12 @@ class Desk:
         words = busy_words(verb)
         if words and self.known.busy:
             raise RefusedError("screen-busy", work=self.known.busy)
-        if not words:
+        with self.busy(words) if words else nullcontext():
             yield
-            return
+
+    @contextmanager
+    def busy(self, words: str) -> Iterator[None]:
+        """Say on every screen what is waited for, and for how long already."""
         begun_s = time.monotonic()
 
         def tell() -> None:

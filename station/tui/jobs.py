@@ -75,7 +75,8 @@ async def install_result(desk: Desk, result: Result, calibration: Calibration) -
     put = partial(install, Path(result.path), state_root(result.path), cell=cell, max_age_days=oldest)
     try:
         try:
-            await asyncio.to_thread(put)
+            with desk.busy("Installing …"):
+                await asyncio.to_thread(put)
         except CalibrationError as refusal:
             if refusal.code not in OVERRIDABLE:
                 raise

@@ -26,9 +26,7 @@ STOP_ELSEWHERE = "STOP on\nits own\npendant", "STOP is on the arm's\nown pendant
 """In place of STOP where a person moves the arm, which the station cannot stop."""
 RAIL_WIDE = 96
 """From this width on each step has a second line."""
-ANSWER = Action(
-    "", "Answer the question", "Tab, then Enter: yes. Enter alone or Escape: no. F12 stops.", look=True
-)
+ANSWER = Action("", "Answer the question", "Tab, then Enter: yes. Enter alone or Escape: no.", look=True)
 
 
 class StopBlock(Static):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -24,16 +25,23 @@ from recordings.schema.messages import CameraIdentity, RobotIdentity
 from tests.calibrate.calling import refused, run
 from tests.calibrate.sessions import Scene, shifted, write_session
 from tests.codes import raises
+from tests.patience import wait_until
 
 
 def test_solve_json_says_what_the_file_holds(
     small_session_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CALIBRATE_PROGRESS", "lines")  # as the screen asks for them
-    done = run("solve", small_session_file, "-o", tmp_path / "c.yaml", "--json", cwd=tmp_path)
+    (tmp_path / "xdg-open").write_text('#!/bin/sh\ncp "$1" opened.new && mv opened.new opened\n')
+    (tmp_path / "xdg-open").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setenv("DISPLAY", ":99")
+    done = run("solve", small_session_file, "-o", tmp_path / "c.yaml", "--json", "--open", cwd=tmp_path)
     assert done.returncode in (0, 4), done.stderr
     assert done.stdout.count("\n") == 1
-    assert "5 of 5" in done.stderr
+    assert "5 of 5" in done.stderr and "4 of 4" in done.stderr
+    wait_until((tmp_path / "opened").exists)
+    assert (tmp_path / "opened").read_text().startswith("<!doctype html>")
     answer = json.loads(done.stdout)
     assert [view["index"] for view in answer["views"]["weights"]] == answer["views"]["used"]
     assert answer["verdict"] == ("pass" if all(gate["passed"] for gate in answer["gates"]) else "fail")

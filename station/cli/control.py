@@ -43,7 +43,8 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
         return
     _print_state(status)
     robot, camera, trigger, session = status.robot, status.camera, status.trigger, status.session
-    words = [f"{robot.model} {robot.condition.safety or 'not connected'}", robot.not_accepted, session.name]
+    state = robot.condition.safety or ("moved by a person" if robot.by_hand else "not connected")
+    words = [f"{robot.model} {state}", robot.not_accepted, robot.notice, session.name]
     if robot.control_path:
         words.append(f"control by {robot.control_path}")
     if session.poses:
@@ -179,11 +180,13 @@ def _incomplete(config: Path) -> bool:
 
     found, _ = load_config(config)
     missing, path = list(missing_for_capture(found)), control_path(found.robot)
-    what = f"{found.robot.model} at {found.robot.host}, {found.mount}, control by {path}"
+    by_hand = found.robot.driver == "posted"
+    driven = "moved by a person" if by_hand else f"at {found.robot.host}, control by {path}"
+    what = f"{found.robot.model} {driven}, {found.mount}"
     out.print(f"{config}: {'incomplete' if missing else 'good'}; {what}")
     for problem in missing:
         out.print(Text.assemble(("MISSING", "red"), f" {problem}"))
-    if words := ": ".join(filter(None, control_trouble(path))):
+    if not by_hand and (words := ": ".join(filter(None, control_trouble(path)))):
         out.print(words)
     out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
     return bool(missing)

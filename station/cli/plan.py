@@ -17,7 +17,7 @@ from rich.text import Text
 from recordings.schema.messages import Mount
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config
-from station.cell.errors import ConfigError, LimitError, StationError
+from station.cell.errors import ConfigError, LimitError, RefusedError, StationError
 from station.cell.layout import cell_geometry
 from station.cell.limits import PlanCheck, Problem, check_plan
 from station.cell.pose_plan import Plan, plan_sha256
@@ -104,6 +104,8 @@ def _simulated() -> tuple[StationConfig, list[float]]:
 def _configured(config: Path, socket: Path) -> tuple[StationConfig, list[float] | None]:
     """The cell of a file, and where its arm stands by the daemon that serves it; None: no daemon tells."""
     cell, _ = load_config(config)
+    if cell.robot.driver == "posted":
+        raise RefusedError("moved-by-hand", robot=cell.robot.model)
     with contextlib.suppress(StationError, OSError, TimeoutError):
         status = asyncio.run(asyncio.wait_for(status_now(socket), _ASK_S))
         ours = (status.cell, status.mount) == (cell.name, cell.mount)

@@ -32,7 +32,7 @@ from station.cell.status import ArmCondition
 from station.devices.clocks import ClockEstimator
 from station.devices.history import HISTORY_S, state_at
 from station.devices.news import CURRENT_S, RESTING_S
-from station.devices.posts import Declaration, Post, read_declaration, read_post
+from station.devices.posts import Post, read_declaration, read_post
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +76,8 @@ class PostedArm:
         self._links: set[asyncio.StreamWriter] = set()
         self._poster = ""
         """The program that has the arm; empty: none."""
-        self._declared = Declaration("live")
+        self._late_posted_s = 0.0
+        """How old a pose is when it is posted, as declared."""
         self._written: Convention | None = None
         self._callbacks: list[Callable[[RobotState], None]] = []
         self._states: deque[RobotState] = deque(maxlen=STATES_KEPT)
@@ -116,12 +117,10 @@ class PostedArm:
     def news(self) -> RobotState | None:
         if time.monotonic() > self._told_s + TOLD_S:
             self.notice = ""
+        if self._wrong is not None and time.monotonic() < self._wrong_s + WRONG_S:
+            raise self._wrong
         if not self._poster or not self._states:
-            raise self._recent_wrong() or StaleStateError(
-                "post-nobody", robot=self.identity.model, socket=self.path
-            )
-        if (wrong := self._recent_wrong()) is not None:
-            raise wrong
+            raise StaleStateError("post-nobody", robot=self.identity.model, socket=self.path)
         age_s = self._age_s()
         if age_s > max(RESTING_S, self._late_s):
             raise self._silent()
@@ -143,7 +142,7 @@ class PostedArm:
         """The program's clock against the host's, or how late poses by arrival may be."""
         if self._clock is not None:
             return self._clock.fit()
-        return ClockFit(0.0, 0.0, self._declared.late_s + PAUSE_S) if self._states else None
+        return ClockFit(0.0, 0.0, self._late_posted_s + PAUSE_S) if self._states else None
 
     async def close(self) -> None:
         if self._server is not None:
@@ -158,9 +157,6 @@ class PostedArm:
 
     def _silent(self) -> StaleStateError:
         return StaleStateError("post-silent", poster=self._poster or "no program", age_s=self._age_s())
-
-    def _recent_wrong(self) -> StaleStateError | None:
-        return self._wrong if time.monotonic() < self._wrong_s + WRONG_S else None
 
     # -- for programs ------------------------------------------------------------------------------------
 
@@ -187,26 +183,22 @@ class PostedArm:
 
     async def _take(self, reader: asyncio.StreamReader) -> None:
         """Take a program's lines until it ends. RobotError where it is none for this cell."""
-        lines = _lines(reader)
+        lines, wanted, model = _lines(reader), SOURCES[self._source], self.identity.model
         try:
             first, *others = await asyncio.wait_for(anext(lines), DECLARED_S)
         except (TimeoutError, StopAsyncIteration):
             raise RobotError("post-undeclared", reason="nothing was written") from None
-        self._declared, self._written = read_declaration(first)
-        self._require_of_this_cell(self._declared)
+        declared, self._written = read_declaration(first)
+        if declared.source != wanted:
+            reason = f"its poses are {declared.source}, the cell takes {wanted} ones"
+            raise RobotError("post-refused", poster=self._poster, reason=reason)
+        if declared.robot and declared.robot != model:
+            reason = f"it posts the arm {declared.robot}, the cell's is {model}"
+            raise RobotError("post-refused", poster=self._poster, reason=reason)
+        self._late_posted_s = declared.late_s
         self._posts(others)
         async for some in lines:
             self._posts(some)
-
-    def _require_of_this_cell(self, declared: Declaration) -> None:
-        wanted, model = SOURCES[self._source], self.identity.model
-        if declared.source != wanted:
-            reason = f"its poses are {declared.source}, the cell takes {wanted} ones"
-        elif declared.robot and declared.robot != model:
-            reason = f"it posts the arm {declared.robot}, the cell's is {model}"
-        else:
-            return
-        raise RobotError("post-refused", poster=self._poster, reason=reason)
 
     def _posts(self, lines: list[bytes]) -> None:
         arrived_ns = time.monotonic_ns()
@@ -227,10 +219,8 @@ class PostedArm:
         told_s = arrived_ns / 1e9 if post.t is None else post.t
         wrong: StaleStateError | None = None
         if before is not None:
-            step_s, waited_s = (
-                told_s - before.stamps.controller_s,
-                (arrived_ns - before.stamps.host_monotonic_ns) / 1e9,
-            )
+            step_s = told_s - before.stamps.controller_s
+            waited_s = (arrived_ns - before.stamps.host_monotonic_ns) / 1e9
             if step_s == 0:
                 return  # posted again: no news
             if step_s > waited_s + CLOCK_STEP_S:
@@ -238,11 +228,12 @@ class PostedArm:
             if step_s < 0 or wrong is not None:
                 self._begin_anew()
             else:
-                wrong = _jump(before.tcp_pose, pose, step_s if post.t is not None else max(step_s, ARRIVAL_S))
+                least_s = ARRIVAL_S if post.t is None else PAUSE_S
+                wrong = _jump(before.tcp_pose, pose, max(step_s, least_s))
         if self._clock is not None:
             if (ahead_s := told_s - arrived_ns / 1e9) > self._ahead_s + HELD_UP_S:
                 # All before were held up on their way, and tell no time.
-                self._clock = ClockEstimator(latency_s=self._declared.late_s)
+                self._clock = ClockEstimator(latency_s=self._late_posted_s)
             self._ahead_s = max(self._ahead_s, ahead_s)
             self._clock.add(told_s, arrived_ns)
         joints = post.joints_rad or ()

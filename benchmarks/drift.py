@@ -5,12 +5,16 @@ The arms are chains written for the tests; nobody described them to the solver.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from benchmarks.trials import rows_of, share_spread, table, trials
+from benchmarks.trials import in_processes, rows_of, share_spread, table, trials
 from calibrate.check.drift import SHIFT_M, find_shift
+from calibrate.check.production import NEWEST, EarlierPictures
 from calibrate.check.trend import entry_of, find_trend
 from calibrate.handeye.posterior import KnownCell
+from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from recordings.schema.messages import Mount
@@ -18,6 +22,7 @@ from tests.calibrate.chains import arm_cell, later_views
 
 TRIALS = 200
 VIEWS, CHECKS = 6, 8
+EARLIER_PICTURES, NEW_PICTURES = 150, 100
 MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 HEADER = ("arm", "mount", "links mm", "false alarms %", "0.5 mm found %", "stated %", "trends of none %",
           "of 0.5 mm found %")  # fmt: skip
@@ -41,7 +46,44 @@ def run() -> str:
         f"direction that is hardest to see. Trends: {CHECKS} checks a week apart, the camera creeping by "
         "0.5 mm from the first to the last, told at 1 % false alarms."
     )
-    return text + "\n\n" + table(HEADER, rows)
+    return text + "\n\n" + table(HEADER, rows) + "\n\n" + production(max(2, count // 10))
+
+
+def production(count: int) -> str:
+    """Alarms on production pictures of cells that nobody touched."""
+    tasks = [(mount, seed) for mount in MOUNTS for seed in range(count)]
+    alarms = [alarm for cell in in_processes(untouched, tasks) for alarm in cell]
+    return (
+        f"Production pictures: {sum(alarms)} alarms in {len(alarms)} tests of {len(tasks)} untouched cells, "
+        f"{EARLIER_PICTURES + NEW_PICTURES} pictures each, of four corners. Unknown to the test: link errors "
+        "of 0.2 mm and mrad without joints, a camera that wanders by 0.02 mm (1σ), and "
+        "every twentieth picture blurred by 1 px (1σ) as a whole."
+    )
+
+
+def untouched(task: tuple[Mount, int]) -> list[bool]:
+    """Test the newest 30 pictures after each new one; tell the alarms."""
+    mount, seed = task
+    cell = arm_cell("seven joints", mount, 0.2, 70_000 + seed)
+    posterior = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
+    assert posterior.posterior is not None
+    known = KnownCell.of(posterior.posterior, posterior.camera).with_board(BoardTolerance())
+    rng, four = np.random.default_rng([seed, 3]), [0, 8, 54, 62]
+    pictures = []
+    for k in range(EARLIER_PICTURES + NEW_PICTURES):
+        wander = np.r_[2e-5 * rng.normal(size=3), np.zeros(3)]
+        (view,) = later_views(cell, wander, 1000 * seed + k, 1)
+        assert view.pixels is not None
+        blur = rng.normal(size=2) * (k % 20 == 0)
+        pictures.append(
+            replace(
+                view, board_points=view.board_points[four], pixels=view.pixels[four] + blur, joints_rad=None
+            )
+        )
+    taken = replace(cell.views, views=tuple(pictures))
+    earlier = EarlierPictures.of(taken.select(list(range(EARLIER_PICTURES))), known)
+    ends = range(EARLIER_PICTURES + NEWEST[-1], len(pictures) + 1)
+    return [not earlier.test(taken.select(list(range(end - NEWEST[-1], end)))).passed for end in ends]
 
 
 def measure(task: tuple[str, Mount, float, int]) -> tuple[float, ...]:

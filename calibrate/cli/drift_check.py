@@ -39,7 +39,7 @@ DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
 MOST_DISAGREEMENT = 3.0
 _BY_CHANCE = 0.001
-"""A smaller p is not worth a second look."""
+"""p below which a failure is told as certain: above it, repeating the check is advised."""
 
 
 def drift_check(
@@ -204,7 +204,7 @@ def _judge(result: DriftCheck, recording: str, taken: datetime, root: Path | Non
 def _doubt_devices(
     recording: Path, info: SessionInfo, root: Path | None, camera: str, other: OtherCellError
 ) -> None:
-    """A session of this very cell with another robot or camera: what is installed is of the one before."""
+    """Put what is installed in doubt where a session of this cell shows another robot or camera."""
     own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
     if own and other.device:
         reason = ValidityReason(f"{other.device}-changed", other.text, dict(other.values))

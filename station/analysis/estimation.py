@@ -38,7 +38,7 @@ COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
 def running_estimate(
     config: StationConfig, camera: CameraModel, lens_is_known: bool, seen: Sequence[CapturedView]
 ) -> EstimateStatus:
-    """Estimate from the views so far; with too few views or too little motion only advice, no numbers.
+    """Estimate from the views so far; with too few views or too little motion without numbers.
 
     `camera`: without a matrix nothing is known of its lens.
     """
@@ -50,11 +50,11 @@ def running_estimate(
         image_views=tuple(tuple(int(n) for n in row) for row in np.sum(shown, axis=0)),
     )
     if len(seen) < FEWEST_FOR_ESTIMATE:
-        return msgspec.structs.replace(blank, advice="too few views yet")
+        return blank
     try:
         views, X, Y = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
-        return msgspec.structs.replace(blank, advice="the motion says too little yet")
+        return blank
     sigma_m, _ = quick_sigma(views, config.board, X, Y, not lens_is_known)
     x, y, z = (float(v) for v in 1000 * X[:3, 3])
     return msgspec.structs.replace(
@@ -64,9 +64,6 @@ def running_estimate(
         board_pose=matrix4(Y),
         sigma_translation_mm=round(1000 * sigma_m, 3),
         enough=sigma_m <= goal_m,
-        advice=f"enough for {1000 * goal_m:.2g} mm: you may finish"
-        if sigma_m <= goal_m
-        else "continue: every pose still helps",
     )
 
 

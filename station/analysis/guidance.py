@@ -88,6 +88,13 @@ class Way:
     """The view differs from all so far."""
 
 
+def motion_px(before: Array, now: Array) -> float | None:
+    """Measure how far the board moved between two images, corners (k, 2) and (k, 2); None: not comparable."""
+    if before.shape != now.shape or not len(now):
+        return None
+    return float(np.median(np.linalg.norm(now - before, axis=1)))
+
+
 def rim(board: BoardSpec) -> Array:
     """Return the corners (4, 3) of the outermost squares, in order around the board."""
     return outline(board)[[0, 2, 7, 5]]

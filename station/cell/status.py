@@ -205,7 +205,6 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Pose of the board in the base (eye-in-hand) or the flange."""
     goal_mm: float | None = None
     enough: bool = False
-    advice: str = ""
     image_views: tuple[tuple[int, ...], ...] = ()
     """Images that show the board in each part of the image, rows from the top."""
 

@@ -95,33 +95,29 @@ class StillnessMonitor:
 
     def unrest(self, found: Stillness) -> str:
         """Name what still moves; empty: settled."""
-        limits, speed_rad_s, joint = self._limits, found.max_joint_speed_rad_s, ""
-        if speed_rad_s > limits.joint_speed_rad_s:
-            speeds = np.abs([s.joint_speeds_rad_s for s in self._states.copy()]).max(axis=0)
-            joint = f"joint {JOINT_NAMES[int(speeds.argmax())]}"
-        checks = (
-            (speed_rad_s, limits.joint_speed_rad_s, _DEG, f"{joint} moves at", "°/s", 2),
-            (found.position_scatter_m, limits.position_m, 1000.0, "the flange scatters by", " mm", 3),
-            (found.rotation_scatter_rad, limits.rotation_rad, _DEG, "the flange turns by", "°", 4),
-            (found.image_motion_px, limits.image_motion_px, 1.0, "the image moves by", " px", 2),
-        )
         return ", ".join(
             f"{what} {scale * value:.{digits}f}{unit} (limit {scale * limit:.{digits}f})"
-            for value, limit, scale, what, unit, digits in checks
+            for value, limit, scale, what, unit, digits in self._checks(found)
             if value is not None and value > limit
         )
 
     def rest(self, found: Stillness) -> float:
         """Rate how still everything is, 0…1, by powers of ten over the limits; 1: settled."""
-        limits, over = self._limits, 1.0
-        for value, limit in (
-            (found.max_joint_speed_rad_s, limits.joint_speed_rad_s),
-            (found.position_scatter_m, limits.position_m),
-            (found.rotation_scatter_rad, limits.rotation_rad),
-            (found.image_motion_px, limits.image_motion_px),
-        ):
-            over = max(over, (value or 0.0) / limit)
+        over = max(1.0, *(value / limit for value, limit, *_ in self._checks(found) if value))
         return max(0.0, 1.0 - math.log10(over) / _DECADES)
+
+    def _checks(self, found: Stillness) -> tuple[tuple[float | None, float, float, str, str, int], ...]:
+        """Pair what was measured with its limit, and scale, name, unit and digits for people."""
+        limits, speed_rad_s, joint = self._limits, found.max_joint_speed_rad_s, ""
+        if speed_rad_s > limits.joint_speed_rad_s:
+            speeds = np.abs([s.joint_speeds_rad_s for s in self._states.copy()]).max(axis=0)
+            joint = f"joint {JOINT_NAMES[int(speeds.argmax())]}"
+        return (
+            (speed_rad_s, limits.joint_speed_rad_s, _DEG, f"{joint} moves at", "°/s", 2),
+            (found.position_scatter_m, limits.position_m, 1000.0, "the flange scatters by", " mm", 3),
+            (found.rotation_scatter_rad, limits.rotation_rad, _DEG, "the flange turns by", "°", 4),
+            (found.image_motion_px, limits.image_motion_px, 1.0, "the image moves by", " px", 2),
+        )
 
     @property
     def at_rest(self) -> bool:

@@ -14,7 +14,7 @@ from calibrate.boards.detect import Detection, detect
 from calibrate.boards.grids import seen_size
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotState
 from station.analysis.found_cell import FoundCell
-from station.analysis.guidance import NextView, Way, next_view, way_to
+from station.analysis.guidance import NextView, Way, motion_px, next_view, way_to
 from station.analysis.worker import CapturedView
 from station.cell.errors import RobotError, StationError
 from station.operate import draft as drafts
@@ -136,10 +136,10 @@ class CellSetup:
             self.counts = seen_size(to_grey(image.pixels))
         if board is None or step not in _LOOKED_FOR:
             return None
-        found, before = detect(image.pixels, board, step is CellStep.BOARD and self.seen is None), self.seen
-        if before is not None and np.array_equal(before[1].indices, found.indices) and found.found:
-            shift_px = np.linalg.norm(found.pixels - before[1].pixels, axis=1)
-            self._moved_s = begun_s if np.median(shift_px) > STILL_PX else self._moved_s
+        found = detect(image.pixels, board, step is CellStep.BOARD and self.seen is None)
+        shift_px = None if self.seen is None else motion_px(self.seen[1].pixels, found.pixels)
+        if shift_px is not None and shift_px > STILL_PX:
+            self._moved_s = begun_s
         if step is CellStep.VIEWS:
             self._guide(found)
         self.seen, self.trouble = (begun_s, found), image_trouble(image, found)[1]

@@ -11,8 +11,8 @@ import numpy as np
 from recordings.errors import CodedError
 from recordings.schema.messages import CameraModel, Image
 from station.analysis.estimation import FEWEST_FOR_LENS
-from station.analysis.guidance import NextView, Way, next_view, way_to
-from station.analysis.worker import BoardDetection, CapturedView
+from station.analysis.guidance import NextView, Way, motion_px, next_view, way_to
+from station.analysis.worker import CapturedView
 from station.cell.status import FEWEST_BY_HAND, GuidanceStatus, StationState
 from station.session.context import SessionContext
 from station.session.freedrive import FreedriveCapture
@@ -34,9 +34,10 @@ class HandGuide:
         self._known: tuple[int, ...] | None = None
         """Numbers of the views by which it was chosen."""
         self._given_up = list[np.ndarray]()
-        self._before: tuple[int, BoardDetection] | None = None
+        self._number, self._pixels = -1, np.zeros((0, 2))
+        """Number of the last preview, and the corners in it."""
         self._motion_px: float | None = None
-        """Of the board between the last two previews; None: it was not seen in both."""
+        """Motion of the board between the last two previews; None: it was not seen in both."""
         self._moved_s, self._failed = 0.0, False
         """When something moved last; whether an image failed or was taken back since: no other is tried."""
 
@@ -47,6 +48,7 @@ class HandGuide:
             if store.state is not StationState.FREE_DRIVE or self._freedrive.taking:
                 if store.state in (StationState.IDLE, StationState.PAUSED):
                     store.update(guidance=GuidanceStatus())
+                    self._known, self._failed = None, False
                 continue
             try:
                 await self._guide()
@@ -67,7 +69,10 @@ class HandGuide:
             scale = wanted.camera.width / image.pixels.shape[1]
             view = CapturedView(-1, np.eye(4), seen.indices, (seen.pixels + 0.5) * scale - 0.5)
             way = await context.workers.call(way_to, wanted, view, timeout_s=_CHOOSE_S)
-        found = context.stillness.measure(self._motion(number, seen))
+        if number != self._number:
+            before, self._pixels = self._pixels, seen.pixels
+            self._number, self._motion_px = number, motion_px(before, seen.pixels)
+        found = context.stillness.measure(self._motion_px)
         moves = "too few robot states" if found is None else context.stillness.unrest(found)
         still = 0.0 if found is None else context.stillness.rest(found)
         if moves or self._motion_px is None:
@@ -119,13 +124,3 @@ class HandGuide:
             )
             self._known = known
         return self._wanted
-
-    def _motion(self, number: int, seen: BoardDetection) -> float | None:
-        """Measure how far the board moved in the image since the preview before, px."""
-        before, self._before = self._before, (number, seen)
-        if before is None or before[0] != number:
-            self._motion_px = None
-            if before is not None and seen.status.found and np.array_equal(before[1].indices, seen.indices):
-                shift = np.linalg.norm(seen.pixels - before[1].pixels, axis=1)
-                self._motion_px = float(np.median(shift))
-        return self._motion_px

@@ -84,7 +84,7 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     end = "" if end_mm is None else f"by the plan ± {end_mm:.2f} mm"
     rows = [head]
     if end and height > 6:
-        rows.append(dim(f"{end} after {len(poses)} poses" + _advice(estimate.advice, width)))
+        rows.append(dim(f"{end} after {len(poses)} poses"))
     rows.append(
         curve(
             [Series(planned, "$faint", dash=2), Series(measured, "$accent")],
@@ -95,10 +95,6 @@ def error_lines(known: Known, width: int, height: int) -> Content:
         )
     )
     return lines(*rows)
-
-
-def _advice(advice: str, width: int) -> str:
-    return f". {advice}" if advice and len(advice) < width - 36 else ""
 
 
 _HEAT = ("$foreground on $h1", "$strong on $h2", "$onaccent on $h3", "$onaccent on $h4")

@@ -170,9 +170,10 @@ def _words(mount: Mount, turn: Array, further_m: float, shift: Array) -> str:
         if abs(angle) >= _NEAR_RAD
     ]
     if sides:
-        told = " and ".join(f"{degrees} {side}" for _, degrees, side in sorted(sides, reverse=True))
+        form = "{1} {2}" if in_hand else "{2} edge {1}"
+        told = " and ".join(form.format(*side) for side in sorted(sides, reverse=True))
         parts.append(
-            f"tilt the camera {told} around the board" if in_hand else f"tilt the board, {told} edge nearer"
+            f"tilt the camera {told} around the board" if in_hand else f"tilt the board: {told} nearer"
         )
     if abs(turn[2]) >= _NEAR_RAD:
         # Seen along z, positive turns are clockwise; a camera turns against its image.

@@ -22,6 +22,8 @@ from station.tui.stopped import Stopped
 from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
 
+BACK = "Backspace takes the last view back"
+
 
 def _progress(known: Known, width: int, height: int) -> Content:
     draw = hand_lines if known.shown.guidance.outline else progress_lines
@@ -68,6 +70,7 @@ class CaptureScreen(StationScreen):
             return
         session = status.session
         by_hand = bool(status.guidance.outline)
+        self.query_one("#progress").border_subtitle = BACK if by_hand else LEGEND
         self.query_one(PreviewPane).wanted = status.guidance.outline
         title = "By hand" if by_hand else "Poses"
         if not by_hand and session.current is not None and status.state in RUNNING:

@@ -1,0 +1,52 @@
+"""Capture by hand on the screen: the wanted outline in the picture, one key to take a view back, a bell."""
+
+from __future__ import annotations
+
+import msgspec
+
+from station.cell.status import DetectionStatus, GuidanceStatus, PoseStatus, StationState, StationStatus
+from station.protocol import verbs
+from station.tui.app import StationApp
+from station.tui.task import Known, next_action
+from station.tui.widgets.preview import PreviewPane
+from tests.tui.conftest import FakeLink, app_on, idle, in_session, until
+
+OUTLINE = ((0.2, 0.2), (0.8, 0.2), (0.8, 0.8), (0.2, 0.8))
+
+
+def by_hand(views: int, **guidance: object) -> StationStatus:
+    poses = tuple(PoseStatus(k, f"hand-{k + 1:02d}", "done") for k in range(views))
+    status = msgspec.structs.replace(
+        idle(StationState.FREE_DRIVE),
+        detection=DetectionStatus(found=True),
+        guidance=GuidanceStatus(outline=OUTLINE, words="Closer", **guidance),  # type: ignore[arg-type]
+    )
+    return in_session(status, poses=poses, captured=views)
+
+
+def outlined(pane: PreviewPane) -> int:
+    return sum(pane.render_line(row).text.count("o") for row in range(pane.size.height))
+
+
+async def test_the_wanted_view_is_drawn_a_view_sounds_and_is_taken_back(link: FakeLink) -> None:
+    link.show(by_hand(2))
+    app = app_on(link)
+    assert isinstance(app, StationApp)
+    bells: list[int] = []
+    app.bell = lambda: bells.append(1)  # type: ignore[method-assign]
+    async with app.run_test(size=(120, 36)) as pilot:
+        pane = app.screen.query_one(PreviewPane)
+        await until(pilot, lambda: outlined(pane) > 20)
+        link.show(by_hand(3))
+        await until(pilot, lambda: bool(bells))
+        await pilot.press("backspace")
+        await until(pilot, lambda: verbs.Skip(2) in link.asked)
+        link.show(idle())
+        await until(pilot, lambda: not outlined(pane))
+
+
+def test_next_is_the_way_until_it_is_enough() -> None:
+    assert next_action(Known(by_hand(3))).label == "Closer"
+    moved = next_action(Known(by_hand(6, cause="moved", warning="The board moved.")))
+    assert moved.look and moved.why == "The board moved."
+    assert next_action(Known(by_hand(12, enough=True))).key == "F7"

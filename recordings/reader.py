@@ -57,7 +57,7 @@ class RobotSamples(NamedTuple):
     stamps_ns: NDArray[np.int64]
     """(m,) on the clock of `View.stamps.host_monotonic_ns`"""
     joints_rad: NDArray[np.float64]
-    """(m, 6)"""
+    """(m, k); k = 0 where not every state tells as many"""
     tcp_pose: NDArray[np.float64]
     """(m, 6) base_from_tcp: x y z [m], rotation vector [rad]"""
 
@@ -138,9 +138,12 @@ class Recording:
     def robot_samples(self) -> RobotSamples:
         """All robot states as arrays, to be interpolated at any time."""
         states = list(self.robot_states())
-        told = np.array([(*state.joints_rad, *state.tcp_pose) for state in states]).reshape(-1, 12)
+        counts = {len(state.joints_rad) for state in states}
+        count = counts.pop() if len(counts) == 1 else 0
+        joints = np.array([state.joints_rad[:count] for state in states], dtype=float)
         stamps = np.array([state.stamps.host_monotonic_ns for state in states], np.int64)
-        return RobotSamples(stamps, told[:, :6], told[:, 6:])
+        poses = np.array([state.tcp_pose for state in states]).reshape(-1, 6)
+        return RobotSamples(stamps, joints.reshape(len(states), count), poses)
 
     def robot_states(self) -> Iterator[RobotState]:
         return chain.from_iterable(segment.robot_states() for segment in self.segments)

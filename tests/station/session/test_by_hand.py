@@ -66,6 +66,7 @@ async def test_views_by_hand_carry_the_told_pose_and_joints(rig: Rig, told: tupl
     recording = sealed(rig)
     assert [view.joints_rad for view in recording.views()] == [told or None] * 2
     assert {state.joints_rad for state in recording.robot_states()} == {told}
+    assert recording.robot_samples().joints_rad.shape[1] == len(told)
     assert rig.arm.log == [] and rig.arm.beats == 0
 
 

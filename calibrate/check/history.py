@@ -10,7 +10,7 @@ import msgspec
 from calibrate.errors import InstallError
 from calibrate.files.folders import calibrations_folder
 from calibrate.files.lines import append_line, read_lines
-from recordings.schema.messages import MAIN_CAMERA
+from recordings.files import MAIN_CAMERA
 
 FILE = "checks.jsonl"
 

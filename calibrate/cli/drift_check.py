@@ -29,11 +29,11 @@ from calibrate.files.install import note_check
 from calibrate.files.validity import Validity, ValidityReason, validity_text
 from calibrate.job import JobOptions
 from calibrate.pipeline import prepare_views
-from recordings.files import state_root
+from recordings.files import MAIN_CAMERA, state_root
 from recordings.importers.dataset import DATASET_FILE
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
-from recordings.schema.messages import MAIN_CAMERA, SessionInfo
+from recordings.schema.messages import SessionInfo
 
 DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."

@@ -15,7 +15,8 @@ from calibrate.cli.installed import CameraName, Root
 from calibrate.files.calibration import FramePose, Lens, source_stamp
 from calibrate.files.loader import InstallationChange, watch
 from calibrate.files.validity import Validity, validity_text
-from recordings.schema.messages import MAIN_CAMERA, Mount, Source
+from recordings.files import MAIN_CAMERA
+from recordings.schema.messages import Mount, Source
 
 
 class Followed(msgspec.Struct, frozen=True):

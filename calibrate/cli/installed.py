@@ -24,8 +24,7 @@ from calibrate.files.formatting import override_text, pose_text, summary, verdic
 from calibrate.files.proof import read_bounded
 from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.files.versions import InstalledVersion, installed_versions
-from recordings.files import state_root
-from recordings.schema.messages import MAIN_CAMERA
+from recordings.files import MAIN_CAMERA, state_root
 
 Root = Annotated[
     Path | None,

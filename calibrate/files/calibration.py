@@ -33,9 +33,8 @@ from calibrate.results import (
     Remark,
 )
 from calibrate.views import array_of
-from recordings.files import ASKED_FOR, write_atomically
+from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
 from recordings.schema.messages import (
-    MAIN_CAMERA,
     BoardSpec,
     CameraIdentity,
     CameraModel,

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from calibrate.errors import InstallError
 from calibrate.files.validity import FILE, Validity, parse_validity, time_text, unrecorded
-from recordings.files import LOG_LIMIT_BYTES, is_session_name, read_file, state_root
-from recordings.schema.messages import MAIN_CAMERA
+from recordings.files import LOG_LIMIT_BYTES, MAIN_CAMERA, is_session_name, read_file, state_root
 
 VERSION_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
 

@@ -44,7 +44,8 @@ from calibrate.files.versions import (
 )
 from calibrate.geometry import difference
 from calibrate.results import Gate
-from recordings.schema.messages import MAIN_CAMERA, Source
+from recordings.files import MAIN_CAMERA
+from recordings.schema.messages import Source
 
 Cell = Literal["real", "imported", "simulated"]
 _CELL_OF: dict[Source, Cell] = {

@@ -22,7 +22,7 @@ from calibrate.files.validity import (
     time_text,
 )
 from calibrate.geometry import Array, Transform
-from recordings.schema.messages import MAIN_CAMERA
+from recordings.files import MAIN_CAMERA
 
 if TYPE_CHECKING:
     from recordings.schema.messages import CameraModel, Mount, Source

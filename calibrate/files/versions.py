@@ -44,8 +44,7 @@ from calibrate.files.validity import (
     time_text,
     unrecorded,
 )
-from recordings.files import open_regular, sync_folder, write_atomically
-from recordings.schema.messages import MAIN_CAMERA
+from recordings.files import MAIN_CAMERA, open_regular, sync_folder, write_atomically
 
 Action = Literal["install", "rollback", "verify"]
 

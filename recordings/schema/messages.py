@@ -25,8 +25,6 @@ ToldJoints = Annotated[tuple[float, ...], msgspec.Meta(max_length=7)]
 """As `Joints`; empty where the arm does not tell them."""
 Matrix4 = tuple[tuple[float, ...], ...]
 """4×4, row major"""
-MAIN_CAMERA = "main"
-"""Name of the camera of a cell that has one, and of folders from before cameras had names."""
 
 
 class BoardKind(StrEnum):

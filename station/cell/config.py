@@ -7,16 +7,9 @@ from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
+from recordings.files import MAIN_CAMERA
 from recordings.schema import stillness
-from recordings.schema.messages import (
-    MAIN_CAMERA,
-    BoardKind,
-    BoardSpec,
-    CameraModel,
-    Matrix4,
-    Mount,
-    Vector6,
-)
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Matrix4, Mount, Vector6
 
 Vector3 = tuple[float, float, float]
 LARGEST_REACH_M = 5.0

@@ -14,8 +14,8 @@ from typing import TypeVar
 import msgspec
 
 from recordings.errors import ErrorData
+from recordings.files import MAIN_CAMERA
 from recordings.plain_text import plain_data
-from recordings.schema.messages import MAIN_CAMERA
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus

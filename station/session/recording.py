@@ -17,18 +17,10 @@ import msgspec
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, require_free_space
+from recordings.files import EMPTY_SUFFIX, MAIN_CAMERA, PART_SUFFIX, require_free_space
 from recordings.manifest import enter_part, read_manifest
 from recordings.recorder import Recorder
-from recordings.schema.messages import (
-    ARM_KINEMATICS_NAME,
-    MAIN_CAMERA,
-    CameraModel,
-    Image,
-    Matrix4,
-    SessionInfo,
-    Stamps,
-)
+from recordings.schema.messages import ARM_KINEMATICS_NAME, CameraModel, Image, Matrix4, SessionInfo, Stamps
 from station.cell.config import matrix4
 from station.cell.errors import CameraError
 from station.cell.layout import guess_matrix

@@ -17,7 +17,7 @@ from calibrate.files.touch import agrees
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
 from calibrate.files.versions import LogEntry, read_log, same_solve
-from recordings.schema.messages import MAIN_CAMERA
+from recordings.files import MAIN_CAMERA
 from station.cell.session_folder import SessionSummary, list_sessions
 
 Marks = frozenset[tuple[str, int]]

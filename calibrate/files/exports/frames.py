@@ -14,8 +14,8 @@ from calibrate.files.calibration import Calibration, source_stamp
 from calibrate.files.validity import Validity, validity_text
 from calibrate.geometry import Array, inverse, pose
 from calibrate.kinematics import MODELS
+from recordings.files import MAIN_CAMERA
 from recordings.importers.frames import FrameTree
-from recordings.schema.messages import MAIN_CAMERA
 
 BODY_FROM_OPTICAL: Array = pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """REP-103: a body frame looks along x with z up, an optical frame along z with y down."""

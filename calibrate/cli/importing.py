@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shlex
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -96,7 +97,7 @@ def import_command(
         elif source.is_dir() and not _is_bag(source):
             told = dataset or _told(source, output)
             given = Given(convention, mount, None if board is None else typed_board(board))
-            facts = _import_found(source, target, told, poses, given, progress)
+            facts = _import_found(source, target, told, poses, given, progress, shown)
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
@@ -120,17 +121,29 @@ def _told(source: Path, output: Path | None) -> Path | None:
 
 @single_threaded_opencv()
 def _import_found(
-    source: Path, target: Path | None, told: Path | None, poses: Path | None, given: Given, progress: Progress
+    source: Path,
+    target: Path | None,
+    told: Path | None,
+    poses: Path | None,
+    given: Given,
+    progress: Progress,
+    shown: bool,
 ) -> ImportJson:
     """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
     described = None if told is None else read_dataset(told)[0]
-    believed = believe(look(source, poses), given, described, progress)
+    ask = _ask if shown and sys.stdin.isatty() else None
+    believed = believe(look(source, poses), given, described, progress, ask)
     dataset = believed.dataset
     content = msgspec.yaml.encode(dataset)
     done = write_views(source, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
     if target is not None and told is None:
         write_atomically(target.with_suffix("." + DATASET_FILE), content)
     return ImportJson(str(target or ""), done.images, done.size_bytes, found=believed.facts)
+
+
+def _ask(why: str) -> Mount:
+    answer = typer.prompt(f"\n{why}.\nIs the camera on the arm? y/n", err=True)
+    return "eye-in-hand" if answer.strip().lower().startswith("y") else "eye-to-hand"
 
 
 class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):

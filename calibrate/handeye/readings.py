@@ -58,7 +58,7 @@ def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
         if np.isfinite(gain) and gain > max(winning, best.log_evidence_gain):
             factor = float(fit.factors[_FACTOR[reading]]) if reading in _FACTOR else 1.0
             before = float(fit.factors[_FOCAL]) if reading is Reading.REFOCUSED else 1.0
-            if reading in _FACTOR and abs(np.log(factor / before)) < _LEAST:
+            if factor <= 0 or (reading in _FACTOR and abs(np.log(factor / before)) < _LEAST):
                 continue
             if reading is Reading.SQUARE_SIZE and abs(abs(np.log(factor)) - np.log(1000.0)) < _NEAR:
                 reading = Reading.MILLIMETRES

@@ -95,6 +95,8 @@ def believe(
             tried += readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
     if not tried and not boards:
         raise ImportSourceError("no-board-found", source=lies.root, images=", ".join(families))
+    if given.convention and not any(map(is_good, tried)):
+        _name_convention(lies, given, progress)
     best = decide(lies, tried)
     pairs = next(
         p
@@ -102,6 +104,16 @@ def believe(
         if (t, f) == (best.table, best.family)
     )
     return _believed(lies, given, best, pairs, ask)
+
+
+def _name_convention(lies: Lies, given: Given, progress: Progress) -> None:
+    """Refuse the convention that was named where the poses fit by another one."""
+    try:
+        others = believe(lies, Given(None, given.mount or "eye-in-hand", given.board), None, progress)
+    except ImportSourceError:
+        return
+    fits = others.dataset.poses.convention if others.dataset.poses else ""
+    raise ImportSourceError("other-convention", source=lies.root, told=given.convention, fits=fits)
 
 
 def _as_before(lies: Lies, told: Dataset, poses: PosesTold) -> Believed:
@@ -150,7 +162,9 @@ def _rows_of_both(robot: Table, board: Table) -> dict[Key, int]:
 
 def _believed(lies: Lies, given: Given, best: Reading, pairs: dict[Key, int], ask: Ask | None) -> Believed:
     seen = best.seen
-    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, ask)
+    mount, inverted, board_inverted, why = mounting(
+        lies, given.mount, best, given.convention is not None, ask
+    )
     how = replace(best.convention, inverse=best.convention.inverse != inverted)
     board, square = _board(best)
     facts = {

@@ -16,7 +16,7 @@ from recordings.schema.messages import Mount
 
 Ask = Callable[[str], Mount]
 _IN_HAND = re.compile(
-    r"eye_?(in|on)_?hand|hand_?(in|on)_?eye|\beih\b|cam\w*2(gripper|end|ee|tool|flange|hand)"
+    r"eye_?(in|on)_?hand|hand_?(in|on)_?eye|hand_in\b|\beih\b|cam\w*2(gripper|end|ee|tool|flange|hand)"
     r"|attached on robot|in_hand|inhand|flange2cam|hand_camera|static_camera false",
     re.I,
 )
@@ -28,7 +28,7 @@ _TO_HAND = re.compile(
 _TOOL_IN_BASE = re.compile(
     r"(end|gripper|ee|tool|tcp|flange|hand)_?(2|to|in)_?base|base_(tcp|ee|tool|flange)|world_end|O_T_EE|t_base_tcp"
     r"|robot_?(pose|coord|pos)|(tcp|tool|eef|ee|end|gripper|arm|effector)_?(pose|xyz|data|coord)|tool_?pose|\bhand\b"
-    r"|robot_?data",
+    r"|robot_?data|pose_(flange|tcp|tool|ee|gripper)|\bmove[jl]\b|(effector|hand)_(wrt|in)?_?world",
     re.I,
 )
 _BASE_IN_TOOL = re.compile(r"base_?(2|to|in)_?(end|gripper|ee|tool|tcp|flange|hand)", re.I)
@@ -36,33 +36,32 @@ _CAMERA_IN_BOARD = re.compile(r"cam\w*?_?(2|to|in|wrt)_?(board|target|marker|obj
 
 
 def mounting(
-    lies: Lies, given: Mount | None, best: Reading, ask: Ask | None
+    lies: Lies, given: Mount | None, best: Reading, as_told: bool, ask: Ask | None
 ) -> tuple[Mount, bool, bool, str]:
     """(mounting, whether the robot's poses are inverted, whether the board's are, why).
 
-    `ask`: asks a person. Raises ImportSourceError (`which-mount`) where neither names nor a person decide.
+    `as_told`: the user named the convention, so the direction, too. `ask`: asks a person. Raises
+    ImportSourceError (`which-mount`) where nothing decides, or the user contradicts names.
     """
     name, seen_in = best.table.name, best.seen.in_front
-    straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
     turned_board = bool(_CAMERA_IN_BOARD.search(best.family)) if all(seen_in) else not seen_in[0]
     fits = _OTHER[best.mount] if turned_board else best.mount
+    straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
+    by_direction = set[Mount]()
+    if as_told or straight != inverted:
+        by_direction = {fits if as_told or straight else _OTHER[fits]}
     named = _named(f"{name} {best.family}") or _named(
         f"{lies.words} {' '.join(f'{k} {str(v).lower()}' for k, v in lies.facts.items())}"
     )
-    by_direction: set[Mount] = {fits if straight else _OTHER[fits]} if straight != inverted else set()
-    mount, why = given, "as told"
-    if mount is None and len(named | by_direction) == 1:
-        (mount,) = named | by_direction
-        why = f"by {'names, and ' if named else ''}the board's motion; {name}"
-    elif mount is None and ask is not None:
-        mount = ask(
-            f"{name} fits as {fits} with poses as they stand, or the other mounting with inverted poses"
-        )
-    if mount is None:
+    possible = by_direction | ({given} if given else named)
+    if len(possible) != 1 and not given and ask is not None:
+        given = ask(f"{name} fits as {fits} as it stands, or the other mounting with inverted poses")
+        possible = {given}
+    if len(possible) != 1:
         raise ImportSourceError("which-mount", source=lies.root, mount=fits, table=name)
-    turn = mount != fits
-    turns_board = turn and best.of_pairs and straight
-    return mount, turn and not turns_board, turned_board != turns_board, why
+    (mount,) = possible
+    why = "as told" if given else f"by {'names, and ' if named else ''}the board's motion; {name}"
+    return mount, mount != fits, turned_board, why
 
 
 def _named(words: str) -> set[Mount]:

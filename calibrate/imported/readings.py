@@ -10,8 +10,9 @@ import numpy as np
 from calibrate.boards.model import board_from_turned
 from calibrate.geometry import Array, inverse, rotation_angle, rotation_log, transform_points
 from calibrate.handeye.axxb.pairs import mount_poses
-from calibrate.handeye.pose_fit import FREE, PoseFit, fit_poses, pose_views
-from calibrate.handeye.readings import clear_gain
+from calibrate.handeye.pose_fit import FREE, PoseFit, PoseViews, fit_poses, pose_views
+from calibrate.handeye.readings import clear_gain, explain_recording, explain_text
+from calibrate.handeye.solution import Reading as NamedReading
 from calibrate.imported.board import FEWEST, Key, Seen
 from calibrate.lens.pnp import choose_candidates
 from calibrate.views import ViewSet
@@ -23,6 +24,8 @@ from recordings.schema.messages import Mount
 _MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
 _MOST = 12
 """Most readings of one table that are fitted: those by which the board seems to move least."""
+_EXPLAINED = 4
+"""Most readings of a refused folder that are tried with their rows shifted, mirrored and the like."""
 _STAYS_M, _STAYS_RAD = 0.015, 0.05
 """Median distance of the board from its place above which no reading is believed."""
 
@@ -37,6 +40,7 @@ class Reading:
     """Images by folder and name, or the table of the board's poses."""
     seen: Seen
     mount: Mount
+    views: ViewSet
     fit: PoseFit
     stays_m: float
     stays_rad: float
@@ -120,7 +124,9 @@ def _moves(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> float:
     return float(np.median(moved))
 
 
-def _fitted(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> tuple[PoseFit, float, float] | None:
+def _fitted(
+    seen: Seen, keys: list[Key], flange: Array, mount: Mount
+) -> tuple[ViewSet, PoseFit, float, float] | None:
     options = [seen.candidates[key] for key in keys]
     chosen = choose_candidates(
         [np.array([c.camera_from_board for c in each]) for each in options], flange, mount
@@ -134,7 +140,8 @@ def _fitted(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> tuple[P
         views.append(
             replace(view, base_from_flange=F, board_points=points, camera_from_board=found.camera_from_board)
         )
-    poses = pose_views(ViewSet(mount, tuple(views), seen.camera), 0.02, 0.003 if seen.square_known else FREE)
+    viewed = ViewSet(mount, tuple(views), seen.camera)
+    poses = _pose_views(viewed, seen)
     try:
         fit = fit_poses(poses)
     except np.linalg.LinAlgError:
@@ -142,7 +149,11 @@ def _fitted(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> tuple[P
     places = mount_poses(flange, mount) @ fit.X[0] @ poses.boards.at(fit.factors)
     away = inverse(fit.Y[0]) @ places
     stays_m = float(np.median(np.linalg.norm(away[:, :3, 3], axis=1)))
-    return fit, stays_m, float(np.median(rotation_angle(away[:, :3, :3])))
+    return viewed, fit, stays_m, float(np.median(rotation_angle(away[:, :3, :3])))
+
+
+def _pose_views(views: ViewSet, seen: Seen) -> PoseViews:
+    return pose_views(views, 0.02, 0.003 if seen.square_known else FREE)
 
 
 def is_good(reading: Reading) -> bool:
@@ -162,15 +173,20 @@ def decide(lies: Lies, readings: list[Reading]) -> Reading:
     good = [reading for reading in readings if is_good(reading)] or readings
     ranked = sorted(good, key=lambda r: -r.fit.log_evidence)
     if not ranked:
-        raise ImportSourceError("no-reading", source=lies.root, nearest="none", stays_m=0.0, stays_rad=0.0)
+        raise ImportSourceError(
+            "no-reading", source=lies.root, nearest="none", stays_m=0.0, stays_rad=0.0, cause="", text=""
+        )
     best = ranked[0]
     if not is_good(best):
+        best, cause, text = _cause(ranked[:_EXPLAINED])
         raise ImportSourceError(
             "no-reading",
             source=lies.root,
             nearest=f"{best.table.name}: {best.text}",
             stays_m=best.stays_m,
             stays_rad=best.stays_rad,
+            cause=cause,
+            text=text,
         )
     for other in ranked[1:]:
         if best.fit.log_evidence - other.fit.log_evidence > clear_gain(len(best.fit.full)):
@@ -183,6 +199,22 @@ def decide(lies: Lies, readings: list[Reading]) -> Reading:
                 second=f"{other.table.name}: {other.text}",
             )
     return best
+
+
+def _cause(nearest: list[Reading]) -> tuple[Reading, str, str]:
+    """(the reading nearest to right, code of what would make it right, sentence), as a solve names them."""
+    ranked = []
+    for n, reading in enumerate(nearest):
+        found = explain_recording(_pose_views(reading.views, reading.seen))
+        gain = found.log_evidence_gain if found.reading in _CAUSES else 0.0
+        ranked.append((-reading.fit.log_evidence - gain, n, reading, found))
+    _, _, best, found = min(ranked, key=lambda each: each[:2])
+    named = found.reading in _CAUSES
+    return best, found.reading.value if named else "", explain_text(found, best.views) if named else ""
+
+
+_CAUSES = (NamedReading.SHIFTED, NamedReading.MIRRORED, NamedReading.BOARD_MOVED, NamedReading.CAMERA_MOVED)
+"""What no convention of numbers mends."""
 
 
 def _same(one: Reading, other: Reading) -> bool:

@@ -7,6 +7,7 @@ must be read as it is meant, and a mistake must be refused by its name.
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +20,10 @@ from benchmarks.real_sets import DATASETS
 from benchmarks.trials import table
 from calibrate.geometry import Array, inverse
 from calibrate.imported import Given, believe, board
-from calibrate.pipeline import single_threaded_opencv
+from calibrate.pipeline import single_threaded_opencv, solve_recording
 from recordings.errors import ImportSourceError
 from recordings.importers.dataset import Dataset, read_dataset, read_poses
+from recordings.importers.folder import write_views
 from recordings.importers.tables import Lies, Table
 from recordings.schema.messages import Mount
 
@@ -74,7 +76,7 @@ def numbers(how: str, T: Array) -> Array:
 
 
 def said(case: Misread, T: Array, mount: Mount, lies: Lies) -> str:
-    """Answer of the import; `wrong` where other poses than the true ones were believed."""
+    """Answer of the import; of other poses than the true ones `gates` (the solve refuses them) or `wrong`."""
     rows = numbers(case.written, case.change(T))
     lies.tables = [Table(case.name, "", rows, [""] * len(rows), [(n,) for n in range(len(rows))])]
     others: dict[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
@@ -83,7 +85,11 @@ def said(case: Misread, T: Array, mount: Mount, lies: Lies) -> str:
     except ImportSourceError as error:
         return str(error.values.get("cause") or error.code)
     got = np.array([row.base_from_flange for row in found.rows])
-    return "read" if np.allclose(got, T, atol=1e-3) and found.dataset.mount == mount else "wrong"
+    if np.allclose(got, T, atol=1e-3) and found.dataset.mount == mount:
+        return "read"
+    with tempfile.TemporaryDirectory() as folder:
+        write_views(lies.root, recording := Path(folder) / "r.mcap", found.dataset, found.rows, {})
+        return "wrong" if solve_recording(recording).passed else "gates"
 
 
 def cases_of(folder: Path) -> tuple[Array, Dataset, Lies]:

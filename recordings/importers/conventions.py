@@ -126,21 +126,13 @@ def possible(numbers: Array) -> list[tuple[Convention, str]]:
         near = f"quaternions of length 1 within {miss:.1g}"
         found = [(Convention(form), near) for form in ("xyzw", "wxyz") if miss < _UNIT_TOLERANCE]
         at = numbers[:, :3]
-        if (first := float(np.abs(np.linalg.norm(numbers[:, :4], axis=1) - 1).max())) < min(
-            miss, _UNIT_TOLERANCE
-        ):
-            near = f"quaternions of length 1 within {first:.1g} first"
-            found = [(Convention(form, rotation_first=True), near) for form in ("xyzw", "wxyz")]
-            at = numbers[:, 4:]
     else:
-        behind = _angles_first(numbers)
-        turn, at = (numbers[:, :3], numbers[:, 3:]) if behind else (numbers[:, 3:], numbers[:, :3])
-        largest = float(np.abs(turn).max())
+        largest, at = float(np.abs(numbers[:, 3:]).max()), numbers[:, :3]
         forms = ("rotvec", "xyz", "ZYX", *(s for s in _SEQUENCES if s not in ("xyz", "ZYX")))
         unit = largest > 2 * math.pi + 0.01  # in degrees an arm that turns so little shows nothing
         found = [
             (
-                Convention(form, degrees=unit, rotation_first=behind),
+                Convention(form, degrees=unit),
                 f"angles to {largest:.4g} {'°' if unit else 'rad'}",
             )
             for form in forms
@@ -152,9 +144,3 @@ def possible(numbers: Array) -> list[tuple[Convention, str]]:
         return []
     told = f"reach {reach:.4g} {'mm' if unit_m == _MM else 'm'}"
     return [(replace(each, unit_m=unit_m), f"{evidence}, {told}") for each, evidence in found]
-
-
-def _angles_first(numbers: Array) -> bool:
-    """Tell whether rows of six begin with angles: those are radians, and positions behind them too large."""
-    first, last = (float(np.abs(numbers[:, part]).max()) for part in (slice(3), slice(3, 6)))
-    return first <= 2 * math.pi + 0.01 and last > 360.0

@@ -12,9 +12,9 @@ import re
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from io import BytesIO
-from itertools import islice, pairwise
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -107,7 +107,6 @@ class _Row:
 def look(source: Path, poses: Path | None = None) -> Lies:
     """Read what lies in `source`; numbers only of `poses`, a file or a folder, where it is given."""
     found, rows = Lies(source), defaultdict[tuple[str, ...], list[_Row]](list)
-    halves = defaultdict[str, dict[str, list[_Row]]](dict)
     words = ["/".join(source.resolve().parts[-3:])]
     files = sorted(islice(_files(source), _FILES_LIMIT), key=natural)
     images = defaultdict[str, list[Path]](list)
@@ -133,20 +132,10 @@ def look(source: Path, poses: Path | None = None) -> Lies:
                 numbers, rotation, key = row
                 named = ".".join((*node.keys, key)).strip(".")
                 told[named, rotation, str(len(numbers))].append(_Row(numbers, rotation, node.image, place))
-            elif (half := _half(node)) is not None:
-                whole = re.sub(_HALVES[half[0]], "", f"{_pattern(name)} {'.'.join(node.keys)}", flags=re.I)
-                halves[whole].setdefault(half[0], []).append(_Row(half[1], "", node.image, place))
         for (named, *form), each in told.items():  # files of one row each make a table together
             rows[f"{_pattern(name) if len(each) == 1 else name} {named}".strip(), *form].extend(each)
     found.images = dict(images)
     found.words = " ".join(dict.fromkeys(words))
-    for name, half_rows in halves.items():
-        at, turn = (half_rows.get(half, []) for half in _HALVES)
-        if len(at) == len(turn):
-            joined = [
-                replace(a, numbers=_joined(a.numbers, b.numbers)) for a, b in zip(at, turn, strict=True)
-            ]
-            rows[name, "", str(len(joined[0].numbers))].extend(joined)
     for (name, rotation, _), each in rows.items():
         for part, some in _two_by_two(each).items():
             if len(some) >= 3:
@@ -162,13 +151,6 @@ def _two_by_two(rows: list[_Row]) -> dict[str, list[_Row]]:
     if len(rows) > 4 and last == [0, 1] * (len(rows) // 2):
         return {" robot": rows[::2], " board": rows[1::2]}
     return {"": rows}
-
-
-def _joined(at: list[float], turn: list[float]) -> list[float]:
-    """One row: position and rotation, or the first three rows of the matrix."""
-    if len(turn) != 9:
-        return at + turn
-    return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])]
 
 
 def _files(source: Path) -> Iterator[Path]:
@@ -235,17 +217,14 @@ def _of_text(text: str) -> Any:
         names = [re.sub(r"\W.*", "", name.strip().lower()) for name in header]
         cells = [re.split(r"[,;\t]", line) for line in lines[1:]]
         return [dict(zip(names, map(_value, row), strict=False)) for row in cells]
-    groups, title = defaultdict[tuple[str, int], list[Any]](list), ""
+    groups = defaultdict[tuple[str, int], list[Any]](list)
     for line in lines:
-        if re.fullmatch(r"\s*[A-Za-z]\w*\s*:\s*", line):
-            title = line.strip(" \t:")
-            continue
         image = _IMAGE.search(line)
         rest = line.replace(image[0], "") if image else line
         inside = [_numbers(part) for part in re.findall(r"\[([^\[\]]+)\]", rest)]
         numbers = next((part for part in inside if len(part) in _POSE_SIZES), _numbers(rest))
         said = _NUMBER.sub("", re.sub(r"\[.*?\]", "", rest))
-        label = " ".join(re.findall(r"[A-Za-z]\w*", said))[:40] or title
+        label = " ".join(re.findall(r"[A-Za-z]\w*", said))[:40]
         row = {"image": image[0], "pose": numbers} if image else numbers
         groups[label, len(numbers)].append(row)
     tree: dict[str, Any] = {}
@@ -256,21 +235,11 @@ def _of_text(text: str) -> Any:
         elif count == 1:
             value = [row[0] for row in plain]
         else:
-            value = _without_count(group) if len(plain) == len(group) else group
+            value = group
         while isinstance(value, list) and len(value) == 1:
             value = value[0]
         tree[label if label not in tree else f"{label} {count}"] = value
     return tree.get("") if set(tree) == {""} else tree
-
-
-def _without_count(rows: list[list[float]]) -> list[Any]:
-    """Rows whose first number only counts them, without it; the count stays as the row's place."""
-    if len(rows) < 3 or len(rows[0]) - 1 not in _POSE_SIZES:
-        return rows
-    first = [row[0] for row in rows]
-    if not all(a.is_integer() and a < b for a, b in pairwise([*first, np.inf])):
-        return rows
-    return [{f"{row[0]:.0f}": row[1:]} for row in rows]
 
 
 def _value(text: str) -> Any:
@@ -288,8 +257,6 @@ class _Node:
     keys: tuple[str, ...]
     place: tuple[int, ...]
     image: str
-    inside: bool = False
-    """It is a part of a node that is a pose."""
 
 
 def _nodes(tree: Any, keys: tuple[str, ...], image: str, place: tuple[int, ...] = ()) -> Iterator[_Node]:
@@ -298,14 +265,12 @@ def _nodes(tree: Any, keys: tuple[str, ...], image: str, place: tuple[int, ...] 
     if isinstance(tree, list) and _pose(tree) is not None:
         return
     if isinstance(tree, dict):
-        whole = _pose(tree) is not None
         named = next((v for v in tree.values() if isinstance(v, str) and _IMAGE.fullmatch(v)), image)
         for stem, parts in _stems(tree):
             yield _Node(parts, (*keys, stem), place, named)
         for key, value in tree.items():
             digits = tuple(map(int, re.findall(r"\d+", str(key))))
-            for node in _nodes(value, (*keys, _pattern(str(key))), named, (*place, *digits)):
-                yield replace(node, inside=node.inside or whole)
+            yield from _nodes(value, (*keys, _pattern(str(key))), named, (*place, *digits))
     elif isinstance(tree, list):
         for at, value in enumerate(tree):
             if isinstance(value, (dict, list)):
@@ -323,21 +288,6 @@ def _stems(tree: dict[str, Any]) -> Iterator[tuple[str, Any]]:
         value = list(parts.values()) if "".join(parts).isdigit() else parts
         if _pose(value) is not None:
             yield stem, value
-
-
-_HALVES = {"position": r"translations?|positions?|tvecs?", "rotation": r"rotations?|orientations?|rvecs?"}
-"""Words that tell lists of one half of each pose, without which both have one name."""
-
-
-def _half(node: _Node) -> tuple[str, list[float]] | None:
-    """(which, numbers) of a position or a rotation that stands alone."""
-    numbers = None if node.inside or not node.keys else _flat(node.value)
-    if numbers is None or not isinstance(node.value, (list, dict)):
-        return None
-    for half, sizes in (("position", (3,)), ("rotation", (3, 4, 9))):
-        if len(numbers) in sizes and re.search(_HALVES[half], node.keys[-1], re.I):
-            return half, numbers
-    return None
 
 
 def _flat(value: Any) -> list[float] | None:
@@ -382,7 +332,10 @@ def _pose(value: Any) -> tuple[list[float], str, str] | None:
                 parts.setdefault(part, flat)
     if len(parts) < 2:
         return None
-    return _joined(parts["position"], parts["rotation"]), "", named
+    at, turn = parts["position"], parts["rotation"]
+    if len(turn) == 9:
+        return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])], "", named
+    return at + turn, "", named
 
 
 def _half_named(key: str) -> re.Pattern[str] | None:

@@ -253,15 +253,10 @@ def board_pairs(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
 
 
 def in_two_tables(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
-    """Another convention and unit each; one counts its rows."""
+    """Another convention and unit each."""
     np.savetxt(folder / "robot.txt", euler("ZYX", 1e3, True)(robot), delimiter=",")
     rotvec = Rotation.from_matrix(board[:, :3, :3]).as_rotvec()
-    np.savetxt(
-        folder / "marker.csv",
-        np.column_stack([np.arange(len(board)) + 1, board[:, :3, 3], rotvec]),
-        delimiter=",",
-        fmt=["%d", *["%.12f"] * 6],
-    )
+    np.savetxt(folder / "marker.csv", np.column_stack([board[:, :3, 3], rotvec]), delimiter=",")
 
 
 def moveits(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:

@@ -122,7 +122,7 @@ async def test_the_result_of_the_session_just_captured_needs_no_picking(link: Fa
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: app.known.status is not None and app.known.status.session.calibration)
         await pilot.press("4")
-        await until(pilot, lambda: "session s-1" in text_of(app, "#verdict"))
+        await until(pilot, lambda: "Session s-1" in text_of(app, "#verdict"))
 
 
 async def test_enter_on_a_session_shows_what_it_gave(link: FakeLink, root: Path) -> None:
@@ -131,4 +131,4 @@ async def test_enter_on_a_session_shows_what_it_gave(link: FakeLink, root: Path)
         table = await list_of_sessions(app, pilot)
         await until(pilot, lambda: table.row_count == 2)
         await pilot.press("down", "enter")
-        await until(pilot, lambda: app.current_mode == "result" and "session s-1" in text_of(app, "#verdict"))
+        await until(pilot, lambda: app.current_mode == "result" and "Session s-1" in text_of(app, "#verdict"))

@@ -12,6 +12,11 @@ from pathlib import Path
 from recordings.errors import RecordingError, disk_error, exists_error
 from recordings.plain_text import bytes_text
 
+MAIN_CAMERA = "main"
+"""Name of the camera of a cell that has one, and of folders from before cameras had names.
+
+Here, because programs load an installed calibration without msgspec.
+"""
 PART_SUFFIX = ".part"
 """Suffix of an unfinished recording; gone once it is finished and on the disk."""
 EMPTY_SUFFIX = ".empty"

@@ -27,7 +27,7 @@ from recordings.schema.viewing import (
 )
 from recordings.segment import RecordingSegment
 
-FLANGE_FRAME, OPTICAL_FRAME = "tool0", "camera_optical_frame"
+FLANGE_FRAME, OPTICAL_FRAME = "tool0", "camera_calibrated_optical_frame"
 """As ROS names them; `calibrate export` uses the same for the flange."""
 FRAME_PERIOD_NS = 10_000_000
 _NS = 1_000_000_000

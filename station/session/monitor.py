@@ -25,8 +25,6 @@ RATE_PERIOD_S = 1.0
 DISK_PERIOD_S = 0.5
 PAUSES = "pauses after this pose"
 FINISHES = "finishes after this pose"
-WALL_STEP_S = 0.5
-"""Smallest step of the wall clock that is reported; less may be slewing, or delay between readings."""
 
 
 class Monitor:
@@ -39,7 +37,6 @@ class Monitor:
         self._read_s = -DISK_PERIOD_S
         self._states_seen = 0
         self._states, self._frames = Rate(), Rate()
-        self._wall_ahead_ns = _wall_ahead_ns()
         moved = context.cell.mover is not None
         self._geometry = cell_geometry(context.cell.config) if moved else None
         context.cell.robot.subscribe(self._count)
@@ -49,7 +46,6 @@ class Monitor:
         self._states_seen += 1
 
     def refresh(self, lag_ms: float) -> None:
-        self._watch_wall_clock()
         self._watch_files()
         store, notice = self._context.store, self._context.cell.robot.notice
         if store.state is StationState.MOVING:
@@ -69,14 +65,6 @@ class Monitor:
         if context.store.state not in RUNNING:
             return ""
         return FINISHES if context.requests.finish else PAUSES if context.requests.pause_by else ""
-
-    def _watch_wall_clock(self) -> None:
-        """Report when the wall clock was set: no data depend on it, but times are compared by people."""
-        ahead_ns = _wall_ahead_ns()
-        step_s, self._wall_ahead_ns = (ahead_ns - self._wall_ahead_ns) / 1e9, ahead_ns
-        if abs(step_s) >= WALL_STEP_S:
-            text = f"the wall clock was set by {step_s:+.1f} s; images and poses are placed by other clocks"
-            self._context.store.event("wall-clock-set", text, "warning", step_s=round(step_s, 1))
 
     def _robot(self) -> RobotStatus:
         context, robot, mover = self._context, self._context.cell.robot, self._context.cell.mover
@@ -161,10 +149,6 @@ class Rate:
             self._per_s = (count - self._count) / passed_s
             self._since_s, self._count = self._since_s + passed_s, count
         return self._per_s
-
-
-def _wall_ahead_ns() -> int:
-    return time.time_ns() - time.monotonic_ns()
 
 
 @dataclass(frozen=True)

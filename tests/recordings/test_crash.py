@@ -10,8 +10,9 @@ import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,9 +80,15 @@ def check_what_is_left(part: Path, acknowledged: list[int]) -> None:
     assert len(list(recording.robot_states())) >= 20 * len(views)
 
 
-def kill_at_a_random_moment(folder: Path, seed: int) -> int:
+def more_in_a_soak(usual: Iterable[int], others: Iterable[int]) -> list[Any]:
+    return [*usual, *(pytest.param(other, marks=pytest.mark.soak) for other in others)]
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("seed", more_in_a_soak(range(3), range(100, 200)))
+def test_kill_9_loses_no_acknowledged_pose(tmp_path: Path, seed: int) -> None:
     """Kills between two lines of the writer's report, after a wait too short to be a whole pose."""
-    path = folder / "a.mcap"
+    path = tmp_path / "a.mcap"
     chance = random.Random(seed)
     process = start(path)
     assert process.stdout is not None
@@ -96,23 +103,14 @@ def kill_at_a_random_moment(folder: Path, seed: int) -> int:
     process.stdout.close()
     acknowledged = [int(line) for line in lines if line.endswith("\n") and line.strip().isdigit()]
     check_what_is_left(path.with_name("a.mcap.part"), acknowledged)
-    return len(acknowledged)
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("seed", range(3))
-def test_kill_9_loses_no_acknowledged_pose(tmp_path: Path, seed: int) -> None:
-    kill_at_a_random_moment(tmp_path, seed)
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("seed", range(100, 200))
-def test_kill_9_at_a_hundred_moments(tmp_path: Path, seed: int) -> None:
-    kill_at_a_random_moment(tmp_path, seed)
-
-
-def fill_the_disk(folder: Path, limit_bytes: int) -> None:
-    path = folder / "a.mcap"
+@pytest.mark.parametrize(
+    "limit_bytes", more_in_a_soak([20_000, 99_999], random.Random(0).sample(range(12_000, 400_000), 100))
+)
+def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, limit_bytes: int) -> None:
+    path = tmp_path / "a.mcap"
     process = start(path, limit_bytes)
     output = process.communicate(timeout=PATIENCE_S)[0].splitlines()
     part = path.with_name("a.mcap.part")
@@ -124,12 +122,6 @@ def check_the_full_disk(part: Path, output: list[str], error: int) -> None:
     assert (output[0], output[-1]) == ("ready", f"error disk {error}")
     assert not part.with_suffix("").exists()
     check_what_is_left(part, [int(line) for line in output[1:-1]])
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("limit_bytes", [20_000, 99_999])
-def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, limit_bytes: int) -> None:
-    fill_the_disk(tmp_path, limit_bytes)
 
 
 @pytest.mark.process
@@ -153,9 +145,3 @@ def test_a_disk_that_is_full_at_the_beginning_leaves_the_name_free(tmp_path: Pat
     said = process.communicate(timeout=PATIENCE_S)[0]
     assert said == f"error disk {errno.EFBIG}\n"
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("seed", range(100))
-def test_a_disk_full_at_a_hundred_points(tmp_path: Path, seed: int) -> None:
-    fill_the_disk(tmp_path, random.Random(seed).randint(12_000, 400_000))

@@ -14,8 +14,10 @@ from recordings.schema.messages import RobotState, View
 from recordings.schema.topics import Topic
 from tests.recordings.small_recording import make_state, make_view, write_small
 
-SAMPLED_EVERY = 307
-"""Prime to 8, so that a sample meets every bit position. `make soak` takes every one."""
+
+def sampled(every: int) -> pytest.MarkDecorator:
+    """Places so far apart; `make soak` takes every one."""
+    return pytest.mark.parametrize("every", [every, pytest.param(1, marks=pytest.mark.soak)])
 
 
 def flips(data: bytes, every: int) -> Iterator[bytearray]:
@@ -25,44 +27,28 @@ def flips(data: bytes, every: int) -> Iterator[bytearray]:
         yield flipped
 
 
-def check_every_flip(path: Path, every: int) -> int:
-    data = path.read_bytes()
-    damaged = path.with_name("damaged.mcap")
+@sampled(307)  # prime to 8, so that a sample meets every bit position
+def test_a_flipped_bit_is_never_silent(small: Path, every: int) -> None:
+    data = small.read_bytes()
+    damaged = small.with_name("damaged.mcap")
     count = 0
     for flipped in flips(data, every):
         damaged.write_bytes(flipped)
         with pytest.raises(RecordingError):
             open_recording(damaged)
         count += 1
-    return count
+    assert count > 500 and (every > 1 or count == 8 * len(data))
 
 
-def test_a_flipped_bit_is_never_silent(small: Path) -> None:
-    assert check_every_flip(small, SAMPLED_EVERY) > 500
-
-
-@pytest.mark.soak
-def test_no_flipped_bit_at_all_is_silent(small: Path) -> None:
-    assert check_every_flip(small, 1) == small.stat().st_size * 8
-
-
-def check_every_cut(path: Path, every: int) -> None:
-    data = path.read_bytes()
-    cut = path.with_name("cut.mcap")
+@sampled(67)
+def test_a_cut_file_is_refused_and_names_recover(small: Path, every: int) -> None:
+    data = small.read_bytes()
+    cut = small.with_name("cut.mcap")
     for length in range(0, len(data), every):
         cut.write_bytes(data[:length])
         refused = (UnfinishedRecordingError, CorruptRecordingError)
         with pytest.raises(refused):
             open_recording(cut)
-
-
-def test_a_cut_file_is_refused_and_names_recover(small: Path) -> None:
-    check_every_cut(small, 67)
-
-
-@pytest.mark.soak
-def test_a_file_cut_at_any_byte_is_refused(small: Path) -> None:
-    check_every_cut(small, 1)
 
 
 def assert_part_of_the_original(recording: Recording) -> tuple[int, int]:
@@ -76,10 +62,11 @@ def assert_part_of_the_original(recording: Recording) -> tuple[int, int]:
     return len(views), len(states)
 
 
-def check_recovery_of_cuts(path: Path, every: int) -> None:
+@sampled(293)
+def test_recovery_of_a_cut_file_saves_every_pose_that_is_in_it(small: Path, every: int) -> None:
     """Each finished pose whose bytes are in the file comes back; more bytes never save less."""
-    data = path.read_bytes()
-    cut, output = path.with_name("cut.mcap.part"), path.with_name("saved.mcap")
+    data = small.read_bytes()
+    cut, output = small.with_name("cut.mcap.part"), small.with_name("saved.mcap")
     saved_before = (0, 0)
     for length in range(0, len(data), every):
         cut.write_bytes(data[:length])
@@ -95,15 +82,6 @@ def check_recovery_of_cuts(path: Path, every: int) -> None:
         saved_before = saved
         output.unlink()
     assert saved_before == (3, 9)
-
-
-def test_recovery_of_a_cut_file_saves_every_pose_that_is_in_it(small: Path) -> None:
-    check_recovery_of_cuts(small, 293)
-
-
-@pytest.mark.soak
-def test_recovery_of_a_file_cut_at_any_byte(small: Path) -> None:
-    check_recovery_of_cuts(small, 1)
 
 
 def test_one_damaged_pose_costs_only_that_pose(tmp_path: Path) -> None:

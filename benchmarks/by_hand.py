@@ -73,8 +73,8 @@ def session(task: tuple[str, Mount, int]) -> tuple[float, ...]:
     """One session: views, moves, pictures kept of what moves, errors of X in mm, by hand and random."""
     name, mount, seed = task
     cell, rng = arm_cell(name, mount, 0.0, seed, views=4), np.random.default_rng([seed, *name.encode()])
-    blank, taken, moves, moving = CameraModel(CAMERA.width, CAMERA.height), ViewSet(mount, (), CAMERA), 0, 0
-    given_up = list[Array]()
+    blank, taken = CameraModel(CAMERA.width, CAMERA.height), ViewSet(mount, (), CAMERA)
+    given_up, moves, moving = list[Array](), 0, 0
     wanted, q = next_view(mount, BOARD, blank, False, []), anywhere(cell, rng, 1)[0]
     while len(taken) < MOST_VIEWS and moves < MOST_MOVES and not enough(taken, wanted):
         moves += 1

@@ -157,26 +157,19 @@ class CellSetup:
         view = CapturedView(-1, np.eye(4), found.indices, found.pixels)
         self.way = way_to(self.wanted, view) if found.found else Way("Show the whole board", False)
 
-    def new_view(self) -> bool:
-        """True when the newest image shows the board from a useful new pose, with the arm at rest."""
-        return not self._not_takable() and self._wanted_for is self.draft and self.way.new
-
-    def _not_takable(self) -> str:
-        if self.seen is None or not self.seen[1].found:
-            return "The board is not seen."
-        if self.state is None or self.seen[0] < self._moved_s + STILL_S:
-            return "The arm does not rest yet."
-        return ""
-
-    def take_view(self) -> None:
-        """Take the view that the newest image shows. StationError: there is none."""
-        if problem := self._not_takable():
-            raise StationError("no-view", reason=problem)
-        assert self.state is not None and self.arm is not None and self.seen is not None
-        view = guided_view(self.state, self.arm.identity.tcp_offset, self.seen[1])
+    def take_view(self) -> bool:
+        """Take the newest image as a view if it is a new one and everything rests; tell whether it was."""
+        seen, state, arm = self.seen, self.state, self.arm
+        if seen is None or state is None or arm is None or self._wanted_for is not self.draft:
+            return False
+        if not self.way.new or seen[0] < self._moved_s + STILL_S:
+            return False
+        view = guided_view(state, arm.identity.tcp_offset, seen[1])
         self.change(views=(*self.draft.views, view))
+        return True
 
     def drop_view(self) -> None:
+        self._moved_s = math.inf  # not again from here
         self.change(views=self.draft.views[:-1], written="")
 
     def correct_mount(self) -> bool:

@@ -42,7 +42,6 @@ SHOWN_WIDTH_PX = 640
 NO_CAMERA = "No camera answers. Check its power, cable and network; this list refreshes every few seconds."
 ONLY_IN = {
     "other_mount": CellStep.MOUNTING,
-    "take": CellStep.VIEWS,
     "drop": CellStep.VIEWS,
     "table_here": CellStep.SAVE,
     "rehearse": CellStep.SAVE,
@@ -62,7 +61,6 @@ class NewCell(ThemedApp[Ending]):
         Binding("pageup", "go(-1)", "Back", tooltip="The step before", priority=True),
         Binding("pagedown", "go(1)", "On", tooltip="The next step", priority=True, show=False),
         Binding("left,right", "other_mount", "Other drawing"),
-        Binding("f2", "take", "Take view", tooltip="Take this view now"),
         Binding("f3", "drop", "Drop view", tooltip="Take the last view away"),
         Binding("f7", "table_here", "Table here", tooltip="The table is as high as the tool now"),
         Binding("f9", "rehearse", "Rehearse", tooltip="Run the whole job with this cell in simulation"),
@@ -162,12 +160,11 @@ class NewCell(ThemedApp[Ending]):
             wanted = self.setup.wanted if self.step is CellStep.VIEWS else None
             pane.wanted = () if wanted is None else wanted.drawn
             pane.show(preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures))
-        if step is self.step is CellStep.VIEWS and self.setup.new_view():
-            self._add_view()
+        if step is self.step is CellStep.VIEWS and self.setup.take_view():
+            self._view_taken()
         self._show()
 
-    def _add_view(self) -> None:
-        self.setup.take_view()
+    def _view_taken(self) -> None:
         self.bell()
         if self.setup.correct_mount():
             self.notify("The views fit the other drawing: step 3 is corrected.")
@@ -235,14 +232,6 @@ class NewCell(ThemedApp[Ending]):
     def action_rehearse(self) -> None:
         if self.setup.draft.written and not self.setup.draft.posted:
             self.exit("rehearse")
-
-    @work(group="view", exclusive=True, exit_on_error=False)
-    async def action_take(self) -> None:
-        """Take a view now, without waiting for a new place or for rest."""
-        try:
-            self._add_view()
-        except StationError as problem:
-            self.notify(str(problem), severity="warning")
 
     def action_drop(self) -> None:
         self.setup.drop_view()

@@ -21,8 +21,6 @@ PART_SUFFIX = ".part"
 """Suffix of an unfinished recording; gone once it is finished and on the disk."""
 EMPTY_SUFFIX = ".empty"
 """Suffix of a segment that holds nothing; recovery sets it aside."""
-MAIN_CAMERA = "main"
-"""Name of the camera of a cell that has one, and of folders from before cameras had names."""
 LOG_LIMIT_BYTES = 64 * 1024 * 1024
 """No file of lines that only grows is larger."""
 ASKED_FOR = 0o666

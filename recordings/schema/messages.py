@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 
-from recordings.files import MAIN_CAMERA as MAIN_CAMERA
-
 if TYPE_CHECKING:  # commands that only ask the daemon do not load numpy
     import numpy as np
     from numpy.typing import NDArray

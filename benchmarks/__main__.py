@@ -32,6 +32,7 @@ SHOWN: dict[str, str] = {
     "any_arm": r"^\| seven joints",
     "arm_table": r"^\| 0.3 mm, (measured|usual), 50 planned \| \d+ \|",
     "mistakes": r"^\*\*",
+    "misread_poses": r"^\*\*",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",
     "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves that touch|predicted)",
     "by_hand": r"^\| (all|ur)",

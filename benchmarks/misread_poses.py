@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,15 +103,18 @@ def cases_of(folder: Path) -> tuple[Array, Dataset, Lies]:
 @single_threaded_opencv()
 def run() -> str:
     """Every mistake on every set; a board is looked for once a set."""
-    rows, right, wrong = [], 0, 0
+    rows, counted = [], Counter[str]()
     for name in filter(None, os.environ.get("BENCH_SETS", ",".join(SETS)).split(",")):
         T, told, lies = cases_of(DATASETS / name)
         seen = board.see_board(lies, told.board, lies.images["images/#"], lambda *_: None)
         with patch("calibrate.imported.folder.see_board", return_value=seen):
             answers = {what: said(case, T, told.mount, lies) for what, case in MISREAD.items()}
-        right += sum(answers[what] in case.says.split() for what, case in MISREAD.items())
-        wrong += sum(answer == "wrong" for answer in answers.values())
+        counted["right"] += sum(answers[what] in case.says.split() for what, case in MISREAD.items())
+        counted.update(answers.values())
         rows += [[name, what, answer, MISREAD[what].says] for what, answer in answers.items()]
         print(name, answers, flush=True)
-    first = f"**{right} of {len(rows)} named or read as meant, {wrong} believed wrongly**\n\n"
+    first = (
+        f"**{counted['right']} of {len(rows)} named or read as meant**, wrong passes: {counted['wrong']}\n\n"
+        f"Believed, then refused by the gates: {counted['gates']}.\n\n"
+    )
     return first + table(["set", "mistake", "answer", "expected"], rows)

@@ -275,8 +275,11 @@ class StationApp(KnowingApp):
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_freedrive(self) -> None:
         """Capture by hand: the operator holds the pendant's freedrive button, the station only looks."""
-        if self.known.live is not None:
-            await self.desk.ask(verbs.Freedrive(self.known.live.state is not StationState.FREE_DRIVE))
+        if self.known.live is None:
+            return
+        begins = self.known.live.state is not StationState.FREE_DRIVE
+        if await self.desk.ask(verbs.Freedrive(begins)) is not None and begins:
+            await self.switch_mode("capture")
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_acknowledge(self) -> None:

@@ -124,6 +124,8 @@ class FreedriveCapture:
         context = self._context
         queue, store = context.require_queue(), context.store
         joints = (await fresh(context.cell.robot)).joints_rad
+        if (refusal := Record.refusal(store.state)) is not None:
+            raise refusal  # STOP, or the end of freedrive, came in between
         index = queue.add(
             PlannedPose(f"hand-{len(queue.statuses) + 1:02d}", joints, why="guided by hand", guided=True)
         )

@@ -79,6 +79,18 @@ async def test_nothing_is_taken_of_what_moves(guided: Rig) -> None:
     rig.camera.jumps = 0
 
 
+async def test_freedrive_that_ends_while_news_are_late_is_no_fault(guided: Rig) -> None:
+    rig = guided
+    await until(lambda: captured(rig) == 1 and rig.state is S.FREE_DRIVE)
+    rig.arm.late = True
+    lead(rig, guided_joints(TRUTH)[1])
+    await until(lambda: rig.session.freedrive.taking)
+    await rig.session.switch_free_drive(1, False)
+    rig.arm.late = False
+    await until(lambda: not rig.session.freedrive.taking)
+    assert rig.state is S.PAUSED and captured(rig) == 1
+
+
 async def test_stop_in_a_view_that_is_taken_by_itself_is_latched(
     guided: Rig, held_camera: asyncio.Event
 ) -> None:

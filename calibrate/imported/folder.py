@@ -14,7 +14,7 @@ from calibrate.imported.board import FEWEST, GUESSED_M, Key, see_board, told_boa
 from calibrate.imported.mounting import Ask, mounting
 from calibrate.imported.readings import Reading, decide, is_good, readings
 from recordings.errors import ImportSourceError
-from recordings.importers.conventions import Convention, convention
+from recordings.importers.conventions import NAMED, Convention, convention
 from recordings.importers.dataset import Dataset, PoseRow, PosesTold
 from recordings.importers.messages import Progress
 from recordings.importers.tables import Lies, Table, natural
@@ -31,6 +31,11 @@ class Given:
     convention: str | None = None
     mount: Mount | None = None
     board: BoardSpec | None = None
+
+    @property
+    def tells_direction(self) -> bool:
+        """A maker's convention is the tool in the base; a spelt one tells the direction only if inverse."""
+        return self.convention in NAMED or (self.convention or "").endswith("-inverse")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +58,6 @@ def believe(
     """Decide how a folder is to be read. ImportSourceError names the nearest reading and the flag.
 
     `ask`: asks a person for the mounting where nothing else tells it.
-
     `told`: a description of before, which is taken as it is where it names table and convention.
     """
     if told is not None:
@@ -67,7 +71,7 @@ def believe(
         for family, paths in lies.images.items()
         if len(pairs := _pairs(table, paths)) >= FEWEST
     ]
-    boards = [(robot, board, pairs) for robot, board, pairs in _pairs_of_tables(lies, robots)]
+    boards = list(_pairs_of_tables(lies, robots))
     if not pairings and not boards:
         images = [f"{len(paths)} {name}" for name, paths in lies.images.items()]
         there = [f"{len(table.numbers)} {table.name}" for table in lies.tables]
@@ -113,6 +117,8 @@ def _name_convention(lies: Lies, given: Given, progress: Progress) -> None:
     except ImportSourceError:
         return
     fits = others.dataset.poses.convention if others.dataset.poses else ""
+    if given.mount is None:  # then the direction is open
+        fits = fits.removesuffix("-inverse")
     raise ImportSourceError("other-convention", source=lies.root, told=given.convention, fits=fits)
 
 
@@ -162,9 +168,7 @@ def _rows_of_both(robot: Table, board: Table) -> dict[Key, int]:
 
 def _believed(lies: Lies, given: Given, best: Reading, pairs: dict[Key, int], ask: Ask | None) -> Believed:
     seen = best.seen
-    mount, inverted, board_inverted, why = mounting(
-        lies, given.mount, best, given.convention is not None, ask
-    )
+    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, given.tells_direction, ask)
     how = replace(best.convention, inverse=best.convention.inverse != inverted)
     board, square = _board(best)
     facts = {

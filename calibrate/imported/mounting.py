@@ -40,7 +40,7 @@ def mounting(
 ) -> tuple[Mount, bool, bool, str]:
     """(mounting, whether the robot's poses are inverted, whether the board's are, why).
 
-    `as_told`: the user named the convention, so the direction, too. `ask`: asks a person. Raises
+    `as_told`: by the user's convention the direction is told, too. `ask`: asks a person. Raises
     ImportSourceError (`which-mount`) where nothing decides, or the user contradicts names.
     """
     name, seen_in = best.table.name, best.seen.in_front

@@ -185,6 +185,9 @@ def test_what_no_motion_can_tell_is_asked(put: Callable[..., Path], images: tupl
     lies = look(put(unnamed))
     with raises("which-mount", mount="eye-in-hand"):
         believe(lies)
+    with raises("which-mount"):
+        believe(lies, Given("euler-ZYX-deg-mm"))
+    assert believe(lies, Given("kuka-abc")).dataset.mount == "eye-in-hand"  # always the tool in the base
     straight = believe(lies, Given(mount="eye-in-hand"))
     np.testing.assert_allclose([row.base_from_flange for row in straight.rows], images[1], atol=1e-6)
     turned = np.array([row.base_from_flange for row in believe(lies, Given(mount="eye-to-hand")).rows])

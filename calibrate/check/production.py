@@ -42,7 +42,7 @@ _MANY = 1e6
 
 @dataclass(frozen=True, eq=False)
 class EarlierPictures:
-    """What the earlier pictures tell of the cell, the tag's place among it."""
+    """What the earlier pictures tell of the cell, the tag's pose included."""
 
     known: KnownCell
     state: CellState
@@ -112,10 +112,11 @@ class EarlierPictures:
         )
 
     def _likelihood(self, m: Array, J: Array, S: Array, before: Array) -> tuple[float, Array, Array]:
-        """Maximise the likelihood of residuals m + J x, S (n, K, 6, 6) in each class, `before` of x known.
+        """Maximise over x the likelihood of residuals m + J x times a normal prior of x about 0.
 
-        Returns its logarithm, x, and the covariance of x. It begins at 0: a blurred picture must not begin as
-        the one that is right.
+        S: (n, K, 6, 6) covariance of a residual in each noise class; before: (g, g) information of the prior.
+        Returns the logarithm of the maximum, x, and its covariance. The search begins at x = 0, so that one
+        blurred picture among three does not begin as the right one.
         """
         S_inverse, residual = np.asarray(np.linalg.inv(S), dtype=float), m
         for _ in range(_ROUNDS):

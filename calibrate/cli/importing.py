@@ -6,7 +6,7 @@ import math
 import os
 import shlex
 import sys
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +14,7 @@ import msgspec
 import typer
 
 from calibrate.boards.model import typed_board
-from calibrate.imported import Given, believe
+from calibrate.imported import Ask, Given, believe
 from calibrate.pipeline import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.files import write_atomically
@@ -90,14 +90,16 @@ def import_command(
     target = None if dry_run else output
     console = plain_console(stderr=True)
     shown = console.is_terminal and not as_json
-    with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
+    with ExitStack() as bar:
+        nothing = nullcontext[Progress](lambda *_: None)
+        progress = bar.enter_context(progress_bar("", console) if shown else nothing)
         if (source / DATASET_FILE).is_file() and (source / POSES_FILE).is_file():
             done = import_folder(source, target, progress)
             facts = ImportJson(str(target or ""), done.images, done.size_bytes)
         elif source.is_dir() and not _is_bag(source):
             told = dataset or _told(source, output)
             given = Given(convention, mount, None if board is None else typed_board(board))
-            facts = _import_found(source, target, told, poses, given, progress, shown)
+            facts = _import_found(source, target, told, poses, given, progress, _ask(bar) if shown else None)
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
@@ -127,11 +129,10 @@ def _import_found(
     poses: Path | None,
     given: Given,
     progress: Progress,
-    shown: bool,
+    ask: Ask | None,
 ) -> ImportJson:
     """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
     described = None if told is None else read_dataset(told)[0]
-    ask = _ask if shown and sys.stdin.isatty() else None
     believed = believe(look(source, poses), given, described, progress, ask)
     dataset = believed.dataset
     content = msgspec.yaml.encode(dataset)
@@ -141,9 +142,15 @@ def _import_found(
     return ImportJson(str(target or ""), done.images, done.size_bytes, found=believed.facts)
 
 
-def _ask(why: str) -> Mount:
-    answer = typer.prompt(f"\n{why}.\nIs the camera on the arm? y/n", err=True)
-    return "eye-in-hand" if answer.strip().lower().startswith("y") else "eye-to-hand"
+def _ask(bar: ExitStack) -> Ask | None:
+    """Ask a person how the camera is mounted, once the bar is gone; None: nobody can answer."""
+
+    def ask(why: str) -> Mount:
+        bar.close()
+        on_arm = typer.confirm(f"{why}.\nIs the camera on the arm?", default=None, err=True)
+        return "eye-in-hand" if on_arm else "eye-to-hand"
+
+    return ask if sys.stdin.isatty() else None
 
 
 class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):

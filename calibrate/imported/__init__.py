@@ -5,5 +5,6 @@ fitted to where the board was, and the evidence decides.
 """
 
 from calibrate.imported.folder import Believed, Given, believe
+from calibrate.imported.mounting import Ask
 
-__all__ = ["Believed", "Given", "believe"]
+__all__ = ["Ask", "Believed", "Given", "believe"]

@@ -29,21 +29,20 @@ def outlined(pane: PreviewPane) -> int:
 
 
 async def test_the_wanted_view_is_drawn_a_view_sounds_and_is_taken_back(link: FakeLink) -> None:
-    link.show(by_hand(2))
+    link.show(idle())
     app = app_on(link)
     assert isinstance(app, StationApp)
     bells: list[int] = []
     app.bell = lambda: bells.append(1)  # type: ignore[method-assign]
     async with app.run_test(size=(120, 36)) as pilot:
-        await pilot.press("f3")  # it ends here, and begins below
-        await until(pilot, lambda: verbs.Freedrive(False) in link.asked)
-        link.show(idle())
-        await until(pilot, lambda: app.known.shown.state is StationState.IDLE)
-        await pilot.press("1", "f3")
+        await until(pilot, lambda: app.known.live is not None)
+        await pilot.press("f3")
+        await until(pilot, lambda: verbs.Freedrive(True) in link.asked)
         await until(pilot, lambda: app.current_mode == "capture")  # where the wanted view is drawn
         link.show(by_hand(2))
         pane = app.screen.query_one(PreviewPane)
         await until(pilot, lambda: outlined(pane) > 20)
+        bells.clear()
         link.show(by_hand(3))
         await until(pilot, lambda: bool(bells))
         await pilot.press("backspace")

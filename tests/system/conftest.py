@@ -17,6 +17,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState, StationStatus
 from station.devices.news import Delay
@@ -165,13 +166,20 @@ async def status_when(client: Client, condition: Callable[[StationStatus], bool]
 
 
 async def go(client: Client, plan: Plan | None, purpose: str = "run") -> None:
-    """Take control, load the plan and approve its motion, like an operator."""
+    """Take control, load the plan and approve its motion, like an operator; again where news came late."""
     rest = (StationState.IDLE, StationState.PAUSED)
-    await status_when(client, lambda s: s.state in rest and s.camera.connected)
-    if plan is not None:
-        await client.request("load_plan", plan=msgspec.to_builtins(plan))
-    summary = await client.request("prepare", purpose=purpose)
-    await client.request("go", token=summary["token"])
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            await status_when(client, lambda s: s.state in rest and s.camera.connected)
+            if plan is not None:
+                await client.request("load_plan", plan=msgspec.to_builtins(plan))
+            try:
+                summary = await client.request("prepare", purpose=purpose)
+                await client.request("go", token=summary["token"])
+                return
+            except RefusedError as refused:
+                if refused.code not in set(Delay):
+                    raise
 
 
 @pytest.fixture

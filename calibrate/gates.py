@@ -1,4 +1,9 @@
-"""Gates: named conditions that a calibration must meet before it may be installed."""
+"""Gates: named conditions that a calibration must meet before it may be installed.
+
+A gate is, under one name, a limit in `GateLimits`, a rule in `_RULES`, and a value that `_measured` yields.
+The value is the solution's, or a field of `GateInputs` that `pipeline.solve_recording` fills. A gate without
+a value has a function of its own that `judge` calls, such as `_session_gate`.
+"""
 
 from __future__ import annotations
 
@@ -90,9 +95,12 @@ def judge(solution: Solution, inputs: GateInputs, limits: GateLimits | None = No
 
 class _Rule(NamedTuple):
     title: str
+    """What is measured, for people."""
     sense: Sense
     unit: str
+    """Of value and limit: m, deg, s, px, share; empty for plain numbers."""
     remedy: str = ""
+    """Next step where the gate is closed; empty: `_measured` yields it with the value."""
 
 
 _ARM = "Check payload, mounting, looseness of board and camera, and the robot's calibrated kinematics."

@@ -47,6 +47,15 @@ def test_the_books_have_no_dead_link(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_the_functions_that_stop_is_said_to_pass_exist() -> None:
+    page, source = (ROOT / "docs/contributor/architecture.md").read_text(), ""
+    way = page[page.index("STOP passes") : page.index("A connected screen")]
+    for name in re.findall(r"`([\w./:]+)`", way.partition("|")[2]):
+        path, _, function = name.rpartition(":")
+        source = (ROOT / "station" / path).read_text() if path else source
+        assert f"def {function.split('.')[-1]}(" in source, name
+
+
 def test_a_decision_record_is_short_and_whole() -> None:
     for path in (ROOT / "docs/decisions").glob("0*.md"):
         text = path.read_text()

@@ -1,0 +1,1 @@
+"""Messages of a recording (`messages`), its topics, and what it shows viewers like Foxglove (`viewing`)."""

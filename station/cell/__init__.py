@@ -1,0 +1,1 @@
+"""What every part of the station may know: configuration, plan, limits, status, errors, folders."""

@@ -1,9 +1,10 @@
 """`python export_readers.py FOLDER`: what other people's libraries make of exported files, as JSON.
 
 FOLDER/points.json holds points (n, 3) in the robot's frame; FOLDER/CASE/FORMAT.SUFFIX the files. Of each:
-`camera`, the points in the camera's optical frame, or `pixels` as OpenCV counts them, or `missing`, the
-library that is not installed. Nothing of the project is imported here; where a format has no free reader, its
-rule stands here.
+`camera`, the points in the camera's optical frame, or `pixels` as OpenCV counts them, or `K` and `D` of a
+file with a lens alone, or `missing`, the library that is not installed. `test_exports.py` compares; its
+`BY_OTHERS` are the formats that another test reads. Nothing of the project is imported here; where a format
+has no free reader, its rule stands here.
 """
 
 from __future__ import annotations

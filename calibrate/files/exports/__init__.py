@@ -1,4 +1,9 @@
-"""Exports of a calibration to the file formats of other programs."""
+"""Exports of a calibration to the file formats of other programs.
+
+A format is a function from Calibration and FrameNames to the file's text, and its row in `FORMATS`. The
+functions are in `ros`, `models` (URDF) and `vision`, where `zivid` is a short example. Every file begins with
+`frames.comment`. `tests/foreign` reads it with another library, and compares with known points.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +21,7 @@ from calibrate.files.validity import require_usable
 class Format(NamedTuple):
     suffix: str
     says: str
+    """For `calibrate export --help`."""
     make: Callable[[Calibration, FrameNames], str]
 
 

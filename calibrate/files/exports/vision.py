@@ -1,4 +1,4 @@
-"""Exports for vision libraries and for people: OpenCV, HALCON, Zivid, the UR pendant."""
+"""Exports for vision libraries: OpenCV, HALCON, Zivid."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """How the camera is mounted, and which way round poses are: what names say of it.
 
-In hand with poses as told looks like fixed with inverted ones, and a board seen by the camera like a camera
-seen by the board with the other mounting. The motion only joins the three; names decide two, or the user.
+Three things are asked: the mounting, and whether the robot's and the board's poses are inverted. A camera in
+hand fits exactly as well as a fixed one with inverted poses, so the motion gives one of the three once the
+other two are known: from names in the data, or from the user.
 """
 
 from __future__ import annotations

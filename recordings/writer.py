@@ -1,6 +1,6 @@
 """Writes one recording file, synchronously: `.mcap.part` until it is finished, synced and renamed.
 
-Raw values and all clocks go in; geometry is applied by the reader's users.
+Values go in as the devices gave them, with all clocks; whoever reads them applies the geometry.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
 SHOWN_PERIOD_NS = 40_000_000
 """Viewers get the arm at 25 Hz; the states themselves are kept at their full rate."""
 KEPT_IN_MEMORY_BYTES = 256 * 2**20
-"""Limit per file: a session of single images stays for the solve that follows."""
+"""Newest part of a file that stays in memory, so that the solve after a session need not read the disk."""
 _FREE_SPACE = "Nothing was kept: free space or name another disk, and begin again."
 _SECOND_NS = 1_000_000_000
 
@@ -76,7 +76,7 @@ class RecordingWriter:
         """Time of the newest state that viewers get."""
         self._attachments: set[str] = set()
         self._session = with_crc({"format": FORMATS[-1], "session": msgspec.json.encode(info).decode()})
-        """Emptied once its copy is in the file."""
+        """The session's facts, written at the file's beginning; empty once `_copy_session` did it again."""
         self._file = OutputFile(self.part_path)
         self._mcap = self._file.writer()
         self._background = BackgroundSync(self._file.descriptor)
@@ -153,7 +153,7 @@ class RecordingWriter:
             self._copy_session()
 
     def _copy_session(self) -> None:
-        """Behind the first view, with the channels so far: a lost page at the beginning does not reach it."""
+        """Write facts and channels again, behind the first view: damage at the beginning loses neither."""
         if self._session:
             self._mcap.add_metadata(SESSION_RECORDS[1], self._session)
             self._session = {}
@@ -179,7 +179,7 @@ class RecordingWriter:
         self._show(Topic.BOARD_TRANSFORM if child == "board" else Topic.FIXED_TRANSFORM, message, time_ns)
 
     def shown(self, topic: Topic, message: Message) -> None:
-        """What another recording of the session shows viewers, as it stands there."""
+        """Copy a message for viewers from another recording of the session, unchanged."""
         self._add(topic, message.data, message.log_time)
 
     def _show(self, topic: Topic, message: Any, time_ns: int, sequence: int | None = None) -> None:
@@ -197,7 +197,7 @@ class RecordingWriter:
         )
 
     def attach(self, name: str, media_type: str, content: bytes) -> None:
-        """A small file that rides along, like `plan.yaml`."""
+        """Add a small file to the recording, such as `plan.yaml`."""
         if not is_attachment_name(name) or name in self._attachments:
             raise RecordingError("attachment-name", name=name)
         if len(content) > ATTACHMENT_LIMIT_BYTES:
@@ -288,7 +288,7 @@ class RecordingWriter:
 
     @contextmanager
     def _disk(self) -> Iterator[None]:
-        """Around everything that writes: refuses after an error, and makes the first error the last."""
+        """Guard a write: the first OSError closes the file, and every later write raises that error again."""
         self._check_usable()
         try:
             yield
@@ -302,7 +302,7 @@ class RecordingWriter:
             raise RecordingError("closed", path=self.path)
 
     def _failed(self, error: OSError) -> RecordingError:
-        """A writer that failed once cannot be trusted again: what it holds in memory is thrown away."""
+        """Close the file; what is still in memory is dropped, as a writer that failed cannot be trusted."""
         remedy = "What was synced before is safe: free space or replace the disk, then "
         self.error = disk_error("write", self.part_path, error, remedy + recover_line(self.part_path))
         self._file.close()
@@ -334,10 +334,10 @@ def derived_recording(
 
 
 class BackgroundSync:
-    """fdatasync of one open file beside its writer; a failed one is raised by the next call.
+    """fdatasync of one open file in a thread; its error is raised by the next call.
 
-    What is on the disk leaves the computer's memory again, but for the newest part: gigabytes of pages that
-    nobody reads made the daemon fall silent for tenths of a second.
+    Then all but the newest `KEPT_IN_MEMORY_BYTES` leave the page cache: gigabytes there, which nobody read,
+    once made the daemon fall silent for tenths of a second.
     """
 
     def __init__(self, descriptor: int) -> None:

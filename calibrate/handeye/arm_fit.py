@@ -1,8 +1,8 @@
 """The estimate with systematic errors of the arm's links and of a bracket, averaged over their sizes.
 
-How large the links' shifts, their turns and a bracket's bends are is not known before, and not fitted: each
-combination of sizes gives an estimate of its own, and they are averaged by their evidence (Bayesian model
-averaging). So an arm without errors costs little, and the region of one with errors is wide enough.
+The sizes (1σ) of the links' shifts, of their turns and of a bracket's bends are unknown. Each combination of
+sizes gives an estimate of its own, and these are averaged by their evidence (Bayesian model averaging). So an
+arm without errors costs little, and the region of one with errors is wide enough.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ SIZES = 0.03 * 2.0 ** np.arange(8)
 BENDS = np.array([0.0, 0.1, 0.4, 1.6])
 """1σ of a bracket's compliance, mrad."""
 RIGID = 0.5
-"""Probability that a bracket does not bend; other sizes share the rest alike."""
+"""Probability that a bracket does not bend; the other `BENDS` share the rest equally."""
 _NONE = 1e-6
 """1σ, mm and mrad, that stands for none: a prior cannot be infinitely narrow."""
 _ROUNDS = 3
-"""Rounds for each combination of sizes; its neighbour's noise is a good start."""
+"""Rounds of `Linear.solve` for each combination: few, as it starts with the noise found for a neighbour."""
 _LEAST = float(np.log(1e-2))
 """Log probability, against the likeliest, below which a combination of sizes is left out."""
 
@@ -44,8 +44,9 @@ class _Sizes:
     """All combinations of sizes, and the prior of the errors for each."""
 
     def __init__(self, links: int, bends: int) -> None:
-        """Take the numbers of errors of the links (shift and turn in turn, 3 each) and of the bracket."""
+        """Take the numbers of the links' errors (each has 3 shifts, then 3 turns) and of the bracket's."""
         self.kinds = np.repeat([*np.tile([0, 1], links // 6), 2], [*np.full(links // 3, 3), bends])
+        """(q,) size that an error goes by, as a place in `Sizes`: 0 shift, 1 turn, 2 bend."""
         self.shape = (len(SIZES), len(SIZES), len(BENDS)) if links else (1, 1, len(BENDS))
 
     def sigma(self, one: Sizes) -> Array:
@@ -98,6 +99,7 @@ def estimate_with_arm_errors(
         chances = np.exp(log_joint - log_all)
         if steps == 0:
             log_bayes = log_all - solve(_NONE, plain.scales).log_evidence
+        # Mean and covariance of the mixture; the latter with the distances of its parts from the mean.
         step = chances @ np.array([s.step for s in solutions])
         by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
         covariances = [linear.covariance(solution) for solution in solutions]
@@ -142,7 +144,7 @@ def _solve(
 def _explore(
     sizes: _Sizes, solve: Callable[[Array, Scales], LinearSolution], scales: Scales
 ) -> dict[Sizes, LinearSolution]:
-    """Solve every combination that is worth it: from shifts as large as turns on to their neighbours."""
+    """Solve the combinations of `alike`, then the neighbours of every likely one; return the likely ones."""
     found: dict[Sizes, LinearSolution] = {}
     chance: dict[Sizes, float] = {}
     ahead = [(one, scales) for one in sizes.alike]
@@ -159,5 +161,5 @@ def _explore(
 
 
 def _against(spread: Array, mean: Array) -> Array:
-    """Compute the ratios (s,) of covariances (s, q, q) to their mean (q, q)."""
+    """Variances (s,) of `spread` (s, q, q) over that of `mean` (q, q), averaged over directions."""
     return np.asarray(np.einsum("ij,sji->s", np.linalg.inv(mean), spread) / len(mean))

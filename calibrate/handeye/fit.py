@@ -28,6 +28,7 @@ FEWEST_FOR_ARM_ERRORS = 8
 FEWEST_USED = 3
 """Fewest views that must not be rejected: two motions need three views."""
 _NARROW = 0.5
+"""Robot noise of the narrow start, as a multiple of what the residuals' medians say (wide: `WIDE`)."""
 _CLEARLY = 5.0
 """Log evidence by which the estimate from the narrow start must beat the one from the wide start."""
 MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
@@ -35,7 +36,11 @@ MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
 
 
 def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) -> CellFit:
-    """Estimate all unknowns of a cell. Raises BadViewsError or DegenerateMotionError: X is not determined."""
+    """Estimate all unknowns of a cell from views with their board poses.
+
+    model_arm: also errors of arm and bracket, from `FEWEST_FOR_ARM_ERRORS` views on. Raises BadViewsError or
+    DegenerateMotionError where X is not determined, PosesDisagreeError where the noise is beyond its limits.
+    """
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = all_pairs(H, C)
     require_motion(pairs)
@@ -51,7 +56,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
     log_bayes, plain, failure = None, found, ""
     arm, joints_note = arm_postures(views) if model_arm else (None, "")
     if model_arm and len(views) >= FEWEST_FOR_ARM_ERRORS:
-        held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
+        held = found.state.X if views.mount == "eye-in-hand" else found.state.Y  # camera or board
         flex = flex_motion(views.base_from_flange, held)
         links = flex[..., :0] if arm is None else arm.chain.by_links(arm.joints_rad)
         STAGES.info("3 of 4: errors of the arm")
@@ -79,6 +84,7 @@ def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Esti
 
 
 def _certify(views: ViewSet, found: Estimate, places: Places) -> tuple[Pairs, GlobalResult]:
+    """Solve A X = X B over the used views again, with the board poses of the final lens and board."""
     H = mount_poses(views.base_from_flange, views.mount)[places]
     pairs = all_pairs(H, found.board_poses[places])
     problem = f"the quadratic objective over the pairs of the {len(places)} used views"
@@ -102,7 +108,10 @@ _NEARER = 0.2
 
 
 def set_boards_right(views: ViewSet, X: Array, Y: Array) -> tuple[ViewSet, tuple[int, ...]]:
-    """Rotate boards onto themselves where that fits Y (4, 4); return the views, and the indices rotated."""
+    """Rotate a board onto itself where that brings it to Y (4, 4): its corners were counted from another end.
+
+    Returns the views, and the places of those changed.
+    """
     H = mount_poses(views.base_from_flange, views.mount)
     apart = pose_distances(H @ X @ views.camera_from_board, Y[None])
     kept, turned = list(views.views), []

@@ -61,7 +61,7 @@ class Arm(Protocol):
     """
 
     guided: bool
-    """True while a person moves the arm by hand: states may then be no later than during a move."""
+    """True while a person moves the arm by hand: states may then be late by `MOVING_S` only."""
 
     def latest(self) -> RobotState:
         """Return the newest state; StaleStateError when it is older than 100 ms.
@@ -112,7 +112,7 @@ class Arm(Protocol):
 
 
 class Mover(Protocol):
-    """What moves an arm. `start_control`, after an approval, replaces the robot's program."""
+    """The driver that moves an arm. `start_control` replaces the program that runs on the robot."""
 
     @property
     def control(self) -> bool:
@@ -146,7 +146,7 @@ class Mover(Protocol):
         """End the move by only this stop path, for a stop test. RobotError where the path is missing."""
 
     async def stop(self, reason: str) -> None:
-        """Decelerate now, by both stop paths; idempotent, in any state, never raises."""
+        """Decelerate now, by control process and dashboard alike; idempotent, in any state, never raises."""
 
     async def end_control(self) -> None:
         """Stop the control program and end its process."""
@@ -170,6 +170,8 @@ async def ready(robot: Arm) -> RobotState:
 
 
 class Camera(Protocol):
+    """A camera: `capture` takes the images of a recording, `glimpse` those for screens."""
+
     @property
     def identity(self) -> CameraIdentity: ...
 

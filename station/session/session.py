@@ -47,6 +47,7 @@ from station.session.threads import DISK
 log = logging.getLogger(__name__)
 
 END_RUN_S = 10.0
+"""Longest wait for a run to end before what must follow it is refused."""
 END_RUN_AT_CLOSE_S, CLOSE_DEVICES_S = 1.0, 1.8
 """Longest waits at the daemon's end for a run and for devices."""
 STOP_WAIT_S = 1.0
@@ -74,6 +75,7 @@ class Session:
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._notes: tuple[str, ...] = ()
+        """What the next preview tells the person beside the motion."""
         cell.robot.subscribe(monitor.add)
         cell.robot.subscribe(self.context.record_state)
         self.store.recorded = self.context.record_event
@@ -134,7 +136,7 @@ class Session:
             await self._halt(self.context.resting, reason, "control-lost")
 
     async def _halt(self, state: StationState, reason: str, cause: str) -> None:
-        """Void the approval, stop the arm by both paths, end the run (after its data are written)."""
+        """Void the approval, end the run and stop the arm; then let the run write its data, `STOP_WAIT_S`."""
         context, run = self.context, self._run
         self._void()
         context.requests = RunRequests(halt=True)
@@ -348,9 +350,9 @@ class Session:
         return await self.freedrive.record()
 
     def admit(self, verb: type[Verb[object]], client_id: int, who: str) -> None:
-        """Permit a request that arrives; control that nobody has is given to the first that needs it.
+        """Permit a request that arrives. If it needs control and nobody has it, its client gets control.
 
-        Not by an approval: it holds only under the control under which the motion was offered.
+        `Go` gets none: an approval is for the client that had control when the motion was offered.
         """
         if verb.control and verb is not verbs.Go and self.store.status.lease.client_id is None:
             self._require_state(verb)
@@ -358,7 +360,10 @@ class Session:
         self.permit(verb, client_id)
 
     def permit(self, verb: type[Verb[object]], client_id: int) -> None:
-        """Raise RefusedError unless a verb is allowed to this client in the present state."""
+        """Raise RefusedError unless a verb is allowed to this client in the present state.
+
+        Called again after each wait: STOP or the loss of control may have come in between.
+        """
         if verb.control:
             self._require_control(client_id)
         self._require_state(verb)
@@ -370,6 +375,7 @@ class Session:
             raise refusal
 
     def _void(self) -> None:
+        """Withdraw the motion that is offered for approval, if any."""
         self.approvals.void()
         self.store.update(go=None)
 

@@ -21,14 +21,14 @@ from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
-from calibrate.imported import Given, believe
+from calibrate.imported import Given, believe, is_described
 from calibrate.job import Solved
 from calibrate.pipeline import picture_coverage, single_threaded_opencv, with_board_poses
 from calibrate.views import BoardView, ViewSet, array_of
 from recordings.errors import ImportSourceError
 from recordings.files import usable_cores
 from recordings.importers import conventions
-from recordings.importers.dataset import DATASET_FILE, POSES_FILE, read_dataset, read_poses
+from recordings.importers.dataset import DATASET_FILE, read_dataset, read_poses
 from recordings.importers.folder import read_image
 from recordings.importers.tables import look
 from recordings.reader import Pictures
@@ -56,12 +56,11 @@ def read_folder(
     the square by the board's motion. poses: the file or folder that holds them, where others may be meant.
     Raises RecordingError, which names what decides.
     """
-    folder, known = Path(folder), None
+    folder = Path(folder)
     if not folder.is_dir():
         raise ImportSourceError("no-folder", path=folder)
-    if (folder / DATASET_FILE).is_file():
-        known = read_dataset(folder / DATASET_FILE)[0]
-    if known is not None and (folder / POSES_FILE).is_file():
+    known = read_dataset(folder / DATASET_FILE)[0] if (folder / DATASET_FILE).is_file() else None
+    if is_described(folder, board, mount, convention, poses) and known is not None:
         rows = read_poses(folder)[0]
     else:
         given = Given(convention, mount, None if board is None else _board(board))

@@ -171,11 +171,13 @@ def _lens_sigma(options: JobOptions, camera: CameraModel) -> tuple[float, ...] |
 
 def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:
     board = options.board or recorded
+    if board.kind is BoardKind.UNSEEN and options.square_m is None:
+        return board
+    check_board(board)
     if options.square_m is not None:
         ratio = options.square_m / board.square_m
         marker_m = None if board.marker_m is None else board.marker_m * ratio
         board = msgspec.structs.replace(board, square_m=options.square_m, marker_m=marker_m)
-    if board.kind is not BoardKind.UNSEEN:
         check_board(board)
     return board
 

@@ -98,7 +98,8 @@ def load_views(
 
 def _told_views(recording: Recording, fewest: int) -> LoadedViews:
     """Take the views of a recording without pictures, in which the board's poses were told."""
-    info, told = recording.info, recording.views()
+    info = recording.info
+    told = [view for view in recording.views() if view.camera_from_board is not None]
     if len(told) < fewest:
         raise _too_few(recording, info.board, len(told), {}, [], fewest)
     poses = np.array([(view.base_from_flange, view.camera_from_board) for view in told], dtype=float)

@@ -31,6 +31,7 @@ from recordings.schema.messages import (
     RobotState,
     SessionInfo,
     View,
+    without_picture,
 )
 from recordings.segment import RecordingSegment
 
@@ -104,6 +105,8 @@ class Recording:
 
     def image(self, view: View) -> Image:
         """The view's image; its array is read-only."""
+        if without_picture(view):
+            raise RecordingError("pairs-only", path=self.path)
         try:
             return self._by_number[view.part].image(view.picture_sequence)
         except KeyError as error:

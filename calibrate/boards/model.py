@@ -51,6 +51,7 @@ def _require(right: bool, code: str, **values: Value) -> None:
 
 def check_board(spec: BoardSpec) -> None:
     """Raise BoardError where the numbers cannot belong to a real board."""
+    _require(spec.kind is not BoardKind.UNSEEN, "board-unseen")
     tag, charuco, april = (spec.kind in SINGLE_TAGS, *(spec.kind is kind for kind in _WITH_MARKERS))
     columns, rows, smallest = spec.columns, spec.rows, 1 if april or tag else 2
     if spec.kind is BoardKind.CHESSBOARD:
@@ -58,7 +59,6 @@ def check_board(spec: BoardSpec) -> None:
     possible = all(smallest <= side <= _LARGEST_SIDE for side in (columns, rows))
     limits = {"smallest": smallest, "largest": _LARGEST_SIDE}
     _require(possible, "board-columns-rows", columns=columns, rows=rows, **limits)
-    _require(spec.kind is not BoardKind.UNSEEN, "board-unseen")
     _require(1e-4 <= spec.square_m <= 10.0, "board-square", square_m=spec.square_m)
     if (tolerance := spec.square_tolerance) is not None:
         _require(0 < tolerance <= LARGEST_TOLERANCE, "board-tolerance", square_tolerance=tolerance)

@@ -14,12 +14,12 @@ import msgspec
 import typer
 
 from calibrate.boards.model import typed_board
-from calibrate.imported import Ask, Given, believe
+from calibrate.imported import Ask, Given, believe, is_described
 from calibrate.pipeline import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, BagPlan, import_bag
-from recordings.importers.dataset import DATASET_FILE, POSES_FILE, read_dataset
+from recordings.importers.dataset import DATASET_FILE, read_dataset
 from recordings.importers.folder import import_folder, write_views
 from recordings.importers.messages import Progress
 from recordings.importers.selection import Wanted
@@ -93,7 +93,7 @@ def import_command(
     with ExitStack() as bar:
         nothing = nullcontext[Progress](lambda *_: None)
         progress = bar.enter_context(progress_bar("", console) if shown else nothing)
-        if (source / DATASET_FILE).is_file() and (source / POSES_FILE).is_file():
+        if is_described(source, dataset, poses, convention, mount, board):
             done = import_folder(source, target, progress)
             facts = ImportJson(str(target or ""), done.images, done.size_bytes)
         elif source.is_dir() and not _is_bag(source):
@@ -137,7 +137,7 @@ def _import_found(
     dataset = believed.dataset
     content = msgspec.yaml.encode(dataset)
     done = write_views(source, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
-    if target is not None and told is None:
+    if target is not None and dataset != described:
         write_atomically(target.with_suffix("." + DATASET_FILE), content)
     return ImportJson(str(target or ""), done.images, done.size_bytes, found=believed.facts)
 

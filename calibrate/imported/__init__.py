@@ -4,7 +4,7 @@ Numbers alone allow many: orders of angles, units, order of a quaternion, camera
 fitted to where the board was, and the evidence decides.
 """
 
-from calibrate.imported.folder import Believed, Given, believe
+from calibrate.imported.folder import Believed, Given, believe, is_described
 from calibrate.imported.mounting import Ask
 
-__all__ = ["Ask", "Believed", "Given", "believe"]
+__all__ = ["Ask", "Believed", "Given", "believe", "is_described"]

@@ -37,6 +37,8 @@ GUESSED_M = 0.02
 """Side of a square about whose size nothing is told."""
 _VOTERS = 24
 """Most images, evenly spread, that a reading is judged by."""
+_MOST_ROWS = 300
+"""Most rows of board poses, evenly spread; of fewer, neighbours show whether rows are shifted."""
 _LARGEST_SIDE_PX = 1000
 """Images are judged reduced to this size: their corners need not be exact."""
 _TRIED = 6
@@ -70,13 +72,16 @@ class Seen:
 def told_boards(table: Table) -> Iterator[Seen]:
     """Every reading of a table of board poses; of an inverted one the solution is the other mounting's."""
     nothing = np.zeros((0, 3)), np.zeros((0, 2))
+    rows = _spread(len(table.numbers), _MOST_ROWS)
     for how, evidence in possible(table.numbers):
-        poses = how.poses(table.numbers)
+        poses = how.poses(table.numbers[rows])
         views: dict[Key, BoardView] = {
             row: BoardView(row, f"row {row + 1}", np.eye(4), *nothing, camera_from_board=T)
-            for row, T in enumerate(poses)
+            for row, T in zip(rows, poses, strict=True)
         }
-        candidates: dict[Key, list[Candidate]] = {row: [Candidate(T, 0)] for row, T in enumerate(poses)}
+        candidates: dict[Key, list[Candidate]] = {
+            row: [Candidate(T, 0)] for row, T in zip(rows, poses, strict=True)
+        }
         before = [bool(np.mean(each[:, 2, 3] > 0) > 0.9) for each in (poses, inverse(poses))]
         board, blank = BoardSpec(BoardKind.UNSEEN), CameraModel(0, 0)
         yield Seen(
@@ -84,12 +89,15 @@ def told_boards(table: Table) -> Iterator[Seen]:
         )
 
 
+def _spread(count: int, most: int) -> list[int]:
+    return list(map(int, np.linspace(0, count - 1, min(count, most))))
+
+
 def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: Progress) -> Seen | None:
     """Find the board in evenly spread images; None: in too few."""
-    places = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _VOTERS)).astype(int))
     images: dict[Path, Grey] = {}
     sizes = set[tuple[int, int]]()
-    for path in (paths[place] for place in places):
+    for path in (paths[place] for place in _spread(len(paths), _VOTERS)):
         with suppress(ImageError, OSError):
             header = read_header(data := read_file(path, IMAGE_LIMIT_BYTES))
             images[path] = to_grey(decode_image(data, header.width, header.height))

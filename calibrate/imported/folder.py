@@ -15,7 +15,7 @@ from calibrate.imported.mounting import Ask, mounting
 from calibrate.imported.readings import Reading, decide, is_good, readings
 from recordings.errors import ImportSourceError
 from recordings.importers.conventions import NAMED, Convention, convention
-from recordings.importers.dataset import Dataset, PoseRow, PosesTold
+from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, PoseRow, PosesTold
 from recordings.importers.messages import Progress
 from recordings.importers.tables import Lies, Table, natural
 from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount
@@ -48,6 +48,14 @@ class Believed:
     """What → (what is believed, its evidence), for people."""
 
 
+def is_described(folder: Path, *given: object) -> bool:
+    """Tell whether dataset.yaml and poses.csv say it all. ImportSourceError where more is given."""
+    described = all((folder / name).is_file() for name in (DATASET_FILE, POSES_FILE))
+    if described and any(given):
+        raise ImportSourceError("described", folder=folder)
+    return described
+
+
 def believe(
     lies: Lies,
     given: Given = Given(),
@@ -58,12 +66,13 @@ def believe(
     """Decide how a folder is to be read. ImportSourceError names the nearest reading and the flag.
 
     `ask`: asks a person for the mounting where nothing else tells it.
-    `told`: a description of before, which is taken as it is where it names table and convention.
+    `told`: a description of before; where it names table and convention it is taken as it is, unless more is
+    given.
     """
     if told is not None:
-        given = Given(given.convention, given.mount or told.mount, given.board or told.board)
-        if told.poses is not None:
+        if told.poses is not None and given == Given():
             return _as_before(lies, told, told.poses)
+        given = Given(given.convention, given.mount or told.mount, given.board or told.board)
     robots = [t for t in lies.tables if t.whose == "robot"] or [t for t in lies.tables if not t.whose]
     pairings: list[tuple[Table, str, dict[Key, int]]] = [
         (table, family, pairs)

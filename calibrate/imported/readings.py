@@ -51,10 +51,6 @@ class Reading:
     def text(self) -> str:
         return f"{self.mount}, {self.convention.name}"
 
-    @property
-    def of_pairs(self) -> bool:
-        return self.seen.convention is not None
-
 
 def readings(
     table: Table, family: str, pairs: dict[Key, int], seens: list[Seen], named: str | None

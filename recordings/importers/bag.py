@@ -14,7 +14,6 @@ from pathlib import Path
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError, wrong_size_error
 from recordings.images import (
@@ -28,7 +27,7 @@ from recordings.images import (
 )
 from recordings.importers.bags import open_bag
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
-from recordings.importers.messages import Array, ImageMessage, Progress
+from recordings.importers.messages import ImageMessage, Progress
 from recordings.importers.selection import Selection, Wanted, select
 from recordings.importers.stops import Standstill, StandstillLimits, find_stops, proposed_limits
 from recordings.schema.messages import CameraModel, Image, Joints, Matrix4, RobotState, Stamps, Vector6, View
@@ -102,7 +101,9 @@ def import_bag(
             other_topics=bag.others,
         )
         if output is None:
-            return replace(plan, wider=_wider(chosen, images_ns, speeds, limits, pair_within_s))
+            return replace(
+                plan, wider=proposed_limits(chosen.track, images_ns, speeds, limits, pair_within_s)
+            )
         if len(stops) < STOPS_LEAST:
             why = ", ".join(f"{count} {reason}" for reason, count in passed.items() if count)
             raise ImportSourceError(
@@ -132,21 +133,6 @@ def import_bag(
             return replace(plan, bytes_written=writer.finish().stat().st_size)
     finally:
         bag.close()
-
-
-def _wider(
-    chosen: Selection,
-    images_ns: NDArray[np.int64],
-    speeds: tuple[NDArray[np.int64], Array] | None,
-    limits: StandstillLimits,
-    pair_within_s: float,
-) -> dict[str, float]:
-    proposed = proposed_limits(chosen.track, images_ns, speeds, limits, pair_within_s)
-    if proposed is None:
-        return {}
-    wider, stops = proposed
-    still_deg = float(np.degrees(wider.rotation_rad))
-    return {"still_mm": 1e3 * wider.position_m, "still_deg": still_deg, "stops": stops}
 
 
 def _description(source: Path, given: Path | None, needed: bool) -> tuple[Dataset | None, bytes]:

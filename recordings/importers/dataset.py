@@ -110,7 +110,8 @@ def read_dataset(path: Path) -> tuple[Dataset, bytes]:
         raise ImportSourceError(
             "dataset", path=path, problems=said, line=first.line, key=first.where
         ) from None
-    for problem in (_board_problem(dataset.board), _camera_problem(dataset.camera)):
+    pairs = dataset.poses is not None and dataset.poses.board_convention  # no board, and no images
+    for problem in () if pairs else (_board_problem(dataset.board), _camera_problem(dataset.camera)):
         if problem:
             key, text = problem
             raise ImportSourceError("dataset", path=path, problems=f"{key}: {text}", line=0, key=key)

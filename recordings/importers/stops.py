@@ -24,6 +24,10 @@ NEW_STOP_RAD = 0.001
 """Farther from the stop before, it is another one, also when nobody saw the arm move."""
 
 
+_LEAST = 1e-12
+"""Metres and radians that stand for none."""
+
+
 @dataclass(frozen=True)
 class StandstillLimits:
     """Limits of standing still; other people's arms report with more noise."""
@@ -89,8 +93,8 @@ def _motion(still: Stillness | None, limits: StandstillLimits) -> float:
     """Motion as a multiple of the limits; infinite where it is not known."""
     if still is None or still.max_joint_speed_rad_s > JOINT_SPEED_RAD_S:
         return np.inf
-    shares = still.position_scatter_m / limits.position_m, still.rotation_scatter_rad / limits.rotation_rad
-    return max(shares)
+    moved = np.array([still.position_scatter_m, still.rotation_scatter_rad])
+    return float(np.max(moved / np.maximum([limits.position_m, limits.rotation_rad], _LEAST)))
 
 
 def proposed_limits(
@@ -99,8 +103,8 @@ def proposed_limits(
     speeds: tuple[NDArray[np.int64], Array] | None,
     limits: StandstillLimits,
     pair_within_s: float,
-) -> tuple[StandstillLimits, int] | None:
-    """Limits by which this arm stands more often, and how often; None: these are as good.
+) -> dict[str, float]:
+    """still_mm and still_deg by which this arm stands more often, and the stops they give; {}: none.
 
     An arm at rest reports with about the same noise everywhere, and one that moves with far more: the widest
     gap between images, by the logarithm of their motion, lies between the two.
@@ -109,14 +113,19 @@ def proposed_limits(
     motion = np.sort([_motion(view.stillness, limits) for view in views])
     motion = motion[np.isfinite(motion) & (motion > 0)]
     if len(motion) < 3:
-        return None
+        return {}
     widest = int(np.argmax(np.diff(np.log(motion)))) if motion[-1] > 2 * motion[0] else len(motion) - 1
     factor = float(f"{1.3 * motion[widest]:.1g}")
     wider = replace(limits, position_m=factor * limits.position_m, rotation_rad=factor * limits.rotation_rad)
     now, then = (
         len(find_stops(track, images_ns, speeds, each, pair_within_s)[0]) for each in (limits, wider)
     )
-    return (wider, then) if factor > 1 and then > now else None
+    told = {
+        "still_mm": 1e3 * wider.position_m,
+        "still_deg": float(np.degrees(wider.rotation_rad)),
+        "stops": then,
+    }
+    return told if factor > 1 and then > now else {}
 
 
 def _stillness(

@@ -155,7 +155,7 @@ def _two_by_two(rows: list[_Row]) -> dict[str, list[_Row]]:
 
 def _files(source: Path) -> Iterator[Path]:
     """All files, also below folders that are links; each folder once."""
-    been = set[str]()
+    been = {os.path.realpath(source)}
     for folder, below, names in os.walk(source, followlinks=True):
         below[:] = sorted(name for name in below if os.path.realpath(Path(folder, name)) not in been)
         been.update(os.path.realpath(Path(folder, name)) for name in below)

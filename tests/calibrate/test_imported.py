@@ -17,6 +17,7 @@ from calibrate.files import exports
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
 from calibrate.imported import Given, believe, board
+from calibrate.job import JobOptions
 from calibrate.kinematics import MODELS
 from calibrate.pipeline import solve_recording
 from calibrate.report.page import report_page
@@ -231,6 +232,20 @@ def test_what_was_believed_needs_no_flags_again(put: Callable[..., Path], tmp_pa
     assert open_recording(out).views() == first.views()
     assert first.info.mount == "eye-in-hand"
     assert first.info.robot.model not in MODELS
+    out.unlink()
+    assert call(main, "import", folder, "-o", out, "--mount", "eye-to-hand").returncode == 0
+    assert open_recording(out).info.mount == "eye-to-hand"  # what is said now counts, and from now on
+    out.unlink()
+    assert call(main, "import", folder, "-o", out).returncode == 0
+    assert open_recording(out).info.mount == "eye-to-hand"
+
+
+def test_a_described_folder_takes_no_options(tmp_path: Path) -> None:
+    """They would be ignored."""
+    for name in ("dataset.yaml", "poses.csv"):
+        (tmp_path / name).touch()
+    told = call(main, "import", tmp_path, "--dry-run", "--mount", "eye-in-hand", "--json")
+    assert json.loads(told.stdout)["error"]["code"] == "described"
 
 
 def test_a_folder_without_poses_says_what_is_there(put: Callable[..., Path]) -> None:
@@ -303,6 +318,14 @@ def test_pairs_of_poses_are_a_recording_without_pictures(
     with raises("objection"):
         install(file, tmp_path / "root", cell="imported")
     assert "Not known" in report_page(job)
+    with raises("board-unseen"):
+        solve_recording(rec, JobOptions(square_m=0.025))
+    with raises("pairs-only"):
+        next(iter(open_recording(rec).images()))
+    views = open_recording(rec).views()
+    rec.unlink()
+    assert call(main, "import", tmp_path, "-o", rec).returncode == 0  # as before
+    assert open_recording(rec).views() == views
 
 
 @pytest.mark.skipif(not MOVEIT.is_file(), reason="the pose pairs of MoveIt's own test are not here")

@@ -125,6 +125,18 @@ def _own_group_only(status: os.stat_result) -> bool:
     )
 
 
+def bind(link: socket.socket, path: Path) -> None:
+    """Bind a Unix socket with mode 0660. OSError.
+
+    The umask is that of all threads and tasks, so nothing is awaited while it is another.
+    """
+    old = os.umask(0o117)
+    try:
+        link.bind(str(path))
+    finally:
+        os.umask(old)
+
+
 def peer_of(link: socket.socket) -> tuple[int, int, int]:
     """Ask the kernel for process, user and group at the other end of a Unix socket."""
     pid, uid, gid = _CREDENTIALS.unpack(link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))

@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import logging
 import math
-import os
 import socket
 import time
 from collections import deque
@@ -27,7 +26,7 @@ from recordings.schema.stillness import LEAST_SAMPLES
 from station.cell.clock_fit import ClockFit
 from station.cell.config import StationConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
-from station.cell.socket_folder import make_folder, peer_of, post_socket
+from station.cell.socket_folder import bind, make_folder, peer_of, post_socket
 from station.cell.status import ArmCondition
 from station.devices.clocks import ClockEstimator
 from station.devices.history import HISTORY_S, state_at
@@ -95,14 +94,14 @@ class PostedArm:
         """Listen, and return when a program has posted a pose. StationError where nothing can listen."""
         if self._server is None:
             make_folder(self.path.parent)
-            old = os.umask(0o117)
+            listening = socket.socket(socket.AF_UNIX)
             try:
                 self.path.unlink(missing_ok=True)
-                self._server = await asyncio.start_unix_server(self._serve, self.path, limit=READ_BYTES)
+                bind(listening, self.path)
             except OSError as error:
+                listening.close()
                 raise StationError("socket", path=self.path, reason=str(error)) from None
-            finally:
-                os.umask(old)
+            self._server = await asyncio.start_unix_server(self._serve, sock=listening, limit=READ_BYTES)
         await self._came.wait()
         return self.identity
 

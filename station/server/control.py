@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
 import socket
 from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable, Coroutine
@@ -19,7 +18,7 @@ import msgspec
 
 from recordings.errors import CodedError
 from station.cell.errors import RefusedError, StationError
-from station.cell.socket_folder import make_folder, peer_of
+from station.cell.socket_folder import bind, make_folder, peer_of
 from station.cell.status import StationStatus, changed_sections
 from station.protocol.messages import (
     CLIENT_LIMIT,
@@ -72,15 +71,12 @@ class ControlServer:
         make_folder(self._path.parent)
         _remove_stale(self._path)
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
-        old = os.umask(0o117)
         try:
-            listening.bind(str(self._path))
+            bind(listening, self._path)
             listening.listen(ACCEPT_BATCH)
         except OSError as error:
             listening.close()
             raise StationError("socket", path=self._path, reason=str(error)) from None
-        finally:
-            os.umask(old)
         self._listening = listening
         self._listen()
 

@@ -18,7 +18,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from station.cell.errors import StationError
-from station.cell.socket_folder import make_folder, motion_page, stop_socket
+from station.cell.socket_folder import bind, make_folder, motion_page, stop_socket
 from station.protocol.stop_client import Motion, Page, create_page, write_page
 from station.server.approval import Peer
 
@@ -66,17 +66,14 @@ class StopServer:
         """Open socket and page, after the caller made sure that no other daemon runs. Raises StationError."""
         make_folder(self._socket_path.parent)
         link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
-        old = os.umask(0o117)
         try:
             link.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
             self._socket_path.unlink(missing_ok=True)
             self._descriptor = create_page(self._page_path, self._said)
-            link.bind(str(self._socket_path))
+            bind(link, self._socket_path)
         except OSError as error:
             link.close()
             raise StationError("socket", path=self._socket_path, reason=str(error)) from None
-        finally:
-            os.umask(old)
         self._link = link
         self._listen()
 

@@ -42,7 +42,9 @@ def state_at(history: Sequence[RobotState], clock: ClockFit | None, host_monoton
 
 
 def _mix(first: Sequence[float], second: Sequence[float], fraction: float) -> tuple[float, ...]:
-    return tuple(x + (y - x) * fraction for x, y in zip(first, second, strict=True))
+    """Interpolate; empty where not both states tell as many joints."""
+    both = zip(first, second, strict=True) if len(first) == len(second) else ()
+    return tuple(x + (y - x) * fraction for x, y in both)
 
 
 def _mix_poses(first: Vector6, second: Vector6, fraction: float) -> Vector6:

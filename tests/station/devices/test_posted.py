@@ -149,9 +149,21 @@ async def test_poses_without_a_time_are_of_their_arrival_within_a_stated_bound(a
     clock = arm.clock()
     assert clock is not None and clock.bound_s == 0.015 + PAUSE_S
     now_ns = time.monotonic_ns()
-    poster.say({"base_from_flange": POSE})
+    poster.say({"base_from_flange": POSE, "joints_rad": [0.1] * 6})
     await until(lambda: now(arm, lambda s: s.stamps.host_monotonic_ns > now_ns))
-    assert arm.at(now_ns).tcp_pose[:3] == tuple(POSE[:3])
+    found = arm.at(now_ns)
+    assert found.tcp_pose[:3] == tuple(POSE[:3]) and found.joints_rad == ()  # told after that moment alone
+
+
+async def test_no_other_file_is_made_with_the_sockets_permissions(tmp_path: Path) -> None:
+    arm = PostedArm(config(), "real", tmp_path / "control.sock")
+    connecting = asyncio.create_task(arm.connect())
+    await asyncio.sleep(0)
+    (tmp_path / "another").mkdir()
+    await until(lambda: arm._server is not None)
+    connecting.cancel()
+    await arm.close()
+    assert (tmp_path / "another").stat().st_mode & 0o700 == 0o700
 
 
 async def test_poses_are_read_in_the_convention_that_was_declared(arm: PostedArm) -> None:

@@ -9,10 +9,11 @@ import time
 import numpy as np
 
 from recordings.errors import CodedError
-from recordings.schema.messages import CameraModel, Image
+from recordings.schema.messages import CameraModel
 from station.analysis.estimation import FEWEST_FOR_LENS
 from station.analysis.guidance import NextView, Way, motion_px, next_view, way_to
 from station.analysis.worker import CapturedView
+from station.cell.errors import RobotError
 from station.cell.status import FEWEST_BY_HAND, GuidanceStatus, StationState
 from station.session.context import SessionContext
 from station.session.freedrive import FreedriveCapture
@@ -40,6 +41,8 @@ class HandGuide:
         """Motion of the board between the last two previews; None: it was not seen in both."""
         self._moved_s, self._failed = 0.0, False
         """When something moved last; whether an image failed or was taken back since: no other is tried."""
+        self._taken = 0
+        """Number of views at the last look."""
 
     async def run(self) -> None:
         store = self._context.store
@@ -48,7 +51,8 @@ class HandGuide:
             if store.state is not StationState.FREE_DRIVE or self._freedrive.taking:
                 if store.state in (StationState.IDLE, StationState.PAUSED):
                     store.update(guidance=GuidanceStatus())
-                    self._known, self._failed = None, False
+                    self._known, self._failed, self._taken = None, False, 0
+                    self._given_up.clear()
                 continue
             try:
                 await self._guide()
@@ -59,10 +63,13 @@ class HandGuide:
 
     async def _guide(self) -> None:
         context, store = self._context, self._context.store
-        if (looked := await self._previews.look()) is None:
+        looked, recording = await self._previews.look(), context.recording
+        if looked is None or recording is None or recording.camera is None:
             return
         number, image, seen = looked
-        wanted, way = await self._next(image), Way("", False)
+        self._failed |= len(context.seen) < self._taken  # one was taken back: none again from here
+        self._taken = len(context.seen)
+        wanted, way = await self._next(recording.camera), Way("", False)
         # With fewer the lens is rough, and its error would pass for one of board or mounting.
         cell = wanted.found if len(wanted.seen) >= FEWEST_FOR_LENS else None
         if seen.status.found:
@@ -72,14 +79,17 @@ class HandGuide:
         if number != self._number:
             before, self._pixels = self._pixels, seen.pixels
             self._number, self._motion_px = number, motion_px(before, seen.pixels)
-        found = context.stillness.measure(self._motion_px)
-        moves = "too few robot states" if found is None else context.stillness.unrest(found)
-        still = 0.0 if found is None else context.stillness.rest(found)
-        if moves or self._motion_px is None:
+        found, moves, still = context.stillness.measure(self._motion_px), "too few robot states", 0.0
+        try:
+            context.cell.robot.latest()
+        except RobotError as error:  # what was measured is not of now
+            found, moves = None, str(error)
+        if found is not None:
+            moves, still = context.stillness.unrest(found), context.stillness.rest(found)
+        if (found is not None and moves) or self._motion_px is None:
             self._moved_s, self._failed = time.monotonic(), False
         if store.state is not StationState.FREE_DRIVE:
             return
-        error_m, goal_m = wanted.sigma_m, context.cell.config.capture.goal_m
         store.update(
             guidance=GuidanceStatus(
                 outline=wanted.drawn,
@@ -90,33 +100,30 @@ class HandGuide:
                 after_mm=None if wanted.after_m is None else round(1000 * wanted.after_m, 3),
                 cause="" if cell is None else cell.cause,
                 warning="" if cell is None else cell.warning,
-                enough=len(context.seen) >= FEWEST_BY_HAND and error_m is not None and error_m <= goal_m,
+                enough=len(context.seen) >= FEWEST_BY_HAND and store.status.estimate.enough,
             )
         )
         if moves or self._motion_px is None or seen.status.cause == "blurred" or self._failed:
             return
         if way.new:
             self._failed = await self._freedrive.record(asked=False) not in context.seen
+            self._taken += not self._failed  # it may be taken back before the next look
         elif seen.status.found and time.monotonic() - self._moved_s > GIVE_UP_S:
             self._given_up.append(wanted.camera_from_board)
             self._known, self._moved_s = None, time.monotonic()
 
-    async def _next(self, image: Image) -> NextView:
+    async def _next(self, recorded: CameraModel) -> NextView:
         """Choose the wanted view anew when the views have changed."""
         context, config = self._context, self._context.cell.config
         if self._wanted is None or tuple(context.seen) != self._known:
             if self._known is not None:
                 self._given_up.clear()
-                self._failed = len(context.seen) < len(self._known)  # taken back: not again from here
-            height, width = image.pixels.shape[:2]
-            recorded = context.recording.camera if context.recording is not None else None
-            camera = config.camera.model or recorded or CameraModel(width, height)
             known = tuple(context.seen)
             self._wanted = await context.workers.call(
                 next_view,
                 config.mount,
                 config.board,
-                context.cell.camera_model or camera,
+                config.camera.model or recorded,
                 context.cell.camera_model is not None,
                 list(context.seen.values()),
                 list(self._given_up),

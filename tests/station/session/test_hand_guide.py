@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+import numpy as np
 import pytest
 
 from station.cell.config import vector6
@@ -62,7 +63,9 @@ async def test_views_are_taken_by_themselves_and_taken_back(guided: Rig) -> None
     lead(rig, stops[-1])
     await until(lambda: captured(rig) == len(stops) and rig.state is S.FREE_DRIVE)
     await rig.session.edit(1, Skip(0))
+    rig.session._guide._given_up.append(np.eye(4))
     await rig.session.finish(1)
+    await until(lambda: not rig.session._guide._given_up)
     kept = [view.index for view in sealed(rig).views()]
     assert kept == [1, 2, 3, len(stops)], "the view that was taken back last is in the way of none"
     assert not [asked for asked in rig.arm.log if asked not in ("close",)], "the station moved nothing"
@@ -79,15 +82,30 @@ async def test_nothing_is_taken_of_what_moves(guided: Rig) -> None:
     rig.camera.jumps = 0
 
 
+async def test_an_arm_that_tells_no_pose_neither_rests_nor_moves(guided: Rig) -> None:
+    rig, store = guided, guided.session.store
+    await until(lambda: captured(rig) == 1 and rig.state is S.FREE_DRIVE)
+    await rig.session.edit(1, Skip(0))
+    await until(lambda: store.status.guidance.new and store.status.guidance.still == 1.0)
+    rig.arm.late = True
+    await until(lambda: store.status.guidance.still == 0.0 and store.status.guidance.moves)
+    rig.arm.late = False
+    await until(lambda: store.status.guidance.still == 1.0)
+    glimpses = rig.camera.glimpses
+    await until(lambda: rig.camera.glimpses > glimpses + 3)
+    assert captured(rig) == 0, "it was taken back, and nothing moved since"
+
+
 async def test_freedrive_that_ends_while_news_are_late_is_no_fault(guided: Rig) -> None:
     rig = guided
     await until(lambda: captured(rig) == 1 and rig.state is S.FREE_DRIVE)
     rig.arm.late = True
-    lead(rig, guided_joints(TRUTH)[1])
+    asked = asyncio.create_task(rig.session.record(1))
     await until(lambda: rig.session.freedrive.taking)
     await rig.session.switch_free_drive(1, False)
     rig.arm.late = False
-    await until(lambda: not rig.session.freedrive.taking)
+    await asyncio.wait({asked})
+    assert asked.exception() is not None
     assert rig.state is S.PAUSED and captured(rig) == 1
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import logging
 import os
 import signal
@@ -16,7 +15,7 @@ from pathlib import Path
 from recordings.schema.messages import Source
 from station.cell.config import REAL_DRIVERS, StationConfig
 from station.cell.errors import ConfigError, RobotError
-from station.cell.process import RealTimeThreads
+from station.cell.process import RealTimeThreads, freeze_startup
 from station.cell.status import StationState
 from station.devices.base import Camera
 from station.devices.cell import Cell
@@ -30,12 +29,6 @@ log = logging.getLogger(__name__)
 
 CONTROL_SERVED_S = 1.0
 GATHER_S = 0.04
-
-
-def freeze_startup() -> None:
-    """Exclude loaded objects from garbage collection, whose pauses would delay heartbeat and STOP."""
-    gc.collect()
-    gc.freeze()
 
 
 def notify(line: str) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -23,8 +22,9 @@ from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
 from station.cell.errors import StationError
+from station.cell.process import freeze_startup
 from station.cell.session_folder import list_sessions
-from station.cell.status import MotionPreview, SessionStatus, StationState
+from station.cell.status import MotionPreview, StationState
 from station.operate.motion import prepared_motion
 from station.protocol import verbs
 from station.protocol.client import Client
@@ -54,12 +54,6 @@ LIVE_PERIOD_S = 0.1
 SETTLED_S = 2.0
 ACKNOWLEDGE = "Leave STOPPED or FAULT after looking"
 DECELERATES = "It decelerates at once, and the session pauses."
-
-
-def freeze_startup() -> None:
-    """Keep what was loaded out of garbage collection, which would make STOP wait (~100 ms)."""
-    gc.collect()
-    gc.freeze()
 
 
 SCREENS: tuple[type[StationScreen], ...] = (
@@ -159,7 +153,8 @@ class StationApp(KnowingApp):
         if before is None or before.session.calibration != status.session.calibration:
             self.action_look_at_disk()
         elif status.guidance.outline and status.session.captured > before.session.captured:
-            self.bell()
+            if status.session.name == before.session.name:  # of another, they were taken before
+                self.bell()
         elif before.session.name and not status.session.name:
             self.result_path = ""  # another session begins: what was looked at is no part of it
         if not self._greeted:
@@ -260,13 +255,10 @@ class StationApp(KnowingApp):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_finish(self) -> None:
-        if (
-            self.known.live is not None
-            and (refusal := verbs.Finish.refusal(self.known.live.state)) is not None
-        ):
+        live, session = self.known.live, self.known.shown.session
+        if live is not None and (refusal := verbs.Finish.refusal(live.state)) is not None:
             self.notify(str(refusal), severity="warning")
             return
-        session = SessionStatus() if self.known.live is None else self.known.live.session
         captured = f"{session.captured} of {len(session.poses)} poses are captured."
         body = f"{captured} The recording is closed; F9 then solves it."
         if await self.desk.question(Confirm("Finish this session?", body, yes="Finish")):

@@ -187,7 +187,7 @@ class Desk:
 
     async def stop(self) -> None:
         """STOP, whatever is shown, and also where nobody answers or no connection is left."""
-        if self.known.status is not None and self.known.status.robot.by_hand:
+        if self.known.live is not None and self.known.live.robot.by_hand:
             self.app.notify(NOT_OURS, severity="error", timeout=10)
             return
         if not self.client.connected:

@@ -23,12 +23,13 @@ from station.cell.status import (
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import Hardware
 from station.protocol.verbs import Check
+from station.tui.desk import STOP_NOBODY
 from station.tui.dialogs import Confirm, ConfirmMotion, Reason
 from station.tui.frame import StopBlock, bar_line, next_line, rail_line
 from station.tui.new_cell import NewCell
 from station.tui.task import DIGITS, Action, Known, next_action, steps
 from tests.recordings.small_recording import make_state
-from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, in_session, opened, text_of, until
+from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, in_session, opened, said, text_of, until
 
 SIZES = [(80, 24), (160, 48)]
 HELD = "protective stop: find what the arm ran into, then enable it again on the pendant"
@@ -217,6 +218,10 @@ async def test_the_screens_have_no_stop_for_an_arm_that_a_person_moves(
         await pilot.press("f12")
         await until(pilot, lambda: bool(pilot.app._notifications))
         assert "stop" not in link.verbs
+        link.show(None)  # what arm the next daemon has is not known: STOP is for it, too
+        await until(pilot, lambda: pilot.app.known.live is None)  # type: ignore[attr-defined]
+        await pilot.press("f12")
+        await until(pilot, lambda: STOP_NOBODY in said(pilot))
 
 
 async def test_stop_can_be_clicked_in_the_wizard_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from station.protocol.verbs import Freedrive, Record
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
 from station.session.ending import failed
+from station.session.estimator import look_back
 from station.session.queue import PoseQueue
 
 log = logging.getLogger(__name__)
@@ -45,6 +46,7 @@ class FreedriveCapture:
             raise RefusedError("still-ending", what="the last image")
         context, store = self._context, self._context.store
         await context.arm()
+        await look_back(context)
         if (refusal := Freedrive.refusal(store.state)) is not None:
             raise refusal  # STOP came in between
         context.requests.halt = False

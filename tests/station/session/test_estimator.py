@@ -85,7 +85,7 @@ class WorkerThatLooksBack(WorkerInThisProcess):
     ) -> Any:
         if function is not seen_before:
             return await super().call(function, *args, timeout_s=timeout_s, **named)
-        assert len(open_recording(args[0]).views()) == BEFORE  # it is whole by then
+        assert len(open_recording(args[0]).views()) == len(self.known)  # it is whole by then
         return self.known
 
 

@@ -14,8 +14,8 @@ from station.protocol.verbs import Skip
 from tests.codes import raises
 from tests.patience import until
 from tests.station.operate.guided_views import guided_joints
-from tests.station.session.test_estimator import WorkerThatSees
-from tests.station.session_rig import TRUTH, NewRig, Rig, sealed
+from tests.station.session.test_estimator import WorkerThatLooksBack, WorkerThatSees
+from tests.station.session_rig import TRUTH, NewRig, Rig, crash, sealed
 
 
 @pytest.fixture
@@ -69,6 +69,17 @@ async def test_views_are_taken_by_themselves_and_taken_back(guided: Rig) -> None
     kept = [view.index for view in sealed(rig).views()]
     assert kept == [1, 2, 3, len(stops)], "the view that was taken back last is in the way of none"
     assert not [asked for asked in rig.arm.log if asked not in ("close",)], "the station moved nothing"
+
+
+async def test_views_before_a_crash_count_in_the_guidance(guided: Rig, new_rig: NewRig) -> None:
+    await until(lambda: captured(guided) == 1 and guided.state is S.FREE_DRIVE)
+    crash(guided)
+    again = await new_rig(with_plan=False, guides=True)
+    again.session.context.workers = WorkerThatLooksBack(guided)  # type: ignore[assignment]
+    again.session.take_lease(1, "anna")
+    await again.session.acknowledge("anna")
+    await again.session.switch_free_drive(1, True)
+    assert list(again.session.context.seen) == [0]
 
 
 async def test_nothing_is_taken_of_what_moves(guided: Rig) -> None:

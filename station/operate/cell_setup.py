@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -122,12 +123,13 @@ class CellSetup:
 
     def read_arm(self) -> None:
         """Take the newest state; none while the arm does not answer."""
-        try:
+        now_s, self.state = time.monotonic(), None
+        with suppress(RobotError):
             self.state = None if self.arm is None else self.arm.latest()
-        except RobotError:
-            self.state = None
-        if self.state is None or max(map(abs, self.state.joint_speeds_rad_s)) > STILL_RAD_S:
-            self._moved_s = time.monotonic()
+        if self.state is None:
+            self._moved_s = max(self._moved_s, now_s)
+        elif max(map(abs, self.state.joint_speeds_rad_s)) > STILL_RAD_S:
+            self._moved_s = now_s
 
     def look(self, begun_s: float, image: Image, step: CellStep) -> Detection | None:
         """Look for the board; None in steps that do not ask for it. A tenth of a second, in any thread."""

@@ -146,6 +146,9 @@ def test_a_corrected_square_keeps_the_views_and_another_board_does_not(
     assert board is not None
     setup.set_board(msgspec.structs.replace(board, square_m=1.05 * board.square_m))
     assert setup.draft.views == done[0].views and not setup.draft.written
+    setup.drop_view()
+    setup.read_arm()  # no answer is no motion, after which it were taken again from here
+    assert setup._moved_s == np.inf
     setup.set_board(msgspec.structs.replace(board, columns=board.columns + 1))
     assert not setup.draft.views
 

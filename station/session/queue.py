@@ -32,7 +32,7 @@ class PoseQueue:
             self._statuses = list(restored)
             for status in restored:
                 if status.state not in ENDED:
-                    self._change(status.index, state="planned")
+                    self.note(status.index, state="planned")
 
     @property
     def sha256(self) -> str:
@@ -69,17 +69,10 @@ class PoseQueue:
     def mark(self, index: int, state: PoseState, reason: str | CodedError = "") -> None:
         kept = self.status(index).counts and state != "done"
         cause = reason.code if isinstance(reason, CodedError) else ""
-        self._change(index, state=state, reason=str(reason), cause=cause, kept=kept)
+        self.note(index, state=state, reason=str(reason), cause=cause, kept=kept)
 
-    def note(self, index: int, *, corners: int | None = None, coverage: float | None = None) -> None:
-        """Note corners and coverage of the image at a pose."""
-        self._change(index, corners=corners, coverage=coverage)
-
-    def note_estimate(self, index: int, sigma_mm: float | None) -> None:
-        """Note the expected error after this pose."""
-        self._change(index, estimated_sigma_mm=sigma_mm)
-
-    def _change(self, index: int, **fields: object) -> None:
+    def note(self, index: int, **fields: object) -> None:
+        """Change fields of a pose's status."""
         self._statuses[index] = msgspec.structs.replace(self.status(index), **fields)
 
     def anew(self, guided: bool = True) -> PoseQueue:
@@ -97,7 +90,7 @@ class PoseQueue:
     def start_attempt(self, index: int) -> int:
         """Begin an attempt; return its number, from 1. In the recording the last attempt counts."""
         attempt = self.status(index).attempt + 1
-        self._change(index, attempt=attempt)
+        self.note(index, attempt=attempt)
         return attempt
 
     def retake(self, index: int) -> None:
@@ -122,7 +115,7 @@ class PoseQueue:
         """Let the image of a pose that is done count no more. RefusedError where there is none."""
         if not self.status(index).counts:
             raise _refused("pose-not-taken", index)
-        self._change(index, state="skipped", reason=TAKEN_BACK, kept=False)
+        self.note(index, state="skipped", reason=TAKEN_BACK, kept=False)
 
     def drop_last(self) -> None:
         """Remove the last pose, of which there is no image."""

@@ -1,21 +1,28 @@
-"""How the camera is mounted, and which way round poses are: what names say of it.
+"""How the camera is mounted, and which way round poses are: what joints and names say of it.
 
 Three things are asked: the mounting, and whether the robot's and the board's poses are inverted. A camera in
 hand fits exactly as well as a fixed one with inverted poses, so the motion gives one of the three once the
-other two are known: from names in the data, or from the user.
+other two are known: from recorded joints (the robot's poses), names in the data, or the user.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 
+import numpy as np
+
+from calibrate.chain import learn_chain
+from calibrate.geometry import inverse
 from calibrate.imported.readings import Reading
 from recordings.errors import ImportSourceError
 from recordings.importers.tables import Lies
 from recordings.schema.messages import Mount
 
 Ask = Callable[[str], Mount]
+_MOST_ROWS = 100
+"""Most joints and poses from which axes are learned."""
 _IN_HAND = re.compile(
     r"eye_?(in|on)_?hand|hand_?(in|on)_?eye|hand_in\b|\beih\b|cam\w*2(gripper|end|ee|tool|flange|hand)"
     r"|attached on robot|in_hand|inhand|flange2cam|hand_camera|static_camera false",
@@ -48,9 +55,11 @@ def mounting(
     turned_board = bool(_CAMERA_IN_BOARD.search(best.family)) if all(seen_in) else not seen_in[0]
     fits = _OTHER[best.mount] if turned_board else best.mount
     straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
+    by_joints = _inverted_by_joints(lies, best)
     by_direction = set[Mount]()
-    if as_told or straight != inverted:
-        by_direction = {fits if as_told or straight else _OTHER[fits]}
+    if by_joints is not None or as_told or straight != inverted:
+        turned = not (as_told or straight) if by_joints is None else by_joints
+        by_direction = {_OTHER[fits] if turned else fits}
     named = _named(f"{name} {best.family}") or _named(
         f"{lies.words} {' '.join(f'{k} {str(v).lower()}' for k, v in lies.facts.items())}"
     )
@@ -61,8 +70,28 @@ def mounting(
     if len(possible) != 1:
         raise ImportSourceError("which-mount", source=lies.root, mount=fits, table=name)
     (mount,) = possible
-    why = "as told" if given else f"by {'names, and ' if named else ''}the board's motion; {name}"
+    evidence = "joints, " * (by_joints is not None) + "names, " * bool(named)
+    why = "as told" if given else f"by {evidence}the board's motion; {name}"
     return mount, mount != fits, turned_board, why
+
+
+def _inverted_by_joints(lies: Lies, best: Reading) -> bool | None:
+    """Tell whether a table of joints moves axes as the inverses of the poses do; None: no table tells.
+
+    An arm's flange is a product of turns in the order of its joints; of its inverse the order is reversed.
+    """
+    flanges = best.convention.poses(best.table.numbers[:_MOST_ROWS])
+    for table in lies.tables:
+        joints = table.numbers[:_MOST_ROWS]
+        rows, count = joints.shape
+        if count > 7 or rows < 2 * count or len(table.numbers) != len(best.table.numbers):
+            continue
+        joints_rad = np.radians(joints) if np.abs(joints).max() > 2 * np.pi else joints
+        with suppress(np.linalg.LinAlgError, ValueError):
+            straight, inverted = (learn_chain(joints_rad, F, 3).explains for F in (flanges, inverse(flanges)))
+            if straight != inverted:
+                return inverted
+    return None
 
 
 def _named(words: str) -> set[Mount]:

@@ -24,6 +24,8 @@ from calibrate.report.page import report_page
 from recordings.cli import main
 from recordings.importers.tables import look
 from recordings.reader import open_recording
+from recordings.schema.messages import Mount
+from tests.calibrate.chains import arm_cell
 from tests.calibrate.sessions import Scene, write_session
 from tests.codes import raises
 from tests.command_line import call
@@ -289,6 +291,25 @@ def in_one_csv(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
     names = [f"{of}_{n}" for of in ("flange", "board") for n in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     rows = np.column_stack([quaternions(robot), quaternions(board)])
     np.savetxt(folder / "pairs.csv", rows, delimiter=",", header=",".join(names), comments="")
+
+
+@pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
+@pytest.mark.parametrize("told", [lambda T: T, np.linalg.inv])
+@pytest.mark.parametrize(("arm", "mount"), [("ur", "eye-in-hand"), ("seven joints", "eye-to-hand")])
+def test_recorded_joints_tell_the_mounting(
+    arm: str, mount: Mount, told: Callable[[np.ndarray], np.ndarray], unit: float, tmp_path: Path
+) -> None:
+    """Their axes belong to the arm: to its poses and not to the inverses."""
+    views = arm_cell(arm, mount, 0.1, 1, views=16).views
+    in_two_tables(tmp_path, told(views.base_from_flange), views.camera_from_board)
+    with raises("which-mount"):
+        believe(look(tmp_path))
+    joints = np.array([view.joints_rad for view in views])
+    np.savetxt(tmp_path / "joints.csv", unit * joints, fmt="%.4f", delimiter=",")
+    found = believe(look(tmp_path))
+    assert found.dataset.mount == mount
+    poses = np.array([row.base_from_flange for row in found.rows])
+    np.testing.assert_allclose(poses, views.base_from_flange, atol=1e-6)
 
 
 MOVEIT = Path(__file__).parents[3] / "shared/datasets/pose-pairs/moveit50.csv"

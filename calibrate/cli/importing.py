@@ -6,7 +6,7 @@ import math
 import os
 import shlex
 import sys
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +24,7 @@ from recordings.importers.folder import import_folder, write_views
 from recordings.importers.messages import Progress
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import StandstillLimits
-from recordings.importers.tables import look
+from recordings.importers.tables import Lies, look
 from recordings.plain_text import plain_text
 from recordings.schema.messages import Mount
 from recordings.schema.stillness import POSITION_M, ROTATION_RAD
@@ -91,15 +91,14 @@ def import_command(
     console = plain_console(stderr=True)
     shown = console.is_terminal and not as_json
     with ExitStack() as bar:
-        nothing = nullcontext[Progress](lambda *_: None)
-        progress = bar.enter_context(progress_bar("", console) if shown else nothing)
+        progress: Progress = bar.enter_context(progress_bar("", console)) if shown else lambda *_: None
         if is_described(source, dataset, poses, convention, mount, board):
             done = import_folder(source, target, progress)
             facts = ImportJson(str(target or ""), done.images, done.size_bytes)
         elif source.is_dir() and not _is_bag(source):
             told = dataset or _told(source, output)
             given = Given(convention, mount, None if board is None else typed_board(board))
-            facts = _import_found(source, target, told, poses, given, progress, _ask(bar) if shown else None)
+            facts = _import_found(look(source, poses), target, told, given, progress, _ask(bar, shown))
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
@@ -123,26 +122,20 @@ def _told(source: Path, output: Path | None) -> Path | None:
 
 @single_threaded_opencv()
 def _import_found(
-    source: Path,
-    target: Path | None,
-    told: Path | None,
-    poses: Path | None,
-    given: Given,
-    progress: Progress,
-    ask: Ask | None,
+    lies: Lies, target: Path | None, told: Path | None, given: Given, progress: Progress, ask: Ask | None
 ) -> ImportJson:
     """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
     described = None if told is None else read_dataset(told)[0]
-    believed = believe(look(source, poses), given, described, progress, ask)
+    believed = believe(lies, given, described, progress, ask)
     dataset = believed.dataset
     content = msgspec.yaml.encode(dataset)
-    done = write_views(source, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
+    done = write_views(lies.root, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
     if target is not None and dataset != described:
         write_atomically(target.with_suffix("." + DATASET_FILE), content)
     return ImportJson(str(target or ""), done.images, done.size_bytes, found=believed.facts)
 
 
-def _ask(bar: ExitStack) -> Ask | None:
+def _ask(bar: ExitStack, shown: bool) -> Ask | None:
     """Ask a person how the camera is mounted, once the bar is gone; None: nobody can answer."""
 
     def ask(why: str) -> Mount:
@@ -150,7 +143,7 @@ def _ask(bar: ExitStack) -> Ask | None:
         on_arm = typer.confirm(f"{why}.\nIs the camera on the arm?", default=None, err=True)
         return "eye-in-hand" if on_arm else "eye-to-hand"
 
-    return ask if sys.stdin.isatty() else None
+    return ask if shown and sys.stdin.isatty() else None
 
 
 class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):

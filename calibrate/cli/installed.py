@@ -99,15 +99,8 @@ def export(
     """
     calibration, validity = named_or_installed(file, root, camera)
     names = FrameNames.of_camera(camera if file is None else calibration.camera_name)
-    frames = FrameNames(
-        base,
-        flange,
-        frame or names.camera,
-        body or names.body,
-        validity,
-        attach,
-        fixed_frames(driver_tf or []),
-    )
+    fixed = fixed_frames(driver_tf or [])
+    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity, attach, fixed)
     given = None if arm is None else read_bounded(arm)
     content = exports.export(calibration, str(to.value), frames, given)
     if validity is not None and validity.state is not ValidityState.VALID:

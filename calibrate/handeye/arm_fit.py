@@ -60,11 +60,6 @@ class _Sizes:
         bend = RIGID if BENDS[one[2]] == 0 else (1 - RIGID) / (len(BENDS) - 1)
         return float(np.log(bend / (self.shape[0] * self.shape[1])))
 
-    @property
-    def alike(self) -> list[Sizes]:
-        """The combinations of a rigid bracket with shifts as large, in mm, as turns in mrad."""
-        return [(size, size, 0) for size in range(self.shape[0])]
-
     def beside(self, one: Sizes) -> list[Sizes]:
         """Return the combinations in which one size is the next smaller or larger."""
         steps = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)]) + one
@@ -147,7 +142,8 @@ def _explore(
     """Solve the combinations of `alike`, then the neighbours of every likely one; return the likely ones."""
     found: dict[Sizes, LinearSolution] = {}
     chance: dict[Sizes, float] = {}
-    ahead = [(one, scales) for one in sizes.alike]
+    # First a rigid bracket, and shifts as large, in mm, as turns in mrad.
+    ahead = [((size, size, 0), scales) for size in range(sizes.shape[0])]
     while ahead:
         one, start = ahead.pop(0)
         if one in found:

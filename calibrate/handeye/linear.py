@@ -15,7 +15,7 @@ import numpy as np
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic, flange_derivatives, flange_residuals
 from calibrate.handeye.corner_modes import INFORMATION, CornerModes
-from calibrate.handeye.mixture import class_chances, expected, weights_of
+from calibrate.handeye.mixture import class_chances, expected
 from calibrate.handeye.noise_scales import WIDE, Scales, first_scales, update_corners, update_robot
 from calibrate.handeye.reprojection import linearise_corners
 from calibrate.handeye.uncertainty import information_lost, inverse_of
@@ -136,8 +136,12 @@ class Linear:
         return S, np.asarray(np.linalg.inv(S), dtype=float)
 
     def weights(self, chances: Array, scales: Scales) -> Array:
-        """Compute how much each view (n,) counts, as `weights_of`."""
-        return weights_of(chances, *self.noise(scales))
+        """Compute the weight (n,) of each view: its information over that of an ordinary view, 0 for garbage.
+
+        Where the corners' noise hides the robot's, ordinary classes hardly differ, and neither do weights.
+        """
+        S, S_inverse = self.noise(scales)
+        return np.asarray(np.einsum("nk,nkij,nji->n", chances, S_inverse, S[:, 0]) / 6)
 
     def board_step(self, solved: LinearSolution) -> Array:
         """Compute the step (n, 6) of the board poses that belongs to the step of the shared unknowns."""

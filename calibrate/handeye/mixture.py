@@ -36,14 +36,6 @@ def class_chances(residual: Array, S: Array, S_inverse: Array, shares: Array) ->
     return density / total, (top + np.log(total))[:, 0]
 
 
-def weights_of(chances: Array, S: Array, S_inverse: Array) -> Array:
-    """Compute the weight (n,) of each view: its information over that of an ordinary view, 0 for garbage.
-
-    Where the corners' noise hides the robot's, the ordinary classes hardly differ, and neither do weights.
-    """
-    return np.asarray(np.einsum("nk,nkij,nji->n", chances, S_inverse, S[:, 0]) / S.shape[-1])
-
-
 def expected(chances: Array, S_inverse: Array) -> Array:
     """Average inverse covariances (n, K, 6, 6) over the classes → (n, 6, 6)."""
     return np.asarray(np.einsum("nk,nkij->nij", chances, S_inverse))

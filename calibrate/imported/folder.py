@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -80,7 +79,12 @@ def believe(
         for family, paths in lies.images.items()
         if len(pairs := _pairs(table, paths)) >= FEWEST
     ]
-    boards = list(_pairs_of_tables(lies, robots))
+    boards = [
+        (robot, board, pairs)
+        for robot in robots
+        for board in lies.tables
+        if board.whose == "board" and len(pairs := _pairs(robot, board)) >= FEWEST
+    ]
     if not pairings and not boards:
         images = [f"{len(paths)} {name}" for name, paths in lies.images.items()]
         there = [f"{len(table.numbers)} {table.name}" for table in lies.tables]
@@ -133,19 +137,20 @@ def _name_convention(lies: Lies, given: Given, progress: Progress) -> None:
 
 def _as_before(lies: Lies, told: Dataset, poses: PosesTold) -> Believed:
     tables = {table.name: table for table in lies.tables}
-    table, board, pairs = tables.get(poses.table), tables.get(poses.images), dict[Key, int]()
-    if table is not None and poses.board_convention and board is not None:
-        pairs = _rows_of_both(table, board)
-    elif table is not None:
-        pairs = _pairs(table, lies.images.get(poses.images, []))
-    if not pairs or table is None:
+    table, board = tables.get(poses.table), tables.get(poses.images) if poses.board_convention else None
+    if table is None or not (pairs := _pairs(table, board or lies.images.get(poses.images, []))):
         raise ImportSourceError("no-pairs", source=lies.root, images=poses.images, tables=poses.table)
     seen = None if board is None else (board, convention(poses.board_convention))
     return Believed(told, _rows(lies, table, convention(poses.convention), pairs, seen))
 
 
-def _pairs(table: Table, paths: list[Path]) -> dict[Key, int]:
-    """Image → row: by the names told beside the rows, by the numbers in both names, or by order."""
+def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
+    """Image → row: by the names told beside the rows, by the numbers in both names, or by order.
+
+    Row of a table of the board's poses → row of the robot's: by order.
+    """
+    if isinstance(paths, Table):
+        return {row: row for row in range(len(paths.numbers)) if len(paths.numbers) == len(table.numbers)}
     named = {Path(name).name: row for row, name in enumerate(table.images) if name}
     by_name: dict[Key, int] = {path: named[path.name] for path in paths if path.name in named}
     if by_name:
@@ -160,19 +165,6 @@ def _pairs(table: Table, paths: list[Path]) -> dict[Key, int]:
     shared: dict[Key, int] = {path: rows[number] for path, number in numbers.items() if number in rows}
     unique = len(rows) == len(table.numbers) and len(set(numbers.values())) == len(numbers)
     return shared if unique and len(shared) > 0.8 * max(len(rows), len(paths)) else {}
-
-
-def _pairs_of_tables(lies: Lies, robots: list[Table]) -> Iterator[tuple[Table, Table, dict[Key, int]]]:
-    """Tables that may tell the robot's and the board's poses of the same views."""
-    for robot in robots:
-        for board in lies.tables:
-            if board.whose == "board" and len(pairs := _rows_of_both(robot, board)) >= FEWEST:
-                yield robot, board, pairs
-
-
-def _rows_of_both(robot: Table, board: Table) -> dict[Key, int]:
-    """Row of the board's table → row of the robot's, by order."""
-    return dict(enumerate(range(len(robot.numbers)))) if len(robot.numbers) == len(board.numbers) else {}
 
 
 def _believed(lies: Lies, given: Given, best: Reading, pairs: dict[Key, int], ask: Ask | None) -> Believed:

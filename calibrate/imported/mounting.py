@@ -55,11 +55,10 @@ def mounting(
     turned_board = bool(_CAMERA_IN_BOARD.search(best.family)) if all(seen_in) else not seen_in[0]
     fits = _OTHER[best.mount] if turned_board else best.mount
     straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
-    by_joints = _inverted_by_joints(lies, best)
-    by_direction = set[Mount]()
-    if by_joints is not None or as_told or straight != inverted:
-        turned = not (as_told or straight) if by_joints is None else by_joints
-        by_direction = {_OTHER[fits] if turned else fits}
+    turned = by_joints = _inverted_by_joints(lies, best)
+    if by_joints is None and (as_told or straight != inverted):
+        turned = not (as_told or straight)
+    by_direction = set() if turned is None else {_OTHER[fits] if turned else fits}
     named = _named(f"{name} {best.family}") or _named(
         f"{lies.words} {' '.join(f'{k} {str(v).lower()}' for k, v in lies.facts.items())}"
     )

@@ -49,7 +49,7 @@ class Reading:
 
     @property
     def text(self) -> str:
-        return f"{self.mount}, {self.convention.name}"
+        return f"{self.table.name}: {self.mount}, {self.convention.name}"
 
 
 def readings(
@@ -178,7 +178,7 @@ def decide(lies: Lies, readings: list[Reading]) -> Reading:
         raise ImportSourceError(
             "no-reading",
             source=lies.root,
-            nearest=f"{best.table.name}: {best.text}",
+            nearest=best.text,
             stays_m=best.stays_m,
             stays_rad=best.stays_rad,
             cause=cause,
@@ -188,12 +188,8 @@ def decide(lies: Lies, readings: list[Reading]) -> Reading:
         if best.fit.log_evidence - other.fit.log_evidence > clear_gain(len(best.fit.full)):
             break
         if other.mount != best.mount or not _same(best, other):
-            raise ImportSourceError(
-                "two-readings",
-                source=lies.root,
-                first=f"{best.table.name}: {best.text}",
-                second=f"{other.table.name}: {other.text}",
-            )
+            both = {"first": best.text, "second": other.text}
+            raise ImportSourceError("two-readings", source=lies.root, **both)
     return best
 
 

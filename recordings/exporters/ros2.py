@@ -20,11 +20,7 @@ from recordings.reader import Recording
 from recordings.schema.definitions import PictureFacts
 from recordings.schema.messages import CameraModel, Matrix4, View
 from recordings.schema.topics import Topic
-from recordings.schema.viewing import (
-    base_from_flange,
-    joint_names,
-    quaternion_xyzw,
-)
+from recordings.schema.viewing import base_from_flange, joint_names, quaternion_xyzw
 from recordings.segment import RecordingSegment
 
 FLANGE_FRAME, OPTICAL_FRAME = "tool0", "camera_calibrated_optical_frame"

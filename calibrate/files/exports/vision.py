@@ -6,11 +6,7 @@ import cv2
 import numpy as np
 
 from calibrate.files.calibration import Calibration
-from calibrate.files.exports.frames import (
-    FrameNames,
-    comment,
-    commented_yaml,
-)
+from calibrate.files.exports.frames import FrameNames, comment, commented_yaml
 from calibrate.geometry import inverse, roll_pitch_yaw
 from calibrate.projection import camera_matrix, distortion
 

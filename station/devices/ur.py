@@ -161,8 +161,11 @@ class UrRobot(UrLink):
             self._child.beat()
 
     async def end_control(self) -> None:
-        """Stop the control program and end its process."""
+        """Stop the control program and end its process. What ended it before is no trouble any more."""
         child, self._child, self.control = self._child, None, False
+        trouble, ended = self._trouble, self._ended_by
+        if trouble is not None and ended is not None and trouble.data == ended.data:
+            self._trouble = None
         if child is None:
             return
         await child.end()

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from station.cell.errors import RobotError, SafetyStopError
+from station.devices.base import ready
 from station.devices.news import Delay
 from station.devices.ur_child import ControlChild
 from tests.codes import raises
@@ -170,6 +171,23 @@ async def test_a_control_process_held_up_between_two_moves_is_named_by_the_next(
         while True:
             await c.robot.move(here, 0.5, 1.0)
     assert told.value.code in set(Delay)  # on a busy computer the controller may be late, too
+
+
+async def test_control_that_ended_between_two_moves_is_no_trouble_once_it_was_told(
+    cell: MakeCell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One approval continues at once, also before the next look at the robot."""
+    monkeypatch.setattr("station.devices.ur_link.RETRY_S", 600.0)
+    c = await cell()
+    control_pid = c.robot.control_pid
+    assert control_pid is not None
+    os.kill(control_pid, signal.SIGSTOP)
+    await until(lambda: c.robot._ended_by is not None)
+    with pytest.raises(RobotError):
+        await ready(c.robot)
+    await c.robot.end_control()
+    await ready(c.robot)
+    await c.robot.start_control()
 
 
 async def test_an_arm_that_goes_another_way_than_the_checked_one_is_stopped(

@@ -126,13 +126,18 @@ def _own_group_only(status: os.stat_result) -> bool:
 
 
 def bind(link: socket.socket, path: Path) -> None:
-    """Bind a Unix socket with mode 0660. OSError.
+    """Bind a Unix socket with mode 0660. StationError: it cannot be, and is closed.
 
     The umask is that of all threads and tasks, so nothing is awaited while it is another.
     """
+    from station.cell.errors import StationError
+
     old = os.umask(0o117)
     try:
         link.bind(str(path))
+    except OSError as error:
+        link.close()
+        raise StationError("socket", path=path, reason=str(error)) from None
     finally:
         os.umask(old)
 

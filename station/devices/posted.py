@@ -94,13 +94,8 @@ class PostedArm:
         """Listen, and return when a program has posted a pose. StationError where nothing can listen."""
         if self._server is None:
             make_folder(self.path.parent)
-            listening = socket.socket(socket.AF_UNIX)
-            try:
-                self.path.unlink(missing_ok=True)
-                bind(listening, self.path)
-            except OSError as error:
-                listening.close()
-                raise StationError("socket", path=self.path, reason=str(error)) from None
+            self.path.unlink(missing_ok=True)
+            bind(listening := socket.socket(socket.AF_UNIX), self.path)
             self._server = await asyncio.start_unix_server(self._serve, sock=listening, limit=READ_BYTES)
         await self._came.wait()
         return self.identity

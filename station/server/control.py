@@ -71,12 +71,8 @@ class ControlServer:
         make_folder(self._path.parent)
         _remove_stale(self._path)
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
-        try:
-            bind(listening, self._path)
-            listening.listen(ACCEPT_BATCH)
-        except OSError as error:
-            listening.close()
-            raise StationError("socket", path=self._path, reason=str(error)) from None
+        bind(listening, self._path)
+        listening.listen(ACCEPT_BATCH)
         self._listening = listening
         self._listen()
 

@@ -267,10 +267,12 @@ class StationApp(KnowingApp):
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_freedrive(self) -> None:
         """Capture by hand: the operator holds the pendant's freedrive button, the station only looks."""
-        if self.known.live is None:
+        if (status := self.known.live) is None:
             return
-        begins = self.known.live.state is not StationState.FREE_DRIVE
-        if await self.desk.ask(verbs.Freedrive(begins)) is not None and begins:
+        begins = status.state is not StationState.FREE_DRIVE
+        if status.guidance.outline and status.state in RUNNING:  # ends after the view that is being taken
+            await self.desk.ask(verbs.Pause())
+        elif await self.desk.ask(verbs.Freedrive(begins)) is not None and begins:
             await self.switch_mode("capture")
 
     @work(exclusive=True, group="command", exit_on_error=False)

@@ -46,8 +46,9 @@ def stopped_text(status: StationStatus) -> Content:
         if session.poses
         else "No session was running."
     )
-    pendant = mark("look", held) if (held := robot.condition.held) else mark("done", "nothing to clear there")
-    safety = Content.assemble(("safety ", "$dim"), (robot.condition.safety or UNKNOWN, "bold $strong"))
+    held, told = robot.condition.held, robot.condition.safety
+    pendant = mark("look", held) if held else mark("done", "nothing to clear there") if told else Content()
+    safety = Content.assemble(("safety ", "$dim"), (told or UNKNOWN, "bold $strong"))
     rests = ""  # its news may be old
     if robot.connected and not robot.by_hand and status.cause in ("stop", *STOPPED_BY):
         rests = " The arm stands still." if robot.still else " The arm is told to stop."

@@ -9,7 +9,7 @@ import pytest
 from calibrate.geometry import pose as pose_of
 from station.cell.config import matrix4
 from station.cell.layout import layout_of
-from station.cell.status import EstimateStatus, PoseStatus, StationState
+from station.cell.status import ArmCondition, EstimateStatus, PoseStatus, StationState
 from station.tui.capture_panels import coverage_lines, error_lines
 from station.tui.progress import chips, counted_line, pose_line
 from station.tui.stopped import stopped_text
@@ -83,6 +83,10 @@ def test_the_card_says_that_the_arm_stands_only_where_it_is_known(cause: str) ->
     assert ("hy it stopped" in rests) is (cause != "protective-stop")
     assert (said(still=False) == rests) is (cause == "stale-state")
     assert (said(still=True, state=None) == rests) is (cause == "stale-state")
+    untold = msgspec.structs.replace(
+        status, robot=msgspec.structs.replace(status.robot, condition=ArmCondition())
+    )
+    assert "✓" in stopped_text(status).plain and "✓" not in stopped_text(untold).plain
 
 
 def test_the_error_falls_towards_its_goal() -> None:

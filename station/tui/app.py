@@ -283,14 +283,12 @@ class StationApp(KnowingApp):
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_release(self) -> None:
         """Release control, so that another screen or a command may take it."""
-        if self.known.live is None or not self.desk.has_control():
-            holder = "" if self.known.live is None else self.known.live.lease.holder
+        if (live := self.known.live) is None or not self.desk.has_control():
+            holder = "" if live is None else live.lease.holder
             self.notify(f"This screen does not have control: {holder or 'nobody'} does.", markup=False)
             return
-        body = f"The arm works. {DECELERATES}"
-        if self.known.live.state not in RUNNING or await self.desk.question(
-            Confirm("Release control?", body, yes="Release")
-        ):
+        asked = Confirm("Release control?", f"The arm works. {DECELERATES}", yes="Release")
+        if live.state not in RUNNING or await self.desk.question(asked):
             await self.desk.ask(verbs.Release())
             self.notify("Control released: another screen or command may take it.")
 

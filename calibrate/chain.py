@@ -240,7 +240,8 @@ def _fit_rotations(joints_rad: Array, R: Array, at: int) -> tuple[Array, float]:
 
     away, turned = joints_rad - joints_rad[at], R @ R[at].T
     square = (away**2).sum(axis=1)
-    near = np.sort(square)[min(joints_rad.shape[1] + 1, len(square) - 1)]
+    others = np.sort(square[square > 0])  # several views may share a posture
+    near = others[: joints_rad.shape[1] + 1].max(initial=1e-12)
     weight = np.exp(-square / near)[:, None]
     start = np.linalg.lstsq(weight * away, weight * rotation_log(turned), rcond=None)[0]
     x = np.append(start, np.zeros(3))

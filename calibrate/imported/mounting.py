@@ -51,8 +51,9 @@ def mounting(
     `as_told`: by the user's convention the direction is told, too. `ask`: asks a person. Raises
     ImportSourceError (`which-mount`) where nothing decides, or the user contradicts names.
     """
-    name, seen_in = best.table.name, best.seen.in_front
-    turned_board = bool(_CAMERA_IN_BOARD.search(best.family)) if all(seen_in) else not seen_in[0]
+    name, seen = best.table.name, best.seen
+    named_so = seen.convention is not None and bool(_CAMERA_IN_BOARD.search(best.family))
+    turned_board = named_so if all(seen.in_front) else not seen.in_front[0]
     fits = _OTHER[best.mount] if turned_board else best.mount
     straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
     turned = by_joints = _inverted_by_joints(lies, best)

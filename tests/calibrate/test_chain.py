@@ -33,6 +33,17 @@ def test_an_arm_is_learned_whole_however_it_is_mounted(name: str, views: int, sp
         assert np.abs(miss).max() < len(joints[0]) * rounding
 
 
+def test_views_of_one_posture_and_joints_that_rest_are_learned_from() -> None:
+    """Ten images at each of 15 stops; one joint is locked. Joints that all rest explain nothing."""
+    arm = DhArm("seven joints")
+    joints = arm.postures(np.random.default_rng(1), 15).repeat(10, axis=0)
+    flanges = arm.forward(joints)
+    assert learn_chain(joints, flanges).explains
+    assert not learn_chain(np.zeros_like(joints), flanges, 1).explains
+    joints[:, 2] = 0.1
+    assert learn_chain(joints, arm.forward(joints)).explains
+
+
 @pytest.mark.parametrize("name", ROWS)
 def test_errors_of_links_move_the_flange_as_stated(name: str) -> None:
     """Against the same arm with a small error behind each joint: they differ by what X or Y can take."""

@@ -205,6 +205,14 @@ def test_names_that_contradict_the_motion_are_no_answer(put: Callable[..., Path]
         believe(look(folder))
 
 
+def test_a_folder_of_images_named_like_poses_says_nothing_of_the_board(put: Callable[..., Path]) -> None:
+    folder = put(kuka)
+    (folder / "cam2board").mkdir()
+    for path in folder.glob("*.png"):
+        path.rename(folder / "cam2board" / path.name)
+    assert believe(look(folder)).dataset.mount == "eye-in-hand"
+
+
 @pytest.mark.parametrize("what", MISREAD)
 def test_a_mistake_is_named_or_read_as_meant(
     what: str, put: Callable[..., Path], images: tuple[Path, np.ndarray]

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from socket import AF_UNIX
+from socket import AF_UNIX, SHUT_WR
 from socket import socket as connection
 from typing import Annotated, Literal
 
@@ -22,6 +22,8 @@ from station.cell.socket_folder import default_socket, post_socket
 from station.cli.console import Socket, err
 from station.devices.posts import read_post
 
+ENDED_S = 5.0
+"""Longest wait for the daemon to read the last lines."""
 PERIOD_S = 0.02
 STANDS_S = 3.0
 """A typed pose is posted for so long: after it the arm may already be on its way to the next place."""
@@ -67,9 +69,17 @@ def post_command(
                     refused = link.recv(4096)
                 if not refused:
                     raise RobotError("post-no-station", socket=path, reason="it ended") from None
-            if refused:
-                err.print(json.loads(refused)["text"], style="red")
-                raise typer.Exit(1)
+            _exit_if(refused or b"")
+        link.shutdown(SHUT_WR)
+        link.settimeout(ENDED_S)
+        with suppress(OSError):
+            _exit_if(link.recv(4096))  # nothing, once all lines are read
+
+
+def _exit_if(refused: bytes) -> None:
+    if refused:
+        err.print(json.loads(refused)["text"], style="red")
+        raise typer.Exit(1)
 
 
 def _typed_lines(name: str, source: str) -> Iterator[bytes]:

@@ -22,6 +22,8 @@ from station.cell.layout import pose_vector
 
 UNIT_TOLERANCE = 1e-3
 """Of a quaternion's length, and of a matrix's rows: of numbers written with three digits or more."""
+LARGEST_S = 1e10
+"""A time beyond, three hundred years, was told in another unit."""
 TURNS_RAD = 4 * math.pi
 """A joint that has turned further was told in degrees."""
 
@@ -42,7 +44,7 @@ class Post(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Pose of the arm at one moment."""
 
     base_from_flange: tuple[float | tuple[float, ...], ...]
-    t: float | None = None
+    t: Annotated[float, msgspec.Meta(ge=-LARGEST_S, le=LARGEST_S)] | None = None
     """The program's monotonic clock, seconds; None: the pose is of when it arrives."""
     joints_rad: Joints | None = None
 

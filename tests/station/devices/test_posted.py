@@ -192,6 +192,7 @@ WRONG = {
     "not a number": (b'{"base_from_flange": [NaN,0,0,0,0,0,1]}\n', "post-unreadable"),
     "a jump": ({"base_from_flange": [0.4, -0.2, 0.45, *POSE[3:]]}, "post-jump"),
     "a turn in no time": ({"base_from_flange": [*POSE[:3], *POSE[4:], POSE[3]]}, "post-jump"),
+    "nanoseconds since 1970": ({"base_from_flange": POSE, "t": 1.8e18}, "post-unreadable"),
     "milliseconds": ({"base_from_flange": POSE, "t": 100_000.0}, "post-clock"),
 }  # fmt: skip
 
@@ -307,3 +308,12 @@ async def test_typed_numbers_count_for_a_while_only_as_the_arm_then_moves_on(arm
     await until(lambda: trouble(arm) == "post-silent")
     typing.stdin.close()
     assert await typing.wait() == 0
+
+
+async def test_a_refused_program_is_told_so_although_it_has_nothing_more_to_say(arm: PostedArm) -> None:
+    words = ["post", "--socket", str(arm.path.with_suffix(".sock"))]
+    posting = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "station.cli", *words, stdin=asyncio.subprocess.PIPE
+    )
+    await posting.communicate(b'{"source": "live", "robot": "another arm"}\n')
+    assert posting.returncode == 1

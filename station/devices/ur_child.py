@@ -22,7 +22,8 @@ import msgspec
 from recordings.errors import ErrorData
 from recordings.files import open_regular
 from station.cell.config import ControlPath
-from station.cell.errors import RobotError
+from station.cell.errors import RobotError, StaleStateError
+from station.devices.news import Delay
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -52,6 +53,8 @@ class _Answer(msgspec.Struct):
     lost: bool = False
     moved: str | None = None
     """Why the move was not taken; empty: it was."""
+    late_ms: float = 0.0
+    """Age of the heartbeat for whose lack it was not taken; 0: there was no lack."""
     stopped: bool = False
     died: bool = False
 
@@ -167,6 +170,9 @@ class ControlChild:
             raise self._trouble(f"did not acknowledge the move within {ACKNOWLEDGE_S:g} s") from None
         if reply.died:
             raise self._death()
+        if reply.moved and reply.late_ms:
+            effect = ": the move was not started"
+            raise StaleStateError(Delay.COMPUTER, late_ms=reply.late_ms, effect=effect)
         if reply.moved:
             raise RobotError("move-refused", reason=reply.moved)
 

@@ -11,7 +11,8 @@ Requests: {"do": "beat", "ns": N}   N: host monotonic time of the session loop; 
 Answers:  {"ready": true, "tcp": [6] | null} · {"refused": an `ErrorData`}
           {"beat": N, "ns": N, "kicked": bool, "lost": bool}   kicked: the beat was fresh and the script took
                                                                it, at `ns`; lost: the script is gone
-          {"moved": why not, empty: it was taken} · {"stopped": true}
+          {"moved": why not, empty: it was taken, "late_ms": age of a heartbeat that is too old, else 0}
+          {"stopped": true}
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class MotionServer:
             if verb == "beat":
                 self._beat(int(request["ns"]))
             elif verb == "move":
-                self.answer({"moved": self._move(request)})
+                self.answer({"late_ms": self._late_ms, "moved": self._move(request)})
             elif verb == "stop":
                 self._stopped = True
                 # Synchronously, because ur_rtde 1.6.5 carries out an asynchronous stopJ as a stopl of the
@@ -76,6 +77,11 @@ class MotionServer:
 
     def answer(self, reply: dict[str, object]) -> None:
         self._channel.send(json.dumps(reply).encode())
+
+    @property
+    def _late_ms(self) -> float:
+        """Age of the session's heartbeat where that alone refuses a move; 0: it does not."""
+        return 0.0 if self._stopped or self._fresh() else (time.monotonic_ns() - self._beat_ns) / 1e6
 
     def _fresh(self) -> bool:
         return time.monotonic_ns() - self._beat_ns <= BEAT_FRESH_NS

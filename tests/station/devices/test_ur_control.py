@@ -123,6 +123,13 @@ def test_a_script_that_took_no_kick_is_never_kicked_again(child: Conversation) -
     assert answers[2]["moved"] and "moveJ" not in child.library.names
 
 
+def test_a_move_that_only_a_late_heartbeat_refuses_tells_how_late(child: Conversation) -> None:
+    old = beat(age_ns=10 * BEAT_FRESH_NS)
+    late, stopped = (answer for answer in child.say(old, move(), STOP, move()) if "moved" in answer)
+    assert late["moved"] and late["late_ms"] >= 10 * BEAT_FRESH_NS / 1e6
+    assert stopped["moved"] and stopped["late_ms"] == 0.0
+
+
 STOP = {"do": "stop", "deceleration": 4.0}
 FRESH = beat(age_ns=-3600 * 10**9)
 """Fresh for the next hour."""
@@ -152,7 +159,7 @@ def test_nothing_moves(
 
 def test_the_watchdog_is_armed_before_every_move_and_moves_are_asynchronous(child: Conversation) -> None:
     answers = child.say(beat(), move(), move())
-    assert answers[1:] == [{"moved": ""}] * 2
+    assert [answer["moved"] for answer in answers[1:]] == ["", ""]
     names = child.library.names
     assert [names[i - 1] for i, name in enumerate(names) if name == "moveJ"] == ["setWatchdog"] * 2
     assert ("moveJ", (True,)) in child.library.calls
@@ -257,6 +264,14 @@ async def test_a_move_that_was_not_taken_raises(parent: Parent) -> None:
     assert (await parent.asked())["do"] == "move"
     parent.answer({"moved": "a stop was asked for"})
     with raises("move-refused"):
+        await moving
+
+
+async def test_a_move_for_which_a_heartbeat_is_missing_was_refused_by_a_late_computer(parent: Parent) -> None:
+    moving = asyncio.create_task(parent.child.move([0.0] * 6, 0.5, 0.5))
+    assert (await parent.asked())["do"] == "move"
+    parent.answer({"moved": "the session's heartbeat is missing", "late_ms": 140.0})
+    with raises("computer-late", late_ms=140.0):
         await moving
 
 

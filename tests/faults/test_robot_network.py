@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -38,13 +40,15 @@ def host() -> Iterator[str]:
     """Name of the namespace that `ROBOT` is in, with a controller; the link is `link-NAME` on both sides."""
     name = f"r{os.getpid() % 100_000}"
     link = f"link-{name}"
-    try:
-        ip("netns", "add", name)
-        ip("link", "add", link, "type", "veth", "peer", "name", link, "netns", name)
-    except subprocess.CalledProcessError as error:
-        pytest.skip(f"no network namespaces here: {error.stderr.decode().strip()}")
+    turn = (Path(tempfile.gettempdir()) / "station-network-tests").open("w")
+    fcntl.flock(turn, fcntl.LOCK_EX)  # all have the same addresses, and the serial of one robot
     far = None
     try:
+        try:
+            ip("netns", "add", name)
+            ip("link", "add", link, "type", "veth", "peer", "name", link, "netns", name)
+        except subprocess.CalledProcessError as error:
+            pytest.skip(f"no network namespaces here: {error.stderr.decode().strip()}")
         ip("addr", "add", f"{STATION}/30", "dev", link)
         ip("link", "set", link, "up")
         ip("-n", name, "addr", "add", f"{ROBOT}/30", "dev", link)
@@ -57,7 +61,9 @@ def host() -> Iterator[str]:
     finally:
         if far is not None:
             far.communicate(b"\n")
-        ip("netns", "del", name)
+        for words in (("link", "del", link), ("netns", "del", name)):  # a link goes later than its namespace
+            subprocess.run(["ip", *words], capture_output=True)
+        turn.close()
 
 
 async def down(name: str, seconds: float) -> None:

@@ -6,6 +6,7 @@ and exported like it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,11 +21,10 @@ from calibrate.geometry import Array
 from calibrate.projection import project_pixels
 from calibrate.recorded_views import Progress, load_views
 from calibrate.views import board_in_camera
-from recordings.exporters.excerpt import copied
 from recordings.reader import Recording
-from recordings.schema.messages import CameraModel, Matrix4, View
+from recordings.schema.messages import CameraModel, Image, Matrix4, View
 from recordings.schema.viewing import DETECTED, Entity, Marks, Polyline
-from recordings.writer import derived_recording
+from recordings.writer import RecordingWriter, derived_recording
 
 USED, REJECTED, PREDICTED = DETECTED, (0.95, 0.1, 0.1), (1.0, 0.8, 0.1)
 MAGNIFIED = 50.0
@@ -79,14 +79,35 @@ def annotate(
         for place in (calibration.result, calibration.board_place):
             T: Matrix4 = tuple(tuple(map(float, row)) for row in place.transform.matrix)
             writer.frame(place.parent_frame, place.child_frame, T)
-        copies = copied(recording, writer, replaced=["calibration.yaml"])
-        for (_, image), of_view, residual in zip(copies, marks, found, strict=True):
+        copies = _copied(recording, writer)
+        for image, of_view, residual in zip(copies, marks, found, strict=True):
             writer.marks(image.sequence, of_view, _text(residual))
         pairs = zip(recording.views(), found, strict=True)
         cameras = [_camera_entity(calibration, camera, view, residual) for view, residual in pairs]
         writer.scene(0, [_board_entity(calibration), *cameras])
         writer.finish()
     return found
+
+
+def _copied(recording: Recording, writer: RecordingWriter) -> Iterator[Image]:
+    """Copy the content, retaken views and an earlier calibration left out; yield each image once written."""
+    kinds = recording.media_types()
+    for name, content in recording.attachments().items():
+        if name != "calibration.yaml":
+            writer.attach(name, kinds[name], content)
+    for state in recording.robot_states():
+        writer.robot_state(state)
+    for segment in recording.segments:
+        for reading in segment.clock_readings():
+            writer.clock_reading(reading)
+    for event in recording.events():
+        writer.event(event)
+    for sequence, (view, image) in enumerate(recording.images()):
+        stored = recording.stored_image(view)
+        image = msgspec.structs.replace(image, sequence=sequence)
+        writer.image(image, stored[1] if stored else None)
+        writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
+        yield image
 
 
 def _marks(

@@ -17,11 +17,10 @@ from types import TracebackType
 from typing import Any, Self
 
 import msgspec
-from mcap.records import Message
 
 from recordings.errors import RecordingError, disk_error, exists_error, recover_line, wrong_size_error
 from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, rename_new, sync_folder
-from recordings.images import ImageError, encode_png, read_header
+from recordings.images import ImageError, read_header
 from recordings.mcap.output import OutputFile
 from recordings.mcap.records import with_crc
 from recordings.schema import viewing
@@ -55,8 +54,8 @@ class RecordingWriter:
     Raises RecordingError from every method; after a write error `recordings recover` takes the `.part` file.
     """
 
-    def __init__(self, path: Path, info: SessionInfo, *, lossless_png: bool = False) -> None:
-        """Creates `path` + '.part'. `lossless_png` compresses images (half the size, 20 ms each)."""
+    def __init__(self, path: Path, info: SessionInfo) -> None:
+        """Creates `path` + '.part'."""
         if path.suffix != ".mcap":
             raise RecordingError("recording-name", path=path)
         if not is_session_name(info.name):
@@ -67,7 +66,6 @@ class RecordingWriter:
         self.part_path = path.with_name(path.name + PART_SUFFIX)
         self.info = info
         self.error: RecordingError | None = None
-        self._lossless_png = lossless_png
         self._start_ns = info.created_wall_ns or time.time_ns()
         self._channels: dict[Topic, _Channel] = {}
         self._images: dict[int, int] = {}
@@ -133,8 +131,6 @@ class RecordingWriter:
         self._add(Topic.CLOCK_READING, encode(reading), time_ns)
 
     def _image(self, image: Image, encoded: bytes | None, time_ns: int) -> tuple[Topic, Any]:
-        if encoded is None and self._lossless_png:
-            encoded = encode_png(image.pixels)
         if encoded is None:
             return Topic.RAW_IMAGE, viewing.raw_image(image.pixels, image.pixel_format, time_ns)
         return Topic.COMPRESSED_IMAGE, viewing.compressed_image(encoded, read_header(encoded).format, time_ns)
@@ -177,10 +173,6 @@ class RecordingWriter:
         time_ns = self._start_ns if stamps is None else self._time_ns(stamps)
         message = viewing.frame_transform(parent, child, parent_from_child, time_ns)
         self._show(Topic.BOARD_TRANSFORM if child == "board" else Topic.FIXED_TRANSFORM, message, time_ns)
-
-    def shown(self, topic: Topic, message: Message) -> None:
-        """Copy a message for viewers from another recording of the session, unchanged."""
-        self._add(topic, message.data, message.log_time)
 
     def _show(self, topic: Topic, message: Any, time_ns: int, sequence: int | None = None) -> None:
         self._add(topic, message.SerializeToString(), time_ns, sequence)
@@ -317,11 +309,9 @@ class _Channel:
 
 
 @contextmanager
-def derived_recording(
-    path: Path, info: SessionInfo, *, lossless_png: bool = False
-) -> Iterator[RecordingWriter]:
+def derived_recording(path: Path, info: SessionInfo) -> Iterator[RecordingWriter]:
     """Write what is made from something that stays: nothing is left behind when the block fails."""
-    writer = RecordingWriter(path, info, lossless_png=lossless_png)
+    writer = RecordingWriter(path, info)
     try:
         yield writer
     except BaseException as problem:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
@@ -93,11 +91,9 @@ def run_batch(
                 append_line(output / RESULTS, result)
                 if progress:
                     progress(count, len(todo), result)
-        results = [done[key] for _, key in tasks]
-        write_output(output / "results.csv", _csv(results))
     except OSError as problem:
         raise BatchError("batch-folder", folder=output, why=problem.strerror or str(problem)) from None
-    return results
+    return [done[key] for _, key in tasks]
 
 
 def batch_key(recording: Path, options: JobOptions) -> str:
@@ -156,14 +152,3 @@ def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchR
         calibration=name,
         content_sha256=content_sha256(plain),
     )
-
-
-def _csv(results: Iterable[BatchResult]) -> bytes:
-    text = io.StringIO(newline="")
-    names = [name for name in BatchResult.__struct_fields__ if name not in ("key", "covariance")]
-    writer = csv.writer(text)
-    writer.writerow(names)
-    for result in results:
-        cells = [getattr(result, name) for name in names]
-        writer.writerow([" ".join(map(str, cell)) if isinstance(cell, tuple) else cell for cell in cells])
-    return text.getvalue().encode()

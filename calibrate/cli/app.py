@@ -38,9 +38,10 @@ COMMANDS = {
     "install": LazyCommand(
         f"{_FILES}:install",
         (
-            "calibrate install cell.yaml --cell-config station.yaml",
+            "calibrate install cell.yaml",
             "calibrate install mine.yaml --cell imported --root my-cell  # of your own images",
         ),
+        gone={"--cell-config": "Leave it out: programs name their robot and camera to load_installed."},
     ),
     "list": LazyCommand(
         f"{_FILES}:list_installed", ("calibrate list", "calibrate list --root my-cell"), gone=_ONE_KIND
@@ -52,11 +53,6 @@ COMMANDS = {
     ),
     "withdraw": LazyCommand(
         f"{_FILES}:withdraw", ("calibrate withdraw 'a pallet hit the camera'",), rare=True
-    ),
-    "metrics": LazyCommand(
-        "calibrate.cli.metrics:metrics",
-        ("calibrate metrics", "calibrate metrics -o /var/lib/node_exporter/calibration.prom"),
-        rare=True,
     ),
     "follow": LazyCommand("calibrate.cli.follow:follow", ("calibrate follow --camera overhead",), rare=True),
     "drift-check": LazyCommand(
@@ -99,7 +95,8 @@ CALIBRATE = LazyGroup(
     gone={
         "check": "Use drift-check.",
         "diff": "`calibrate show` shows each; `calibrate install` tells how far it is from the one before.",
-        "fleet": "Run `calibrate metrics` on each cell.",
+        "fleet": "Run `calibrate list --json` on each cell.",
+        "metrics": "Use `calibrate list --json`: versions, validity and σ of every camera.",
         "report": "Use `calibrate solve REC --report FILE`.",
         "watch": "`calibrate drift-check FOLDER` tests production pictures; run it from a timer.",
         "sweep": "Frame times carry their own bound; `station doctor` shows it.",

@@ -48,7 +48,7 @@ def batch(
 ) -> None:
     """Solve many recordings; resumable.
 
-    OUTPUT then holds a calibration each, results.jsonl and results.csv.
+    OUTPUT then holds a calibration each and results.jsonl.
     The limits are those of one solve in a process here; on a cluster the workers' own hold.
     Exit codes: 0 all solved, 3 some recordings could not be solved.
     """
@@ -77,7 +77,7 @@ def _tell(results: list[BatchResult], output: Path) -> None:
     failed = [result for result in results if not result.solved]
     out.print(
         f"{len(results)} recordings: {good} PASS, {len(results) - good - len(failed)} FAIL, "
-        f"{len(failed)} not solved. {output}/results.csv, results.jsonl"
+        f"{len(failed)} not solved. {output}/results.jsonl"
     )
     for result in failed:
         err.print(f"{Path(result.recording).name}: {result.error}", soft_wrap=True)

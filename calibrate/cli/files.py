@@ -1,9 +1,9 @@
-"""Boards, cameras and cells from files that a person names on the command line."""
+"""Boards and cameras from files that a person names on the command line."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -46,30 +46,6 @@ def read_camera(path: Path) -> tuple[CameraModel, dict[str, float]]:
     camera_matrix(camera)
     distortion(camera)
     return camera, {}
-
-
-class CellFacts(NamedTuple):
-    """Facts of a station's configuration on its calibrations; empty or None where it says nothing."""
-
-    robot_serial: str
-    camera_serial: str
-    camera: str
-    max_age_days: float | None
-
-
-def read_cell(path: Path) -> CellFacts:
-    """Read them from a station's configuration. Raises UsageError."""
-    plain = _read(path, "a station's configuration")
-    robot, camera, rule = plain.get("robot"), plain.get("camera"), plain.get("validity") or {}
-    if not isinstance(robot, dict) or not isinstance(camera, dict) or not isinstance(rule, dict):
-        raise UsageError(
-            "input-file", path=path, why="no station configuration, robot and camera are missing"
-        )
-    days = rule.get("max_age_days")
-    if not isinstance(days, int | float | None):
-        raise UsageError("input-file", path=path, why=f"validity.max_age_days {days!r} is no number of days")
-    robot_serial, camera_serial = (str(device.get("serial") or "") for device in (robot, camera))
-    return CellFacts(robot_serial, camera_serial, str(camera.get("name") or ""), days)
 
 
 def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:

@@ -11,7 +11,6 @@ import msgspec
 import typer
 
 from calibrate.cli.contracts import InstalledJson, ListedJson
-from calibrate.cli.files import CellFacts, read_cell
 from calibrate.cli.output import AsJson, check_target, err, out, print_json
 from calibrate.errors import UsageError
 from calibrate.files import exports
@@ -119,9 +118,6 @@ def install(
         installing.Cell,
         typer.Option(help="Kind of cell the root belongs to; others than real need --root"),
     ] = "real",
-    cell_config: Annotated[
-        Path | None, typer.Option(help="The station's configuration: robot, camera, greatest age of a proof")
-    ] = None,
     camera: Annotated[str, typer.Option(help="Name of the camera (default: as in the file)")] = "",
     max_age_days: Annotated[
         float | None,
@@ -142,20 +138,12 @@ def install(
     """
     if root is None and cell != "real":
         raise UsageError("root-missing", cell=cell)
-    facts = CellFacts("", "", "", None) if cell_config is None else read_cell(cell_config)
     made = installing.install(
-        file,
-        root,
-        cell=cell,
-        camera=camera or facts.camera,
-        override=override,
-        robot_serial=facts.robot_serial,
-        camera_serial=facts.camera_serial,
-        max_age_days=facts.max_age_days if max_age_days is None else max_age_days,
+        file, root, cell=cell, camera=camera, override=override, max_age_days=max_age_days
     )
     _switched(made, as_json)
     if not as_json:
-        camera = camera or facts.camera or read_calibration(made.path).camera_name
+        camera = camera or read_calibration(made.path).camera_name
         out.print(f"To undo: {installing.undo_line(root, camera)}", soft_wrap=True)
 
 

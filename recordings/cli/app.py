@@ -22,9 +22,8 @@ RECORDINGS = LazyGroup(
         "export": LazyCommand(
             "recordings.cli.commands:export_command",
             (
-                "recordings export session.mcap --to csv -o tables",
                 "recordings export session.mcap --to folder -o images  # edit, then import",
-                "recordings export session.mcap --to excerpt -o small.mcap",
+                "recordings export session.mcap --to ros2 -o bag",
             ),
         ),
         "recover": LazyCommand(
@@ -34,5 +33,5 @@ RECORDINGS = LazyGroup(
     },
     help="Look into, make, convert and rescue recordings.",
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage, 3 done with loss.",
-    gone={"excerpt": "Use `recordings export REC --to excerpt -o small.mcap`."},
+    gone={"excerpt": "Copy the recording, or use `recordings export REC --to folder -o images`."},
 )

@@ -43,17 +43,11 @@ def export_command(
     output: Annotated[Path, typer.Option("-o", "--output", help="What to write; it must not exist.")],
     to: Annotated[
         Target,
-        typer.Option(
-            "--to",
-            help="folder: images and poses, for `import`; csv: tables; ros2: a bag; excerpt: an .mcap file.",
-        ),
+        typer.Option("--to", help="folder: images and poses, for `import`; ros2: a bag."),
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Write images and poses, tables, a ROS 2 bag, or an excerpt.
-
-    An excerpt solves like the whole: its images are lossless PNG, its robot states those around the images.
-    """
+    """Write images and poses, or a ROS 2 bag."""
     from recordings.exporters.export import export_recording
 
     path = export_recording(open_recording(recording), output, to)

@@ -1,6 +1,6 @@
-"""Recordings for other people's programs: folders and tables, ROS 2 bags, smaller recordings."""
+"""Recordings for other people's programs: folders of images, ROS 2 bags."""
 
 from typing import Literal
 
-Target = Literal["folder", "csv", "ros2", "excerpt"]
+Target = Literal["folder", "ros2"]
 """Kind of output of `recordings export`."""

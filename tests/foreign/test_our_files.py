@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings.exporters.excerpt import write_excerpt
-from recordings.reader import open_recording
 from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.schema.viewing import DETECTED, Entity, Marks, Polyline
@@ -47,10 +45,6 @@ def _at(message, stamps):  # type: ignore[no-untyped-def]
     return replace(message, stamps=stamps)
 
 
-def excerpt(folder: Path) -> Path:
-    return write_excerpt(open_recording(fresh(folder)), folder / "excerpt.mcap")
-
-
 def recovered(folder: Path) -> Path:
     path = fresh(folder)
     data = bytearray(path.read_bytes())
@@ -59,7 +53,7 @@ def recovered(folder: Path) -> Path:
     return recover_recording(path, folder / "saved.mcap")[0].path
 
 
-FILES = {"fresh": fresh, "sample": lambda folder: SAMPLE, "excerpt": excerpt, "recovered": recovered}
+FILES = {"fresh": fresh, "sample": lambda folder: SAMPLE, "recovered": recovered}
 
 
 @pytest.mark.parametrize("judge", JUDGES)

@@ -92,21 +92,3 @@ def test_files_that_people_write(findings: Findings) -> None:
     assert findings("plan", plan) == []
     assert findings("plan", {**plan, "poses": "25"})
     assert findings("calibration", {"format": "handeye-calibration/1", "result": 5})
-
-
-def test_prometheus_reads_the_metrics(tmp_path: Path) -> None:
-    parse = library("prometheus_client.parser", "prometheus-client").text_string_to_metric_families
-    place = ("--root", tmp_path / "cell")
-    file = tmp_path / "c.yaml"
-    assert run("solve", SAMPLE, "-o", file, cwd=tmp_path).returncode in (0, 4)
-    cell = decode_calibration(file.read_bytes(), "c").source
-    for camera in ("main", "overhead"):
-        named = ("--cell", cell, "--camera", camera, "--override", "a trial of it")
-        done = run("install", file, *named, *place, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-    run("withdraw", "a pallet hit it", "--camera", "overhead", *place, cwd=tmp_path)
-    families = list(parse(run("metrics", *place, cwd=tmp_path).stdout))
-    assert all(family.documentation and family.type == "gauge" for family in families)
-    (states,) = (family for family in families if family.name == "calibration_validity")
-    held = {sample.labels["camera"]: sample.labels["state"] for sample in states.samples if sample.value}
-    assert held == {"main": "valid", "overhead": "withdrawn"}

@@ -157,7 +157,7 @@ def test_a_missing_part_is_shown_by_info_and_given_up_by_recover(tmp_path: Path)
     shown = run("info", tmp_path)
     assert shown.returncode == 3 and "session-2.mcap" in "".join(shown.stdout.split())
     assert len(json.loads(run("info", tmp_path, "--json").stdout)["missing"]) == 1
-    assert run("export", tmp_path, "--to", "excerpt", "-o", tmp_path / "b.mcap").returncode == 1
+    assert run("export", tmp_path, "--to", "folder", "-o", tmp_path / "b").returncode == 1
     for _ in range(2):
         assert run("recover", tmp_path).returncode == 3
         assert not list(tmp_path.glob("*.damaged"))

@@ -1,8 +1,7 @@
-"""Exports come back through other readers' own rules: import, csv."""
+"""Exports come back through other readers' own rules."""
 
 from __future__ import annotations
 
-import csv
 import errno
 from pathlib import Path
 
@@ -13,23 +12,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings.cli import main
-from recordings.exporters.excerpt import write_excerpt
 from recordings.exporters.export import export_recording
+from recordings.images import encode_png
 from recordings.importers.folder import import_folder
 from recordings.mcap.output import OutputFile
 from recordings.reader import open_recording
-from recordings.schema.messages import Stamps, matrix_from_quaternion
-from recordings.schema.topics import Topic
-from recordings.schema.viewing import DETECTED, Marks, quaternion_xyzw
+from recordings.schema.messages import matrix_from_quaternion
+from recordings.schema.viewing import quaternion_xyzw
 from recordings.writer import RecordingWriter
 from tests.command_line import call
 from tests.recordings.small_recording import (
-    START_NS,
-    TURNED,
     make_image,
     make_info,
     make_picture,
-    make_state,
     make_view,
     refused,
 )
@@ -56,37 +51,13 @@ def test_an_imported_file_is_exported_byte_for_byte(folder: Path, tmp_path: Path
         assert (out / f"images/{index:03d}.png").read_bytes() == (folder / f"images/{index}.png").read_bytes()
 
 
-def test_tables_hold_every_value_in_full_precision(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        for count in range(4):
-            writer.robot_state(make_state(count))
-        for sequence, attempt in enumerate([1, 2]):
-            writer.image(make_picture(sequence))
-            writer.view(make_view(0, sequence, attempt))
-        recording = open_recording(writer.finish())
-    out = export_recording(recording, tmp_path / "out", "csv")
-    tables = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in out.iterdir()}
-    assert {name: len(rows) for name, rows in tables.items()} == {
-        "robot_states": 4,
-        "pictures": 2,
-        "views": 2,
-        "events": 0,
-        "camera_clock": 0,
-    }
-    state = tables["robot_states"][3]
-    assert float(state["joints_rad.2"]) == make_state(3).joints_rad[1]
-    assert int(state["stamps.host_monotonic_ns"]) == make_state(3).stamps.host_monotonic_ns
-    assert [row["attempt"] for row in tables["views"]] == ["1", "2"]
-    assert float(tables["views"][0]["base_from_flange.3.4"]) == TURNED[2][3]
-
-
 def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.mkdir()
     with refused("exists"):
-        export_recording(open_recording(small), taken, "csv")
+        export_recording(open_recording(small), taken, "folder")
     with refused("disk", errno=errno.ENOENT):
-        export_recording(open_recording(small), tmp_path / "no" / "out", "csv")
+        export_recording(open_recording(small), tmp_path / "no" / "out", "folder")
     assert list(taken.iterdir()) == []
     assert not (tmp_path / "no").exists()
 
@@ -99,37 +70,10 @@ def test_an_export_that_fails_halfway_leaves_nothing(small: Path, tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
-def test_an_excerpt_keeps_the_views_and_the_states_around_them(tmp_path: Path) -> None:
-    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.attach("plan.yaml", "application/yaml", b"poses: 2\n")
-        writer.frame("base", "board", TURNED)
-        for count in range(1000):  # 2 s at 500 Hz
-            writer.robot_state(make_state(count))
-        for sequence, (index, attempt, at_s) in enumerate([(0, 1, 0.2), (0, 2, 0.5), (1, 1, 1.5)]):
-            writer.image(make_picture(sequence))
-            writer.marks(sequence, [Marks(np.array([[3.0, 4.0]]), DETECTED)])
-            stamps = Stamps(host_monotonic_ns=round(at_s * 1e9), host_wall_ns=START_NS)
-            writer.view(msgspec.structs.replace(make_view(index, sequence, attempt), stamps=stamps))
-        original = open_recording(writer.finish())
-    excerpt = open_recording(write_excerpt(original, tmp_path / "b.mcap", window_s=0.1))
-    assert [(v.index, v.attempt) for v in excerpt.views()] == [(0, 2), (1, 1)]
-    np.testing.assert_array_equal(excerpt.image(excerpt.views()[0]).pixels, make_image(1))
-    kept_s = [state.stamps.host_monotonic_ns / 1e9 for state in excerpt.robot_states()]
-    assert kept_s == pytest.approx(
-        [0.4 + 0.002 * i for i in range(101)] + [1.4 + 0.002 * i for i in range(101)]
-    )
-    assert excerpt.attachments() == original.attachments()
-    (whole,), (part,) = original.segments, excerpt.segments
-    for topic in (Topic.BOARD_TRANSFORM, Topic.ANNOTATIONS):
-        shown = [[(m.log_time, m.data) for m in s.stored(topic)] for s in (part, whole)]
-        assert shown[0] == shown[1] != []
-
-
-@pytest.mark.parametrize("make", ["import", "excerpt"])
 def test_a_full_disk_leaves_no_half_of_a_recording_that_can_be_made_again(
-    small: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: str
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recording, real_write = open_recording(small), OutputFile.write
+    real_write = OutputFile.write
 
     def write(file: OutputFile, data: bytes) -> int:
         if file.size_bytes > 2000:
@@ -139,11 +83,11 @@ def test_a_full_disk_leaves_no_half_of_a_recording_that_can_be_made_again(
     monkeypatch.setattr(OutputFile, "write", write)
     output = tmp_path / "out.mcap"
     with refused("disk", errno=errno.ENOSPC):
-        import_folder(folder, output) if make == "import" else write_excerpt(recording, output)
+        import_folder(folder, output)
     assert not list(tmp_path.glob("out*"))
 
 
-@pytest.mark.parametrize("target", ["folder", "csv", "ros2"])
+@pytest.mark.parametrize("target", ["folder", "ros2"])
 def test_the_command_line_writes_each_target(small: Path, tmp_path: Path, target: str) -> None:
     result = call(main, "export", small, "--to", target, "-o", tmp_path / "out")
     assert result.returncode == 0, result.stderr
@@ -161,11 +105,11 @@ def test_quaternions_turn_as_scipy_says_and_back() -> None:
         np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), turn.as_matrix(), atol=1e-12)
 
 
-@pytest.mark.parametrize("lossless_png", [False, True])
-def test_a_colour_mosaic_leaves_in_colours(tmp_path: Path, lossless_png: bool) -> None:
+@pytest.mark.parametrize("encoded", [None, encode_png(make_image(0))])
+def test_a_colour_mosaic_leaves_in_colours(tmp_path: Path, encoded: bytes | None) -> None:
     """Nothing in a folder could say that it is one."""
-    with RecordingWriter(tmp_path / "a.mcap", make_info(), lossless_png=lossless_png) as writer:
-        writer.image(msgspec.structs.replace(make_picture(0), pixel_format="BayerGR8"))
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.image(msgspec.structs.replace(make_picture(0), pixel_format="BayerGR8"), encoded)
         writer.view(make_view(0))
         recording = open_recording(writer.finish())
     folder = export_recording(recording, tmp_path / "out", "folder")

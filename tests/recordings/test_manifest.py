@@ -8,7 +8,6 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from recordings.exporters.excerpt import write_excerpt
 from recordings.manifest import MANIFEST_FILE, Manifest, enter_part, read_manifest
 from recordings.reader import open_recording
 from recordings.recover import recover_recording
@@ -64,9 +63,7 @@ def test_recover_gives_a_missing_part_up_and_every_reader_says_so(session: Path,
     assert lost.missing
     assert lost.path.name == "session-3.mcap"
     recording = open_recording(session)
-    (loss,) = recording.losses
-    excerpt = write_excerpt(recording, tmp_path / "small.mcap")
-    assert loss in open_recording(excerpt).info.note
+    assert len(recording.losses) == 1
     kept.rename(session / "session-3.mcap")
     assert open_recording(session).losses == ()
     assert len(open_recording(session).segments) == 3

@@ -31,6 +31,7 @@ from calibrate.projection import camera_matrix, distortion, project_pixels
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from recordings.schema.stillness import WINDOW_S, scatter
+from station.analysis.estimation import quick_sigma
 from station.analysis.guidance import NextView, next_view, rim, way_to
 from station.analysis.worker import CapturedView
 from station.cell.config import CaptureConfig, StillnessConfig
@@ -100,8 +101,9 @@ def session(task: tuple[str, Mount, int]) -> tuple[float, ...]:
 
 
 def enough(taken: ViewSet, wanted: NextView) -> bool:
-    goal_m = CaptureConfig().goal_m
-    return len(taken) >= FEWEST_BY_HAND and wanted.sigma_m is not None and wanted.sigma_m <= goal_m
+    if len(taken) < FEWEST_BY_HAND or (found := wanted.found) is None:
+        return False
+    return quick_sigma(found.views, BOARD, found.X, found.Y, True)[0] <= CaptureConfig().goal_m
 
 
 def seen(view: BoardView) -> CapturedView:

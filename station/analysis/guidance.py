@@ -61,10 +61,8 @@ class NextView:
     """The wanted view, (4, 4)"""
     found: FoundCell | None = None
     """The cell by the views so far; None: they are not enough."""
-    sigma_m: float | None = None
-    """Predicted 1σ of X's translation (root of the summed variances) by the views so far."""
     after_m: float | None = None
-    """The same with the wanted view."""
+    """Predicted 1σ of X's translation (root of the summed variances) with the wanted view."""
 
     @property
     def outline(self) -> Array:
@@ -129,8 +127,7 @@ def next_view(
     each = view_information(mount, lens, flange, X, Y, points, USUAL_NOISE)
     known, gains = each[: len(at)].sum(axis=0), each[len(at) :]
     best = int(np.argmin(objective(known + gains)))
-    now_m, after_m = (sigma_of(total, prior)[0] for total in (known, known + gains[best]))
-    return NextView(mount, board, lens, at, pool[best], found, now_m, after_m)
+    return NextView(mount, board, lens, at, pool[best], found, sigma_of(known + gains[best], prior)[0])
 
 
 def way_to(wanted: NextView, seen: CapturedView) -> Way:

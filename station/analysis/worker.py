@@ -105,10 +105,13 @@ def sight(
         full = camera.width / image.shape[1]  # previews may be smaller than the camera's images
         pixels = (found.pixels + 0.5) * full - 0.5
         distance_m, tilt_rad = _distance_and_tilt(pixels, board_points(board)[found.indices], camera)
-    cause = advice = ""
+    cause: str = found.cause
+    advice = ""
     if exposure is not None:
         light = assess(image, found.pixels if found.found else None, *exposure)
-        cause, advice = light.cause, light.text
+        advice = light.text
+        if cause in ("", "not-found"):
+            cause = light.cause or cause
     status = DetectionStatus(
         found=found.found,
         reason=found.reason,

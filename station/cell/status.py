@@ -171,7 +171,7 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     tilt_rad: float | None = None
     distance_m: float | None = None
     cause: str = ""
-    """over-exposed, under-exposed or blurred; empty: none."""
+    """Why no board was found, or over-exposed, under-exposed, blurred; empty: nothing is wrong."""
     advice: str = ""
     """What is wrong with light or focus, and what to set; empty: nothing."""
 
@@ -224,8 +224,6 @@ class GuidanceStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """How still arm and image are, 0…1; 1: a view may be taken."""
     moves: str = ""
     """What still moves; empty: nothing."""
-    new: bool = False
-    """The view differs from all that were taken."""
     after_mm: float | None = None
     """Expected error after the wanted view; now: `EstimateStatus.sigma_translation_mm`."""
     cause: str = ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -21,8 +22,8 @@ from station.cli.console import err
 from station.cli.daemon import answers, ensure_daemon, own_daemon, tell_what_goes_on, user_config
 from station.devices.aravis import AravisCamera
 from station.devices.discovery import discover, discover_usb
-from station.devices.ur_dashboard import STOP, DashboardError
-from station.devices.ur_link import UrLink
+from station.devices.ur_dashboard import STOP
+from station.devices.ur_link import UrLink, not_connected
 from station.devices.ur_probe import identify, open_dashboard, unsupported_model
 from station.devices.webcam import WebcamCamera, discover_webcams
 from station.operate.draft import POSTED, ArmReader, CameraChoice, CameraReader
@@ -38,11 +39,9 @@ class GuidedArm(UrLink):
             return str(problem)
 
     async def stop(self) -> None:
-        if self.dashboard is not None and self.dashboard.alive:
-            try:
-                await self.dashboard.ask(STOP)
-            except DashboardError as problem:
-                err.print(str(problem))
+        if self.dashboard is None:
+            raise not_connected(self.config.host)
+        await self.dashboard.ask(STOP)
 
 
 class PostedReader:
@@ -55,6 +54,9 @@ class PostedReader:
 
     def latest(self) -> RobotState:
         raise StaleStateError("post-nobody", robot=self.identity.model, socket=post_socket(default_socket()))
+
+    def subscribe(self, callback: Callable[[RobotState], None]) -> None:
+        """Its states come to the daemon."""
 
     def trouble(self) -> str:
         return ""

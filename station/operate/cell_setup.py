@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,24 +11,18 @@ import msgspec
 import numpy as np
 
 from calibrate.boards.corners import to_grey
-from calibrate.boards.detect import Detection, detect
 from calibrate.boards.grids import seen_size
+from recordings.images import viewable
 from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotState
-from station.analysis.found_cell import FoundCell
-from station.analysis.guidance import NextView, Way, motion_px, next_view, way_to
-from station.analysis.worker import CapturedView
+from station.analysis.hand_guide import HandGuide
+from station.analysis.worker import BoardDetection, CapturedView, sight
+from station.cell.config import StillnessConfig
 from station.cell.errors import RobotError, StationError
+from station.cell.layout import flange_pose
+from station.cell.status import GuidanceStatus
+from station.cell.stillness import StillnessMonitor
 from station.operate import draft as drafts
 from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep, Draft, Hardware
-from station.operate.guided_views import (
-    STILL_PX,
-    STILL_RAD_S,
-    STILL_S,
-    captured,
-    find_cell,
-    guided_view,
-    image_trouble,
-)
 
 GREY_WANTED = 110.0
 """Mean grey of a well exposed image of paper and table, of 255."""
@@ -50,27 +44,13 @@ class CellSetup:
         """Mounting that is selected."""
         self.state: RobotState | None = None
         """Newest state of the arm; None: it does not answer."""
-        self._moved_s = time.monotonic()
-        self.seen: tuple[float, Detection] | None = None
-        """Time at which the newest image was requested, and the board in it."""
+        self.seen: BoardDetection | None = None
+        """The board in the newest image; None: it was not looked for."""
         self.counts: tuple[int, int] | None = None
         """Inner corners of a chessboard in the image, counted while no board is known."""
-        self.wanted: NextView | None = None
-        """View that would help most after those so far; None: not chosen yet."""
-        self._wanted_for: Draft | None = None
-        self.way = Way("", False)
-        """From the newest image to it."""
-        self.trouble = ""
-        """What is wrong with the newest image; empty: nothing."""
-
-    @property
-    def found(self) -> FoundCell | None:
-        """Camera and board pose by the views so far; None: not determined."""
-        return find_cell(self.draft)
-
-    @property
-    def rests(self) -> bool:
-        return time.monotonic() > self._moved_s + STILL_S
+        self.guide: HandGuide | None = None
+        self.guidance = GuidanceStatus()
+        self._stillness = StillnessMonitor(StillnessConfig())
 
     def keep(self, draft: Draft) -> None:
         """Set and save the draft. StationError when it cannot be saved; it is then kept in memory."""
@@ -89,7 +69,8 @@ class CellSetup:
         arm = await self._hardware.arm(host)
         if self.arm is not None:
             await self.arm.close()
-        self.arm = arm
+        self.arm, self._stillness = arm, StillnessMonitor(StillnessConfig())
+        arm.subscribe(self._stillness.add)
         same = self.draft.robot is not None and self.draft.robot.serial == arm.identity.serial
         self._found(same, host=host, robot=arm.identity)
 
@@ -117,66 +98,54 @@ class CellSetup:
 
     def _found(self, same: bool, **values: object) -> None:
         """Keep what a device tells; views of another device count no more."""
-        self.keep(
-            msgspec.structs.replace(self.draft, **values) if same else self.draft.without_views(**values)
-        )
+        if not same:
+            values = {"views": (), "written": "", **values}
+        self.keep(msgspec.structs.replace(self.draft, **values))
+        self.guide = None
 
     def read_arm(self) -> None:
         """Take the newest state; none while the arm does not answer."""
-        now_s, self.state = time.monotonic(), None
+        self.state = None
         with suppress(RobotError):
             self.state = None if self.arm is None else self.arm.latest()
-        if self.state is None:
-            self._moved_s = max(self._moved_s, now_s)
-        elif max(map(abs, self.state.joint_speeds_rad_s)) > STILL_RAD_S:
-            self._moved_s = now_s
 
-    def look(self, begun_s: float, image: Image, step: CellStep) -> Detection | None:
-        """Look for the board; None in steps that do not ask for it. A tenth of a second, in any thread."""
-        board = self.draft.board
-        if board is None and step is CellStep.BOARD and self.counts is None:
-            self.counts = seen_size(to_grey(image.pixels))
-        if board is None or step not in _LOOKED_FOR:
-            return None
-        found = detect(image.pixels, board, step is CellStep.BOARD and self.seen is None)
-        shift_px = None if self.seen is None else motion_px(self.seen[1].pixels, found.pixels)
-        if shift_px is not None and shift_px > STILL_PX:
-            self._moved_s = begun_s
-        if step is CellStep.VIEWS:
-            self._guide(found)
-        self.seen, self.trouble = (begun_s, found), image_trouble(image, found)[1]
-        return found
+    async def look(self, begun_ns: int, image: Image, step: CellStep) -> bool:
+        """Look for the board, and guide in the step of the views; tell whether a view was taken.
 
-    def _guide(self, found: Detection) -> None:
-        """Choose the wanted view, anew when the views have changed, and the way to it."""
+        `begun_ns`: when the image was asked for, host monotonic.
+        """
         draft = self.draft
-        if draft.mount is None or draft.board is None:
-            return
-        if self.wanted is None or self._wanted_for is not draft:
-            blank = CameraModel(draft.width, draft.height)
-            self.wanted = next_view(draft.mount, draft.board, blank, False, captured(draft.views))
-            self._wanted_for = draft
-        view = CapturedView(-1, np.eye(4), found.indices, found.pixels)
-        self.way = way_to(self.wanted, view) if found.found else Way("Show the whole board", False)
-
-    def take_view(self) -> bool:
-        """Take the newest image as a view if it is a new one and everything rests; tell whether it was."""
-        seen, state, arm = self.seen, self.state, self.arm
-        if seen is None or state is None or arm is None or self._wanted_for is not self.draft:
+        if draft.board is None and step is CellStep.BOARD and self.counts is None:
+            self.counts = await asyncio.to_thread(seen_size, to_grey(image.pixels))
+        if draft.board is None or step not in _LOOKED_FOR:
+            self.seen = None
             return False
-        if not self.way.new or seen[0] < self._moved_s + STILL_S:
+        pixels = viewable(image.pixels, image.pixel_format)
+        light = (image.exposure_us or draft.exposure_us, image.gain_db)
+        thorough = step is CellStep.BOARD and self.seen is None
+        self.seen = seen = await asyncio.to_thread(sight, pixels, draft.board, None, thorough, light)
+        if step is not CellStep.VIEWS or draft.mount is None or self.arm is None:
             return False
-        view = guided_view(state, arm.identity.tcp_offset, seen[1])
-        self.change(views=(*self.draft.views, view))
+        if self.guide is None:
+            self.guide = HandGuide(self.arm.latest, self._stillness)
+        arm, guide, blank = self.arm, self.guide, CameraModel(draft.width, draft.height)
+        cell = (draft.mount, draft.board, blank, False)
+        self.guidance = await guide.look(cell, draft.views, image, seen)
+        if not guide.take or self.draft is not draft or self._stillness.moved_ns >= begun_ns:
+            return False
+        flange = np.array(flange_pose(arm.latest(), arm.identity.tcp_offset))
+        view = CapturedView(len(draft.views), flange, seen.indices, seen.pixels)
+        self.change(views=(*draft.views, view), written="")
+        guide.taken(True)
         return True
 
     def drop_view(self) -> None:
-        self._moved_s = math.inf  # not again from here
         self.change(views=self.draft.views[:-1], written="")
 
     def correct_mount(self) -> bool:
         """Take the other mounting where the views fit it far better; tell whether they did."""
-        if self.found is None or not self.found.other_fits:
+        found = self.draft.found
+        if found is None or not found.other_fits:
             return False
         self.mount = "eye-to-hand" if self.mount == "eye-in-hand" else "eye-in-hand"
         self.set_mount()

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from enum import StrEnum
+from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
 
 import msgspec
+import numpy as np
 
 from recordings.files import ASKED_FOR, read_file, write_atomically
-from recordings.schema.messages import BoardSpec, Image, Matrix4, Mount, RobotIdentity, RobotState, Vector6
+from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotIdentity, RobotState
+from station.analysis.found_cell import FoundCell, find_cell
+from station.analysis.worker import CapturedView
 
+FEWEST_GUIDED = 4
+"""Fewest views that are asked for."""
 _LIMIT_BYTES = 1024 * 1024
 DRAFT_FILE = "new-cell.json"
 POSTED = "posted "
@@ -51,6 +58,9 @@ class ArmReader(Protocol):
     def remote(self) -> bool | None:
         """Remote control is on; None where there is no such switch."""
 
+    def subscribe(self, callback: Callable[[RobotState], None]) -> None:
+        """Call back with every state in order: the callback must be quick."""
+
     def latest(self) -> RobotState:
         """Newest state. Raises RobotError."""
 
@@ -58,7 +68,7 @@ class ArmReader(Protocol):
         """Why the arm cannot be guided now, and what to do on the pendant; empty: nothing."""
 
     async def stop(self) -> None:
-        """STOP, by the dashboard: it ends whatever program runs on the controller. Never raises."""
+        """STOP, by the dashboard: it ends whatever program runs on the controller. Raises RobotError."""
 
     async def close(self) -> None: ...
 
@@ -91,16 +101,6 @@ class Hardware(Protocol):
         """Open it. Raises CameraError."""
 
 
-class GuidedView(msgspec.Struct, frozen=True):
-    """View from a pose to which a person moved the arm by hand."""
-
-    joints_rad: Vector6
-    base_from_flange: Matrix4
-    indices: tuple[int, ...]
-    """Rows of `board_points`"""
-    pixels: tuple[tuple[float, float], ...]
-
-
 class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
     """Facts of the cell that are known so far."""
 
@@ -112,7 +112,7 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
     exposure_us: float = 10_000.0
     mount: Mount | None = None
     board: BoardSpec | None = None
-    views: tuple[GuidedView, ...] = ()
+    views: tuple[CapturedView, ...] = ()
     table_m: float | None = None
     """Height of the table in `base`; None: derived from the board."""
     written: str = ""
@@ -123,18 +123,31 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
         """Name of an arm that a person moves and a program posts; empty: the station reads the arm itself."""
         return self.host.partition(POSTED)[2].strip() if self.host.startswith(POSTED) else ""
 
-    def without_views(self, **changes: object) -> Draft:
-        """Return the draft with changes, and without the views, which they invalidate."""
-        return msgspec.structs.replace(self, **{"views": (), "written": "", **changes})
+    @property
+    def found(self) -> FoundCell | None:
+        """Camera and board pose and a rough lens by the views, in about 0.1 s; None: they are not enough."""
+        if self.mount is None or self.board is None:
+            return None
+        return _find(self.mount, self.board, CameraModel(self.width, self.height), False, self.views)
+
+    @property
+    def enough(self) -> bool:
+        """The views so far are enough for planning."""
+        return len(self.views) >= FEWEST_GUIDED and self.found is not None and self.found.good
+
+
+_find = lru_cache(maxsize=2)(find_cell)
+"""It is asked with every image."""
 
 
 def load_draft(root: Path) -> Draft:
     """Load what was found before; an empty one where there is nothing, or nothing readable."""
     with contextlib.suppress(OSError, msgspec.DecodeError):
-        return msgspec.json.decode(read_file(root / DRAFT_FILE, _LIMIT_BYTES), type=Draft)
+        content = read_file(root / DRAFT_FILE, _LIMIT_BYTES)
+        return msgspec.json.decode(content, type=Draft, dec_hook=lambda kind, rows: np.array(rows))
     return Draft()
 
 
 def save_draft(root: Path, draft: Draft) -> None:
     root.mkdir(parents=True, exist_ok=True)
-    write_atomically(root / DRAFT_FILE, msgspec.json.encode(draft), ASKED_FOR)
+    write_atomically(root / DRAFT_FILE, msgspec.json.encode(draft, enc_hook=np.ndarray.tolist), ASKED_FOR)

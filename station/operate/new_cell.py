@@ -33,8 +33,7 @@ from station.cell.config import (
 from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, RefusedError
 from station.cell.layout import guess_from, layout_of
-from station.operate.draft import STEPS, CellStep, Draft
-from station.operate.guided_views import FEWEST_GUIDED, enough, find_cell
+from station.operate.draft import FEWEST_GUIDED, STEPS, CellStep, Draft
 
 _ROOM_M = 0.35
 """Margin of the workspace box around the guided views and the board, metres."""
@@ -71,7 +70,7 @@ def next_step(draft: Draft) -> CellStep:
         return CellStep.MOUNTING
     if draft.board is None:
         return CellStep.BOARD
-    return CellStep.SAVE if draft.posted or enough(draft) else CellStep.VIEWS
+    return CellStep.SAVE if draft.posted or draft.enough else CellStep.VIEWS
 
 
 def summary(draft: Draft, step: CellStep) -> str:
@@ -149,7 +148,7 @@ def _rounded3(values: Array) -> Vector3:
 
 def made_config(draft: Draft) -> StationConfig:
     """Make the configuration from the draft. RefusedError names the step that is missing."""
-    found, camera = None if draft.posted else find_cell(draft), draft.camera
+    found, camera = None if draft.posted else draft.found, draft.camera
     whole = found is not None or draft.posted
     if draft.robot is None or camera is None or draft.board is None or draft.mount is None or not whole:
         step = next_step(draft)

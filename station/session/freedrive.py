@@ -1,17 +1,20 @@
-"""Capture in freedrive: the operator moves the arm by hand, the station only records."""
+"""Capture in freedrive: the operator moves the arm by hand, the station guides and records."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 
+import msgspec
 import numpy as np
 
+from recordings.errors import CodedError
 from recordings.schema.messages import NO_PICTURE, View
+from station.analysis.hand_guide import HandGuide
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StaleStateError
 from station.cell.pose_plan import Plan, PlannedPose
-from station.cell.status import StationState
+from station.cell.status import FEWEST_BY_HAND, GuidanceStatus, StationState
 from station.cell.stillness import NotStillError
 from station.devices.base import fresh
 from station.protocol.verbs import Freedrive, Record
@@ -19,6 +22,7 @@ from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
 from station.session.ending import failed
 from station.session.estimator import look_back
+from station.session.previews import PREVIEW_PERIOD_S, Previewer
 from station.session.queue import PoseQueue
 
 log = logging.getLogger(__name__)
@@ -29,10 +33,45 @@ _GUIDE = "Guide the arm by hand. The station does not move it."
 class FreedriveCapture:
     """Capture in freedrive. Never moves the arm, so it needs no approval."""
 
-    def __init__(self, context: SessionContext) -> None:
-        self._context = context
+    def __init__(self, context: SessionContext, previews: Previewer) -> None:
+        self._context, self._previews = context, previews
+        self.guide: HandGuide | None = None
+        """Of the freedrive under way, or of the last one."""
         self._taking = asyncio.Lock()
         context.store.watch(self._note_guiding)
+
+    async def run(self) -> None:
+        """Guide the person, and take views by themselves, until cancelled."""
+        store, told = self._context.store, ""
+        while True:
+            await asyncio.sleep(PREVIEW_PERIOD_S)
+            if store.state is not StationState.FREE_DRIVE or self.taking:
+                if store.state in (StationState.IDLE, StationState.PAUSED):
+                    store.update(guidance=GuidanceStatus())
+                    told = ""
+                continue
+            try:
+                await self._look()
+            except CodedError as error:  # a lost image, a late state: the next look may see more
+                log.debug("no guidance: %s", error)
+            except Exception as error:  # capture by hand goes on without it
+                if told != (told := repr(error)):
+                    log.exception("the guidance failed")
+
+    async def _look(self) -> None:
+        context, store, config = self._context, self._context.store, self._context.cell.config
+        looked, recording, guide = await self._previews.look(), context.recording, self.guide
+        if looked is None or guide is None or recording is None or recording.camera is None:
+            return
+        lens, known = config.camera.model or recording.camera, context.cell.camera_model is not None
+        cell, views = (config.mount, config.board, lens, known), list(context.seen.values())
+        guidance = await guide.look(cell, views, *looked)
+        if store.state is not StationState.FREE_DRIVE:
+            return
+        enough = len(context.seen) >= FEWEST_BY_HAND and store.status.estimate.enough
+        store.update(guidance=msgspec.structs.replace(guidance, enough=enough))
+        if guide.take:
+            guide.taken(await self.record(asked=False) in context.seen)
 
     def _note_guiding(self) -> None:
         """Tell the robot driver whether a person may move the arm, for its limits on late states."""
@@ -50,6 +89,7 @@ class FreedriveCapture:
         if (refusal := Freedrive.refusal(store.state)) is not None:
             raise refusal  # STOP came in between
         context.requests.halt = False
+        self.guide = HandGuide(context.cell.robot.latest, context.stillness, context.workers.call)
         # Enter the state at once: while the file is opened no motion is offered and no image begun.
         store.enter(StationState.FREE_DRIVE, "The recording is being opened.")
         async with self._taking:

@@ -39,14 +39,14 @@ class Previewer:
         self._taken_s = 0.0
         self._count = 0
 
-    async def look(self) -> tuple[int, Image, BoardDetection] | None:
-        """Return number, image and detection of the newest preview; None without one."""
+    async def look(self) -> tuple[Image, BoardDetection] | None:
+        """Return image and detection of the newest preview; None without one."""
         async with self._taking:
             if time.monotonic() - self._taken_s >= PREVIEW_PERIOD_S:
                 await self._take()
         if self._picture is None or self._sighting is None:
             return None
-        return self._count, self._picture, self._sighting
+        return self._picture, self._sighting
 
     async def preview(self, width: int, height: int) -> PreviewImage:
         """Return a JPEG that fits into width × height, px; empty without an image."""

@@ -34,7 +34,6 @@ from station.session.device_connector import DeviceConnector
 from station.session.ending import close_or_seal, unmark_busy
 from station.session.estimator import Estimator, look_back
 from station.session.freedrive import FreedriveCapture
-from station.session.hand_guide import HandGuide
 from station.session.motion import ApprovalManager, MotionApproval, previewed, session_motion
 from station.session.previews import Previewer
 from station.session.queue import PoseQueue
@@ -69,9 +68,8 @@ class Session:
         self.supervisor = SessionSupervisor(self.context, self._jogged, self._void)
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
-        self.freedrive = FreedriveCapture(self.context)
+        self.freedrive = FreedriveCapture(self.context, self.previews)
         self._estimator = Estimator(self.context)
-        self._guide = HandGuide(self.context, self.previews, self.freedrive)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._notes: tuple[str, ...] = ()
@@ -89,7 +87,7 @@ class Session:
             show_interrupted(self.context, *found)
         if self.context.cell.plan is not None and self.context.queue is None:
             self._replace_plan(self.context.cell.plan)
-        loops = (self.supervisor.run(), self.devices.run(), self._estimator.run(), self._guide.run())
+        loops = (self.supervisor.run(), self.devices.run(), self._estimator.run(), self.freedrive.run())
         self._tasks = [asyncio.create_task(loop) for loop in loops]
 
     async def close(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from textual.content import Content
 
-from station.cell.status import FEWEST_BY_HAND, StationStatus
+from station.cell.status import FEWEST_BY_HAND, DetectionStatus, GuidanceStatus
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
 from station.tui.words import UNKNOWN, degrees, dim, facts, limit_bar, lines, mark, mm
@@ -13,9 +13,8 @@ BURNT = 0.01
 """Share of saturated pixels above which the image counts as too bright."""
 
 
-def quality_line(status: StationStatus) -> Content:
+def quality_line(seen: DetectionStatus) -> Content:
     """Judge the board in the newest image: corners, sharpness and light, with advice where one is poor."""
-    seen = status.detection
     if not seen.found:
         advice = f"  {seen.advice}" if seen.advice else ""
         return mark("look", seen.reason or "no board in view") + dim(advice)
@@ -37,13 +36,20 @@ def quality_line(status: StationStatus) -> Content:
     return line + Content.styled(f"   {seen.advice}", "$warn") if seen.advice else line
 
 
+def still_lines(guidance: GuidanceStatus, cells: int) -> tuple[Content, Content]:
+    """Draw how still everything is, and say what moves."""
+    colour = "$ok" if guidance.still >= 1.0 else "$warn"
+    bar = limit_bar(guidance.still, 1.0, cells, colour, at=1.0)
+    return (
+        dim("still ") + bar + dim(f" {100 * guidance.still:.0f} %"),
+        dim(guidance.moves or "nothing moves"),
+    )
+
+
 def hand_lines(known: Known, width: int, height: int) -> Content:
     """Say how still everything is, what the last view was worth, and what the wanted one would be."""
     status = known.shown
     seen, guidance = status.session, status.guidance
-    cells = max(6, width - 14)
-    still = guidance.still >= 1.0
-    bar = limit_bar(guidance.still, 1.0, cells, "$ok" if still else "$warn", at=1.0)
     errors = [p.estimated_sigma_mm for p in seen.poses if p.counts]
     now, before = (errors[-1] if errors else None), (errors[-2] if errors[1:] else None)
     worth = [("view", str(seen.captured), f"of {FEWEST_BY_HAND} or more")]
@@ -51,11 +57,7 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
         worth.append(("now", f"± {now:.2f}", "mm" if before is None else f"mm, before ± {before:.2f}"))
     if guidance.after_mm is not None and (now is None or guidance.after_mm < now):
         worth.append(("with the next", f"± {guidance.after_mm:.2f}", "mm"))
-    rows = [
-        dim("still ") + bar + dim(f" {100 * guidance.still:.0f} %"),
-        dim(guidance.moves or "nothing moves"),
-    ]
-    rows += [facts(each) for each in worth]
+    rows = [*still_lines(guidance, max(6, width - 14)), *(facts(each) for each in worth)]
     if guidance.warning:
         rows.insert(0, mark("look", guidance.warning))
     elif guidance.enough:

@@ -43,7 +43,7 @@ class CaptureScreen(StationScreen):
             with Vertical(id="live-left"):
                 with Box("Camera", id="picture", below="+ found corners  o: in a browser"):
                     yield PreviewPane(id="preview")
-                    yield Line(lambda known, _: quality_line(known.shown), id="quality")
+                    yield Line(lambda known, _: quality_line(known.shown.detection), id="quality")
                 yield Panel("What happened", newest_events, id="events", below="6 all")
             with Vertical(id="live-right"):
                 with Box("Poses", id="progress", below=LEGEND):

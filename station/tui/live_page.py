@@ -54,7 +54,7 @@ def news_of(known: Known, picture: PreviewImage) -> dict[str, object]:
         "next": f"{action.key}  {action.label}".strip(),
         "why": action.why,
         "look": action.look,
-        "seen": quality_line(status).plain,
+        "seen": quality_line(status.detection).plain,
         "still": status.guidance.still if by_hand else float(status.robot.still),
         "outline": status.guidance.outline,
         "saved": status.session.captured,

@@ -26,7 +26,6 @@ from station.cell.errors import StationError
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
-from station.operate.guided_views import enough
 from station.tui.desk import NOT_OURS
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
 from station.tui.new_cell_steps import DRAWINGS, PAGES, about, accept, file_text, live_lines, next_of, typed
@@ -61,7 +60,7 @@ class NewCell(ThemedApp[Ending]):
         Binding("pageup", "go(-1)", "Back", tooltip="The step before", priority=True),
         Binding("pagedown", "go(1)", "On", tooltip="The next step", priority=True, show=False),
         Binding("left,right", "other_mount", "Other drawing"),
-        Binding("f3", "drop", "Drop view", tooltip="Take the last view away"),
+        Binding("backspace", "drop", "Take back", tooltip="Take the last view back"),
         Binding("f7", "table_here", "Table here", tooltip="The table is as high as the tool now"),
         Binding("f9", "rehearse", "Rehearse", tooltip="Run the whole job with this cell in simulation"),
         Binding("escape", "leave", "Leave", tooltip="Leave; what was found is kept"),
@@ -144,23 +143,21 @@ class NewCell(ThemedApp[Ending]):
         await asyncio.sleep(LOOK_S)
 
     async def _look(self) -> None:
-        assert self.setup.camera is not None
-        begun_s, step = time.monotonic(), self.step
-        image = await self.setup.camera.glimpse()
-        counted = self.setup.counts
-        found = await asyncio.to_thread(self.setup.look, begun_s, image, step)
+        setup, begun_ns, step = self.setup, time.monotonic_ns(), self.step
+        assert setup.camera is not None
+        image, counted = await setup.camera.glimpse(), setup.counts
+        taken = await setup.look(begun_ns, image, step)
         line = self.query_one("#typed", Input)
-        if step is self.step is CellStep.BOARD and self.setup.counts != counted and not line.value:
-            line.value = typed(self.setup, step)
+        if step is self.step is CellStep.BOARD and setup.counts != counted and not line.value:
+            line.value = typed(setup, step)
             line.cursor_position = len(line.value)
         pane = self.query_one(PreviewPane)
         if pane.display:
             self._pictures += 1
-            corners = np.zeros((0, 2)) if found is None else found.pixels
-            wanted = self.setup.wanted if self.step is CellStep.VIEWS else None
-            pane.wanted = () if wanted is None else wanted.drawn
+            corners = np.zeros((0, 2)) if setup.seen is None else setup.seen.pixels
+            pane.wanted = setup.guidance.outline if self.step is CellStep.VIEWS else ()
             pane.show(preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures))
-        if step is self.step is CellStep.VIEWS and self.setup.take_view():
+        if taken:
             self._view_taken()
         self._show()
 
@@ -169,11 +166,11 @@ class NewCell(ThemedApp[Ending]):
         if self.setup.correct_mount():
             self.notify("The views fit the other drawing: step 3 is corrected.")
         self._tell_found()
-        if enough(self.setup.draft):
+        if self.setup.draft.enough:
             self.step = flow.next_step(self.setup.draft)
 
     def _tell_found(self) -> None:
-        found = self.setup.found
+        found = self.setup.draft.found
         self._say("#problem", "" if found is None else found.warning)
 
     # --- keys ---
@@ -186,7 +183,11 @@ class NewCell(ThemedApp[Ending]):
         if self.setup.draft.posted:
             self.notify(NOT_OURS, severity="error")
             return
-        await self.setup.stop()
+        try:
+            await self.setup.stop()
+        except StationError as problem:
+            self.notify(f"STOP was not sent: {problem} Press the EMERGENCY STOP.", severity="error")
+            return
         self.notify(
             "STOP was sent to the controller. If the arm moves, press the EMERGENCY STOP.",
             severity="warning",
@@ -289,7 +290,7 @@ class NewCell(ThemedApp[Ending]):
             "#next",
             next_line(next_of(setup, self.step, self.query_one("#typed", Input).value.strip()), width),
         )
-        self._say("#live-lines", "\n".join(live_lines(setup, self.step)))
+        self._say("#live-lines", live_lines(setup, self.step))
 
     def _rail(self) -> tuple[Step, ...]:
         draft = self.setup.draft

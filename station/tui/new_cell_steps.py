@@ -7,17 +7,19 @@ import math
 from dataclasses import dataclass
 
 import msgspec
+from textual.content import Content
 
 from calibrate.boards.model import describe_board, typed_board
 from recordings.errors import CodedError
 from recordings.schema.messages import Mount
 from station.cell.errors import StationError
+from station.cell.status import DetectionStatus
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
-from station.operate.draft import CellStep
-from station.operate.guided_views import FEWEST_GUIDED, enough
-from station.tui.task import Action
-from station.tui.words import mark
+from station.operate.draft import FEWEST_GUIDED, CellStep
+from station.tui.capture_panels import quality_line, still_lines
+from station.tui.task import Action, to_wanted
+from station.tui.words import dim, lines
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ PAGES = {
     CellStep.VIEWS: Page(
         "Guide the arm to four views of the board",
         "Hold the pendant's Freedrive button (on the back) and bring the found corners (+) into the outline "
-        "(o). Each view is taken by itself when arm and picture rest and the view is new.",
+        "(o). Each new view is taken by itself when arm and picture rest. Backspace takes the last one back.",
         ("#picture",),
     ),
     CellStep.SAVE: Page(
@@ -75,6 +77,7 @@ REMOTE_OFF = (
     "The station can drive the arm only in Remote Control: ☰ → Settings → System → Remote Control → Enable, "
     "then the icon top right → Remote Control."
 )
+STILL_CELLS = 30
 _TINY_M = 0.005
 """Squares below this size are rare: the number may be one of centimetres."""
 POSTED_SAVE = (
@@ -99,7 +102,7 @@ def about(setup: CellSetup, step: CellStep) -> str:
 def typed(setup: CellSetup, step: CellStep) -> str:
     """Return the text that the input line begins with."""
     if step is CellStep.BOARD and (board := setup.draft.board) is not None:
-        if (found := setup.found) is not None and found.cause == "square-size":
+        if (found := setup.draft.found) is not None and found.cause == "square-size":
             board = msgspec.structs.replace(board, square_m=round(board.square_m * found.scale, 4))
         return flow.board_words(board)
     if step is CellStep.BOARD and setup.counts is not None:
@@ -129,9 +132,9 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
         case CellStep.BOARD:
             return Action("Enter", "This board", "Lay it so that the camera sees it.")
         case CellStep.VIEWS:
-            if enough(draft):
+            if draft.enough:
                 return Action("Enter", "On to the file", "The views are enough.")
-            return Action("", setup.way.words or "Hold still", "The outline in the picture shows it.")
+            return to_wanted(setup.guidance, DetectionStatus() if setup.seen is None else setup.seen.status)
         case _ if not draft.written:
             return Action("Enter", "Write the file", "")
     if draft.posted:
@@ -151,47 +154,39 @@ def _board_typed(setup: CellSetup, text: str) -> Action:
     return Action("Enter", describe_board(board), why, look=tiny)
 
 
-def live_lines(setup: CellSetup, step: CellStep) -> list[str]:
+def live_lines(setup: CellSetup, step: CellStep) -> Content:
     """Return the lines that follow arm and camera, shown ten times a second."""
-    found = setup.found
+    draft, found = setup.draft, setup.draft.found
+    arm, board, seen = Content(setup.arm_words()), dim(""), setup.seen
+    if draft.board is not None:
+        board = (
+            dim(f"{describe_board(draft.board)}: looking …") if seen is None else quality_line(seen.status)
+        )
     match step:
         case CellStep.ROBOT:
-            return [setup.arm_words()]
+            return arm
         case CellStep.BOARD:
-            return _board_lines(setup)
+            return board
         case CellStep.VIEWS:
-            views = len(setup.draft.views)
-            taken = "✓" * views + "○" * max(0, FEWEST_GUIDED - views)
-            lines = [setup.arm_words(), *_board_lines(setup)]
-            lines.append(f"views {taken}   {'rests' if setup.rests else 'moves'}")
+            views = len(draft.views)
+            taken = Content(f"views {'✓' * views}{'○' * max(0, FEWEST_GUIDED - views)}")
+            rows = [arm, board, *still_lines(setup.guidance, STILL_CELLS), taken]
             if found is not None:
                 x, y, z = 1000 * found.X[:3, 3]
                 sigma = f"± {1000 * found.sigma_m:.0f} mm, {math.degrees(found.sigma_rad):.1f}°"
-                lines.append(f"camera x {x:.0f} y {y:.0f} z {z:.0f} mm {sigma}")
-            return lines
+                rows.append(Content(f"camera x {x:.0f} y {y:.0f} z {z:.0f} mm {sigma}"))
+            return lines(*rows)
         case CellStep.SAVE if found is not None:
-            limits = flow.limits_of(setup.draft, found)
+            limits = flow.limits_of(draft, found)
             assert limits.workspace_min_m is not None and limits.workspace_max_m is not None
             sides = zip("xyz", limits.workspace_min_m, limits.workspace_max_m, strict=True)
             box = ", ".join(f"{axis} {1000 * low:.0f} … {1000 * high:.0f}" for axis, low, high in sides)
-            table_mm = 1000 * flow.table_height_m(setup.draft, found)
-            return [
-                f"workspace of flange and camera: {box} mm",
-                f"table at {table_mm:.0f} mm: the arm stays above it",
-            ]
-    return []
-
-
-def _board_lines(setup: CellSetup) -> list[str]:
-    board, seen = setup.draft.board, setup.seen
-    if board is None:
-        return []
-    if seen is None:
-        return [f"{describe_board(board)}: looking …"]
-    if not seen[1].found:
-        return [mark("failed", setup.trouble or "not in the image").plain]
-    trouble = [mark("look", setup.trouble).plain] if setup.trouble else []
-    return [mark("done", f"{len(seen[1].pixels)} corners").plain, *trouble]
+            table_mm = 1000 * flow.table_height_m(draft, found)
+            return lines(
+                Content(f"workspace of flange and camera: {box} mm"),
+                Content(f"table at {table_mm:.0f} mm: the arm stays above it"),
+            )
+    return dim("")
 
 
 async def accept(setup: CellSetup, step: CellStep, text: str) -> bool:
@@ -215,7 +210,7 @@ async def accept(setup: CellSetup, step: CellStep, text: str) -> bool:
                 return counted == (board.columns, board.rows)  # else the image is looked at first
             return draft.board is not None
         case CellStep.VIEWS:
-            return enough(draft)
+            return draft.enough
     if text:
         try:
             height_m = float(text.replace("mm", "").replace(",", ".")) / 1000

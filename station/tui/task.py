@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from station.cell.config import StationConfig
-from station.cell.status import StationState, StationStatus
+from station.cell.status import DetectionStatus, GuidanceStatus, StationState, StationStatus
 from station.operate.ending import Way, after_solve
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Check
@@ -243,6 +243,11 @@ def _by_hand(status: StationStatus) -> Action:
         return Action("", "Hold still", "The view is being taken.")
     if guidance.enough:
         return Action("F7", "Enough: finish", f"{many(status.session.captured, 'view')} are saved.")
+    return to_wanted(guidance, seen)
+
+
+def to_wanted(guidance: GuidanceStatus, seen: DetectionStatus) -> Action:
+    """Tell the way from what is seen to the wanted view."""
     if not seen.found:
         return Action("", "Show the whole board", seen.reason)
     why = guidance.warning or "The outline in the picture shows it. A new view is taken when all is still."

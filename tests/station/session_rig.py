@@ -287,7 +287,7 @@ class Rig:
         self.session = Session(cell, root)
         self.session.context.workers = self.worker  # type: ignore[assignment]
         if not guides:
-            self.session._guide.run = asyncio.Event().wait  # type: ignore[method-assign,assignment]
+            self.session.freedrive.run = asyncio.Event().wait  # type: ignore[method-assign,assignment]
         self.states: list[StationState] = []
         self.session.store.watch(self._note)
 

@@ -42,14 +42,13 @@ def test_who_follows_it_from_nothing_finds_the_camera(mount: Mount) -> None:
     for k in range(FEWEST_BY_HAND):
         wanted = next_view(mount, BOARD, BLANK, False, views)
         assert in_image(wanted)
-        assert wanted.sigma_m is None or wanted.after_m < wanted.sigma_m
         C = wanted.camera_from_board
         now = seen(C, k, implied_flange(mount, X, Y, C))
-        assert way_to(wanted, now).new and (wanted.sigma_m is None or not way_to(wanted, now).words)
+        assert way_to(wanted, now).new and (wanted.found is None or not way_to(wanted, now).words)
         views.append(now)
     wanted = next_view(mount, BOARD, BLANK, False, views)
     assert wanted.found is not None and wanted.found.good
-    assert wanted.sigma_m is not None and wanted.sigma_m < 0.0005
+    assert wanted.after_m is not None and wanted.after_m < 0.0005
     off = difference(wanted.found.X, X)
     assert np.linalg.norm(off[:3]) < 0.002 and np.linalg.norm(off[3:]) < 0.003
     assert not way_to(wanted, views[5]).new

@@ -9,8 +9,8 @@ from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_poi
 from calibrate.kinematics import MODELS, forward, inverse_nearest
 from calibrate.projection import project
 from recordings.schema.messages import RobotIdentity
-from station.cell.config import matrix4, vector6
-from station.operate.draft import CameraChoice, Draft, GuidedView
+from station.analysis.worker import CapturedView
+from station.operate.draft import CameraChoice, Draft
 from station.simulation.truth import CellTruth
 
 NEARER_M = (0.0, 0.02, -0.05, 0.06, 0.0)
@@ -38,26 +38,20 @@ def guided_joints(truth: CellTruth) -> list[Array]:
     return found
 
 
-def seen_by_hand(truth: CellTruth, joints: Array, noise_px: float = 0.1, seed: int = 0) -> GuidedView:
-    """Give what the true camera sees from there."""
-    rng = np.random.default_rng(seed)
+def seen_by_hand(truth: CellTruth, joints: Array, index: int) -> CapturedView:
+    """Give what the true camera sees from there, with noise of 0.1 px."""
+    rng = np.random.default_rng(index)
     flange = forward(MODELS[truth.robot_model], joints)
     X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
     seen = inverse(flange @ X) @ Y if truth.mount == "eye-in-hand" else inverse(X) @ flange @ Y
     points = board_points(truth.board)
     pixels = project(truth.camera, transform_points(seen, points)).pixels
-    pixels = pixels + rng.normal(0, noise_px, pixels.shape)
-    return GuidedView(
-        vector6(joints),
-        matrix4(flange),
-        tuple(range(len(points))),
-        tuple((float(x), float(y)) for x, y in pixels),
-    )
+    return CapturedView(index, flange, np.arange(len(points)), pixels + rng.normal(0, 0.1, pixels.shape))
 
 
 def draft_of(truth: CellTruth, views: int = 4) -> Draft:
     """The draft of a person who did everything right."""
-    taken = [seen_by_hand(truth, q, seed=k) for k, q in enumerate(guided_joints(truth)[:views])]
+    taken = [seen_by_hand(truth, q, k) for k, q in enumerate(guided_joints(truth)[:views])]
     return Draft(
         host="127.0.0.9",
         robot=RobotIdentity(model=truth.robot_model, serial="2026"),

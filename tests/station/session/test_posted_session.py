@@ -51,7 +51,7 @@ async def test_the_same_stops_give_the_same_calibration(tmp_path: Path) -> None:
     arm, camera = PostedArm(config, "playback", tmp_path / "control.sock"), RecordedCamera()
     session = Session(Cell(config, arm, camera, "playback"), tmp_path / "root")
     camera.blind, session.context.workers = True, WorkerInThisProcess()  # type: ignore[assignment]
-    session._guide.run = asyncio.Event().wait  # type: ignore[method-assign,assignment]
+    session.freedrive.run = asyncio.Event().wait  # type: ignore[method-assign,assignment]
     store = session.store
     await session.start()
     await until(lambda: arm.path.exists())

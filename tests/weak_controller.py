@@ -11,8 +11,8 @@ from typing import Any
 
 from station.devices.rtde import SafetyMode
 from station.simulation.controller import __main__, machine
-from station.simulation.controller.arm import JointMotion, MakePath, SimulatedArm
-from station.simulation.controller.paths import JointPath
+from station.simulation.controller.arm import JointMotion, SimulatedArm
+from station.simulation.controller.kinematics import Vector
 from station.simulation.controller.robot import SimulatedRobot
 
 WEAKNESSES = (
@@ -34,14 +34,11 @@ class WeakArm(SimulatedArm):
     weakness = ""
     ignored = braked = False
 
-    def start(self, make_path: MakePath, speed: float, acceleration: float) -> JointMotion:
-        return super().start(make_path, speed * (FASTER if self.weakness == "too-fast" else 1), acceleration)
+    def start(self, goals: tuple[Vector, ...], speed: float, acceleration: float) -> JointMotion:
+        return super().start(goals, speed * (FASTER if self.weakness == "too-fast" else 1), acceleration)
 
     def brake(self, deceleration_rad_s2: float) -> None:
         self._weakly(lambda: super(WeakArm, self).brake(deceleration_rad_s2))
-
-    def brake_tool(self, deceleration_m_s2: float) -> None:
-        self._weakly(lambda: super(WeakArm, self).brake_tool(deceleration_m_s2))
 
     def _weakly(self, brake: Callable[[], None]) -> None:
         if not self.moving:
@@ -84,7 +81,7 @@ class WeakRobot(SimulatedRobot):
         q = arm.command
         if self.weakness == "swings-back":
             arm.braked = False
-            arm.start(lambda start: JointPath(start, (start[0] - BACK_RAD * self._way, *start[1:])), 0.1, 1.4)
+            arm.start(((q[0] - BACK_RAD * self._way, *q[1:]),), 0.1, 1.4)
         elif self.weakness == "drifts-at-rest":
             arm.command = (q[0] + DRIFT_RAD_S * self.dt_s, *q[1:])
 

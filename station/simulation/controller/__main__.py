@@ -16,7 +16,7 @@ import msgspec
 from station.simulation.controller.admin import AdminServer
 from station.simulation.controller.kinematics import TABLES
 from station.simulation.controller.machine import Machine, precise_loop
-from station.simulation.controller.state import ArmTruth, Settings, version_of
+from station.simulation.controller.state import ArmTruth, Settings
 
 PARENT_POLL_S = 0.5
 
@@ -86,10 +86,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--model", choices=sorted(TABLES), help="default: UR10 (CB3, 125 Hz)")
     add("--host", default="127.0.0.1", help="loopback address to listen on")
     add("--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors")
-    text = "a program that the dashboard can load; it only waits"
-    add("--program", dest="programs", action="append", metavar="NAME", help=text)
-    text = "answer with another version, for example 5.25.1"
-    add("--software", type=version_of, metavar="VERSION", help=text)
     add("--local", dest="remote", action="store_const", const=False, help="start in local control (e-Series)")
     add("--time-scale", type=float, metavar="F", help="the arm moves F times faster; for tests")
     add("--die-with-parent", action="store_true", help="end when standard input closes or the parent is gone")

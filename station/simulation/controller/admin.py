@@ -16,10 +16,10 @@ from typing import Annotated, Any, get_type_hints
 import msgspec
 from msgspec import Meta
 
+from station.simulation.controller.arm import JointPath, UnreachableError
 from station.simulation.controller.interpreted import InterpretedProgram
 from station.simulation.controller.machine import Machine
 from station.simulation.controller.network import Cut
-from station.simulation.controller.paths import JointPath, UnreachableError
 from station.simulation.controller.robot import WAITS
 from station.simulation.controller.rtde_server import ADMIN
 from station.simulation.controller.state import Six
@@ -104,7 +104,7 @@ def hand_move(machine: Machine, path: list[Six], speed_rad_s: JointSpeed = 0.5) 
     speed_rad_s."""
     robot = machine.robot
     length_rad = JointPath(robot.arm.command, *path).length
-    if not robot.lead(lambda start: JointPath(start, *path), speed_rad_s, HAND_RAD_S2):
+    if not robot.lead(tuple(path), speed_rad_s, HAND_RAD_S2):
         raise ValueError("the arm is not free: a program plays, a safety stop holds it, or it has no power")
     return {"length_rad": length_rad}
 

@@ -1,29 +1,14 @@
-"""The arm itself: follows one motion at a time, lags a little, and can be made to misbehave."""
+"""The arm itself: follows one joint move at a time, lags a little, and can be made to misbehave."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from math import dist, exp, inf, pi
+from dataclasses import dataclass
+from itertools import pairwise
+from math import exp, sqrt
 
-from station.simulation.controller.kinematics import (
-    JOINT_LIMIT_RAD,
-    ArmGeometry,
-    Rigid,
-    Vector,
-    between,
-    compose,
-    forward,
-    position,
-)
-from station.simulation.controller.paths import (
-    Braking,
-    JointPath,
-    Path,
-    Profile,
-    Trapezoid,
-    UnreachableError,
-)
+from station.simulation.controller.kinematics import JOINT_LIMIT_RAD, ArmGeometry, Vector, between
 
 LAG_S = 0.015
 """Time constant with which the true joints follow the commanded ones."""
@@ -32,52 +17,102 @@ SCALE_PER_S = 5.0
 PROGRAM_END_RAD_S2 = 4.0
 """Deceleration when the program ends under a motion."""
 ZERO: Vector = (0.0,) * 6
-
-JOINT_SPEED_RAD_S = pi
-"""No joint goes faster, whatever a script asks for."""
-
-MakePath = Callable[[Vector], Path]
-"""Joints where the motion begins → its path."""
-Speeds = Callable[[Vector, float], Vector]
-"""Commanded joints and the cycle's length [s] → the joint speeds wanted now. Raises UnreachableError."""
 SPAN_S = 15.0
 
 
-class JointMotion:
-    """One way from here to there. `done` once the arm's command rests at its end."""
+class UnreachableError(Exception):
+    """The arm cannot go there: a joint would be beyond its limit."""
 
-    def __init__(self, make_path: MakePath, speed: float, acceleration: float) -> None:
-        self.make_path = make_path
+
+class JointPath:
+    """Through given joints one after the other, all joints together, each in proportion to its own way.
+
+    Its parameter `s` is the leading joint's angle [rad], from 0 to `length`.
+    """
+
+    def __init__(self, start: Vector, *goals: Vector) -> None:
+        if any(not abs(q) <= JOINT_LIMIT_RAD for goal in goals for q in goal):
+            raise UnreachableError(f"joints {goals} are outside ±2π")
+        self._corners = (start, *goals)
+        self._ends = [0.0]
+        for first, second in pairwise(self._corners):
+            step = max(abs(b - a) for a, b in zip(first, second, strict=True))
+            self._ends.append(self._ends[-1] + step)
+        self.length = self._ends[-1]
+
+    def at(self, s: float) -> Vector:
+        for i, end in enumerate(self._ends[1:]):
+            if s < end:
+                begin = self._ends[i]
+                return between(self._corners[i], self._corners[i + 1], (s - begin) / (end - begin))
+        return self._corners[-1]
+
+
+@dataclass(frozen=True)
+class Trapezoid:
+    """Constant acceleration, constant speed, constant deceleration (or a triangle, when short).
+
+    `at` gives (s, ds/dt) at a time from the start.
+    """
+
+    length: float
+    speed: float
+    acceleration: float
+
+    @property
+    def peak_speed(self) -> float:
+        return min(self.speed, sqrt(self.length * self.acceleration))
+
+    @property
+    def duration_s(self) -> float:
+        if self.length == 0:
+            return 0.0
+        return self.length / self.peak_speed + self.peak_speed / self.acceleration
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        total, peak, a = self.duration_s, self.peak_speed, self.acceleration
+        ramp_s = peak / a
+        if t_s >= total:
+            return self.length, 0.0
+        if t_s < ramp_s:
+            return a * t_s * t_s / 2, a * t_s
+        if t_s < total - ramp_s:
+            return peak * (t_s - ramp_s / 2), peak
+        left = total - t_s
+        return self.length - a * left * left / 2, a * left
+
+
+@dataclass(frozen=True)
+class Braking:
+    """Constant deceleration from where the arm is to rest, on the same path."""
+
+    start: float
+    speed: float
+    duration_s: float
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        if self.duration_s <= 0:
+            return self.start, 0.0
+        t = min(t_s, self.duration_s)
+        u = t / self.duration_s
+        return self.start + self.speed * t * (1 - u / 2), self.speed * (1 - u)
+
+
+Profile = Trapezoid | Braking
+
+
+class JointMotion:
+    """One way through joints. `done` once the arm's command rests at its end."""
+
+    def __init__(self, goals: tuple[Vector, ...], speed: float, acceleration: float) -> None:
+        self.goals = goals
         self.speed = speed
         self.acceleration = acceleration
-        self.path: Path | None = None
+        self.path: JointPath | None = None
         self.profile: Profile | None = None
         self.elapsed_s = 0.0
         self.braking = False
         self.done = False
-
-
-class Stream(JointMotion):
-    """A motion without an end, whose speeds are asked for in every cycle: servoj, speedj and their kin."""
-
-    def __init__(self, wanted: Speeds, acceleration: float, speeds: Vector) -> None:
-        super().__init__(JointPath, 0.0, acceleration)
-        self.wanted = wanted
-        self.speeds = speeds
-
-    def step(self, joints: Vector, dt_s: float, scale: float) -> Vector:
-        """The next joints: all speeds change together, the leading one by at most the acceleration."""
-        wanted = ZERO if self.braking else self.wanted(joints, dt_s)
-        fastest = max(map(abs, wanted))
-        if fastest > JOINT_SPEED_RAD_S:
-            wanted = tuple(v * JOINT_SPEED_RAD_S / fastest for v in wanted)
-        change = max(abs(w - v) for w, v in zip(wanted, self.speeds, strict=True))
-        share = 1.0 if change <= self.acceleration * dt_s else self.acceleration * dt_s / change
-        self.speeds = between(self.speeds, wanted, share)
-        moved = tuple(q + v * dt_s * scale for q, v in zip(joints, self.speeds, strict=True))
-        if any(abs(q) > JOINT_LIMIT_RAD for q in moved):
-            raise UnreachableError("a joint reaches its limit")
-        return moved
 
 
 class SimulatedArm:
@@ -85,7 +120,6 @@ class SimulatedArm:
 
     def __init__(self, table: ArmGeometry, joints_rad: Vector, draw_miss: Callable[[], Vector]) -> None:
         self.table = table
-        self.flange_from_tcp: Rigid = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
         self.command = joints_rad
         self.command_speed = ZERO
         self.actual = joints_rad
@@ -102,70 +136,28 @@ class SimulatedArm:
     def moving(self) -> bool:
         return self.motion is not None
 
-    def start(self, make_path: MakePath, speed: float, acceleration: float) -> JointMotion:
+    def start(self, goals: tuple[Vector, ...], speed: float, acceleration: float) -> JointMotion:
         """Goes there; from a running motion it comes to rest first. Raises UnreachableError."""
-        motion = JointMotion(make_path, speed, acceleration)
+        motion = JointMotion(goals, speed, acceleration)
         if self.motion is None:
             self._begin(motion)
         else:
-            make_path(self.command)  # an impossible goal is refused now, not after the braking
+            JointPath(self.command, *goals)  # an impossible goal is refused now, not after the braking
             self.brake(PROGRAM_END_RAD_S2)
             self._next = motion
         return motion
 
     def _begin(self, motion: JointMotion) -> None:
-        motion.path = motion.make_path(self.command)
+        motion.path = JointPath(self.command, *motion.goals)
         motion.profile = Trapezoid(motion.path.length, motion.speed, motion.acceleration)
         self.motion = motion
         self._misses = (self.miss, self._draw_miss())
 
-    @property
-    def streams(self) -> bool:
-        return isinstance(self.motion, Stream) and not self.motion.braking
-
-    @property
-    def stream_speeds(self) -> Vector:
-        """Joint speeds a stream goes on from: those of the running one, before the slider scales them."""
-        return self.motion.speeds if self.streams else self.command_speed  # type: ignore[union-attr]
-
-    def stream(self, wanted: Speeds, acceleration: float) -> JointMotion:
-        """Goes on from where and how fast the arm is now; a running motion ends here."""
-        self._drop_next()
-        stream = Stream(wanted, acceleration, self.stream_speeds)
-        if self.motion is not None:
-            self.motion.done = True
-        self.motion = stream
-        return stream
-
     def brake(self, deceleration_rad_s2: float) -> None:
         """Comes to rest on its path, the leading joint at this deceleration."""
-        self._brake_in(max(map(abs, self.command_speed)) / deceleration_rad_s2)
-
-    def brake_tool(self, deceleration_m_s2: float) -> None:
-        """Comes to rest on its path, the tool's point at this deceleration (a pure turn: the joints)."""
-        speed_m_s = self.tool_speed_m_s()
-        if speed_m_s < 1e-4:
-            self.brake(deceleration_m_s2)
-        else:
-            self._brake_in(speed_m_s / deceleration_m_s2)
-
-    def tool_speed_m_s(self) -> float:
-        step_s = 1e-4
-        later = tuple(q + step_s * v for q, v in zip(self.command, self.command_speed, strict=True))
-        here = compose(forward(self.table, self.command), self.flange_from_tcp)
-        there = compose(forward(self.table, later), self.flange_from_tcp)
-        return dist(position(here), position(there)) / step_s
-
-    def _brake_in(self, duration_s: float) -> None:
+        duration_s = max(map(abs, self.command_speed)) / deceleration_rad_s2
         self._drop_next()
         motion = self.motion
-        if isinstance(motion, Stream):
-            if not motion.braking:
-                motion.speeds = tuple(v * self.scale for v in motion.speeds)
-                motion.acceleration = 0.0
-            slower = max(map(abs, motion.speeds)) / duration_s if duration_s > 0 else inf
-            motion.acceleration, motion.braking = max(slower, motion.acceleration), True
-            return
         if motion is None or motion.profile is None:
             return
         s, speed = motion.profile.at(motion.elapsed_s)
@@ -192,7 +184,7 @@ class SimulatedArm:
         self.command_speed = self.actual_speed = ZERO
 
     def step(self, dt_s: float, wanted_scale: float) -> None:
-        """One cycle. Raises UnreachableError when the path leaves the arm's reach (the arm then rests)."""
+        """One cycle."""
         change = SCALE_PER_S * dt_s
         self.scale += max(-change, min(change, wanted_scale - self.scale))
         if self.motion is not None:
@@ -202,34 +194,16 @@ class SimulatedArm:
         self._lag(dt_s)
 
     def _follow(self, motion: JointMotion, dt_s: float) -> None:
-        if isinstance(motion, Stream):
-            self._flow(motion, dt_s)
-            return
         assert motion.path is not None and motion.profile is not None
         motion.elapsed_s += dt_s * (1.0 if motion.braking else self.scale)
         profile = motion.profile
         s, _ = profile.at(motion.elapsed_s)
-        try:
-            joints = motion.path.at(s)
-        except UnreachableError:
-            self.freeze()
-            raise
+        joints = motion.path.at(s)
         self.command_speed = tuple((b - a) / dt_s for a, b in zip(self.command, joints, strict=True))
         self.command = joints
         share = min(1.0, motion.elapsed_s / profile.duration_s) if profile.duration_s > 0 else 1.0
         self.miss = between(*self._misses, share)
         if motion.elapsed_s >= profile.duration_s:
-            self._end(motion)
-
-    def _flow(self, motion: Stream, dt_s: float) -> None:
-        try:
-            joints = motion.step(self.command, dt_s, 1.0 if motion.braking else self.scale)
-        except UnreachableError:
-            self.freeze()
-            raise
-        self.command_speed = tuple((b - a) / dt_s for a, b in zip(self.command, joints, strict=True))
-        self.command = joints
-        if motion.braking and not any(motion.speeds):
             self._end(motion)
 
     def _end(self, motion: JointMotion) -> None:

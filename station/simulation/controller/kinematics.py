@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass, field
-from math import acos, atan2, copysign, cos, hypot, pi, sin, sqrt
+from math import atan2, copysign, cos, pi, sin, sqrt
 from operator import add
 from pathlib import Path
 
@@ -96,15 +96,6 @@ def compose(A: Rigid, B: Rigid) -> Rigid:
     )
 
 
-def invert(A: Rigid) -> Rigid:
-    a0, a1, a2, x, a4, a5, a6, y, a8, a9, a10, z = A
-    return (
-        a0, a4, a8, -(a0 * x + a4 * y + a8 * z),
-        a1, a5, a9, -(a1 * x + a5 * y + a9 * z),
-        a2, a6, a10, -(a2 * x + a6 * y + a10 * z),
-    )  # fmt: skip
-
-
 def from_rotvec(rx: float, ry: float, rz: float, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Rigid:
     """Rotation vector [rad] and translation [m] (Rodrigues' formula)."""
     angle = sqrt(rx * rx + ry * ry + rz * rz)
@@ -155,82 +146,3 @@ def forward(table: ArmGeometry, joints_rad: Vector) -> Rigid:
         step = (ct, -st * ca, st * sa, a * ct, st, ct * ca, -ct * sa, a * st, 0.0, sa, ca, d)
         found = compose(found, step)
     return found
-
-
-def inverse_all(table: ArmGeometry, base_from_flange: Rigid) -> list[Vector]:
-    """Every solution of the nominal geometry, at most 8. At a wrist singularity: those with wrist 3 = 0.
-
-    Derived from the geometry: the wrist's centre lies d4 beside the plane of the arm (2 × q1); the angle
-    between wrist 2's axis and the flange's axis (2 × q5); then a planar two-link arm (2 × q3).
-    """
-    T = base_from_flange
-    a2, a3 = table.a_m[1], table.a_m[2]
-    d1, _, _, d4, d5, d6 = table.d_m
-    wx, wy, wz = T[3] - d6 * T[2], T[7] - d6 * T[6], T[11] - d6 * T[10]
-    radius = hypot(wx, wy)
-    if radius < d4:
-        return []
-    solutions: list[Vector] = []
-    beside = acos(d4 / radius)
-    for side in (beside, -beside):
-        q1 = atan2(wy, wx) + pi / 2 + side
-        s1, c1 = sin(q1), cos(q1)
-        # Row of the frame "sideways of the arm" in the flange: what wrists 2 and 3 turn.
-        hx, hy, hz = T[0] * s1 - T[4] * c1, T[1] * s1 - T[5] * c1, T[2] * s1 - T[6] * c1
-        for flip in (1.0, -1.0):
-            s5 = flip * hypot(hx, hy)
-            q5 = atan2(s5, hz)
-            q6 = atan2(-hy / s5, hx / s5) if abs(s5) > 1e-9 else 0.0
-            s6, c6 = sin(q6), cos(q6)
-            # Frame 5 y axis in base; d5 runs against it.
-            ux, uy, uz = T[0] * s6 + T[1] * c6, T[4] * s6 + T[5] * c6, T[8] * s6 + T[9] * c6
-            # Origin of frame 3 in the plane of the arm: step back over d5, along the plane's axes.
-            px, pz = (wx + d5 * ux) * c1 + (wy + d5 * uy) * s1, wz + d5 * uz - d1
-            c3 = (px * px + pz * pz - a2 * a2 - a3 * a3) / (2 * a2 * a3)
-            if abs(c3) > 1 + 1e-9:
-                continue
-            bend = acos(max(-1.0, min(1.0, c3)))
-            q234 = atan2(-(ux * c1 + uy * s1), uz)
-            for q3 in (bend, -bend):
-                q2 = atan2(pz, px) - atan2(a3 * sin(q3), a2 + a3 * cos(q3))
-                solutions.append(tuple(_wrap(q) for q in (q1, q2, q3, q234 - q2 - q3, q5, q6)))
-    return solutions
-
-
-def _wrap(angle: float) -> float:
-    return (angle + pi) % (2 * pi) - pi
-
-
-def inverse_nearest(table: ArmGeometry, base_from_flange: Rigid, near_rad: Vector) -> Vector | None:
-    """The solution nearest to `near_rad` (largest joint difference), turns chosen within ±2π; or None."""
-    published = table.published
-    if published is None:
-        return _nearest(table, base_from_flange, near_rad)
-    # The published table has an analytic inverse; the difference is millimetres, and gone after two rounds.
-    aim = base_from_flange
-    for _ in range(3):
-        joints = _nearest(published, aim, near_rad)
-        if joints is None:
-            return None
-        off = compose(base_from_flange, invert(forward(table, joints)))
-        aim = compose(off, forward(published, joints))
-    return joints
-
-
-def _nearest(table: ArmGeometry, base_from_flange: Rigid, near_rad: Vector) -> Vector | None:
-    best, best_distance = None, float("inf")
-    for solution in inverse_all(table, base_from_flange):
-        turned = tuple(_nearest_turn(q, near) for q, near in zip(solution, near_rad, strict=True))
-        distance = max(abs(q - near) for q, near in zip(turned, near_rad, strict=True))
-        if distance < best_distance:
-            best, best_distance = turned, distance
-    return best
-
-
-def _nearest_turn(angle: float, near: float) -> float:
-    turned = angle + 2 * pi * round((near - angle) / (2 * pi))
-    if turned > JOINT_LIMIT_RAD:
-        return turned - 2 * pi
-    if turned < -JOINT_LIMIT_RAD:
-        return turned + 2 * pi
-    return turned

@@ -6,10 +6,9 @@ Knows no socket, so that every rule here can be tested without one.
 from __future__ import annotations
 
 import logging
-from math import inf
 
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
-from station.simulation.controller.arm import PROGRAM_END_RAD_S2, JointMotion, MakePath
+from station.simulation.controller.arm import PROGRAM_END_RAD_S2, JointMotion, UnreachableError
 from station.simulation.controller.interpreted import InterpretedProgram
 from station.simulation.controller.kinematics import (
     Rigid,
@@ -21,15 +20,13 @@ from station.simulation.controller.kinematics import (
     plus,
     position,
 )
-from station.simulation.controller.paths import UnreachableError
-from station.simulation.controller.state import DIGITAL_BANKS, ControllerState, Journal, Settings
+from station.simulation.controller.state import ControllerState, Journal, Settings
 from station.simulation.controller.uploads import Upload
 from station.simulation.controller.urscript_parser import ScriptError, ScriptSyntaxError
 
 log = logging.getLogger(__name__)
 
 PROGRAM_START_S = 0.05
-UNLOCK_AFTER_S = 5.0
 WAITS = "while True:\n  sync()\nend"
 """A program that only occupies the arm."""
 
@@ -39,7 +36,6 @@ class SimulatedRobot(ControllerState):
         super().__init__(settings, journal)
         self.program: InterpretedProgram | None = None
         self._starting: tuple[int, InterpretedProgram] | None = None
-        self._safety_since_s = -inf
         self._silence_s = 0.0
         self._hands: JointMotion | None = None
 
@@ -56,11 +52,7 @@ class SimulatedRobot(ControllerState):
         by_hand = self._hands is not None and not self._hands.done
         held |= self.runtime_state == RuntimeState.PAUSED and not by_hand
         scale = 0.0 if held else 1.0 if by_hand else self.slider
-        try:
-            if not (late and self.arm.streams):  # whose speeds come from a program that has no such cycle
-                self.arm.step(self.dt_s * self.settings.time_scale, scale)
-        except UnreachableError as error:
-            self.protective_stop(str(error))
+        self.arm.step(self.dt_s * self.settings.time_scale, scale)
         self.history.add(monotonic_ns, self.arm.actual, self.arm.miss)
         self.publish()
 
@@ -73,7 +65,7 @@ class SimulatedRobot(ControllerState):
         self._starting = None
         self.program = program
         self.runtime_state = RuntimeState.PLAYING
-        self.tell("key", title="PROGRAM_XXX_STARTED", text=program.name)
+        self.tell("PROGRAM_XXX_STARTED", program.name)
 
     def _step_program(self, late: bool) -> None:
         assert self.program is not None
@@ -90,28 +82,16 @@ class SimulatedRobot(ControllerState):
             if not late and not self.program.step():
                 self.stop_program("the program ended")
         except (ScriptError, UnreachableError) as error:
-            line = error.line if isinstance(error, ScriptError) else 0
-            self.tell("exception", text=getattr(error, "text", str(error)), line=line)
             self.stop_program(f"runtime error: {error}")
 
     def receive_inputs(self, names: tuple[str, ...], elements: tuple[float, ...]) -> None:
         """A data packet: it acts in the next cycle."""
         self.inputs.write(names, elements)
-        get = self.inputs.get
         for name in names:
             if name in self.outputs.types:  # input registers can be read back
                 self.outputs.set(name, *self.inputs.vector(name))
         if self.watched in names:
             self._silence_s = 0.0
-        if "speed_slider_mask" in names and get("speed_slider_mask"):
-            self.slider = max(0.0, min(1.0, get("speed_slider_fraction")))
-            self.journal.note("rtde", "speed slider", fraction=self.slider)
-        for bank, (first_bit, _) in DIGITAL_BANKS.items():
-            output = f"{bank}_digital_output"
-            if f"{output}_mask" in names:
-                mask, wanted = int(get(f"{output}_mask")), int(get(output))
-                self.set_digital_outputs(mask << first_bit, wanted << first_bit)
-                self.journal.note("rtde", output, mask=mask, value=wanted)
 
     @property
     def safe(self) -> bool:
@@ -125,16 +105,16 @@ class SimulatedRobot(ControllerState):
     @property
     def free_for_hands(self) -> bool:
         """The pendant's arrows or free-drive may move the arm."""
-        playing = self.runtime_state == RuntimeState.PLAYING and not self.freedrive
+        playing = self.runtime_state == RuntimeState.PLAYING
         return self.safe and self.robot_mode == RobotMode.RUNNING and not playing
 
-    def lead(self, make_path: MakePath, speed_rad_s: float, acceleration_rad_s2: float) -> bool:
+    def lead(self, path: tuple[Vector, ...], speed_rad_s: float, acceleration_rad_s2: float) -> bool:
         """A person moves the arm; a paused program's motion is lost. False while it is not free."""
         if not self.free_for_hands:
             return False
         if self.arm.moving:
             self.arm.freeze()
-        self._hands = self.arm.start(make_path, speed_rad_s, acceleration_rad_s2)
+        self._hands = self.arm.start(path, speed_rad_s, acceleration_rad_s2)
         return True
 
     def upload(self, upload: Upload) -> None:
@@ -153,12 +133,8 @@ class SimulatedRobot(ControllerState):
             program = InterpretedProgram(self, name, upload.text)
         except ScriptSyntaxError as error:
             self.journal.note("controller", "syntax error", name=name, error=str(error))
-            self.tell("exception", text=error.text, line=error.line)
             log.warning("%s: %s", name, error)
-            # A bare line that means nothing leaves the program alone, as on URSim 1.8 to 3.1
-            # (ros-industrial/universal_robot, pull request 165): many clients send `f()` behind a `def f()`.
-            if upload.name:
-                self.stop_program("replaced by a program that cannot start")
+            self.stop_program("replaced by a program that cannot start")
         else:
             self.start_program(program)
 
@@ -173,7 +149,7 @@ class SimulatedRobot(ControllerState):
             self.journal.note("controller", "program stopped", name=name, reason=reason)
         if self.program is not None:
             self.program.end()
-            self.tell("key", title="PROGRAM_XXX_STOPPED", text=self.program.name)
+            self.tell("PROGRAM_XXX_STOPPED", self.program.name)
         self.program = self._starting = None
         self.runtime_state = RuntimeState.STOPPED
         self.watchdog_s = self._silence_s = 0.0
@@ -186,11 +162,8 @@ class SimulatedRobot(ControllerState):
         return True
 
     def play_program(self) -> bool:
-        """Resumes a paused program, or starts the loaded one."""
+        """Resumes a paused program."""
         ready = self.safe and self.robot_mode == RobotMode.RUNNING
-        if ready and self.runtime_state == RuntimeState.STOPPED and self.loaded:
-            self.start_program(InterpretedProgram(self, self.loaded, WAITS))
-            return True
         if not ready or self.program is None or self.runtime_state != RuntimeState.PAUSED:
             return False
         self.runtime_state = RuntimeState.PLAYING
@@ -198,37 +171,28 @@ class SimulatedRobot(ControllerState):
         return True
 
     def protective_stop(self, reason: str) -> None:
-        """The arm rests at once; only `unlock` brings it back, and only after 5 s."""
+        """The arm rests at once, until the controller is started again."""
         self.journal.note("controller", "protective stop", reason=reason)
-        self._safety(SafetyMode.PROTECTIVE_STOP)
+        self.safety_mode = SafetyMode.PROTECTIVE_STOP
         self.arm.freeze()
         if self.program is None:
             self.stop_program("protective stop")
         else:
             self.runtime_state = RuntimeState.PAUSED
 
-    def unlock(self) -> bool:
-        """Ends a protective stop. False within 5 s of its start."""
-        if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
-            return True
-        if self.time_s - self._safety_since_s < UNLOCK_AFTER_S:
-            return False
-        self._safety(SafetyMode.NORMAL)
-        return True
-
     def safeguard(self, on: bool) -> None:
         if on:
-            self._safety(SafetyMode.SAFEGUARD_STOP)
+            self.safety_mode = SafetyMode.SAFEGUARD_STOP
             self.pause_program()
         elif self.safety_mode == SafetyMode.SAFEGUARD_STOP:
-            self._safety(SafetyMode.NORMAL)
+            self.safety_mode = SafetyMode.NORMAL
 
     def emergency_stop(self, on: bool) -> None:
         if on:
-            self._safety(SafetyMode.ROBOT_EMERGENCY_STOP)
+            self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
             self.power_off(RobotMode.IDLE if self.settings.is_e_series else RobotMode.POWER_OFF)
         elif self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
-            self._safety(SafetyMode.NORMAL)
+            self.safety_mode = SafetyMode.NORMAL
             self.robot_mode = RobotMode.POWER_OFF
 
     def power_off(self, mode: RobotMode = RobotMode.POWER_OFF) -> None:
@@ -236,29 +200,11 @@ class SimulatedRobot(ControllerState):
         self.arm.freeze()
         self.robot_mode = mode
 
-    def power_on(self) -> None:
-        if self.safe and self.robot_mode == RobotMode.POWER_OFF:
-            self.robot_mode = RobotMode.IDLE
-
-    def release_brakes(self) -> None:
-        if self.safe and self.robot_mode == RobotMode.IDLE:
-            self.robot_mode = RobotMode.RUNNING
-
-    def run(self) -> None:
-        """Power on and brakes released, in one."""
-        self.power_on()
-        self.release_brakes()
-
     def reset(self, running: bool) -> None:
         """After a reboot."""
         self.clear()
-        self._safety(SafetyMode.NORMAL)
+        self.safety_mode = SafetyMode.NORMAL
         self.robot_mode = RobotMode.RUNNING if running else RobotMode.POWER_OFF
-
-    def _safety(self, mode: SafetyMode) -> None:
-        if mode != self.safety_mode:
-            self._safety_since_s = self.time_s
-        self.safety_mode = mode
 
     def true_flange(self, joints: Vector, miss: Vector) -> Rigid:
         """base_from_flange with the arm's real lengths and its repeatability error."""

@@ -2,15 +2,13 @@
 
 Programs see and change this; `robot` adds what the controller does by itself. The RTDE variables are those of
 `variables.csv`; names and types: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". A row's `cb3` and
-`e_series` say from which version a controller of that series has it; where the guide states none, the oldest
-one of RTDE; empty: never.
+`e_series` say from which version a controller of that series has it; empty: never.
 """
 
 from __future__ import annotations
 
 import random
 import time
-from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -52,8 +50,6 @@ _SAFETY_BITS = {
     | SafetyStatus.EMERGENCY_STOPPED
     | SafetyStatus.STOPPED_DUE_TO_SAFETY,
 }
-DIGITAL_BANKS = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}
-"""First bit in `actual_digital_…_bits`, and how many there are."""
 _JOINT_MODE = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255}
 
 
@@ -90,10 +86,6 @@ class Settings(ArmTruth, frozen=True, kw_only=True):
     time_scale: Annotated[float, Meta(gt=0)] = 1.0
     """The arm moves this many times faster than it says; clocks stay real. For tests."""
     remote: bool = True
-    programs: tuple[str, ...] = ()
-    """That the dashboard can load. Each only waits."""
-    software: tuple[int, ...] = ()
-    """Another version than the usual one."""
 
     def differences(self, of: str) -> list[Vector]:
         return [getattr(self, f"{of}_{column}") for column in ("a_m", "d_m", "alpha_rad", "theta_rad")]
@@ -104,8 +96,7 @@ class Settings(ArmTruth, frozen=True, kw_only=True):
 
     @property
     def version(self) -> tuple[int, ...]:
-        usual = E_SERIES_VERSION if self.is_e_series else CB3_VERSION
-        return (*self.software, *(0,) * (4 - len(self.software))) if self.software else usual
+        return E_SERIES_VERSION if self.is_e_series else CB3_VERSION
 
     @property
     def rate_hz(self) -> int:
@@ -141,25 +132,17 @@ class Journal:
 @dataclass(frozen=True)
 class Variable:
     type: str
-    since: dict[bool, tuple[int, ...]]
-    """e-Series or not → its first version."""
+    series: tuple[bool, bool]
+    """Whether controllers of CB3, and of the e-Series, have it."""
     rest: tuple[float, ...]
     """Its value while nothing else is known; () is zero."""
-
-    def known_to(self, e_series: bool, version: tuple[int, ...]) -> bool:
-        return e_series in self.since and self.since[e_series] <= version
-
-
-def version_of(text: str) -> tuple[int, ...]:
-    return tuple(map(int, text.split(".")))
 
 
 def _read() -> dict[str, dict[str, Variable]]:
     found: dict[str, dict[str, Variable]] = {"input": {}, "output": {}}
     for row in read_table("variables.csv"):
-        columns = ((False, row["cb3"]), (True, row["e_series"]))
-        since = {e: version_of(v) for e, v in columns if v}
-        variable = Variable(row["type"], since, tuple(map(float, row["rest"].split())))
+        series = bool(row["cb3"]), bool(row["e_series"])
+        variable = Variable(row["type"], series, tuple(map(float, row["rest"].split())))
         stem, _, span = row["name"].rpartition("_")
         first, dash, last = span.partition("-")
         numbers = range(int(first), int(last) + 1) if dash else ()
@@ -176,8 +159,8 @@ both halves are writable."""
 class VariableStore:
     """Values of named variables in one flat list, so that a recipe is packed by one index lookup."""
 
-    def __init__(self, variables: dict[str, Variable], e_series: bool, version: tuple[int, ...]) -> None:
-        self.types = {n: v.type for n, v in variables.items() if v.known_to(e_series, version)}
+    def __init__(self, variables: dict[str, Variable], e_series: bool) -> None:
+        self.types = {name: v.type for name, v in variables.items() if v.series[e_series]}
         """Variables that clients of this controller may ask for; the others have values too."""
         self._slots: dict[str, slice] = {}
         self.elements: list[float] = []
@@ -212,7 +195,7 @@ class VariableStore:
             start += count
 
 
-class ControllerState(ABC):
+class ControllerState:
     def __init__(self, settings: Settings, journal: Journal) -> None:
         self.settings = settings
         self.journal = journal
@@ -230,15 +213,12 @@ class ControllerState(ABC):
         self.safety_mode = SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.remote = settings.remote
-        self.freedrive = False
-        self.loaded = ""
-        """The program that the dashboard loaded."""
         self.watchdog_s = 0.0
         """Longest silence of `watched`, an input variable, that is allowed; 0 = none."""
         self.watched = ""
         self.watchdog_pauses = False
-        self.tell: Callable[..., None] = lambda kind, **details: None
-        """Says something to the clients of the primary interface."""
+        self.tell: Callable[[str, str], None] = lambda title, program: None
+        """Says to the clients of the primary interface that a program started or stopped."""
         self.clear()
 
     def clear(self) -> None:
@@ -248,21 +228,11 @@ class ControllerState(ABC):
         self._seen: dict[str, tuple[Vector, Vector, Rigid]] = {}
         """Per tool pose: joints, TCP and pose it was last computed for."""
         self.inputs, self.outputs = (
-            VariableStore(VARIABLES[side], self.settings.is_e_series, self.settings.version)
-            for side in ("input", "output")
+            VariableStore(VARIABLES[side], self.settings.is_e_series) for side in ("input", "output")
         )
 
     def cycles(self, seconds: float) -> int:
         return max(1, round(seconds / self.dt_s))
-
-    @abstractmethod
-    def protective_stop(self, reason: str) -> None:
-        """The arm rests at once."""
-
-    def set_digital_outputs(self, mask: int, values: int) -> None:
-        """Bits of `actual_digital_output_bits`."""
-        before = int(self.outputs.get("actual_digital_output_bits"))
-        self.outputs.set("actual_digital_output_bits", before & ~mask | values & mask)
 
     def _draw_miss(self) -> Vector:
         m, rad = self.settings.robot_sigma_m, self.settings.robot_sigma_rad
@@ -302,8 +272,7 @@ class ControllerState(ABC):
         if before is not None and before[0] is joints and before[1] is self.tcp:
             self.outputs.set(f"{name}_speed", *(0.0,) * 6)
             return
-        self.arm.flange_from_tcp = from_pose(self.tcp)
-        T = compose(forward(self.table, joints), self.arm.flange_from_tcp)
+        T = compose(forward(self.table, joints), from_pose(self.tcp))
         self.outputs.set(f"{name}_pose", *to_pose(T))
         self._seen[name] = (joints, self.tcp, T)
         if before is not None and before[1] is self.tcp:

@@ -69,7 +69,7 @@ class Stand:
         self.run(0.5 * goes / speed_rad_s + 0.1)
         self.stopped_ns = self.now_ns
         if way is StopWay.CONTROL:
-            robot.arm.brake_tool(2.0)
+            robot.arm.brake(4.0)
             robot.stop_program("stop")
         elif way in (StopWay.DASHBOARD, StopWay.KILLED):
             robot.stop_program("stop")

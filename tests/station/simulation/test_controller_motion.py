@@ -1,22 +1,19 @@
-"""How the simulated arm moves: profiles, straight lines, stops, slider, and its deliberate faults."""
+"""How the simulated arm moves: profiles, stops, slider, and its deliberate faults."""
 
 from __future__ import annotations
 
 from itertools import pairwise
-from math import pi
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.simulation.controller.arm import SimulatedArm
-from station.simulation.controller.kinematics import TABLES, Vector, compose, forward, from_pose
-from station.simulation.controller.paths import JointPath, LinePath, Trapezoid, UnreachableError
+from station.simulation.controller.arm import SimulatedArm, Trapezoid
+from station.simulation.controller.kinematics import TABLES, Vector
 
 UR10 = TABLES["UR10"]
 HOME = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)
 DT = 0.008
-TOOL = from_pose((0.0, 0.0, 0.1, 0.0, 0.0, 0.0))
 
 positive = st.floats(0.01, 10.0)
 
@@ -39,7 +36,7 @@ def seconds_to_rest(arm: SimulatedArm) -> float:
 
 
 def go(arm: SimulatedArm, goal: Vector, speed: float = 1.0, acceleration: float = 2.0) -> None:
-    arm.start(lambda start: JointPath(start, goal), speed, acceleration)
+    arm.start((goal,), speed, acceleration)
 
 
 @given(length=positive, speed=positive, acceleration=positive, share=st.floats(0, 1))
@@ -55,40 +52,6 @@ def test_a_trapezoid_keeps_its_limits_and_arrives(
     later, v_later = profile.at(share * total + step)
     assert later >= s - 1e-9
     assert abs(v_later - v) <= acceleration * step * (1 + 1e-6) + 1e-9
-
-
-def test_a_straight_line_is_straight_and_turns_about_one_axis() -> None:
-    arm = make_arm()
-    first = compose(forward(UR10, HOME), TOOL)
-    goal = (
-        first[0],
-        *first[1:3],
-        first[3] + 0.1,
-        *first[4:7],
-        first[7] - 0.05,
-        *first[8:11],
-        first[11] + 0.08,
-    )
-    arm.start(lambda start: LinePath(UR10, TOOL, start, goal), 0.1, 0.5)
-    while arm.moving:
-        arm.step(DT, 1.0)
-        T = compose(forward(UR10, arm.command), TOOL)
-        u = (T[3] - first[3]) / 0.1
-        assert (T[7] - first[7], T[11] - first[11]) == pytest.approx((-0.05 * u, 0.08 * u), abs=1e-9)
-        assert T[:3] == pytest.approx(first[:3], abs=1e-9)
-
-
-def test_a_line_that_leaves_the_reach_freezes_the_arm() -> None:
-    """Both ends are in reach; between them the line crosses the cylinder no wrist centre can enter."""
-    arm = SimulatedArm(UR10, (0.0, -1.0, 1.9, -2.4, -1.5, 0.0), lambda: (0.0,) * 6)
-    first = forward(UR10, arm.command)
-    goal = compose(from_pose((0.0, 0.0, 0.0, 0.0, 0.0, pi)), first)
-    goal = (*first[:3], goal[3], *first[4:7], goal[7], *first[8:])
-    identity = from_pose((0.0,) * 6)
-    arm.start(lambda q: LinePath(UR10, identity, q, goal), 0.5, 2.0)
-    with pytest.raises(UnreachableError):
-        run(arm, 10.0)
-    assert not arm.moving and arm.command == arm.actual
 
 
 @pytest.mark.parametrize("deceleration", [0.5, 2.0, 8.0])

@@ -8,13 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.simulation.controller.script_functions import PURE
-from station.simulation.controller.urscript import (
-    List,
-    Pose,
-    ScriptRun,
-    ScriptRuntimeError,
-)
+from station.simulation.controller.urscript import List, Pose, ScriptRun, ScriptRuntimeError
 from station.simulation.controller.urscript_parser import ScriptSyntaxError
 
 
@@ -24,7 +18,7 @@ class Tape:
     def __init__(self, text: str) -> None:
         self.said: list[Any] = []
         self.killed = 0
-        self.run = ScriptRun(text, {**PURE, "say": self.said.append, "sync": self._sync, "wait": self._wait})
+        self.run = ScriptRun(text, {"say": self.said.append, "sync": self._sync, "wait": self._wait})
 
     def _sync(self) -> Any:
         yield
@@ -63,11 +57,8 @@ def said(text: str) -> list[Any]:
         ("1 == 1.0", True),
         ("[1, 2, 3][1]", 2),
         ("p[0, 0, 1, 0, 0, 0]", Pose([0, 0, 1, 0, 0, 0])),
-        ("norm([3.0, -4.0])", 5.0),
-        ("norm(-3)", 3),
         ("[[1, 2], [3]][0][1]", 2),
         ("'a # b'", "a # b"),
-        ("floor(d2r(180) * 100)", 314),
         ("[\n  1,  # in brackets lines may end\n  2\n]", List([1, 2])),
     ],
 )
@@ -178,7 +169,7 @@ def lambda():
   None = import(1)
   is = import(from=2, class=None)
   say(is)
-  say(length('é'))
+  say('é')
 end
 """
 
@@ -190,7 +181,7 @@ end
         (SCOPE, [11, 20, 100, 3, 15]),
         (COPIES, [1, [9, 7], [9, 2]]),
         (THREADS, [10, 20, 20]),
-        (PYTHON_WORDS, [5, 1]),
+        (PYTHON_WORDS, [5, "é"]),
         ("def p():\n a = [1]\n def f():\n  a = [3]\n  return 9\n end\n a[0] = f()\n say(a)\nend", [[9]]),
     ],
     ids=["blocks", "scope", "copies", "threads", "Python's words", "item of the new list"],
@@ -252,7 +243,7 @@ def test_halt_ends_everything_wherever_it_is_said(where: str) -> None:
 )
 def test_a_text_that_is_no_program(text: str) -> None:
     with pytest.raises(ScriptSyntaxError):
-        ScriptRun(text, {**PURE, "say": lambda what: None})
+        ScriptRun(text, {"say": lambda what: None})
 
 
 @pytest.mark.parametrize(
@@ -267,7 +258,6 @@ def test_a_text_that_is_no_program(text: str) -> None:
         "say(1 + 'a')",
         "say(1 / 0)",
         "say(1 < [1])",
-        "say(sqrt(-1))",
         "say(p[1, 2] + p[1, 2])",
         "def p():\n def f(x):\n return x\n end\n say(f(1, 2))\nend",
         "def p():\n def f(x):\n return x\n end\n f()\nend",

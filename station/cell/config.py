@@ -85,7 +85,7 @@ class CameraConfig(Section, frozen=True):
     GONE: ClassVar = frozenset(
         {
             "playback_pace", "ptp", "time_offset", "gain", "packet_delay_us", "invert_trigger_line",
-            "exposure_line", "frame_rate_hz",
+            "exposure_line", "frame_rate_hz", "trigger_activation", "trigger_delay_us",
         }
     )  # fmt: skip
 
@@ -105,10 +105,6 @@ class CameraConfig(Section, frozen=True):
     """Packet size, bytes; None: negotiated"""
     trigger_line: str = "Line0"
     """Input that the trigger box is wired to, for `trigger: hardware`"""
-    trigger_activation: Literal["RisingEdge", "FallingEdge", "AnyEdge", "LevelHigh", "LevelLow"] = (
-        "RisingEdge"
-    )
-    trigger_delay_us: float = 0.0
     model: CameraModel | None = None
     """Known intrinsics; None: estimated from the session's images."""
     model_is_rough: bool = False

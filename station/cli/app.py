@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from recordings.cli.lazy import LazyCommand, LazyGroup
 
-_APPROVED = {"--go": "Use --approve."}
-_PLAN_DRAWN = "Plan (2) on the screen draws the plan and turns it."
-
 STATION = LazyGroup(
     {
         "tui": LazyCommand(
             "station.cli.daemon:tui_command",
             ("station tui",),
-            gone={"--replay": "Foxglove and `calibrate solve --report` show a recording."},
         ),
         "demo": LazyCommand(
             "station.cli.demo:demo_command",
@@ -26,7 +22,6 @@ STATION = LazyGroup(
                 "station serve --simulate --mount eye-to-hand --noise mid",
                 "station serve --replay session.mcap",
             ),
-            gone={"--hardware-trigger": "A simulated camera is triggered by software."},
         ),
         "plan": LazyCommand(
             "station.cli.plan:plan_command",
@@ -34,15 +29,6 @@ STATION = LazyGroup(
                 "station plan --config station.yaml -o plan.yaml  # from where the arm stands",
                 "station plan --config station.yaml --check plan.yaml",
             ),
-            gone={
-                "--foxglove": _PLAN_DRAWN,
-                "--picture": _PLAN_DRAWN,
-                "--start": "`station serve` tells where the arm stands.",
-                "--scene": "Give the cell's --config; without it the paper's simulated cell is planned for.",
-                "--taught": "Write the joints into a plan (robot, mount, poses) and `--check` it.",
-                "--d-optimal": "Leave it out: the poses are chosen for the smallest error.",
-                "--from-list": "Write the joints into a plan (robot, mount, poses) and `--check` it.",
-            },
         ),
         "capture": LazyCommand(
             "station.cli.session:capture_command",
@@ -50,7 +36,6 @@ STATION = LazyGroup(
                 "station capture --plan plan.yaml",
                 "station capture --plan plan.yaml --headless --approve 0123456789ab",
             ),
-            _APPROVED | {"--sweep": "Frame times carry their own bound; `station doctor` shows it."},
         ),
         "status": LazyCommand(
             "station.cli.control:status_command", ("station status", "station status --json")
@@ -65,9 +50,7 @@ STATION = LazyGroup(
             "station.cli.control:acknowledge_command", ("station acknowledge",), rare=True
         ),
         "pause": LazyCommand("station.cli.control:pause_command", ("station pause",), rare=True),
-        "resume": LazyCommand(
-            "station.cli.session:resume_command", ("station resume",), _APPROVED, rare=True
-        ),
+        "resume": LazyCommand("station.cli.session:resume_command", ("station resume",), rare=True),
         "finish": LazyCommand("station.cli.control:finish_command", ("station finish",), rare=True),
         "retake": LazyCommand(
             "station.cli.control:retake_command", ("station retake 7  # then: station resume",), rare=True
@@ -76,7 +59,6 @@ STATION = LazyGroup(
         "drift-check": LazyCommand(
             "station.cli.session:drift_check_command",
             ("station drift-check", "station drift-check --poses 12"),
-            _APPROVED,
         ),
         "accept": LazyCommand(
             "station.cli.accept:accept_command",

@@ -32,7 +32,7 @@ class AravisCamera:
         self._device: GenicamDevice | None = None
         self._worker = DeviceThread("aravis")
         self._busy = asyncio.Lock()
-        self._clock = FrameClock(config.trigger_delay_us)
+        self._clock = FrameClock()
         self.identity = CameraIdentity(driver="aravis")
         self.counter = FrameCounter()
 

@@ -50,17 +50,14 @@ def by_clock(start_device_ns: int, exposure_us: float, fit: ClockFit, source: Ti
     return FrameTime(fit.to_host_ns(device_s) + round(exposure_us * 500), fit.bound_at(device_s), source)
 
 
-def by_trigger(
-    fired_ns: int, fired_bound_s: float, delay_us: float, exposure_us: float, arrival_ns: int
-) -> FrameTime:
-    """Time a frame by the pulse of a trigger box and the camera's set delay after it.
+def by_trigger(fired_ns: int, fired_bound_s: float, exposure_us: float, arrival_ns: int) -> FrameTime:
+    """Time a frame by the pulse of a trigger box.
 
     What the camera adds of its own is not known: the bound is all that lies between pulse and arrival.
     """
-    start_ns = fired_ns + round(delay_us * 1000)
-    left_s = (arrival_ns - exposure_us * 1000 - start_ns) / 1e9
+    left_s = (arrival_ns - exposure_us * 1000 - fired_ns) / 1e9
     return FrameTime(
-        start_ns + round(exposure_us * 500), max(fired_bound_s, fired_bound_s + left_s), "trigger"
+        fired_ns + round(exposure_us * 500), max(fired_bound_s, fired_bound_s + left_s), "trigger"
     )
 
 

@@ -107,10 +107,8 @@ class FrameClock:
     driver adds readings of the camera's clock where there is one.
     """
 
-    def __init__(self, trigger_delay_us: float = 0.0) -> None:
-        """`trigger_delay_us`: delay that is set in the camera."""
+    def __init__(self) -> None:
         self.readings = DeviceClock()
-        self._delay_us = trigger_delay_us
         self._newest: FrameTime | None = None
         self._impossible = 0
         self._opened = False
@@ -139,7 +137,7 @@ class FrameClock:
         self._newest = by_arrival(arrival_ns, image.exposure_us, asked_ns)
         if pulse is not None:
             fired = pulse.host_monotonic_ns, pulse.bound_s
-            self._newest = by_trigger(*fired, self._delay_us, image.exposure_us, arrival_ns)
+            self._newest = by_trigger(*fired, image.exposure_us, arrival_ns)
         if fit is not None and image.stamps.device_ns:
             told = by_clock(image.stamps.device_ns, image.exposure_us, fit, "latched")
             if _possible(told, image, asked_ns):

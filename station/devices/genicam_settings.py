@@ -55,22 +55,16 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
 
 
 def _set_trigger(camera: Any, config: CameraConfig) -> None:
-    """Set one frame per trigger, delay and edge, all explicitly, as cameras keep earlier settings."""
+    """Set one frame per trigger, without delay, at the rising edge, as cameras keep earlier settings."""
     hardware = config.trigger == "hardware"
     camera.set_trigger(config.trigger_line if hardware else "Software")
-    delay_us = config.trigger_delay_us if hardware else 0.0
-    delays = [name for name in ("TriggerDelay", "TriggerDelayAbs") if camera.is_feature_available(name)]
-    if delays:
-        camera.set_float(delays[0], delay_us)
-    elif delay_us:
-        raise CameraError("camera-cannot", what="delay its trigger", key="camera.trigger_delay_us")
+    for name in ("TriggerDelay", "TriggerDelayAbs"):
+        if camera.is_feature_available(name):
+            camera.set_float(name, 0.0)
     if not hardware:
         return
     if camera.is_feature_available("TriggerActivation"):
-        camera.set_string("TriggerActivation", config.trigger_activation)
-    elif config.trigger_activation != "RisingEdge":
-        what = f"trigger on {config.trigger_activation}"
-        raise CameraError("camera-cannot", what=what, key="camera.trigger_activation")
+        camera.set_string("TriggerActivation", "RisingEdge")
     if camera.is_feature_available("LineSelector"):
         camera.set_string("LineSelector", config.trigger_line)
         if camera.is_feature_available("LineMode") and camera.get_string("LineMode") != "Input":

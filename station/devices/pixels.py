@@ -1,9 +1,8 @@
-"""GenICam pixel formats: decoding bytes to images, and encoding for the simulated camera."""
+"""GenICam pixel formats: decoding bytes to images."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recordings.images import Pixels
 from station.cell.errors import CameraError
@@ -35,13 +34,3 @@ def decode(data: bytes, width: int, height: int, pixel_format: str) -> Pixels:
         image = raw.reshape(height, width, 3)
         return image if pixel_format == "BGR8" else np.ascontiguousarray(image[:, :, ::-1])
     return raw.reshape(height, width)
-
-
-def encode(grey: NDArray[np.uint8], pixel_format: str) -> bytes:
-    """Encode a grey image (height, width) in a pixel format; in colour formats all channels are grey."""
-    if pixel_format in _COLOUR:
-        return np.repeat(grey[:, :, None], 3, axis=2).tobytes()
-    if pixel_format not in _WIDE:
-        return grey.tobytes()
-    wide, bits = grey.astype("<u2"), int(pixel_format.removeprefix("Mono"))
-    return (wide << (bits - 8) | wide >> (16 - bits)).astype("<u2").tobytes()

@@ -5,15 +5,12 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
-from calibrate.geometry import difference
-from calibrate.kinematics import forward
 from recordings.errors import CodedError, RecordingError, Value
 from recordings.images import viewable
 from recordings.recorder import Recorder
@@ -22,7 +19,6 @@ from recordings.schema.messages import CameraModel, CaptureEvent, Image, RobotSt
 from station.analysis.pool import Workers
 from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.errors import RefusedError
-from station.cell.layout import arm_model
 from station.cell.status import Event, Level, SessionStatus, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.base import ready
@@ -179,20 +175,11 @@ class SessionContext:
         )
 
 
-def displacement(context: SessionContext, before: Sequence[float], after: Sequence[float]) -> str:
-    """Describe the flange's motion between two joints (6,), as '84 mm and 22°'."""
-    delta = difference(*forward(arm_model(context.cell.config.robot), [after, before]))
-    distance_m, angle_rad = np.linalg.norm(delta[:3]), np.linalg.norm(delta[3:])
-    return f"{1000 * distance_m:.0f} mm and {np.degrees(angle_rad):.0f}°"
-
-
 class StatusStore:
     """Newest status, with callbacks for changes. For the event loop's thread only."""
 
     def __init__(self, status: StationStatus) -> None:
         self.status = status
-        self.entered = 0
-        """Number of states entered so far; tells two visits of one state apart."""
         self._watchers: list[Callable[[], None]] = []
         self.recorded: Callable[[Event], None] = lambda event: None
         """Called for every event, to record it."""
@@ -228,7 +215,6 @@ class StatusStore:
         """Enter a state; `reason` is for people, `cause` for programs. TransitionError: not allowed."""
         if state is not self.state:
             check_transition(self.state, state)
-            self.entered += 1
         if isinstance(reason, CodedError):
             cause = reason.code
         self.update(state=state, reason=str(reason), cause=cause)

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
+from calibrate.geometry import difference
+from calibrate.kinematics import forward
 from recordings.errors import RecordingError
 from recordings.files import require_free_space
 from recordings.schema.messages import RobotState, Vector6
@@ -18,11 +20,12 @@ from station.analysis.worker import check_run
 from station.cell.arm_acceptance import StopTestMove
 from station.cell.config import vector6
 from station.cell.errors import LimitError, RefusedError
+from station.cell.layout import arm_model
 from station.cell.limits import PlanCheck
 from station.cell.pose_plan import Plan
 from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
-from station.session.context import SessionContext, displacement
+from station.session.context import SessionContext
 from station.session.queue import PoseQueue
 from station.session.threads import DISK
 
@@ -67,7 +70,7 @@ def session_motion(context: SessionContext, purpose: Purpose) -> Motion:
     return Motion(purpose, queue, queue.open)
 
 
-async def previewed(context: SessionContext, motion: Motion, notes: tuple[str, ...]) -> MotionPreview:
+async def previewed(context: SessionContext, motion: Motion) -> MotionPreview:
     """Check the whole path in the worker and make the preview. LimitError: not free; RobotError."""
     try:
         await DISK.run(require_free_space, context.root, context.cell.config.capture.free_space_bytes)
@@ -90,11 +93,18 @@ async def previewed(context: SessionContext, motion: Motion, notes: tuple[str, .
         largest_step_rad=round(check.largest_step_rad, 4),
         top_speed_m_s=round(check.top_speed_m_s, 3),
         duration_s=round(check.duration_s + overhead_s, 1),
-        first_move=f"{displacement(context, start, plan.poses[0].joints_rad)} to pose {poses[0] + 1}",
-        warnings=(*notes, *await _warnings(context, arm)),
+        first_move=f"{_displacement(context, start, plan.poses[0].joints_rad)} to pose {poses[0] + 1}",
+        warnings=tuple(await _warnings(context, arm)),
         start_joints_rad=start,
         stop_test=motion.stop_test,
     )
+
+
+def _displacement(context: SessionContext, before: Sequence[float], after: Sequence[float]) -> str:
+    """Describe the flange's motion between two joints (6,), as '84 mm and 22°'."""
+    delta = difference(*forward(arm_model(context.cell.config.robot), [after, before]))
+    distance_m, angle_rad = np.linalg.norm(delta[:3]), np.linalg.norm(delta[3:])
+    return f"{1000 * distance_m:.0f} mm and {np.degrees(angle_rad):.0f}°"
 
 
 async def _refused(context: SessionContext, plan: Plan, check: PlanCheck, start: Vector6) -> LimitError:

@@ -109,7 +109,7 @@ class Run:
             return False
         try:
             motion = Motion(Purpose.RESUME, queue, left)
-            preview = await previewed(context, motion, ())
+            preview = await previewed(context, motion)
         except StationError as trouble:
             store.problem(trouble)
             return False

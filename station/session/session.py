@@ -65,15 +65,13 @@ class Session:
         monitor = StillnessMonitor(config.stillness)
         self.context = SessionContext(cell, self.store, Workers(start_worker, warm_up), monitor, root)
         self.approvals = ApprovalManager(time.monotonic)
-        self.supervisor = SessionSupervisor(self.context, self._jogged, self._void)
+        self.supervisor = SessionSupervisor(self.context, self._void)
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
         self.freedrive = FreedriveCapture(self.context, self.previews)
         self._estimator = Estimator(self.context)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
-        self._notes: tuple[str, ...] = ()
-        """What the next preview tells the person beside the motion."""
         cell.robot.subscribe(monitor.add)
         cell.robot.subscribe(self.context.record_state)
         self.store.recorded = self.context.record_event
@@ -180,7 +178,7 @@ class Session:
         else:
             await look_back(context)
             motion = session_motion(context, purpose)
-        preview = await previewed(context, motion, self._notes)
+        preview = await previewed(context, motion)
         self.permit(verbs.Prepare, client_id)
         if self.approvals.voids != voids:
             raise RefusedError("changed")
@@ -207,7 +205,6 @@ class Session:
             go = replace(go, approval=approval or f"motion approved by {self.store.status.lease.holder}")
         finally:
             self.store.update(go=None)
-        self._notes = ()
         context.requests = RunRequests()
         run, motion = Run(context, go), go.motion
         if motion.stop_test is None:
@@ -376,11 +373,6 @@ class Session:
         """Withdraw the motion that is offered for approval, if any."""
         self.approvals.void()
         self.store.update(go=None)
-
-    def _jogged(self, how_far: str) -> None:
-        self._notes = (f"the arm was moved by {how_far} since the pause",)
-        self._void()
-        self.store.event("jogged", f"Arm moved {how_far} while paused. Approve again.", "warning")
 
 
 def show_interrupted(context: SessionContext, folder: Path, state: SessionState) -> None:

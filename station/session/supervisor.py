@@ -1,4 +1,4 @@
-"""Supervisor: heartbeat to the arm, monitoring of the resting arm, status. Nothing in it may block.
+"""Supervisor: heartbeat to the arm, monitoring of its link, status. Nothing in it may block.
 
 The arm's watchdog and systemd's depend on this loop alone: when it stalls, the arm stops and the daemon is
 restarted. So the heartbeat must not be sent from elsewhere.
@@ -12,41 +12,31 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-import numpy as np
-
-from recordings.schema.messages import Vector6
-from station.cell.config import vector6
-from station.cell.errors import RobotError, StaleStateError
+from station.cell.errors import StaleStateError
 from station.cell.status import StationState
-from station.cell.stillness import JOGGED_RAD
 from station.devices.news import CURRENT_S, TOLD_S, Delay
 from station.protocol.states import RUNNING
-from station.session.context import SessionContext, displacement
+from station.session.context import SessionContext
 from station.session.monitor import Monitor
 
 log = logging.getLogger(__name__)
 
 TICK_S = 0.02
 STATUS_TICKS = 5
-RESTING_RAD_S = 0.01
 LAGS_KEPT = 3000
 
 
 class SessionSupervisor:
-    def __init__(
-        self, context: SessionContext, jogged: Callable[[str], None], lost: Callable[[], None]
-    ) -> None:
-        """`jogged`: called with how far the resting arm was moved; `lost`: when its states are too late."""
+    def __init__(self, context: SessionContext, lost: Callable[[], None]) -> None:
+        """`lost`: called when the arm's states are too late."""
         self._context = context
         self._monitor = Monitor(context)
-        self._jogged, self._lost = jogged, lost
+        self._lost = lost
         self.first: Callable[[], None] = lambda: None
         """Called first in every round."""
         self.ticked: Callable[[], None] = lambda: None
         """Called after every round."""
         self._failure = ""
-        self._rest: tuple[int, Vector6] | None = None
-        """Number of the present pause (`store.entered`), and the joints (6,) at rest in it."""
         self._silent = ""
         """Code of what is wrong while the robot's states are later than allowed; empty: they are not."""
         self._late_since_s = 0.0
@@ -77,7 +67,6 @@ class SessionSupervisor:
         """Refresh the status. An error is reported and does not end the heartbeat."""
         try:
             self._watch_link()
-            self._watch_rest()
             self._monitor.refresh(self.lag_ms())
         except Exception as error:
             if repr(error) != self._failure:
@@ -125,21 +114,3 @@ class SessionSupervisor:
         told = any(event.code in set(Delay) and event.wall_ns > began_ns for event in store.status.events)
         if late is not None and now_s - since_s > TOLD_S - CURRENT_S and not told:
             store.problem(late)
-
-    def _watch_rest(self) -> None:
-        """Detect when the arm is moved while the session is paused, which voids an offered motion."""
-        context = self._context
-        if context.store.state is not StationState.PAUSED or context.cell.mover is None:
-            return
-        try:
-            state = context.cell.robot.latest()
-        except RobotError:
-            return
-        pause, joints = context.store.entered, vector6(state.joints_rad)
-        if self._rest is None or self._rest[0] != pause:
-            if max(map(abs, state.joint_speeds_rad_s)) < RESTING_RAD_S:  # not while the arm still brakes
-                self._rest = pause, joints
-            return
-        if np.abs(np.subtract(joints, self._rest[1])).max() > JOGGED_RAD:
-            self._jogged(displacement(context, self._rest[1], joints))
-            self._rest = pause, joints

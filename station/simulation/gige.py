@@ -25,7 +25,6 @@ import typer
 from numpy.typing import NDArray
 
 from station.cell.errors import CameraError, RobotError
-from station.devices.pixels import encode
 from station.simulation.camera_process import CameraProcess
 from station.simulation.cells import make_cell
 from station.simulation.truth import read_truth
@@ -40,10 +39,7 @@ ADDRESSES = {
     for node in _ROOT.iterfind("*[Address]", _GENICAM)
 }
 """Feature → address of its register."""
-PIXEL_FORMATS = {
-    entry.attrib["Name"]: int(entry.findtext("Value", "", _GENICAM))
-    for entry in _ROOT.iterfind("Enumeration[@Name='PixelFormat']/EnumEntry", _GENICAM)
-}
+MONO8 = int(_ROOT.findtext("Enumeration[@Name='PixelFormat']/EnumEntry[@Name='Mono8']/Value", "", _GENICAM))
 OWN_MEMORY = 0xA000
 """First register that Aravis does not use itself."""
 FAKE_TRIGGER_SOURCE, FAKE_TRIGGER_SOFTWARE = 0x304, 1
@@ -113,7 +109,7 @@ class GigeCamera:
         ):
             self._write(name, text.encode() + b"\0")
         values = {"SensorWidth": width, "SensorHeight": height, "Width": width, "Height": height}
-        values |= {"PixelFormat": PIXEL_FORMATS["Mono8"], "ExposureTime": 10_000, "Gain": 0}
+        values |= {"PixelFormat": MONO8, "ExposureTime": 10_000, "Gain": 0}
         for name, address in ADDRESSES.items():
             if name in values or address >= OWN_MEMORY:
                 self.set_register(address, values.get(name, 0))
@@ -122,17 +118,12 @@ class GigeCamera:
     def _write(self, name: str, data: bytes) -> None:
         self._lib.arv_fake_camera_write_memory(self._camera, ADDRESSES[name], len(data), data)
 
-    def _fill_buffer(self, buffer: int, _: int, exposure_us: int, gain: int, pixel_format: int) -> None:
-        names = {value: name for name, value in PIXEL_FORMATS.items()}
+    def _fill_buffer(self, buffer: int, _: int, exposure_us: int, gain: int, __: int) -> None:
         width, height = self.register("Width"), self.register("Height")
         grey, device_ns = self._source(width, height, float(exposure_us), gain / GAIN_STEPS_PER_DB)
-        # The buffer's reported size is not set yet; it holds width × height pixels of this format.
+        # The buffer's reported size is not set yet; it holds width × height pixels.
         target = self._lib.arv_buffer_get_data(buffer, ctypes.byref(ctypes.c_size_t()))
-        if names[pixel_format] == "Mono8":
-            ctypes.memmove(target, grey.ctypes.data, grey.nbytes)
-        else:
-            data = encode(grey, names[pixel_format])
-            ctypes.memmove(target, data, len(data))
+        ctypes.memmove(target, grey.ctypes.data, grey.nbytes)
         self._lib.arv_buffer_set_timestamp(buffer, device_ns)
 
 

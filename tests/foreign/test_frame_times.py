@@ -86,25 +86,21 @@ async def test_a_frame_that_lost_packets_widens_their_gaps(lonely_network: None)
             )
 
 
-async def test_line_delay_and_edge_are_set_as_configured(lonely_network: None) -> None:
+async def test_the_line_is_set_as_configured(lonely_network: None) -> None:
     class Box:
         async def fire(self) -> Any: ...
 
     emulated = emulator()
-    config = {
-        "trigger": "hardware", "trigger_line": "Line2", "trigger_activation": "FallingEdge",
-        "trigger_delay_us": 250.0,
-    }  # fmt: skip
+    config = {"trigger": "hardware", "trigger_line": "Line2"}
     with emulated:
         camera = AravisCamera(CameraConfig(device="127.0.0.1", **config), Box())  # type: ignore[arg-type]
         await camera.open()
         settings = await camera.settings()
         await camera.close()
     assert emulated.register(description.TRIGGER_SOURCE) == description.TRIGGER_SOURCES["Line2"]
-    assert emulated.register(description.TRIGGER_ACTIVATION) == 1
-    assert emulated.number(description.TRIGGER_DELAY) == 250.0
+    assert emulated.register(description.TRIGGER_ACTIVATION) == 0
     assert emulated.register(description.LINE_SELECTOR) == 2 and emulated.register(description.LINE_MODE) == 0
-    assert settings["TriggerSource"] == "Line2" and settings["TriggerActivation"] == "FallingEdge"
+    assert settings["TriggerSource"] == "Line2" and settings["TriggerActivation"] == "RisingEdge"
 
 
 async def test_doctor_sees_every_camera_on_the_wire_and_what_keeps_it_from_use(lonely_network: None) -> None:

@@ -20,8 +20,8 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from station.devices.pixels import encode
 from tests.gige_vision import description as at
+from tests.gige_vision.pixels import encode
 from tests.numbered_gige import numbered_picture
 
 CONTROL_PORT = 3956

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from recordings.images import eight_bits, viewable
-from station.devices.pixels import FORMATS, decode, encode
+from station.devices.pixels import FORMATS, decode
 from tests.codes import raises
+from tests.gige_vision.pixels import encode
 
 GREY = np.random.default_rng(1).integers(0, 256, (6, 8), np.uint8)
 

@@ -247,26 +247,6 @@ async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> 
     await control.close()
 
 
-async def test_an_arm_that_still_brakes_was_not_moved_by_anybody(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    state = rig.arm._state
-    speed = 0.3
-
-    def braking() -> Any:
-        return msgspec.structs.replace(state(), joint_speeds_rad_s=(speed, *(0.0,) * 5))
-
-    monkeypatch.setattr(rig.arm, "_state", braking)
-    await rig.go_until_it_moves()
-    await rig.session.lease_lost(1)
-    await asyncio.sleep(0.15)
-    first, *rest = rig.arm.joints
-    rig.arm.joints = (first + 0.05, *rest)  # type: ignore[assignment]
-    speed = 0.0
-    await asyncio.sleep(0.25)
-    assert not rig.told("jogged")
-
-
 async def test_a_device_that_fails_in_an_unforeseen_way_is_named_and_tried_again(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

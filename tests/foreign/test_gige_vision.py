@@ -16,10 +16,11 @@ import pytest
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
-from station.devices.pixels import decode, encode
+from station.devices.pixels import decode
 from tests.codes import raises
 from tests.gige_vision import description
 from tests.gige_vision.camera import EmulatedCamera, Packets
+from tests.gige_vision.pixels import encode
 from tests.numbered_gige import numbered_picture
 
 pytestmark = pytest.mark.gige

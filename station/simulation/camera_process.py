@@ -63,11 +63,7 @@ class CameraFaults(msgspec.Struct):
     """Exposure that the camera uses instead of the one set, µs"""
     board: BoardSpec | None = None
     """Board that lies there instead of the right one"""
-    cover: float = 0.0
-    """Share of the image, from the left, that something dark covers"""
     ringing: Ringing | None = None
-    knock: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Shift of the camera, in its own frame; m"""
 
     def inject(self, name: str, value: Any = None) -> None:
         """Inject a fault. ValueError for an unknown name."""
@@ -88,8 +84,7 @@ class CameraFaults(msgspec.Struct):
     def bracket(self, host_monotonic_ns: int) -> Array:
         """Transform (4, 4) of the camera as it is now from the camera as it should be."""
         angle_rad = self.ringing.angle_rad(host_monotonic_ns) if self.ringing is not None else 0.0
-        x, y, z = self.knock
-        return pose_from_rotvec((-x, -y, -z), (angle_rad, 0.0, 0.0))
+        return pose_from_rotvec((0.0, 0.0, 0.0), (angle_rad, 0.0, 0.0))
 
 
 class CameraProcess:
@@ -165,9 +160,7 @@ class CameraProcess:
             blur_px=self.truth.blur_px * camera.width / self.truth.camera.width,
         )
         board = self.faults.board or self.truth.board
-        picture = render(camera, board, camera_from_board, light, self._rng)
-        picture[:, : round(self.faults.cover * picture.shape[1])] = 20
-        return picture
+        return render(camera, board, camera_from_board, light, self._rng)
 
     def camera_from_board(self, base_from_flange: Array) -> Array:
         if self.truth.mount == "eye-in-hand":

@@ -1,9 +1,7 @@
 """Simulated GigE Vision camera as a process: Aravis's fake camera with rendered images.
 
 Its features are those of `genicam.xml`. It speaks the real control and stream protocols over loopback: run it
-only in a network namespace that has nothing but `lo`, for discovery broadcasts. Faults are JSON lines on
-standard input, as for the rendered camera, with `packet-loss` (share of packets) besides. It ends with its
-input.
+only in a network namespace that has nothing but `lo`, for discovery broadcasts. It ends with its input.
 """
 
 from __future__ import annotations
@@ -78,13 +76,6 @@ class GigeCamera:
 
     def set_register(self, address: int, value: int) -> None:
         self._lib.arv_fake_camera_write_register(self._camera, address, value)
-
-    def set_packet_loss(self, share: float) -> None:
-        glib = ctypes.CDLL("libgobject-2.0.so.0")
-        glib.g_object_set.restype = None
-        glib.g_object_set(
-            ctypes.c_void_p(self._server), b"gvsp-lost-ratio", ctypes.c_double(share), ctypes.c_void_p()
-        )
 
     def watch_latch(self, device_ns: Callable[[], int]) -> None:
         """Serve GevTimestampControlLatch in a thread until the end of the process."""
@@ -179,40 +170,22 @@ def rendered_source(camera: CameraProcess) -> Source:
 def main(
     controller_host: Annotated[str, typer.Option(help="Whose arm the camera looks at.")] = "",
     truth: Annotated[Path | None, typer.Option(help="File of the simulated cell.")] = None,
-    address: Annotated[str, typer.Option(help="Loopback address of the camera.")] = "127.0.0.1",
     serial: Annotated[str, typer.Option(help="As the camera reports it.")] = "SIM00000",
 ) -> None:
-    """Serve until standard input ends; print one JSON line when listening."""
+    """Serve at 127.0.0.1 until standard input ends; print one JSON line when listening."""
     cell = make_cell() if truth is None else read_truth(truth)
     rendered = CameraProcess(cell, controller_host, cell.exposure_us, cell.gain_db)
     rendered.warm_up()
-    serve(rendered_source(rendered), rendered, address, serial, rendered.faults.inject)
-
-
-def serve(
-    source: Source, rendered: CameraProcess, address: str, serial: str, inject: Callable[[str, Any], None]
-) -> None:
-    """Serve the camera. `rendered` gives size and clock; `inject` handles faults other than of GigE."""
     cv2.setNumThreads(1)
-    model = rendered.truth.camera
+    model = cell.camera
     try:
-        camera = GigeCamera(source, model.width, model.height, address, serial)
+        camera = GigeCamera(rendered_source(rendered), model.width, model.height, "127.0.0.1", serial)
     except CameraError as error:
         print(error, file=sys.stderr)
         raise SystemExit(1) from error
     camera.watch_latch(lambda: rendered.device_ns(time.monotonic_ns()))
-    print(json.dumps({"ready": True, "address": address, "serial": serial}), flush=True)
-    for line in sys.stdin:
-        request = json.loads(line)
-        name, value = request["name"], request.get("value")
-        match name:
-            case "packet-loss":
-                camera.set_packet_loss(float(value))
-            case "register":
-                camera.set_register(*value)
-            case _:
-                inject(name, value)
-        print(json.dumps({"done": name}), flush=True)
+    print(json.dumps({"ready": True, "serial": serial}), flush=True)
+    sys.stdin.read()
 
 
 if __name__ == "__main__":

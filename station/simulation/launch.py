@@ -166,36 +166,24 @@ def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subp
     return child, words or f"no ready line within {timeout_s:g} s"
 
 
-class SimulatedGige(ChildProcess):
-    def inject(self, fault: str, value: object = None) -> None:
-        """Inject a fault of `CameraFaults`, or `packet-loss` (share of packets); return when in effect."""
-        assert self.process.stdin is not None and self.process.stdout is not None
-        self.process.stdin.write(json.dumps({"name": fault, "value": value}).encode() + b"\n")
-        self.process.stdin.flush()
-        if not self.process.stdout.readline():
-            reason = f"it ended on the fault '{fault}'"
-            raise CameraError("no-simulation", device="GigE camera", reason=reason)
-
-
 def start_gige(
     controller_host: str = "",
     *,
     truth: Path | None = None,
     serial: str = "SIM00000",
-    module: str = "station.simulation.gige",
     log: Path | None = None,
-) -> SimulatedGige:
+) -> ChildProcess:
     """Start the camera on 127.0.0.1 and wait until it listens; blocking, so call it outside an event loop.
 
-    module: another program with the same command line. log: where its standard error goes.
+    log: where its standard error goes.
 
     CameraError where there is any network interface but `lo`: GigE discovery broadcasts on all of them.
     """
     if not is_isolated():
         raise CameraError("not-isolated")
-    command = [sys.executable, "-m", module, "--serial", serial, "--controller-host", controller_host]
-    command += [] if truth is None else ["--truth", str(truth)]
+    command = [sys.executable, "-m", "station.simulation.gige", "--serial", serial]
+    command += ["--controller-host", controller_host, *([] if truth is None else ["--truth", str(truth)])]
     process, problem = _start(command, GIGE_TIMEOUT_S, log)
     if problem:
         raise CameraError("simulation-not-started", device="GigE camera", reason=problem)
-    return SimulatedGige(process)
+    return ChildProcess(process)

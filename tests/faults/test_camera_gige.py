@@ -12,42 +12,44 @@ import pytest
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
-from station.simulation.gige import ADDRESSES
-from station.simulation.launch import SimulatedGige
 from tests.codes import raises
-from tests.numbered_gige import start_numbered
+from tests.gige_vision import description as at
+from tests.gige_vision.camera import EmulatedCamera
 
 pytestmark = pytest.mark.gige
-CONFIG = CameraConfig(device="127.0.0.1", packet_size=8996)
+CONFIG = CameraConfig(device="127.0.0.1")
 
 
 @pytest.fixture
-def server(lonely_network: None) -> Iterator[SimulatedGige]:
-    with start_numbered() as running:
+def emulated(lonely_network: None) -> Iterator[EmulatedCamera]:
+    with EmulatedCamera() as running:
         yield running
 
 
-async def test_23_settings_changed_behind_our_back_are_refused(server: SimulatedGige) -> None:
+async def test_23_settings_changed_behind_our_back_are_refused(emulated: EmulatedCamera) -> None:
     camera = AravisCamera(CONFIG)
     await camera.open()
     try:
-        for name, before, value in (("ExposureTime", 10_000, 4000), ("Gain", 0, 100), ("Width", 1280, 640)):
-            register = ADDRESSES[name]
-            server.inject("register", [register, value])
+        for change, address, before, value in (
+            (emulated.set_number, at.EXPOSURE, 10_000, 4000),
+            (emulated.set_number, at.GAIN, 0, 10),
+            (emulated.set_register, at.WIDTH, 1280, 640),
+        ):
+            change(address, value)
             with raises("settings-changed"):
                 await camera.capture()
-            server.inject("register", [register, before])
+            change(address, before)
         await camera.capture()
     finally:
         await camera.close()
 
 
-async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: SimulatedGige) -> None:
+async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(lonely_network: None) -> None:
     camera = AravisCamera(CONFIG)
-    await camera.open()
     try:
-        await camera.capture()
-        server.process.kill()
+        with EmulatedCamera(serial="KJ0042"):
+            await camera.open()
+            await camera.capture()
         beats = 0
 
         async def beat() -> None:
@@ -61,7 +63,7 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
             await camera.capture(timeout_s=4.0)
         assert beats > 20, "the loop goes on while Aravis waits"
         beating.cancel()
-        with start_numbered():
+        with EmulatedCamera(serial="KJ0042"):
             assert (await camera.capture()).pixels.shape == (1024, 1280)
             assert camera.identity.serial == "KJ0042"
     finally:
@@ -72,16 +74,15 @@ _LOST_AND_FORGOTTEN = """
 import ctypes, gc, time
 from station.cell.config import CameraConfig
 from station.devices.aravis_device import GenicamDevice
-from tests.numbered_gige import start_numbered
+from tests.gige_vision.camera import EmulatedCamera
 
-with start_numbered() as server:
-    device = GenicamDevice(CameraConfig(device="127.0.0.1", packet_size=8996))
+with EmulatedCamera():
+    device = GenicamDevice(CameraConfig(device="127.0.0.1"))
     device.open()
     device._stream = None
     gc.collect()
-    server.process.kill()
-    # Aravis gives up the camera in 4 to 7 s. A handler called in its thread has to wait: this sleep keeps the
-    # interpreter to itself.
+    # This sleep keeps the interpreter to itself: the camera is silent, and Aravis gives it up in 4 to 7 s. A
+    # handler called in its thread has to wait.
     ctypes.PyDLL(None).usleep(8_000_000)
     time.sleep(0.1)
     assert device.lost

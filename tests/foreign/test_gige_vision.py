@@ -20,8 +20,7 @@ from station.devices.pixels import decode
 from tests.codes import raises
 from tests.gige_vision import description
 from tests.gige_vision.camera import EmulatedCamera, Packets
-from tests.gige_vision.pixels import encode
-from tests.numbered_gige import numbered_picture
+from tests.gige_vision.pixels import encode, numbered_picture
 
 pytestmark = pytest.mark.gige
 SIZE = (640, 480)

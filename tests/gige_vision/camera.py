@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.gige_vision import description as at
-from tests.gige_vision.pixels import encode
-from tests.numbered_gige import numbered_picture
+from tests.gige_vision.pixels import encode, numbered_picture
 
 CONTROL_PORT = 3956
 _DISCOVERY, _RESEND, _READ_REGISTER, _WRITE_REGISTER = 0x0002, 0x0040, 0x0080, 0x0082

@@ -1,4 +1,4 @@
-"""Encoding of images in GenICam's pixel formats, for cameras of tests."""
+"""Images of cameras of tests: numbered ones, and their encoding in GenICam's pixel formats."""
 
 from __future__ import annotations
 
@@ -14,3 +14,16 @@ def encode(grey: NDArray[np.uint8], pixel_format: str) -> bytes:
         return grey.tobytes()
     wide, bits = grey.astype("<u2"), int(pixel_format.removeprefix("Mono"))
     return (wide << (bits - 8) | wide >> (16 - bits)).astype("<u2").tobytes()
+
+
+_noise: dict[tuple[int, int], NDArray[np.uint8]] = {}
+
+
+def numbered_picture(number: int, width: int, height: int) -> NDArray[np.uint8]:
+    """Noise that moves with the number, and the number itself in the first eight bytes; nearly free."""
+    if (width, height) not in _noise:
+        _noise[width, height] = np.random.default_rng(0).integers(0, 256, (height + 64, width), np.uint8)
+    shift = number % 64
+    picture = _noise[width, height][shift : shift + height].copy()
+    picture.reshape(-1)[:8] = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
+    return picture

@@ -4,7 +4,7 @@ The person matches the outline of the wanted view within 3 cm and 8° (1σ of le
 the joints get, 0.8 rad around home; gives it up after one try; ignores it in 15 of 100 moves and goes to a
 random view in sight. Goes 8 % too far, waits 0.2 s, comes back. What hangs on the arm then swings by 2 mm,
 dying away in 0.3 s; the hand drifts by 3 mm/s for another 0.5 to 1.5 s, then lets go. In one move of twenty
-the board is touched and shakes by 1 mm for a second. Twelve views at least, and until the goal of 0.5 mm,
+the board is touched and shakes by 1 mm for a second. Twelve views at least, and until the goal of 1 mm,
 twenty at most. Lens, camera and board pose are unknown at first. Random: as many views, uniform in the same
 joints, of those that show the whole board. Corners 0.15 px, robot 0.02 mm and 0.02 mrad. Kept while moving:
 the board faster than 2 mm/s.
@@ -23,6 +23,7 @@ from scipy.optimize import least_squares
 
 from benchmarks.trials import Miss, rms, rows_of, table, trials
 from calibrate.geometry import Array, pose, rotation_exp, transform_points
+from calibrate.handeye.metrics import median_distance_m, point_error_m
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import calibrate_intrinsics
@@ -31,7 +32,7 @@ from calibrate.projection import camera_matrix, distortion, project_pixels
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from recordings.schema.stillness import WINDOW_S, scatter
-from station.analysis.estimation import quick_sigma
+from station.analysis.estimation import quick_covariance
 from station.analysis.guidance import NextView, next_view, rim, way_to
 from station.analysis.worker import CapturedView
 from station.cell.config import CaptureConfig, StillnessConfig
@@ -103,7 +104,9 @@ def session(task: tuple[str, Mount, int]) -> tuple[float, ...]:
 def enough(taken: ViewSet, wanted: NextView) -> bool:
     if len(taken) < FEWEST_BY_HAND or (found := wanted.found) is None:
         return False
-    return quick_sigma(found.views, BOARD, found.X, found.Y, True)[0] <= CaptureConfig().goal_m
+    covariance = quick_covariance(found.views, BOARD, found.X, found.Y, True)
+    distance_m = median_distance_m(found.views.camera_from_board)
+    return point_error_m(found.X, covariance, distance_m) <= CaptureConfig().goal_m
 
 
 def seen(view: BoardView) -> CapturedView:

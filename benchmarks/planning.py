@@ -105,10 +105,14 @@ def _compare_choices(cell: RandomCell, result: CellResult, rng: np.random.Genera
 
 def _squares(errors: Array, X: Array) -> tuple[float, float, float]:
     """Mean squared errors of X (visits, 6): translation, rotation, and of a point ahead of the camera."""
-    ahead = errors[:, :3] + np.cross(errors[:, 3:], AHEAD_M * X[:3, 2])
-    scaled = (1e3 * errors[:, :3], np.rad2deg(errors[:, 3:]), 1e3 * ahead)
+    scaled = (1e3 * errors[:, :3], np.rad2deg(errors[:, 3:]), 1e3 * _ahead(errors, X, AHEAD_M))
     mm, deg, point = (float((e**2).sum(axis=1).mean()) for e in scaled)
     return mm, deg, point
+
+
+def _ahead(errors: Array, X: Array, distance_m: float) -> Array:
+    """Errors (n, 3) of a point so far ahead of the camera, by those of X (n, 6)."""
+    return errors[:, :3] + np.cross(errors[:, 3:], distance_m * X[:3, 2])
 
 
 def _plan_and_check(cell: RandomCell, result: CellResult, rng: np.random.Generator, seed: int) -> None:
@@ -128,10 +132,10 @@ def _plan_and_check(cell: RandomCell, result: CellResult, rng: np.random.Generat
     flange = forward(ARM, joints[1:])
     result.unseen += sum(not shows_board(cell.camera_from_board(E)) for E in flange)
     result.motion_s = check_plan(plan, cell.start, scene.geometry).duration_s
-    last = plan.poses[-1].predicted_sigma_m
-    assert last is not None
+    last, distance_m = plan.poses[-1].predicted_sigma_m, plan.working_distance_m
+    assert last is not None and distance_m is not None
     errors = np.array([x_error(cell, flange, rng) for _ in range(2 * VISITS)])
-    result.achieved = [float(e) / last for e in np.linalg.norm(errors[:, :3], axis=1)]
+    result.achieved = [float(e) / last for e in np.linalg.norm(_ahead(errors, cell.X, distance_m), axis=1)]
 
 
 def _check_path(start: Array, target: Array, cell: RandomCell, result: CellResult) -> None:

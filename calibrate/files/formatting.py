@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -28,15 +28,18 @@ class ShownFigure:
     """Condition or unit of the figure: 'at 487 mm', 'passed'."""
 
 
+def predicted_error(error_mm: float | None, distance_m: float | None) -> ShownFigure:
+    """Make the one figure of accuracy, as every screen and page shows it: 1σ of a point so far away."""
+    value = "–" if error_mm is None else f"± {error_mm:.3g} mm (1σ)"
+    return ShownFigure("predicted error", value, f"at {1000 * distance_m:.0f} mm" if distance_m else "")
+
+
 def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str, ShownFigure]:
     """Collect the figures that a calibration is judged by, most important first, without unknown ones."""
     quality, gates, views = calibration.quality, calibration.quality.gates, calibration.views
-    without = "without the arm's own" * quality.without_arm
-    position = f"± {calibration.sigma.translation_mm:.3g} mm (1σ)"
-    shown = {"error": ShownFigure("camera position", position, without)}
-    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
-        at = f"at {1000 * quality.working_distance_m:.0f} mm" + f", {without}" * bool(without)
-        shown["error"] = ShownFigure("predicted error", f"± {quality.predicted_error_mm:.3g} mm (1σ)", at)
+    error = predicted_error(quality.predicted_error_mm, quality.working_distance_m)
+    without = ", without the arm's own" * quality.without_arm
+    shown = {"error": replace(error, about=error.about + without)}
     if (held := quality.holdout) is not None:
         missed = f"{1000 * held.e_t_m:.3g} mm, e_R {held.e_R:.3g}"
         shown["held_out"] = ShownFigure("held-out error", missed, f"over {len(held.pairs)} samples")
@@ -51,14 +54,12 @@ def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str
 
 def accuracy_text(calibration: Calibration) -> str:
     """Write how right the result is, and the limit, as a sentence."""
-    figure, quality = figures(calibration)["error"], calibration.quality
-    of = "The camera's position"
-    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
-        of = f"A point {quality.working_distance_m:.2f} m from the camera"
-    without = ", without the arm's own error" * ("without" in figure.about)
+    quality, value = calibration.quality, figures(calibration)["error"].value
+    without = ", without the arm's own error" * quality.without_arm
     gates = [gate for gate in quality.gates if gate.name == "predicted_error_m"]
     limit = f" The limit is {gates[0].shown(gates[0].limit)}." if gates else ""
-    return f"{of} is right to {figure.value}{without}.{limit}"
+    point = f"A point {quality.working_distance_m or 0.0:.2f} m from the camera"
+    return f"{point} is right to {value}{without}.{limit}"
 
 
 def use_text(calibration: Calibration) -> str:

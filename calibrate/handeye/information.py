@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from calibrate.geometry import Array
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.linear import Linear
+from calibrate.handeye.metrics import point_error_m
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.projection import camera_matrix
 from calibrate.results import SHAPE
@@ -121,7 +122,6 @@ def covariance_of(information: Array, prior: Array | None = None) -> Array:
     return np.asarray(np.linalg.inv(scaled) * scale[..., :, None] * scale[..., None, :])
 
 
-def sigma_of(information: Array, prior: Array) -> tuple[float, float]:
-    """Compute 1σ of X from information (p, p) and prior: root of the summed variances, metres, radians."""
-    diagonal = np.diag(covariance_of(information, prior))
-    return float(np.sqrt(diagonal[:3].sum())), float(np.sqrt(diagonal[3:6].sum()))
+def predicted_error_m(information: Array, prior: Array, X: Array, distance_m: float) -> float:
+    """Predict the error of a point as `point_error_m`, from information (p, p) and its prior."""
+    return point_error_m(X, covariance_of(information, prior)[:6, :6], distance_m)

@@ -170,7 +170,8 @@ def rehearsal_text(job: SolvedRecording) -> str:
     about = json.loads(attachments["rehearsal.json"])
     true_X = np.array(json.loads(attachments["truth.json"])["camera_mount"])
     off = difference(job.calibration.transform.matrix, true_X)
-    reached = f"{quality.predicted_error_mm:.2f} mm (1σ) {figures(job.calibration)['error'].about}"
+    error = figures(job.calibration)["error"]
+    reached = f"{error.value} {error.about}"
     repeats = f"{about['robot_sigma_mm']:.2g} mm and {about['robot_sigma_deg']:.2g}° (1σ per axis)"
     off_deg = np.degrees(np.linalg.norm(off[3:]))
     return (

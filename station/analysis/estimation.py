@@ -15,7 +15,8 @@ from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose
-from calibrate.handeye.information import USUAL_NOISE, prior_information, sigma_of, view_information
+from calibrate.handeye.information import USUAL_NOISE, covariance_of, prior_information, view_information
+from calibrate.handeye.metrics import median_distance_m, point_error_m
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
@@ -42,11 +43,9 @@ def running_estimate(
 
     `camera`: without a matrix nothing is known of its lens.
     """
-    goal_m = config.capture.goal_m
     shown = [count_in_parts(camera, view.pixels, COVERAGE_ROWS, COVERAGE_COLUMNS) > 0 for view in seen]
     blank = EstimateStatus(
         len(seen),
-        goal_mm=1000 * goal_m,
         image_views=tuple(tuple(int(n) for n in row) for row in np.sum(shown, axis=0)),
     )
     if len(seen) < FEWEST_FOR_ESTIMATE:
@@ -55,15 +54,17 @@ def running_estimate(
         views, X, Y = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return blank
-    sigma_m, _ = quick_sigma(views, config.board, X, Y, not lens_is_known)
+    distance_m = median_distance_m(views.camera_from_board)
+    error_m = point_error_m(X, quick_covariance(views, config.board, X, Y, not lens_is_known), distance_m)
     x, y, z = (float(v) for v in 1000 * X[:3, 3])
     return msgspec.structs.replace(
         blank,
         translation_mm=(round(x, 2), round(y, 2), round(z, 2)),
         camera_pose=matrix4(X),
         board_pose=matrix4(Y),
-        sigma_translation_mm=round(1000 * sigma_m, 3),
-        enough=sigma_m <= goal_m,
+        predicted_error_mm=round(1000 * error_m, 3),
+        working_distance_m=round(distance_m, 4),
+        enough=error_m <= config.capture.goal_m,
     )
 
 
@@ -108,13 +109,13 @@ def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
     return X, np.asarray(gripper[0] @ X @ board[0])
 
 
-def quick_sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> tuple[float, float]:
-    """Predict 1σ of X: translation (m) and rotation (rad), roots of the summed variances."""
+def quick_covariance(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> Array:
+    """Predict the covariance (6, 6) of X."""
     points = board_points(board)
     flange = views.base_from_flange
     each = view_information(views.mount, views.camera, flange, X, Y, points, USUAL_NOISE)
     prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
-    return sigma_of(each.sum(axis=0), prior)
+    return covariance_of(each.sum(axis=0), prior)[:6, :6]
 
 
 def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:

@@ -15,7 +15,7 @@ from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse
 from calibrate.views import ViewSet
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
-from station.analysis.estimation import FEWEST_FOR_CELL, quick_sigma, solve_quickly
+from station.analysis.estimation import FEWEST_FOR_CELL, quick_covariance, solve_quickly
 from station.analysis.worker import CapturedView
 from station.cell.layout import board_place
 
@@ -99,15 +99,15 @@ def find_cell(
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return None
     spread_m, other_m = _spread_m(views, X), _spread_m(other_views, other_X)
-    sigma_m, sigma_rad = quick_sigma(views, board, X, Y, not lens_known)
+    variances = np.diag(quick_covariance(views, board, X, Y, not lens_known))
     # Few views give a rough lens, so state at least the disagreement between the views.
-    sigma_m = float(np.hypot(sigma_m, spread_m))
+    sigma_m = float(np.sqrt(variances[:3].sum() + spread_m**2))
     return FoundCell(
         views=views,
         X=X,
         Y=Y,
         sigma_m=max(sigma_m, _LEAST_SIGMA_M),
-        sigma_rad=max(sigma_rad, _LEAST_SIGMA_RAD),
+        sigma_rad=max(float(np.sqrt(variances[3:].sum())), _LEAST_SIGMA_RAD),
         spread_m=spread_m,
         scale=_scale(views, X),
         other_fits=_OTHER_MOUNT * other_m < spread_m,

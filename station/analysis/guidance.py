@@ -17,7 +17,13 @@ import numpy as np
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, pose, rotation_angle, rotation_exp, rotation_log, transform_points
-from calibrate.handeye.information import USUAL_NOISE, prior_information, sigma_of, view_information
+from calibrate.handeye.information import (
+    USUAL_NOISE,
+    predicted_error_m,
+    prior_information,
+    view_information,
+)
+from calibrate.handeye.metrics import median_distance_m
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.pnp import candidate_poses, solve_pnp
 from calibrate.projection import camera_matrix, intrinsics_names, project_pixels
@@ -62,7 +68,7 @@ class NextView:
     found: FoundCell | None = None
     """The cell by the views so far; None: they are not enough."""
     after_m: float | None = None
-    """Predicted 1σ of X's translation (root of the summed variances) with the wanted view."""
+    """Predicted error (`point_error_m`) at the board's distance with the wanted view."""
 
     @property
     def outline(self) -> Array:
@@ -121,13 +127,15 @@ def next_view(
     lens, at = views.camera, views.camera_from_board
     prior = prior_information(lens, lens_known, BoardTolerance.of(board))
     free = None if lens_known else slice(12, 12 + len(intrinsics_names(lens)))
-    objective = Objective("A", float(np.median(np.linalg.norm(at[:, :3, 3], axis=1))), prior, free)
+    distance_m = median_distance_m(at)
+    objective = Objective("A", distance_m, prior, free)
     pool = _candidates(views, board, given_up)
     flange = np.concatenate([views.base_from_flange, implied_flange(mount, X, Y, pool)])
     each = view_information(mount, lens, flange, X, Y, points, USUAL_NOISE)
     known, gains = each[: len(at)].sum(axis=0), each[len(at) :]
     best = int(np.argmin(objective(known + gains)))
-    return NextView(mount, board, lens, at, pool[best], found, sigma_of(known + gains[best], prior)[0])
+    after_m = predicted_error_m(known + gains[best], prior, X, distance_m)
+    return NextView(mount, board, lens, at, pool[best], found, after_m)
 
 
 def way_to(wanted: NextView, seen: CapturedView) -> Way:

@@ -185,8 +185,8 @@ class CaptureConfig(Section, frozen=True):
     """Largest bound of the image time for which a pose is accepted. At the stillness limit of 2 mrad/s it is
     0.04 mm at one metre."""
     free_space_bytes: Annotated[int, msgspec.Meta(ge=0)] = 2_000_000_000
-    goal_m: Positive = 0.0005
-    """Expected error of X (1σ of its translation) below which the session is complete enough."""
+    goal_m: Positive = 0.001
+    """Predicted error (1σ of a point at the board's distance) below which the session is complete enough."""
 
 
 class ValidityConfig(Section, frozen=True):

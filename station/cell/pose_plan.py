@@ -35,7 +35,7 @@ class PlannedPose(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknow
     view: ExpectedView | None = None
     why: str = ""
     predicted_sigma_m: float | None = None
-    """Expected 1σ of X's translation after this pose."""
+    """Predicted error (1σ) of a point at the plan's working distance after this pose."""
     guided: bool = False
     """True when a person brought the arm there by hand."""
 
@@ -53,6 +53,8 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     note: str = ""
     criterion: Criterion | None = None
     """Criterion by which the planner chose the poses; None: a person taught, listed or changed some."""
+    working_distance_m: float | None = None
+    """Median distance of camera and board, for which the poses state a predicted error."""
 
 
 def plan_sha256(plan: Plan) -> str:

@@ -53,7 +53,6 @@ class SessionSummary(msgspec.Struct, frozen=True):
     """File of the recording, or folder of several; empty: nothing was recorded."""
     source: Source | Literal[""]
     views: int
-    bytes: int
     sealed: bool
     calibration: str
     """Path of the calibration file made from it; empty: none."""
@@ -136,7 +135,6 @@ def _described(folder: Path) -> SessionSummary:
         recording=str(files[0] if len(files) == 1 else folder) if files else "",
         source=state.source if state else "",
         views=sum(pose.counts for pose in state.poses) if state else 0,
-        bytes=sum(file.stat().st_size for file in files),
         sealed=bool(files) and not any(file.name.endswith(PART_SUFFIX) for file in files),
         calibration=str(calibration) if calibration.is_file() else "",
     )

@@ -55,7 +55,7 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     corners: int | None = None
     predicted_sigma_mm: float | None = None
     estimated_sigma_mm: float | None = None
-    """Expected error after this pose, by the images so far (`predicted_sigma_mm`: when planned)."""
+    """Predicted error after this pose, by the images so far (`predicted_sigma_mm`: when planned)."""
     coverage: float | None = None
     base_from_flange: Matrix4 | None = None
     """Expected flange pose."""
@@ -198,13 +198,16 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
     views: int = 0
     translation_mm: tuple[float, float, float] | None = None
-    sigma_translation_mm: float | None = None
+    predicted_error_mm: float | None = None
+    """1σ of a point at the working distance, as the calibration file states it."""
+    working_distance_m: float | None = None
+    """Median distance of camera and board."""
     camera_pose: Matrix4 | None = None
     """Pose of the camera in the flange (eye-in-hand) or the base."""
     board_pose: Matrix4 | None = None
     """Pose of the board in the base (eye-in-hand) or the flange."""
-    goal_mm: float | None = None
     enough: bool = False
+    """The predicted error reached `capture.goal_m`."""
     image_views: tuple[tuple[int, ...], ...] = ()
     """Images that show the board in each part of the image, rows from the top."""
 
@@ -225,7 +228,7 @@ class GuidanceStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     moves: str = ""
     """What still moves; empty: nothing."""
     after_mm: float | None = None
-    """Expected error after the wanted view; now: `EstimateStatus.sigma_translation_mm`."""
+    """Predicted error after the wanted view; now: `EstimateStatus.predicted_error_mm`."""
     cause: str = ""
     """What is probably wrong with the cell: other-mounting, square-size or moved; empty: nothing."""
     warning: str = ""
@@ -239,6 +242,8 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     folder: str = ""
     plan_sha256: str = ""
     poses: tuple[PoseStatus, ...] = ()
+    working_distance_m: float | None = None
+    """Distance of the point whose predicted error the plan states."""
     current: int | None = None
     """Number of the pose under way, or of the last one."""
     captured: int = 0

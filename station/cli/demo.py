@@ -15,11 +15,10 @@ from typing import Annotated
 import msgspec
 import numpy as np
 import typer
-from rich.table import Table
 from rich.text import Text
 
 from calibrate.files.calibration import Calibration, Sigma, read_calibration
-from calibrate.files.formatting import arm_sentences
+from calibrate.files.formatting import arm_sentences, use_text
 from calibrate.geometry import difference
 from recordings.files import state_root
 from recordings.reader import open_recording
@@ -128,7 +127,7 @@ def demo_command(
     if as_json:
         print_json(result)
     else:
-        _show_demo(result, arm is not None and arm.offered, time.monotonic() - started_s)
+        _show_demo(result, solved, arm is not None and arm.offered, time.monotonic() - started_s)
         for sentence in arm_sentences(solved):
             out.print(sentence)
     if opened:
@@ -139,17 +138,14 @@ def demo_command(
         raise typer.Exit(3)
 
 
-def _show_demo(result: DemoJson, with_table: bool, duration_s: float) -> None:
-    table = Table(title=f"SIMULATED cell, seed {result.seed}: {result.mount}, {result.scene} scene")
-    for heading in ("", "translation", "rotation"):
-        table.add_column(heading, justify="left" if not heading else "right")
-    on_table = ", by the corrected arm" if with_table else ""
-    for name, value in (
-        (f"error against the truth{on_table}", result.truth_error),
-        (f"standard uncertainty{on_table}", result.sigma),
-    ):
-        table.add_row(name, f"{value.translation_mm:.3f} mm", f"{value.rotation_deg:.4f}°")
-    out.print(table)
+def _show_demo(result: DemoJson, solved: Calibration, arm_is_corrected: bool, duration_s: float) -> None:
+    out.print(f"SIMULATED cell, seed {result.seed}: {result.mount}, {result.scene} scene", style="bold")
+    out.print(use_text(solved))
+    off, by_table = result.truth_error, ", by the corrected arm," * arm_is_corrected
+    out.print(
+        f"The true camera pose is known here. The found one{by_table} is off by {off.translation_mm:.3f} mm "
+        f"and {off.rotation_deg:.4f}°."
+    )
     verdict = "all gates passed" if result.gates_passed else ("a gate FAILED", "red")
     taken = f"{result.poses.captured} of {result.poses.planned} poses, "
     out.print(Text.assemble(taken, verdict, f", {duration_s:.0f} s in all"))

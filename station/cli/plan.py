@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from calibrate.files.formatting import predicted_error
 from recordings.schema.messages import Mount
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config
@@ -154,7 +155,7 @@ def _summary(plan: Plan, outcome: PlanCheck) -> PlanJson:
 
 def _show(plan: Plan, outcome: PlanCheck, goal_m: float) -> None:
     table = Table(box=None, pad_edge=False)
-    for heading in ("pose", "move s", "turn °", "margin mm", "σ mm"):
+    for heading in ("pose", "move s", "turn °", "margin mm", "error mm"):
         table.add_column(heading, justify="left" if heading == "pose" else "right", no_wrap=True)
     table.add_column("why")
     for pose, move in zip(plan.poses, outcome.moves, strict=True):
@@ -172,8 +173,11 @@ def _show(plan: Plan, outcome: PlanCheck, goal_m: float) -> None:
         f"at most {outcome.top_speed_m_s:.2f} m/s and {np.rad2deg(outcome.largest_step_rad):.0f}° in one move"
     )
     if (last_m := plan.poses[-1].predicted_sigma_m) is not None:
-        goal = f"(goal {1000 * goal_m:.2g} mm, capture.goal_m)"
-        out.print(f"expected error {1000 * last_m:.2f} mm {goal}, if corners and arm are as good as assumed")
+        error = predicted_error(1000 * last_m, plan.working_distance_m)
+        out.print(
+            f"{error.label} {error.about}: {error.value}, goal {1000 * goal_m:g} mm (capture.goal_m), "
+            "if corners and arm are as good as assumed"
+        )
     if plan.note:
         out.print(f"note: {plan.note}")
     for problem in outcome.problems:

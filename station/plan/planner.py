@@ -10,7 +10,8 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.handeye.information import USUAL_NOISE, MeasurementNoise, sigma_of
+from calibrate.handeye.information import USUAL_NOISE, MeasurementNoise, predicted_error_m
+from calibrate.handeye.metrics import median_distance_m
 from calibrate.kinematics import forward
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
@@ -243,8 +244,10 @@ def _describe(
     objective: Objective,
 ) -> Plan:
     known = gained.cumsum(axis=0)
+    C = layout.camera_from_board(forward(layout.geometry.model, joints))
+    distance_m = median_distance_m(C)
     poses = tuple(
-        planned_pose(layout, number, q, sigma_of(total, objective.prior)[0])
+        planned_pose(layout, number, q, predicted_error_m(total, objective.prior, layout.X, distance_m))
         for number, (q, total) in enumerate(zip(joints, known, strict=True))
     )
     limits = layout.geometry.limits
@@ -256,4 +259,5 @@ def _describe(
         joint_acceleration_rad_s2=limits.joint_acceleration_rad_s2,
         seed=options.seed,
         criterion=options.criterion,
+        working_distance_m=round(distance_m, 4),
     )

@@ -168,6 +168,7 @@ class SessionContext:
         self.store.update_session(
             plan_sha256=queue.sha256,
             poses=queue.statuses,
+            working_distance_m=queue.plan.working_distance_m,
             current=current,
             captured=queue.done,
             source=self.cell.source,

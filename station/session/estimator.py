@@ -63,7 +63,7 @@ class Estimator:
             if odd is not None:
                 context.store.problem(odd, "warning", seen[-1].index)
             if queue is not None and queue is context.queue:
-                queue.note(self._known[-1], estimated_sigma_mm=estimate.sigma_translation_mm)
+                queue.note(self._known[-1], estimated_sigma_mm=estimate.predicted_error_mm)
                 context.store.update_session(poses=queue.statuses)
             if (recording := context.recording) is not None:
                 with contextlib.suppress(RecordingError):  # a full disk is reported by the run

@@ -1,4 +1,4 @@
-"""Panels of the capture screen: image quality, expected error, coverage of the image."""
+"""Panels of the capture screen: image quality, predicted error, coverage of the image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from textual.content import Content
 from station.cell.status import FEWEST_BY_HAND, DetectionStatus, GuidanceStatus
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
-from station.tui.words import UNKNOWN, degrees, dim, facts, limit_bar, lines, mark, mm
+from station.tui.words import degrees, dim, error_facts, facts, limit_bar, lines, mark, mm
 
 BURNT = 0.01
 """Share of saturated pixels above which the image counts as too bright."""
@@ -49,15 +49,12 @@ def still_lines(guidance: GuidanceStatus, cells: int) -> tuple[Content, Content]
 def hand_lines(known: Known, width: int, height: int) -> Content:
     """Say how still everything is, what the last view was worth, and what the wanted one would be."""
     status = known.shown
-    seen, guidance = status.session, status.guidance
-    errors = [p.estimated_sigma_mm for p in seen.poses if p.counts]
-    now, before = (errors[-1] if errors else None), (errors[-2] if errors[1:] else None)
-    worth = [("view", str(seen.captured), f"of {FEWEST_BY_HAND} or more")]
-    if now is not None:
-        worth.append(("now", f"± {now:.2f}", "mm" if before is None else f"mm, before ± {before:.2f}"))
-    if guidance.after_mm is not None and (now is None or guidance.after_mm < now):
-        worth.append(("with the next", f"± {guidance.after_mm:.2f}", "mm"))
-    rows = [*still_lines(guidance, max(6, width - 14)), *(facts(each) for each in worth)]
+    guidance = status.guidance
+    now_mm, after_mm = status.estimate.predicted_error_mm, guidance.after_mm
+    rows = [*still_lines(guidance, max(6, width - 14))]
+    rows.append(facts(("view", str(status.session.captured), f"of {FEWEST_BY_HAND} or more")))
+    if after_mm is not None and (now_mm is None or after_mm < now_mm):
+        rows.append(error_facts("with the next view", after_mm, None))
     if guidance.warning:
         rows.insert(0, mark("look", guidance.warning))
     elif guidance.enough:
@@ -66,14 +63,12 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
 
 
 def error_lines(known: Known, width: int, height: int) -> Content:
-    """Draw the expected error after each pose: estimated solid, planned dotted, the goal dashed."""
-    status = known.shown
-    estimate, poses = status.estimate, status.session.poses
-    goal = estimate.goal_mm
-    now = estimate.sigma_translation_mm
-    head = facts(("", f"± {now:.2f}" if now is not None else f"± {UNKNOWN}", "mm"))
+    """Draw the predicted error after each pose: by images solid, planned dotted, the goal dashed."""
+    estimate, session, goal = known.shown.estimate, known.shown.session, known.goal_mm
+    poses = session.poses
+    head = error_facts("", estimate.predicted_error_mm, estimate.working_distance_m)
     if goal:
-        head += Content.assemble(("   goal ", "$dim"), (f"± {goal:.2f}", "$warn"))
+        head += Content.assemble(("   goal ", "$dim"), (f"{goal:g} mm", "$warn"))
     if estimate.enough:
         head += Content("   ") + mark("done", "reached")
     measured = [(i + 1.0, p.estimated_sigma_mm) for i, p in enumerate(poses) if p.estimated_sigma_mm]
@@ -82,11 +77,10 @@ def error_lines(known: Known, width: int, height: int) -> Content:
         for i, p in enumerate(poses)
         if p.predicted_sigma_mm and p.predicted_sigma_mm < 100 * (goal or 0.5)
     ]
-    end_mm = poses[-1].predicted_sigma_mm if poses else None
-    end = "" if end_mm is None else f"by the plan ± {end_mm:.2f} mm"
     rows = [head]
-    if end and height > 6:
-        rows.append(dim(f"{end} after {len(poses)} poses"))
+    if poses and poses[-1].predicted_sigma_mm is not None and height > 6:
+        end = error_facts("by the plan", poses[-1].predicted_sigma_mm, session.working_distance_m)
+        rows.append(end + dim(f" after {len(poses)} poses"))
     rows.append(
         curve(
             [Series(planned, "$faint", dash=2), Series(measured, "$accent")],

@@ -48,7 +48,7 @@ class CaptureScreen(StationScreen):
             with Vertical(id="live-right"):
                 with Box("Poses", id="progress", below=LEGEND):
                     yield Panel("", _progress, id="poses")
-                yield Panel("Expected error of position (1σ)", error_lines, id="error")
+                yield Panel("Predicted error", error_lines, id="error")
                 title = "Where the board was seen"
                 yield Panel(title, coverage_lines, id="coverage", below="images per part")
         yield Stopped(id="stopped")

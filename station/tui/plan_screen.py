@@ -9,14 +9,14 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.content import Content
 
-from station.cell.status import PoseStatus, StationStatus
+from station.cell.status import PoseStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import MakePlan, Retake, Skip
 from station.tui.frame import Line
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
-from station.tui.words import MARKS, UNKNOWN, Mark, dim, facts, lines, many, mark
+from station.tui.words import MARKS, Mark, dim, error_facts, facts, lines, many, mark
 
 COLUMNS = ("#", "error after", "state", "reason")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves)."
@@ -25,8 +25,6 @@ SKIP = "Skip this pose; of a captured one only its retake"
 NEW = "Plan 25 poses from the configured initial poses (seconds)"
 NEW_FOR_ARM = "Plan 25 poses that also tell the errors of the arm's table, board and lens"
 POSE_VERBS = {"retake": Retake, "skip": Skip}
-SIGMA_SHOWN_MM = 100.0
-"""Larger errors are not shown: after the first poses they are metres, which say nothing."""
 _STATES: dict[str, tuple[Mark, str]] = {
     "planned": ("todo", "planned"),
     "done": ("done", "saved"),
@@ -37,8 +35,6 @@ _STATES: dict[str, tuple[Mark, str]] = {
 
 def row_of(pose: PoseStatus) -> tuple[Content, ...]:
     """Make a row of the table."""
-    sigma_mm = pose.estimated_sigma_mm or pose.predicted_sigma_mm
-    shown = f"{sigma_mm:7.2f}" if sigma_mm and sigma_mm <= SIGMA_SHOWN_MM else f"{UNKNOWN:>7}"
     kind, word = _STATES.get(pose.state, ("now", pose.state))
     if pose.kept:
         kind, word = "look", "to be captured again"
@@ -46,23 +42,22 @@ def row_of(pose: PoseStatus) -> tuple[Content, ...]:
         word = f"failed: {pose.reason}"
     return (
         Content.styled(f"{pose.index + 1:>3} ", "$foreground") + mark(kind),
-        facts(("", shown, "mm")),
+        error_facts("", pose.estimated_sigma_mm or pose.predicted_sigma_mm, None),
         Content.styled(word, MARKS[kind][1]),
         Content.styled(pose.why or pose.name, "$foreground"),
     )
 
 
-def facts_line(status: StationStatus) -> Content:
+def facts_line(known: Known) -> Content:
     """Sum the plan up in one line."""
-    poses = status.session.poses
-    if not poses:
+    session, goal_mm = known.shown.session, known.goal_mm
+    if not (poses := session.poses):
         return dim(NO_PLAN)
     end_mm = poses[-1].predicted_sigma_mm
-    line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose"))
-    if end_mm is not None:
-        line += Content("   ") + facts(("expected at the end", f"± {end_mm:.2f}", "mm (1σ)"))
-        if (goal := status.estimate.goal_mm) is not None:
-            line += Content("   ") + mark("done" if end_mm <= goal else "look", f"goal {goal:g} mm")
+    line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose")) + Content("   ")
+    line += error_facts("predicted error at the end", end_mm, session.working_distance_m)
+    if end_mm is not None and goal_mm is not None:
+        line += Content("   ") + mark("done" if end_mm <= goal_mm else "look", f"goal {goal_mm:g} mm")
     left_out = sum(pose.state == "skipped" for pose in poses)
     return line + dim(f"   {many(left_out, 'pose')} skipped" * bool(left_out))
 
@@ -70,9 +65,9 @@ def facts_line(status: StationStatus) -> Content:
 def detail_of(pose: PoseStatus, before: PoseStatus | None) -> Content:
     """Describe one pose: its reason, what it brings, and what went wrong."""
     rows = [Content.assemble((f"{pose.name}  ", "bold $strong"), pose.why or "added by hand")]
-    gains = [p.predicted_sigma_mm for p in (before, pose) if p is not None and p.predicted_sigma_mm]
-    if len(gains) == 2 and max(gains) <= SIGMA_SHOWN_MM:
-        rows.append(facts(("brings", f"± {gains[0]:.2f} → ± {gains[1]:.2f}", "mm")))
+    if before is not None and pose.predicted_sigma_mm is not None:
+        gain = [error_facts("", p.predicted_sigma_mm, None) for p in (before, pose)]
+        rows.append(dim("brings ") + dim(" → ").join(gain))
     seen = "" if pose.corners is None else f"{many(pose.corners, 'corner')} in attempt {pose.attempt}"
     if pose.reason or seen:
         kind: Mark = "failed" if pose.state == "failed" else "look" if pose.reason else "done"
@@ -92,10 +87,10 @@ class PlanScreen(StationScreen):
     ]
 
     def body(self) -> ComposeResult:
-        yield Line(lambda known, _: facts_line(known.shown), id="plan-facts")
+        yield Line(lambda known, _: facts_line(known), id="plan-facts")
         with Horizontal(id="plan"):
             with Vertical(id="plan-left"):
-                with Box("Poses", id="plan-poses", below="expected error after each, 1σ"):
+                with Box("Poses", id="plan-poses", below="predicted error after each"):
                     yield Rows(*COLUMNS, id="plan-table")
                 yield Panel("Why", self._why, id="plan-detail")
             yield Panel("The cell", self._cell, id="plan-cell", below=LEGEND)

@@ -10,14 +10,15 @@ from textual.binding import Binding, BindingType
 from textual.content import Content
 from textual.widgets import Static
 
+from calibrate.files.formatting import figures
 from station.tui.installed import Kept
 from station.tui.jobs import check_session, recover_session, solve_session
 from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
-from station.tui.words import UNKNOWN, facts, mark, size
+from station.tui.words import facts, mark
 
 NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
-COLUMNS = ("session", "what became of it", "verdict", "predicted error", "views", "size")
+COLUMNS = ("session", "what became of it", "verdict", "views", "predicted error")
 
 
 class SessionsScreen(StationScreen):
@@ -85,12 +86,11 @@ class SessionsScreen(StationScreen):
 
 def _row(kept: Kept) -> tuple[Content, ...]:
     session, found, check = kept.session, kept.calibration, kept.check
-    predicted, unit = UNKNOWN, "mm"
+    error = Content()
     became, verdict = kept.word, mark("todo", "not solved")
     if found is not None:
-        quality = found.quality
-        predicted = UNKNOWN if quality.predicted_error_mm is None else f"± {quality.predicted_error_mm:.2f}"
-        unit = "mm + arm" if quality.without_arm else unit
+        figure = figures(found)["error"]
+        error = facts(("", figure.value, figure.about))
         verdict = mark("failed" if found.verdict == "FAIL" else "done", found.verdict)
         became = became or "solved, not installed"
     elif check is not None:
@@ -104,7 +104,6 @@ def _row(kept: Kept) -> tuple[Content, ...]:
         Content.styled(session.name, "$foreground"),
         Content.styled(("● " if now else "") + became, style),
         verdict,
-        facts(("", f"{predicted:>6}", unit)),
         Content.styled(f"{session.views:>4}", "$foreground"),
-        Content.styled(size(session.bytes), "$foreground"),
+        error,
     )

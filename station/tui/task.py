@@ -94,6 +94,11 @@ class Known:
         return self.live is not None and self.live.state in RUNNING
 
     @property
+    def goal_mm(self) -> float | None:
+        """Predicted error at which the views are enough; None: not told yet."""
+        return None if self.configuration is None else 1000 * self.configuration.capture.goal_m
+
+    @property
     def missing(self) -> Check | None:
         return next((check for check in self.checks if check.state == "failed"), None)
 

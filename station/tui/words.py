@@ -10,6 +10,7 @@ from typing import Literal
 from rich.text import Text
 from textual.content import Content
 
+from calibrate.files.formatting import predicted_error
 from station.cell.status import StationState, StationStatus
 
 STATE_WORDS = {state: state.value.upper() for state in StationState} | {StationState.DISCONNECTED: "NO ROBOT"}
@@ -26,6 +27,7 @@ MARKS: dict[Mark, tuple[str, str]] = {
 """Sign and colour: no state is told by colour alone."""
 UNKNOWN = "–"
 """A number that is not known; never 0."""
+ERROR_SHOWN_MM = 100.0
 BAR, TRACK, LIMIT = "━", "─", "┃"
 
 
@@ -68,6 +70,13 @@ def facts(*pairs: tuple[str, str, str]) -> Content:
         ]
         parts.append(("   ", ""))
     return Content.assemble(*parts[:-1])
+
+
+def error_facts(label: str, error_mm: float | None, distance_m: float | None) -> Content:
+    """Write a predicted error as pages and commands do; metres, after the first poses, say nothing."""
+    known = error_mm is not None and error_mm <= ERROR_SHOWN_MM
+    figure = predicted_error(error_mm if known else None, distance_m)
+    return facts((label, figure.value, figure.about))
 
 
 def limit_bar(value: float, limit: float, cells: int, colour: str, at: float = 0.7) -> Content:

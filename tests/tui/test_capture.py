@@ -99,14 +99,19 @@ def test_the_error_falls_towards_its_goal() -> None:
         )
         for i in range(25)
     )
-    estimate = EstimateStatus(6, (1.0, 2.0, 3.0), 0.83, goal_mm=0.5)
+    estimate = EstimateStatus(6, (1.0, 2.0, 3.0), 0.83, 0.5)
     status = msgspec.structs.replace(in_session(idle(), poses=poses), estimate=estimate)
-    lines = error_lines(Known(status), 60, 14).plain.split("\n")
-    assert "± 0.83 mm" in lines[0] and "goal ± 0.50" in lines[0] and "reached" not in lines[0]
+    lines = error_lines(Known(status, configuration=CELL), 60, 14).plain.split("\n")
+    assert (
+        "0.83 mm" in lines[0]
+        and "500 mm" in lines[0]
+        and "goal 1 mm" in lines[0]
+        and "reached" not in lines[0]
+    )
     assert len(lines) == 14
-    assert any(line.startswith(" 0.50 ") for line in lines)
+    assert any(line.startswith(" 1.00 ") for line in lines)
     enough = msgspec.structs.replace(status, estimate=msgspec.structs.replace(estimate, enough=True))
-    assert "✓ reached" in error_lines(Known(enough), 60, 14).plain
+    assert "✓ reached" in error_lines(Known(enough, configuration=CELL), 60, 14).plain
 
 
 def test_a_curve_stays_in_its_room_whatever_it_is_given() -> None:

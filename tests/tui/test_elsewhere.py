@@ -78,8 +78,8 @@ async def test_an_error_without_the_arm_s_own_is_marked_in_the_list(link: FakeLi
     async with app.run_test(size=(80, 24)) as pilot:
         table = await list_of_sessions(app, pilot)
         await until(pilot, lambda: table.row_count == 2)
-        shown = {str(table.get_row_at(line)[0]): str(table.get_row_at(line)[3]) for line in range(2)}
-        assert "+ arm" in shown["s-2"] and "+ arm" not in shown["s-1"]
+        shown = {str(table.get_row_at(line)[0]): str(table.get_row_at(line)[4]) for line in range(2)}
+        assert "the arm" in shown["s-2"] and "the arm" not in shown["s-1"]
 
 
 async def test_the_result_says_what_is_installed_and_who_took_it_back(link: FakeLink, root: Path) -> None:

@@ -11,6 +11,7 @@ from station.cell.status import PoseStatus
 from station.protocol import verbs
 from station.tui.desk import busy_words
 from station.tui.plan_screen import facts_line
+from station.tui.task import Known
 from tests.tui.conftest import FakeLink, app_on, idle, in_session, opened, said, text_of, until
 
 
@@ -70,4 +71,4 @@ def test_the_error_at_the_end_is_that_of_the_last_pose_alone() -> None:
     for last_known, shown in ((True, True), (False, False)):
         poses[-1] = msgspec.structs.replace(poses[-1], predicted_sigma_mm=2.2 if last_known else None)
         changed = in_session(idle(), poses=tuple(poses))
-        assert ("±" in facts_line(changed).plain) is shown
+        assert ("±" in facts_line(Known(changed)).plain) is shown

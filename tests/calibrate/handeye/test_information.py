@@ -6,7 +6,13 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import inverse, perturb, pose, random_rotation, rotation_exp, transform_points
-from calibrate.handeye.information import MeasurementNoise, covariance_of, prior_information, view_information
+from calibrate.handeye.information import (
+    MeasurementNoise,
+    covariance_of,
+    predicted_error_m,
+    prior_information,
+    view_information,
+)
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.projection import intrinsics_vector, project, with_intrinsics_vector
@@ -46,6 +52,8 @@ def test_the_predicted_sigma_is_the_one_that_the_solver_states(mount):
     predicted = covariance_of(each.sum(axis=0), prior)[:6, :6]
     ratio = np.sqrt(np.diag(solution.covariance) / np.diag(predicted))
     assert (ratio > 0.7).all() and (ratio < 1.4).all()
+    shown_m = predicted_error_m(each.sum(axis=0), prior, cell.X, solution.working_distance_m)
+    assert 0.7 < shown_m / solution.predicted_error_m < 1.4
 
 
 @MOUNTS

@@ -90,7 +90,7 @@ class StationApp(KnowingApp):
         ),
         Binding("f4", "release", "Release", show=False, tooltip="Release control of the arm"),
         *(
-            Binding(DIGITS[s.MODE], f"open('{s.MODE}')", s.MODE.title(), group=GO_TO, tooltip=s.TIP)
+            Binding(DIGITS[s.MODE], f"switch_mode('{s.MODE}')", s.MODE.title(), group=GO_TO, tooltip=s.TIP)
             for s in SCREENS
         ),
         Binding("ctrl+q", "leave", "Quit", show=False, tooltip="Close this screen; the daemon goes on"),
@@ -207,9 +207,6 @@ class StationApp(KnowingApp):
         self.known, self._marks = replace(self.known, sessions=kept), found
 
     # --- what the screens ask for by a key ---
-
-    async def action_open(self, mode: str) -> None:
-        await self.switch_mode(mode)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def action_solve_newest(self) -> None:

@@ -89,7 +89,7 @@ class Rail(Line):
     def on_click(self, event: events.Click) -> None:
         if self.size.height > 1:
             place = min(len(STEPS) - 1, len(STEPS) * event.x // self.size.width)
-            self.run_worker(self.app.run_action(f"open('{STEPS[place]}')"))
+            self.run_worker(self.app.run_action(f"switch_mode('{STEPS[place]}')"))
 
 
 class Frame(Horizontal):

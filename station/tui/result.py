@@ -16,7 +16,7 @@ from textual.content import Content
 from textual.widgets import DataTable, Static
 
 from calibrate.files.calibration import Calibration
-from calibrate.files.formatting import accuracy_text, arm_sentences, figures, noise_text, use_text
+from calibrate.files.formatting import accuracy_text, arm_sentences, figures, noise_text, pose_text, use_text
 from calibrate.files.install import change_text
 from calibrate.files.touch import LIMIT_SIGMAS, agrees, touch_sigmas, touch_text
 from calibrate.files.validity import ValidityState, validity_text
@@ -30,7 +30,7 @@ from station.tui.jobs import install_result, undo_install
 from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.touch_corners import run_touch_test
-from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, sentence, shortened, signed
+from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, sentence, shortened
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 5, Enter shows older ones."
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
@@ -167,27 +167,19 @@ def change_lines(result: Result, calibration: Calibration) -> list[Content]:
 
 
 def pose_lines(calibration: Calibration) -> list[Content]:
-    """Write the camera pose; positions in millimetres."""
-    result = calibration.result
-    sigmas = 1000 * np.sqrt(np.diag(np.array(calibration.covariance))[:3])
-    rows = [dim(f"{result.parent_frame}_from_{result.child_frame}")]
-    for axis, value, sigma in zip("xyz", result.translation_m, sigmas, strict=True):
-        value_mm = (f"{signed(1000 * value):>9}", "bold $strong")
-        rows.append(Content.assemble((f"{axis} ", "bold"), value_mm, (f" ± {sigma:.2f} mm", "$dim")))
-    quaternion = " ".join(signed(q, 5) for q in result.rotation_xyzw)
-    sigma = calibration.sigma
-    rows.append(dim(f"position ± {sigma.translation_mm:.2f} mm, rotation ± {sigma.rotation_deg:.3f}° (1σ)"))
-    rows.append(dim(f"x y z w {quaternion}"))
-    return [*rows, *map(Content, arm_sentences(calibration))]
+    """Write the camera pose, its standard uncertainty, and the arm's part in it."""
+    result, sigma = calibration.result, calibration.sigma
+    return [
+        dim(f"{result.parent_frame}_from_{result.child_frame}"),
+        *(Content.styled(words.strip(), "bold $strong") for words in pose_text(calibration).split(",")),
+        dim(f"position ± {sigma.translation_mm:.2f} mm, rotation ± {sigma.rotation_deg:.3f}° (1σ)"),
+        *map(Content, arm_sentences(calibration)),
+    ]
 
 
 def view_lines(calibration: Calibration) -> list[Content]:
-    held_out, folds = figures(calibration).get("held_out"), calibration.quality.cross_validation
-    rows = [] if held_out is None else [Content(f"{held_out.value} {held_out.label} {held_out.about}")]
-    if folds is not None:
-        rows.append(Content(f"{folds.rms_mm:.2f} mm over folds, claimed {folds.claimed_mm:.2f} mm"))
     rejected = (f"view {view.index + 1} rejected: {view.reason}" for view in calibration.views.rejected)
-    return [*rows, Content(noise_text(calibration)), *(mark("look", text) for text in rejected)]
+    return [Content(noise_text(calibration)), *(mark("look", text) for text in rejected)]
 
 
 class ResultScreen(StationScreen):

@@ -98,11 +98,6 @@ def rich_text(content: Content, variables: dict[str, str]) -> Text:
     return text
 
 
-def signed(value: float, digits: int = 2) -> str:
-    """Write a number with its sign always, and a minus as wide as a plus."""
-    return f"{value:+.{digits}f}".replace("-", "−")
-
-
 def state_of(status: StationStatus) -> tuple[str, str]:
     """Return text and style of the state's chip."""
     state = status.state

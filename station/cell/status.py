@@ -87,7 +87,6 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     state: RobotState | None = None
     """Newest state; None: not connected."""
     condition: ArmCondition = ArmCondition()
-    rate_hz: float = 0.0
     remote: bool | None = None
     control: bool = False
     """True while the control process runs."""
@@ -145,7 +144,6 @@ class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     identity: CameraIdentity | None = None
     """None: not connected."""
     counts: CameraCounts = CameraCounts()
-    fps: float = 0.0
     timing: FrameTiming | None = None
 
     @property
@@ -177,13 +175,8 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
-    recording: bool = False
-    path: str = ""
-    bytes: int = 0
-    drops: int = 0
     free_bytes: int | None = None
     """Free space on the sessions' disk; None: not known."""
-    error: str = ""
 
 
 class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -330,8 +323,6 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     lease: LeaseStatus = LeaseStatus()
     go: MotionPreview | None = None
     """Motion that waits for a person's approval."""
-    loop_lag_ms: float = 0.0
-    """Largest delay of the daemon's event loop in the last second."""
     events: tuple[Event, ...] = ()
     """Newest events, at most 100."""
 

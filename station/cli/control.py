@@ -54,7 +54,7 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     out.print(", ".join(filter(None, words)))
     words = ["camera not connected"]
     if camera.connected:
-        words = [f"{camera.model} {camera.fps:.1f} fps", f"{camera.counts.missing} frames dropped"]
+        words = [camera.model, f"{camera.counts.missing} frames dropped"]
     if trigger.present:
         words.append(f"trigger {trigger.pulses} pulses, {trigger.frames} frames")
     out.print(", ".join(words))

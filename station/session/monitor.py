@@ -10,7 +10,6 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.schema.messages import RobotState
 from station.cell.config import SPEED_CAP_M_S
 from station.cell.errors import RobotError
 from station.cell.layout import cell_geometry
@@ -21,7 +20,6 @@ from station.protocol.states import RUNNING
 from station.session.context import SessionContext
 from station.session.threads import WATCH
 
-RATE_PERIOD_S = 1.0
 DISK_PERIOD_S = 0.5
 PAUSES = "pauses after this pose"
 FINISHES = "finishes after this pose"
@@ -35,17 +33,10 @@ class Monitor:
         self._files = _Files()
         self._reading: asyncio.Task[_Files] | None = None
         self._read_s = -DISK_PERIOD_S
-        self._states_seen = 0
-        self._states, self._frames = Rate(), Rate()
         moved = context.cell.mover is not None
         self._geometry = cell_geometry(context.cell.config) if moved else None
-        context.cell.robot.subscribe(self._count)
 
-    def _count(self, state: RobotState) -> None:
-        """Count a state."""
-        self._states_seen += 1
-
-    def refresh(self, lag_ms: float) -> None:
+    def refresh(self) -> None:
         self._watch_files()
         store, notice = self._context.store, self._context.cell.robot.notice
         if store.state is StationState.MOVING:
@@ -54,8 +45,7 @@ class Monitor:
             robot=self._robot(),
             camera=self._camera(),
             trigger=self._trigger(),
-            recorder=self._recorder(),
-            loop_lag_ms=round(lag_ms, 1),
+            recorder=RecorderStatus(self._files.free_bytes),
             pending=self._pending(),
         )
 
@@ -70,7 +60,6 @@ class Monitor:
         context, robot, mover = self._context, self._context.cell.robot, self._context.cell.mover
         shown = RobotStatus(
             identity=robot.identity,
-            rate_hz=round(self._states.update(self._states_seen)),
             remote=mover.remote if mover else None,
             control=mover is not None and mover.control,
             control_path=mover.control_path if mover else "",
@@ -96,9 +85,7 @@ class Monitor:
 
     def _camera(self) -> CameraStatus:
         camera, shown = self._context.cell.camera, self._context.store.status.camera
-        counts = camera.counts()
-        fps = round(self._frames.update(counts.frames), 1)
-        return CameraStatus(shown.identity, counts, fps, camera.timing)
+        return CameraStatus(shown.identity, camera.counts(), camera.timing)
 
     def _trigger(self) -> TriggerStatus:
         shown, box = self._context.store.status.trigger, self._context.cell.trigger
@@ -106,19 +93,6 @@ class Monitor:
             return shown
         paired = self._context.cell.camera.counts().paired
         return msgspec.structs.replace(shown, pulses=box.pulses, frames=paired)
-
-    def _recorder(self) -> RecorderStatus:
-        free_bytes = self._files.free_bytes
-        if (recorder := self._context.recorder) is None:
-            return RecorderStatus(free_bytes=free_bytes)
-        return RecorderStatus(
-            recording=True,
-            path=str(recorder.part_path),
-            bytes=recorder.bytes_written,
-            drops=recorder.dropped,
-            free_bytes=free_bytes,
-            error=str(recorder.error or ""),
-        )
 
     def _watch_files(self) -> None:
         """Read files in a thread, as a hanging disk must not delay the heartbeat."""
@@ -136,19 +110,6 @@ class Monitor:
             self._reading = asyncio.create_task(
                 WATCH.run(_read_files, context, session.folder if session.recording else "")
             )
-
-
-class Rate:
-    """Rate of something that is counted, over the last period of at least `RATE_PERIOD_S`."""
-
-    def __init__(self) -> None:
-        self._since_s, self._count, self._per_s = time.monotonic(), 0, 0.0
-
-    def update(self, count: int) -> float:
-        if (passed_s := time.monotonic() - self._since_s) >= RATE_PERIOD_S:
-            self._per_s = (count - self._count) / passed_s
-            self._since_s, self._count = self._since_s + passed_s, count
-        return self._per_s
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class SessionSupervisor:
         """Refresh the status. An error is reported and does not end the heartbeat."""
         try:
             self._watch_link()
-            self._monitor.refresh(self.lag_ms())
+            self._monitor.refresh()
         except Exception as error:
             if repr(error) != self._failure:
                 self._failure = repr(error)

@@ -152,7 +152,7 @@ async def test_a_status_repaints_only_what_it_changes(
         await pilot.pause(1.0)
         monkeypatch.setattr(Compositor, "render_update", noted)
         status = idle()
-        link.show(msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, rate_hz=7.0)))
+        link.show(msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, speed_m_s=0.1)))
         await until(pilot, lambda: updates)
         await pilot.pause(0.3)
         assert "LayoutUpdate" not in updates

@@ -94,23 +94,6 @@ async def test_a_glimpse_is_smaller_and_never_counts_as_a_frame_and_unknown_faul
     assert (await camera.capture()).sequence == 0
 
 
-async def test_the_event_loop_is_free_while_a_picture_is_made(camera: RenderedCamera) -> None:
-    beats, running = 0, True
-
-    async def beat() -> None:
-        nonlocal beats
-        while running:
-            await asyncio.sleep(0.001)
-            beats += 1
-
-    beating = asyncio.create_task(beat())
-    for _ in range(3):
-        await camera.capture()
-    running = False
-    await beating
-    assert beats > 40, "a picture takes 40 ms; a loop that renders itself beats three times"
-
-
 async def test_without_a_controller_the_camera_says_so(cell: CellTruth) -> None:
     rendered = RenderedCamera(cell, "127.254.253.252")
     await rendered.open()

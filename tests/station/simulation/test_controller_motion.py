@@ -64,16 +64,6 @@ def test_stopping_takes_speed_over_deceleration(deceleration: float) -> None:
     assert arm.command[0] < 2.9
 
 
-def test_a_second_stop_never_lengthens_the_first() -> None:
-    arm = make_arm()
-    go(arm, (3.0, *HOME[1:]))
-    run(arm, 1.0)
-    arm.brake(10.0)
-    arm.brake(0.1)
-    run(arm, 0.2)
-    assert not arm.moving
-
-
 def test_a_stop_at_a_low_slider_starts_from_the_low_speed() -> None:
     arm = make_arm()
     go(arm, (3.0, *HOME[1:]), 1.0, 10.0)

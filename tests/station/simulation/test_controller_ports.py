@@ -48,43 +48,6 @@ def test_versions_and_samples_at_the_rate_that_was_asked_for(
     assert [b - a for a, b in pairwise(stamps)] == pytest.approx([step_s] * 7, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("model", "names", "types"),
-    [
-        (
-            "UR10",
-            b"timestamp,actual_q,robot_mode,runtime_state,joint_mode,actual_digital_input_bits,payload_cog",
-            b"DOUBLE,VECTOR6D,INT32,UINT32,VECTOR6INT32,UINT64,VECTOR3D",
-        ),
-        ("UR10", b"timestamp,ft_raw_wrench,nonsense", b"DOUBLE,NOT_FOUND,NOT_FOUND"),
-        ("UR10e", b"timestamp,ft_raw_wrench,nonsense", b"DOUBLE,VECTOR6D,NOT_FOUND"),
-    ],
-)
-def test_types_are_those_that_a_controller_of_that_series_has(arm, rtde, model, names, types) -> None:
-    client = rtde(arm(model))
-    assert client.request(PacketType.OUTPUT_SETUP, struct.pack(">d", 125.0) + names)[1:] == types
-    starts = b"NOT_FOUND" not in types
-    assert client.request(PacketType.START) == bytes([starts]), "nothing to send was agreed"
-
-
-@pytest.mark.parametrize(("model", "extra", "size"), [("UR10", "", 1132), ("UR10e", "ft_raw_wrench", 1180)])
-def test_ur_rtdes_default_recipe_has_its_size(arm, rtde, model, extra, size) -> None:
-    """57 variables on CB3, 58 on e-Series: packet lengths as seen on the wire."""
-    names = f"""timestamp target_q target_qd target_qdd target_current target_moment actual_q actual_qd
-        actual_current joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose
-        target_TCP_speed actual_digital_input_bits joint_temperatures actual_execution_time robot_mode
-        joint_mode safety_mode actual_tool_accelerometer speed_scaling target_speed_fraction actual_momentum
-        actual_main_voltage actual_robot_voltage actual_robot_current actual_joint_voltage
-        actual_digital_output_bits runtime_state standard_analog_input0 standard_analog_input1
-        standard_analog_output0 standard_analog_output1 robot_status_bits safety_status_bits {extra} payload
-        payload_cog payload_inertia output_int_register_2""".split()
-    names += [f"output_{kind}_register_{i}" for kind in ("int", "double") for i in range(12, 20)]
-    client = rtde(arm(model))
-    client.start(*names)
-    kind, payload = client.receive()
-    assert kind == PacketType.DATA and len(payload) + 3 == size
-
-
 def test_inputs_are_claimed_until_the_link_ends(arm, rtde, admin) -> None:
     running = arm("UR10")
     first, second, ask = rtde(running), rtde(running), admin(running)

@@ -37,11 +37,6 @@ def test_a_bad_truth_file_is_an_error_that_names_it(tmp_path: Path) -> None:
         start_controller("UR10", truth=tmp_path / "absent.json")
 
 
-def test_a_child_that_is_not_ready_in_time_is_killed(tmp_path: Path) -> None:
-    with raises("simulation-not-started"):
-        start_controller("UR10", host="127.0.0.1", timeout_s=0.001)
-
-
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe(number: signal.Signals) -> None:
     code = (

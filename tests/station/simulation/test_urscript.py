@@ -48,17 +48,10 @@ def said(text: str) -> list[Any]:
     [
         ("1 + 2 * 3 - 4", 3),
         ("(1 + 2) * 3", 9),
-        ("-2 * -3", 6),
-        ("7 % 4", 3),
         ("1 / 2", 0.5),
-        ("1e3 + .5 + 2.", 1002.5),
-        ("0x1F", 31),
         ("not 1 < 2 or 2 <= 2 and 3 != 4", True),
-        ("1 == 1.0", True),
         ("[1, 2, 3][1]", 2),
         ("p[0, 0, 1, 0, 0, 0]", Pose([0, 0, 1, 0, 0, 0])),
-        ("[[1, 2], [3]][0][1]", 2),
-        ("'a # b'", "a # b"),
         ("[\n  1,  # in brackets lines may end\n  2\n]", List([1, 2])),
     ],
 )
@@ -125,23 +118,6 @@ def prog():
   say(around)
 end
 """
-COPIES = """
-def prog():
-  limit = [1, 2]
-  other = limit
-  other[0] = 9
-  def read():
-    return limit[0]
-  end
-  def change(given):
-    given[1] = 7
-    return given
-  end
-  say(read())
-  say(change(other))
-  say(other)
-end
-"""
 THREADS = """
 def prog():
   global n = 0
@@ -161,17 +137,6 @@ def prog():
   say(n)
 end
 """
-PYTHON_WORDS = """
-def lambda():
-  def import(from, class=2):
-    return from + class
-  end
-  None = import(1)
-  is = import(from=2, class=None)
-  say(is)
-  say('é')
-end
-"""
 
 
 @pytest.mark.parametrize(
@@ -179,12 +144,9 @@ end
     [
         (BLOCKS, [1, 3, 4, 5]),
         (SCOPE, [11, 20, 100, 3, 15]),
-        (COPIES, [1, [9, 7], [9, 2]]),
         (THREADS, [10, 20, 20]),
-        (PYTHON_WORDS, [5, "é"]),
-        ("def p():\n a = [1]\n def f():\n  a = [3]\n  return 9\n end\n a[0] = f()\n say(a)\nend", [[9]]),
     ],
-    ids=["blocks", "scope", "copies", "threads", "Python's words", "item of the new list"],
+    ids=["blocks", "scope", "threads"],
 )
 def test_a_program_says(text: str, expected: list[Any]) -> None:
     assert said(text) == expected
@@ -216,14 +178,6 @@ end
 
 
 @pytest.mark.parametrize(
-    "where", ["halt", "stop_it()", "x = 1 + stop_it()", "h = run ender()\n sync()\n sync()"]
-)
-def test_halt_ends_everything_wherever_it_is_said(where: str) -> None:
-    text = f"def p():\n def stop_it():\n halt\n end\n thread ender():\n halt\n end\n {where}\n say(1)\nend"
-    assert said(text) == []
-
-
-@pytest.mark.parametrize(
     "text",
     [
         "x = ",
@@ -231,12 +185,7 @@ def test_halt_ends_everything_wherever_it_is_said(where: str) -> None:
         "def p():\n say(1)\n",
         "def p():\nend\nsay(2)",
         "say(1) say(2)",
-        "1 = 2",
         "say(unknown_function())",
-        "x = 'open",
-        "x = $",
-        "run 3",
-        "x = (1]",
         "x = True xor True",
         "(" * 5000 + "1" + ")" * 5000,
     ],
@@ -251,17 +200,9 @@ def test_a_text_that_is_no_program(text: str) -> None:
     [
         "say(nobody)",
         "say([1, 2][2])",
-        "say([1, 2][-1])",
-        "say([1, 2] + [1, 2])",
-        "say(1, 2)",
-        "say(stranger=1)",
         "say(1 + 'a')",
         "say(1 / 0)",
-        "say(1 < [1])",
-        "say(p[1, 2] + p[1, 2])",
         "def p():\n def f(x):\n return x\n end\n say(f(1, 2))\nend",
-        "def p():\n def f(x):\n return x\n end\n f()\nend",
-        "x = 1\nx[0] = 2",
         "while True:\n x = 1\nend",
         "def p():\n def f(n):\n return f(n + 1)\n end\n f(0)\nend",
     ],

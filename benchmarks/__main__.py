@@ -30,7 +30,6 @@ SHOWN: dict[str, str] = {
     "coverage": r"^\| (clean|size 0.5 %|bent 0.5 mm|arm 0.4 mm, arm unknown) \| eye-to",
     "outliers": r"^\| (far|shuffled) \| 40 % \| eye-in|moved \| 35 % \| eye-in",
     "any_arm": r"^\| seven joints",
-    "arm_table": r"^\| 0.3 mm, (measured|usual), 50 planned \| \d+ \|",
     "mistakes": r"^\*\*",
     "misread_poses": r"^\*\*",
     "offline": r"all\*\*|OpenCV: read|ratio|peak",

@@ -79,7 +79,6 @@ class PreparedViews:
     views: ViewSet
     intrinsics: Intrinsics | None
     """Estimated intrinsics; None when they were given."""
-    stage_ms: dict[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,3 +175,5 @@ class Solved:
 class SolvedRecording(PreparedViews, Solved):
     coverage: float
     calibration: Calibration
+    solve_ms: float
+    """Of everything, opening and detection included."""

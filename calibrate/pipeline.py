@@ -33,19 +33,6 @@ from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 _WORST_VIEW_PX = 20.0
 
 
-class _Stopwatch:
-    """Time by stage, in milliseconds, in the order in which stages end."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-        self.stage_ms: dict[str, float] = {}
-
-    def lap(self, stage: str) -> None:
-        """The time since the last lap belongs to `stage`."""
-        now = time.perf_counter()
-        self.stage_ms[stage], self._last = 1e3 * (now - self._last), now
-
-
 @contextmanager
 def single_threaded_opencv() -> Iterator[None]:
     """OpenCV adds up in another order on every run when it uses its own threads."""
@@ -69,9 +56,7 @@ def prepare_views(
     Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
     """
     options = options or JobOptions()
-    watch = _Stopwatch()
     recording = open_recording(path)
-    watch.lap("open")
     camera = options.camera
     if options.find_intrinsics:
         recorded = recording.info.camera
@@ -80,10 +65,8 @@ def prepare_views(
     loaded = load_views(recording, board, camera, progress, options.threads, fewest)
     if options.without:
         loaded = without_views(loaded, options.without, fewest)
-    watch.lap("detect")
     views, intrinsics = with_board_poses(loaded.views, loaded.board, options.lens_model)
-    watch.lap("lens and board poses")
-    return PreparedViews(recording, loaded, views, intrinsics, watch.stage_ms)
+    return PreparedViews(recording, loaded, views, intrinsics)
 
 
 def with_board_poses(
@@ -131,17 +114,15 @@ def solve_recording(
     `verify`: a recording of the same camera and board at other poses, which judges the corrected arm.
     """
     options = options or JobOptions()
+    begun_s = time.perf_counter()
     prepared = prepare_views(path, options, progress)
     recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
-    watch = _Stopwatch()
     solution = solve_views(views, solver_options(options, prepared))
-    watch.lap("solve")
     if verify is not None:
         same = replace(options, board=loaded.board, square_m=None, camera=solution.camera, without=())
         same = replace(same, find_intrinsics=False)
         elsewhere = prepare_views(verify, same, progress, 1)
         solution = verify_elsewhere(solution, elsewhere.views, verify.name)
-        watch.lap("verify")
     used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
     coverage = picture_coverage(used)
     inputs = GateInputs(
@@ -151,14 +132,13 @@ def solve_recording(
     calibration = make_calibration(
         recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen
     )
-    watch.lap("judge")
-    made = vars(prepared) | {"stage_ms": prepared.stage_ms | watch.stage_ms}
     return SolvedRecording(
-        **made,
+        **vars(prepared),
         solution=solution,
         coverage=coverage,
         gates=gates,
         calibration=calibration,
+        solve_ms=1e3 * (time.perf_counter() - begun_s),
     )
 
 

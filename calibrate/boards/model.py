@@ -91,21 +91,28 @@ def typed_board(text: str) -> BoardSpec:
     """Parse a typed board: '8x5 30' is a chessboard of 8 × 5 inner corners, squares of 30 mm.
 
     Other kinds are named first; marker size (charuco) or gap (april-grid) and dictionary come last, unless
-    the defaults: 'charuco 8x6 30 22 DICT_5X5_100'. Raises BoardError.
+    the defaults: 'charuco 8x6 30 22 DICT_5X5_100'. A single tag has a side and a number: 'april-tag 120 3'.
+    Raises BoardError.
     """
     in_mm = re.sub(r"(\d+(?:\.\d+)?) *cm\b", lambda cm: f"{10 * float(cm[1]):g}", text.replace("×", "x"))
     words = re.sub(r"(?<=\d) *mm|,", " ", in_mm).split()
     try:
         kind = BoardKind.CHESSBOARD if words[0][0].isdigit() else BoardKind(words.pop(0).lower())
-        columns, rows = (int(part) for part in words[0].lower().split("x"))
         dictionary = words.pop().upper() if words[-1].upper().startswith("DICT_") else None
-        size_m, *marker = (float(word) / 1000 for word in words[1:])
+        number, columns, rows = 0, 1, 1
+        if kind in SINGLE_TAGS:
+            number = int(words.pop()) if len(words) > 1 else 0
+        else:
+            columns, rows = (int(part) for part in words.pop(0).lower().split("x"))
+        size_m, *marker = (float(word) / 1000 for word in words)
         usual_m, usual = usual_markers(kind, size_m)
-        if len(marker) > (usual_m is not None) or min(columns, rows) < 3 or not 0.002 <= size_m <= 0.5:
+        too_few = kind not in SINGLE_TAGS and min(columns, rows) < 3
+        if len(marker) > (usual_m is not None) or too_few or not 0.002 <= size_m <= 0.5:
             raise ValueError
     except (ValueError, IndexError):
         raise BoardError("no-board-typed", typed=text) from None
-    board = BoardSpec(kind, columns, rows, size_m, marker[0] if marker else usual_m, dictionary or usual)
+    marker_m = marker[0] if marker else usual_m
+    board = BoardSpec(kind, columns, rows, size_m, marker_m, dictionary or usual, tag_id=number)
     check_board(board)
     return board
 

@@ -5,12 +5,6 @@ from __future__ import annotations
 from recordings.cli.lazy import LazyCommand, LazyGroup
 
 _SOLVE, _FILES = "calibrate.cli.solve", "calibrate.cli.installed"
-_NO_TIME_OFFSET = {"--time-offset": "Poses are taken at rest: leave it out."}
-_ONE_KIND = {"--cell": "A root holds one kind of cell: leave it out."}
-_GONE_FROM_SOLVE = {
-    "--accept-move": "The message names what moved and when. Record again.",
-    **_NO_TIME_OFFSET,
-}
 COMMANDS = {
     "solve": LazyCommand(
         f"{_SOLVE}:solve",
@@ -18,12 +12,10 @@ COMMANDS = {
             "calibrate solve session.mcap -o cell.yaml --report cell.html",
             "calibrate solve session.mcap -o cell.yaml --without 3,7",
         ),
-        gone=_GONE_FROM_SOLVE,
     ),
     "compare": LazyCommand(
         f"{_SOLVE}:compare",
         ("calibrate compare session.mcap", "calibrate compare session.mcap --camera cell.yaml"),
-        gone=_NO_TIME_OFFSET,
     ),
     "show": LazyCommand(
         f"{_FILES}:show", ("calibrate show  # the installed one", "calibrate show cell.yaml")
@@ -41,15 +33,11 @@ COMMANDS = {
             "calibrate install cell.yaml",
             "calibrate install mine.yaml --cell imported --root my-cell  # of your own images",
         ),
-        gone={"--cell-config": "Leave it out: programs name their robot and camera to load_installed."},
     ),
-    "list": LazyCommand(
-        f"{_FILES}:list_installed", ("calibrate list", "calibrate list --root my-cell"), gone=_ONE_KIND
-    ),
+    "list": LazyCommand(f"{_FILES}:list_installed", ("calibrate list", "calibrate list --root my-cell")),
     "rollback": LazyCommand(
         f"{_FILES}:rollback",
         ("calibrate rollback --reason 'camera was knocked'", "calibrate rollback 3"),
-        gone=_ONE_KIND,
     ),
     "withdraw": LazyCommand(
         f"{_FILES}:withdraw", ("calibrate withdraw 'a pallet hit the camera'",), rare=True
@@ -68,8 +56,8 @@ COMMANDS = {
         "calibrate.cli.board:board",
         (
             "calibrate board -o board.pdf --paper A4",
-            "calibrate board --kind charuco --columns 12 --rows 9 --square-mm 30 --marker-mm 22 -o board.svg",
-            "calibrate board --kind april-tag --id 3 --square-mm 120 -o tag.pdf",
+            "calibrate board 'charuco 12x9 30 22' -o board.svg",
+            "calibrate board 'april-tag 120 3' -o tag.pdf",
         ),
     ),
     "batch": LazyCommand(
@@ -78,13 +66,6 @@ COMMANDS = {
             "calibrate batch monday.mcap tuesday.mcap -o results",
             "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",
         ),
-        gone={
-            "--scheduler-file": "Give --scheduler the address in it.",
-            **dict.fromkeys(
-                ("--tls-ca", "--tls-cert", "--tls-key"),
-                "Name it in Dask's configuration: distributed.comm.tls.",
-            ),
-        },
         rare=True,
     ),
 }

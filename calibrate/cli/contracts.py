@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.files.calibration import (
     Arm,
@@ -74,22 +76,18 @@ class InstalledJson(msgspec.Struct, frozen=True):
     validity: Validity | None
 
 
-class DriftPowerJson(msgspec.Struct, frozen=True):
-    translation_0_5_mm: float
-    rotation_0_1_deg: float
-
-
 class DriftCheckJson(msgspec.Struct, frozen=True):
-    """`calibrate drift-check --json`"""
+    """`calibrate drift-check --json`: the fields of `DriftCheck`, and what follows for what is installed."""
 
     passed: bool
     own_views: bool
-    shift: list[float]
-    covariance: list[list[float]]
+    shift: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     statistic: float
     threshold: float
     p_value: float
-    power: DriftPowerJson
+    power_translation: float
+    power_rotation: float
     views_needed: int | None
     disagreement: float
     views: int

@@ -16,18 +16,18 @@ from calibrate.check.history import Trend, append_check, earlier_results, read_c
 from calibrate.check.production import MOST_PICTURES, check_production
 from calibrate.check.same_cell import CellIdentity, OtherCellError, require_same_cell
 from calibrate.check.trend import entry_of, find_trend
-from calibrate.cli.contracts import DriftCheckJson, DriftPowerJson
+from calibrate.cli.contracts import DriftCheckJson
 from calibrate.cli.files import read_board
 from calibrate.cli.installed import Root, named_or_installed
 from calibrate.cli.output import AsJson, detection_progress, out, print_json
-from calibrate.cli.solve_options import BoardFile, Threads
+from calibrate.cli.solve_options import BoardFile
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration, Provenance
 from calibrate.files.folders import current_version, readable_folder
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
 from calibrate.files.validity import Validity, ValidityReason, validity_text
-from calibrate.job import JobOptions
+from calibrate.job import JobOptions, PreparedViews
 from calibrate.pipeline import prepare_views
 from recordings.files import MAIN_CAMERA, state_root
 from recordings.importers.dataset import DATASET_FILE
@@ -57,7 +57,6 @@ def drift_check(
     root: Root = None,
     camera: Annotated[str, typer.Option(help="Name of a folder's camera in the cell")] = MAIN_CAMERA,
     as_json: AsJson = False,
-    threads: Threads = None,
 ) -> None:
     """Test the installed calibration on new views.
 
@@ -72,90 +71,63 @@ def drift_check(
 
     Exit codes: 0 PASS, 4 FAIL, 1 views or files unusable (the calibration's source, say), 2 wrong options.
     """
-    if (source / DATASET_FILE).is_file():
-        _check_production(source, board, calibration_file, root, camera, as_json, threads)
-        return
-    camera = ""
-    if calibration_file is None:
+    production = (source / DATASET_FILE).is_file()
+    if not production and calibration_file is None:
         camera = open_recording(source).info.camera_identity.name or MAIN_CAMERA
     calibration, _ = named_or_installed(calibration_file, root, camera)
-    with detection_progress() as progress:
-        options = _options(board, calibration, threads)
-        prepared = prepare_views(source, options, progress, fewest=FEWEST_FOR_DRIFT_CHECK)
-    info = prepared.recording.info
-    try:
-        require_same_cell(str(source), calibration, CellIdentity.of(info))
-    except OtherCellError as other:
-        if calibration_file is None:
-            _doubt_devices(source, info, root, camera, other)
-        raise
-    result = check_drift(prepared.views, calibration, prepared.loaded.board)
-    own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
-    judged = not own and calibration_file is None
-    before, trend = _log(result, calibration, info, root, camera) if judged else ([], None)
-    validity = _judge(result, info.name, _taken(info), root, camera) if judged else None
+    options = JobOptions(
+        board=None if board is None else read_board(board), camera=calibration.intrinsics.model
+    )
+    with tempfile.TemporaryDirectory(prefix="drift-check-") as place, detection_progress() as progress:
+        recording = source
+        if production:
+            recording = Path(place) / f"{source.resolve().name}.mcap"
+            import_folder(source, recording, newest=MOST_PICTURES)
+        prepared = prepare_views(
+            recording, options, progress, fewest=1 if production else FEWEST_FOR_DRIFT_CHECK
+        )
+    info, noted = prepared.recording.info, calibration_file is None
+    own, trend, validity, before = False, None, None, list[bool]()
+    if production:
+        result = _check_pictures(source, prepared, calibration)
+        text = production_text(result, len(prepared.views))
+        if noted and not result.passed:  # none passed proves nothing
+            validity = _judge(result, source.name, datetime.now(UTC), root, camera)
+    else:
+        _require_this_cell(source, info, calibration, root, camera, noted)
+        result = check_drift(prepared.views, calibration, prepared.loaded.board)
+        text = check_text(result, calibration)
+        own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
+        if noted and not own:
+            before, trend = _log(result, calibration, info, root, camera)
+            validity = _judge(result, info.name, _taken(info), root, camera)
     proves_nothing = own and result.passed
     if as_json:
-        print_json(_plain(result, trend, own, validity))
+        said = {"passed": result.passed and not own, "own_views": own, "validity": validity}
+        known = vars(result) | said | {"trend": "" if trend is None else trend.text}
+        print_json(DriftCheckJson(**{name: known[name] for name in DriftCheckJson.__struct_fields__}))
     elif proves_nothing:
         out.print(OWN_VIEWS.format(recording=source), style="yellow")
     else:
-        _tell(result, check_text(result, calibration))
+        out.print(text, style="green" if result.passed else "bold red")
         if before:
             out.print(f"Earlier drift checks: {sum(before)} of {len(before)} passed.")
         if trend is not None:
             out.print(trend.text, style="yellow")
-        _print_validity(validity)
+        if validity is not None:
+            style = VALIDITY_STYLES[validity.state]
+            out.print(f"The installed calibration is {validity_text(validity)}", style=style)
     if not result.passed:
         raise typer.Exit(DRIFTED)
     if proves_nothing:
         raise typer.Exit(BadViewsError.exit_code)
 
 
-def _check_production(
-    folder: Path,
-    board: Path | None,
-    calibration_file: Path | None,
-    root: Path | None,
-    camera: str,
-    as_json: bool,
-    threads: int | None,
-) -> None:
-    """Test production pictures. An alarm puts the installed calibration in doubt; none proves nothing."""
-    calibration, _ = named_or_installed(calibration_file, root, camera)
-    with tempfile.TemporaryDirectory(prefix="drift-check-") as place, detection_progress() as progress:
-        recording = Path(place) / f"{folder.resolve().name}.mcap"
-        import_folder(folder, recording, newest=MOST_PICTURES)
-        prepared = prepare_views(recording, _options(board, calibration, threads), progress, fewest=1)
+def _check_pictures(folder: Path, prepared: PreparedViews, calibration: Calibration) -> DriftCheck:
     mount = prepared.recording.info.mount
     if mount != calibration.mount:
         raise OtherCellError(where=str(folder), differs="mounting", found=mount, calibrated=calibration.mount)
-    result = check_production(prepared.views, known_cell(calibration, prepared.loaded.board))
-    alarm = calibration_file is None and not result.passed
-    validity = _judge(result, folder.name, datetime.now(UTC), root, camera) if alarm else None
-    if as_json:
-        print_json(_plain(result, None, False, validity))
-    else:
-        _tell(result, production_text(result, len(prepared.views)))
-        _print_validity(validity)
-    if not result.passed:
-        raise typer.Exit(DRIFTED)
-
-
-def _options(board: Path | None, calibration: Calibration, threads: int | None) -> JobOptions:
-    """Look for the board through the lens of the calibration."""
-    spec = None if board is None else read_board(board)
-    return JobOptions(board=spec, camera=calibration.intrinsics.model, threads=threads)
-
-
-def _tell(result: DriftCheck, text: str) -> None:
-    out.print(text, style="green" if result.passed else "bold red")
-
-
-def _print_validity(validity: Validity | None) -> None:
-    if validity is not None:
-        style = VALIDITY_STYLES[validity.state]
-        out.print(f"The installed calibration is {validity_text(validity)}", style=style)
+    return check_production(prepared.views, known_cell(calibration, prepared.loaded.board))
 
 
 def _log(
@@ -201,18 +173,28 @@ def _judge(result: DriftCheck, recording: str, taken: datetime, root: Path | Non
     )
 
 
-def _doubt_devices(
-    recording: Path, info: SessionInfo, root: Path | None, camera: str, other: OtherCellError
+def _require_this_cell(
+    recording: Path,
+    info: SessionInfo,
+    calibration: Calibration,
+    root: Path | None,
+    camera: str,
+    noted: bool,
 ) -> None:
-    """Put what is installed in doubt where a session of this cell shows another robot or camera."""
-    own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
-    if own and other.device:
-        reason = ValidityReason(f"{other.device}-changed", other.text, dict(other.values))
-        note_check(root, "drift-check", reason, passed=False, proves=True, when=_taken(info), camera=camera)
+    """Refuse views of another cell; a session of this cell with another device doubts what is installed."""
+    try:
+        require_same_cell(str(recording), calibration, CellIdentity.of(info))
+    except OtherCellError as other:
+        own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
+        if noted and own and other.device:
+            reason = ValidityReason(f"{other.device}-changed", other.text, dict(other.values))
+            when = _taken(info)
+            note_check(root, "drift-check", reason, passed=False, proves=True, when=when, camera=camera)
+        raise
 
 
 def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
-    """Tell whether the calibration was made from this recording; an excerpt is of the same session."""
+    """Tell whether the calibration was made from this recording; an annotated copy is of the same session."""
     session = (info.name, info.created_wall_ns)
     known = bool(info.created_wall_ns) and session == (provenance.session, provenance.recorded_wall_ns)
     return known or sha256 == provenance.recording_sha256
@@ -222,9 +204,11 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
     """Verdict, shift, power of the test, and what to do."""
     frame = f"{calibration.result.parent_frame}_from_{calibration.result.child_frame}"
     if not result.passed:
+        weak = f"Weak evidence (p = {result.p_value:.3f}). Repeat the check."
+        sure = "Check the camera's bracket, and calibrate again."
         text = (
             f"FAIL: camera shift {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° "
-            f"(p = {result.p_value:.1e}). {_next_step(result)}"
+            f"(p = {result.p_value:.1e}). {sure if result.p_value < _BY_CHANCE else weak}"
         )
     else:
         verdict = "PASS" if result.power >= POWER else "PASS, low sensitivity"
@@ -252,12 +236,6 @@ def production_text(result: DriftCheck, pictures: int) -> str:
     )
 
 
-def _next_step(result: DriftCheck) -> str:
-    if result.p_value < _BY_CHANCE:
-        return "Check the camera's bracket, and calibrate again."
-    return f"Weak evidence (p = {result.p_value:.3f}). Repeat the check."
-
-
 def _more_text(result: DriftCheck, calibration: Calibration) -> str:
     if result.views_needed is not None:
         return (
@@ -268,22 +246,4 @@ def _more_text(result: DriftCheck, calibration: Calibration) -> str:
     return (
         f"The installed calibration limits the power (1σ {sigma.translation_mm:.2f} mm, "
         f"{sigma.rotation_deg:.3f}°). Calibrate again with more poses."
-    )
-
-
-def _plain(result: DriftCheck, trend: Trend | None, own: bool, validity: Validity | None) -> DriftCheckJson:
-    return DriftCheckJson(
-        passed=result.passed and not own,
-        own_views=own,
-        shift=result.shift.tolist(),
-        covariance=result.covariance.tolist(),
-        statistic=result.statistic,
-        threshold=result.threshold,
-        p_value=result.p_value,
-        power=DriftPowerJson(result.power_translation, result.power_rotation),
-        views_needed=result.views_needed,
-        disagreement=result.disagreement,
-        views=result.views,
-        trend="" if trend is None else trend.text,
-        validity=validity,
     )

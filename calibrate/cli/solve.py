@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +15,7 @@ from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.cli.contracts import CompareJson, SolveJson
+from calibrate.cli.files import read_board, read_camera
 from calibrate.cli.output import (
     AsJson,
     OpenReport,
@@ -23,36 +26,67 @@ from calibrate.cli.output import (
     out,
     print_json,
 )
-from calibrate.cli.solve_options import MemoryLimit, TimeLimit, job_options, picture_options, takes
+from calibrate.cli.solve_options import (
+    BoardFile,
+    CameraFile,
+    GatesFile,
+    MemoryLimit,
+    ProfileName,
+    Seed,
+    TimeLimit,
+)
 from calibrate.errors import UsageError
 from calibrate.files.calibration import write_calibration, write_output
 from calibrate.files.formatting import summary
 from calibrate.files.install import install_line
+from calibrate.gates import GateLimits, read_limits
 from calibrate.geometry import roll_pitch_yaw
 from calibrate.handeye.solution import camera_frames
 from calibrate.job import JobOptions, SolvedRecording
+from calibrate.lens.intrinsics import LensModel
 from calibrate.pipeline import prepare_views, solve_recording, solver_options
 from calibrate.results import PeerResult
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
-Verify = Annotated[
-    Path | None,
-    typer.Option(help="A recording at other poses, same board: judges the corrected arm"),
-]
 GATE_FAILED = 4
 
 
-@takes(job_options)
 def solve(
     recording: Rec,
-    options: JobOptions,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Default: NAME.calibration.yaml in this folder")
     ] = None,
     as_json: AsJson = False,
     report: Annotated[Path | None, typer.Option(help="Also write the report (HTML)")] = None,
     opened: OpenReport = False,
-    verify: Verify = None,
+    profile: ProfileName = "robust",
+    seed: Seed = 0,
+    board: BoardFile = None,
+    square_mm: Annotated[
+        float | None, typer.Option("--square-mm", help="Square size that replaces the recorded one")
+    ] = None,
+    camera: CameraFile = None,
+    find_intrinsics: Annotated[
+        bool,
+        typer.Option("--estimate-intrinsics", help="Estimate the intrinsics even where some are recorded"),
+    ] = False,
+    lens: Annotated[LensModel, typer.Option("--lens", help="Lens of estimated intrinsics")] = "plumb_bob",
+    without: Annotated[str, typer.Option(help="Poses to exclude, e.g. 3,7")] = "",
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads of the board detection")] = None,
+    gates: GatesFile = None,
+    working_distance_mm: Annotated[
+        float | None, typer.Option(min=1.0, max=1e5, help="Distance for predicted error, mm")
+    ] = None,
+    robot_accuracy_mm: Annotated[
+        float | None, typer.Option(min=0.0, help="Arm without joints: its error, 1σ per axis")
+    ] = None,
+    robot_accuracy_deg: Annotated[
+        float | None, typer.Option(min=0.0, help="The same of its orientation (1 mrad a mm)")
+    ] = None,
+    verify: Annotated[
+        Path | None,
+        typer.Option(help="A recording at other poses, same board: judges the corrected arm"),
+    ] = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
@@ -61,6 +95,22 @@ def solve(
     Next: look at the report, then `calibrate install`.
     Exit codes: 0 all gates passed, 4 written, but a gate failed.
     """
+    if camera is not None and find_intrinsics:
+        why = "--camera fixes the intrinsics, --estimate-intrinsics estimates them"
+        raise UsageError("options", why=why, advice="Choose one of them.")
+    options = replace(
+        _given(board, camera, seed),
+        profile=profile,
+        square_m=None if square_mm is None else square_mm / 1000,
+        lens_model=lens,
+        find_intrinsics=find_intrinsics,
+        without=_numbers(without),
+        threads=threads,
+        limits=GateLimits() if gates is None else read_limits(gates),
+        working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
+        robot_accuracy_m=None if robot_accuracy_mm is None else robot_accuracy_mm / 1000,
+        robot_accuracy_rad=None if robot_accuracy_deg is None else math.radians(robot_accuracy_deg),
+    )
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target, "calibration")
     if opened and report is None:
@@ -91,6 +141,20 @@ def solve(
         raise typer.Exit(GATE_FAILED)
 
 
+def _given(board: Path | None, camera: Path | None, seed: int) -> JobOptions:
+    """Options with the board and the lens of files, where some are named."""
+    model, sigma = (None, {}) if camera is None else read_camera(camera)
+    spec = None if board is None else read_board(board)
+    return JobOptions(seed=seed, board=spec, camera=model, camera_sigma=sigma)
+
+
+def _numbers(words: str) -> tuple[int, ...]:
+    try:
+        return tuple(sorted({int(word) for word in words.split(",") if word}))
+    except ValueError:
+        raise typer.BadParameter(f"--without {words}: give pose numbers, e.g. 3,7") from None
+
+
 def solve_json(job: SolvedRecording) -> SolveJson:
     """Build the object that `calibrate solve --json` prints: the file's structs, side by side."""
     found = job.calibration
@@ -99,7 +163,7 @@ def solve_json(job: SolvedRecording) -> SolveJson:
         "board": found.quality.board,
         "verdict": "pass" if job.passed else "fail",
         "warnings": found.quality.remarks,
-        "solve_ms": sum(job.stage_ms.values()),
+        "solve_ms": job.solve_ms,
     }
     return SolveJson(**{name: known[name] for name in SolveJson.__struct_fields__})
 
@@ -110,8 +174,13 @@ def _root_of(target: Path) -> Path | None:
     return sessions.parent if sessions.name == "sessions" else None
 
 
-@takes(picture_options)
-def compare(recording: Rec, options: JobOptions, as_json: AsJson = False) -> None:
+def compare(
+    recording: Rec,
+    board: BoardFile = None,
+    camera: CameraFile = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+) -> None:
     """Compare all methods on the same views.
 
     e_t, e_R: held-out error; spread: of the board's pose over the views; px: reprojection error; σ from ours:
@@ -119,13 +188,13 @@ def compare(recording: Rec, options: JobOptions, as_json: AsJson = False) -> Non
     """
     from calibrate.handeye.peers import compare_all
 
+    options = _given(board, camera, seed)
     with bounded(), detection_progress() as progress:
         prepared = prepare_views(recording, options, progress)
         results = compare_all(prepared.views, solver_options(options, prepared))
     if as_json:
         views = [view.index for view in prepared.views]
-        answer = CompareJson(prepared.views.mount, views, results)
-        print_json(msgspec.to_builtins(answer, enc_hook=np.ndarray.tolist))
+        print_json(CompareJson(prepared.views.mount, views, results))
         return
     table = Table(*_PEER_HEAD, box=None)
     for peer in results:

@@ -25,8 +25,12 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on s
 
 
 def print_json(value: object) -> None:
-    """Print a struct, paths in it as text, in one line."""
-    sys.stdout.write(msgspec.json.encode(value, enc_hook=os.fspath).decode() + "\n")
+    """Print a struct in one line, paths in it as text, arrays as lists."""
+    sys.stdout.write(msgspec.json.encode(value, enc_hook=_plain_value).decode() + "\n")
+
+
+def _plain_value(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else os.fspath(value)
 
 
 def plain_console(**settings: Any) -> Console:

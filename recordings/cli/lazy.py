@@ -35,7 +35,7 @@ ALL = "`COMMAND -h`: its options. `--all`: every command. `--version`."
 
 
 class GoneError(CodedError):
-    """A command or an option of an earlier release is asked for."""
+    """A command of an earlier release is asked for."""
 
     code = "gone"
     exit_code = 2
@@ -48,8 +48,6 @@ class LazyCommand(NamedTuple):
     """`module:function`; the function is declared as typer declares it."""
     examples: tuple[str, ...] = ()
     """Command lines as a person types them, a remark behind `#`."""
-    gone: Mapping[str, str] = {}
-    """Options that are no more, and what to do instead."""
     rare: bool = False
     """Listed by `--all` only."""
 
@@ -120,14 +118,12 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Load the command that is asked for: the group itself holds a stub with its line of help."""
-        _refuse_gone(args[0], self._gone)
+        if args[0] in self._gone:
+            raise GoneError(word=args[0], instead=self._gone[args[0]])
         name, _, rest = super().resolve_command(ctx, args)
         if name is None:
             return None, None, rest
-        command = self._lazy[name]
-        for word in rest:
-            _refuse_gone(word.partition("=")[0], command.gone)
-        return name, command.load(name), rest
+        return name, self._lazy[name].load(name), rest
 
 
 def _print_version(asked: bool) -> None:
@@ -164,11 +160,6 @@ def _group_options() -> list[Any]:
     for option in options:
         option.hidden = True
     return options
-
-
-def _refuse_gone(word: str, gone: Mapping[str, str]) -> None:
-    if word in gone:
-        raise GoneError(word=word, instead=gone[word])
 
 
 def run(name: str, group: LazyGroup) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from recordings.cli.lazy import LazyCommand, LazyGroup
 from recordings.errors import CodedError
+from tests.codes import raises
 
 
 def run(program: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -43,11 +44,8 @@ def test_a_missing_extra_is_named_in_one_line() -> None:
     assert "calibration-station[station]" in done.stderr and len(done.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize("words", [("old",), ("new", "--slow"), ("new", "--slow=1")])
-def test_what_is_gone_is_refused_with_what_to_do_instead(words: tuple[str, ...]) -> None:
-    new = LazyCommand("recordings.cli.commands:info_command", gone={"--slow": "It is always fast."})
-    group = LazyGroup({"new": new}, "", "", gone={"old": "Use new."})
-    with pytest.raises(CodedError) as refused:
-        group(list(words), prog_name="x")
-    assert (refused.value.code, refused.value.exit_code) == ("gone", 2)
-    assert refused.value.remedy in {"Use new.", "It is always fast."}
+def test_what_is_gone_is_refused_with_what_to_do_instead() -> None:
+    group = LazyGroup({"new": LazyCommand("x:y")}, "", "", gone={"old": "Use new."})
+    with raises("gone", CodedError) as refused:
+        group(["old"], prog_name="x")
+    assert (refused.value.remedy, refused.value.exit_code) == ("Use new.", 2)

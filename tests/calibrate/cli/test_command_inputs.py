@@ -213,5 +213,5 @@ def test_a_file_of_another_kind_is_named_with_what_to_give(session_file: Path, t
 def test_options_that_contradict_each_other_are_refused(
     session_file: Path, real_file: Path, tmp_path: Path
 ) -> None:
-    done = run("solve", session_file, "--camera", real_file, "--find-intrinsics", cwd=tmp_path)
+    done = run("solve", session_file, "--camera", real_file, "--estimate-intrinsics", cwd=tmp_path)
     refused(done, 2, "options")

@@ -179,8 +179,10 @@ def test_the_board_prints(tmp_path: Path) -> None:
     done = run("board", "-o", "b.pdf", "--paper", "A4", cwd=tmp_path)
     assert done.returncode == 0
     assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF-")
-    warned = run("board", "-o", "b.svg", "--columns", 11, "--rows", 9, cwd=tmp_path)
+    warned = run("board", "11x9 25", "-o", "b.svg", cwd=tmp_path)
     assert warned.stderr, "it looks the same when turned by 180°"
+    tag = run("board", "april-tag 120 3", "-o", "b.svg", cwd=tmp_path)
+    assert "april-tag 3 of DICT_APRILTAG_36h11, 120 mm" in tag.stdout
     assert run("board", "-o", "b.ppm", cwd=tmp_path).returncode == 0
     assert (tmp_path / "b.ppm").read_bytes().startswith(b"P6\n1000 900\n255\n")
     refused(run("board", "-o", "b.bmp", cwd=tmp_path), 2, "board-format")
@@ -199,15 +201,13 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(small_session_file: Path
     again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)
     assert again.returncode == 0
     assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
-    refused(run("batch", "a.mcap", "--tls-key", "k.pem", cwd=tmp_path), 2, "gone", "distributed.comm.tls")
     refused(run("fleet", "cells", cwd=tmp_path), 2, "gone", "calibrate list")
     refused(run("metrics", cwd=tmp_path), 2, "gone", "calibrate list")
     refused(run("sweep", "sweep.mcap", cwd=tmp_path), 2, "gone", "station doctor")
     refused(run("diff", "a.yaml", "b.yaml", cwd=tmp_path), 2, "gone", "calibrate show")
     refused(run("report", recordings[0], cwd=tmp_path), 2, "gone", "--report")
-    for command in ("solve", "compare"):
-        refused(run(command, recordings[0], "--time-offset=a.yaml", cwd=tmp_path), 2, "gone", "at rest")
-    refused(run("solve", recordings[0], "--accept-move", cwd=tmp_path), 2, "gone", "Record again")
+    for option in ("--time-offset=a.yaml", "--accept-move"):
+        refused(run("solve", recordings[0], option, cwd=tmp_path), 2, "", option.partition("=")[0])
     alone = run("solve", recordings[0], "-o", "alone.yaml", cwd=tmp_path)
     assert alone.returncode in (0, 4)
     pooled = read_calibration(tmp_path / "out" / rows[0]["calibration"])

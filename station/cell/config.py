@@ -75,6 +75,8 @@ class RobotConfig(Section, frozen=True):
     kinematics: KinematicsDeltas | None = None
     control: ControlPath | None = None
     """Control path; None: ur_rtde where it is installed, else script"""
+    tcp_port: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None
+    """posted: port of 127.0.0.1 at which poses are taken too, from programs that give a token; None: none"""
 
 
 REAL_DRIVERS = ("aravis", "webcam")

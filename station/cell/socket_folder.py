@@ -51,6 +51,11 @@ def post_socket(control: Path) -> Path:
     return control.with_suffix(".post")
 
 
+def post_token(control: Path) -> Path:
+    """Return the path of the file with the token of programs that post by TCP (`robot.tcp_port`)."""
+    return control.with_suffix(".post-token")
+
+
 def motion_page(control: Path) -> Path:
     """Return the path of the file with STOP and motion state (`protocol.stop_client`)."""
     return control.with_suffix(".motion")

@@ -1,7 +1,8 @@
 """An arm that a person moves and whose pose a program posts, behind `devices.base.Arm`.
 
-The program writes lines (`devices.posts`) to a Unix socket beside the control socket. The first program has
-the arm until it ends. Nothing is ever sent to the arm; a program that is refused is told why and let go.
+The program writes lines (`devices.posts`) to a Unix socket beside the control socket, or, where
+`robot.tcp_port` says so, to this port of 127.0.0.1, with a token as its first line. The first program has the
+arm until it ends. Nothing is ever sent to the arm; a program that is refused is told why and let go.
 Reading is slow on purpose: whatever is written to the socket, control and STOP in the same loop go on.
 """
 
@@ -11,22 +12,25 @@ import asyncio
 import contextlib
 import logging
 import math
+import secrets
 import socket
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
 
 from calibrate.geometry import rotation_angle, rotation_exp
+from recordings.files import write_atomically
 from recordings.importers.conventions import Convention
 from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState, Source, Stamps, Vector6
 from recordings.schema.stillness import LEAST_SAMPLES
 from station.cell.clock_fit import ClockFit
 from station.cell.config import StationConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
-from station.cell.socket_folder import bind, make_folder, peer_of, post_socket
+from station.cell.socket_folder import bind, make_folder, peer_of, post_socket, post_token
 from station.cell.status import ArmCondition
 from station.devices.clocks import ClockEstimator
 from station.devices.history import HISTORY_S, state_at
@@ -66,12 +70,13 @@ class PostedArm:
         self.guided = False
         self.notice = ""
         self.kinematics: ArmKinematics | None = None
-        self.path = post_socket(control)
+        self.path, self.token_file = post_socket(control), post_token(control)
+        self._tcp_port = config.robot.tcp_port
         self._source = source
         self._late_s = max(CURRENT_S, config.stillness.window_s / 2)
         """Age up to which a pose is the present one: at least `LEAST_SAMPLES` come in a window of rest."""
         self._slowest_s = config.stillness.window_s / LEAST_SAMPLES
-        self._server: asyncio.Server | None = None
+        self._servers = list[asyncio.Server]()
         self._links: set[asyncio.StreamWriter] = set()
         self._poster = ""
         """The program that has the arm; empty: none."""
@@ -92,11 +97,14 @@ class PostedArm:
 
     async def connect(self) -> RobotIdentity:
         """Listen, and return when a program has posted a pose. StationError where nothing can listen."""
-        if self._server is None:
+        if not self._servers:
             make_folder(self.path.parent)
             self.path.unlink(missing_ok=True)
             bind(listening := socket.socket(socket.AF_UNIX), self.path)
-            self._server = await asyncio.start_unix_server(self._serve, sock=listening, limit=READ_BYTES)
+            unix = await asyncio.start_unix_server(self._serve, sock=listening, limit=READ_BYTES)
+            self._servers.append(unix)
+            if self._tcp_port is not None:
+                self._servers.append(await self._listen(self._tcp_port))
         await self._came.wait()
         return self.identity
 
@@ -139,12 +147,13 @@ class PostedArm:
         return ClockFit(0.0, 0.0, self._late_posted_s + PAUSE_S) if self._states else None
 
     async def close(self) -> None:
-        if self._server is not None:
-            self._server.close()
-            self._server = None
+        if self._servers:
+            while self._servers:
+                self._servers.pop().close()
             for link in self._links:
                 link.transport.abort()
             self.path.unlink(missing_ok=True)
+            self.token_file.unlink(missing_ok=True)
 
     def _age_s(self) -> float:
         return time.monotonic() - self._states[-1].stamps.host_monotonic_ns / 1e9
@@ -154,10 +163,25 @@ class PostedArm:
 
     # -- for programs ------------------------------------------------------------------------------------
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _listen(self, port: int) -> asyncio.Server:
+        """Listen on this computer's own address alone, for programs that can read a file of this user."""
+        token = secrets.token_hex(16).encode()
+        try:
+            write_atomically(self.token_file, token + b"\n", 0o600)
+            return await asyncio.start_server(
+                partial(self._serve, token=token), "127.0.0.1", port, limit=READ_BYTES
+            )
+        except OSError as error:
+            raise StationError("socket", path=f"127.0.0.1:{port}", reason=str(error)) from None
+
+    async def _serve(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, token: bytes = b""
+    ) -> None:
         poster, holds = _name_of(writer.get_extra_info("socket")), False
         self._links.add(writer)
         try:
+            if token and not await _gives(token, reader):
+                raise RobotError("post-token", file=self.token_file)
             if self._poster:
                 raise RobotError("post-refused", poster=poster, reason=f"{self._poster} has the arm")
             self._poster, holds = poster, True
@@ -258,6 +282,15 @@ class PostedArm:
         self.notice, self._told_s = notice, time.monotonic()
 
 
+async def _gives(token: bytes, reader: asyncio.StreamReader) -> bool:
+    """Tell whether a program's first line is the token."""
+    try:
+        first = await asyncio.wait_for(reader.readline(), DECLARED_S)
+    except (TimeoutError, ValueError):  # ValueError: a line that never ends
+        return False
+    return secrets.compare_digest(first.strip(), token)
+
+
 async def _lines(reader: asyncio.StreamReader) -> AsyncIterator[list[bytes]]:
     """Yield the whole lines of each piece; a line that never ends is cut."""
     rest = b""
@@ -287,6 +320,8 @@ def _jump(before: Vector6, after: Vector6, seconds: float) -> StaleStateError | 
 
 def _name_of(link: socket.socket) -> str:
     """Name the program at the other end: 'python3 (pid 4711)'."""
+    if link.family is not socket.AF_UNIX:
+        return "a program by TCP"
     pid = peer_of(link)[0]
     with contextlib.suppress(OSError):
         return f"{Path(f'/proc/{pid}/comm').read_text().strip()} (pid {pid})"

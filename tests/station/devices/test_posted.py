@@ -6,12 +6,14 @@ import asyncio
 import contextlib
 import json
 import resource
+import socket
 import sys
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -68,18 +70,19 @@ class Poster:
         return code
 
 
-def config(model: str = "arm of three words", **still: float) -> Any:
-    import msgspec
-
-    robot, limits = RobotConfig(driver="posted", model=model, serial="A1"), StillnessConfig(**still)
+def config(tcp_port: int | None = None, **still: float) -> Any:
+    robot = RobotConfig(driver="posted", model="arm of three words", serial="A1", tcp_port=tcp_port)
+    limits = StillnessConfig(**still)
     return msgspec.structs.replace(memory_config(), robot=robot, stillness=limits)
 
 
 @pytest.fixture
 async def arm(tmp_path: Path) -> AsyncIterator[PostedArm]:
-    arm = PostedArm(config(), "real", tmp_path / "control.sock")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    arm = PostedArm(config(port), "real", tmp_path / "control.sock")
     connecting = asyncio.create_task(arm.connect())
-    await until(lambda: arm.path.exists())
+    await until(lambda: len(arm._servers) == 2)
     yield arm
     connecting.cancel()
     await arm.close()
@@ -160,7 +163,8 @@ async def test_no_other_file_is_made_with_the_sockets_permissions(tmp_path: Path
     connecting = asyncio.create_task(arm.connect())
     await asyncio.sleep(0)
     (tmp_path / "another").mkdir()
-    await until(lambda: arm._server is not None)
+    await until(lambda: arm._servers)
+    assert len(arm._servers) == 1 and not arm.token_file.exists()
     connecting.cancel()
     await arm.close()
     assert (tmp_path / "another").stat().st_mode & 0o700 == 0o700
@@ -246,6 +250,29 @@ async def test_the_first_program_has_the_arm_until_it_ends(arm: PostedArm) -> No
     third = await Poster.at(arm)
     await third.rest(3)
     await until(lambda: trouble(arm) == "")
+
+
+@pytest.mark.parametrize("first", [b"", b"0" * 32 + b"\n", b"{}\n", b"x" * 10_000], ids=len)
+async def test_a_program_by_tcp_gives_the_token_first_and_is_one_as_any_other(
+    arm: PostedArm, first: bytes
+) -> None:
+    assert arm.token_file.stat().st_mode & 0o777 == 0o600
+
+    async def by_tcp(token: bytes) -> Poster:
+        poster = Poster(*await asyncio.open_connection("127.0.0.1", arm._tcp_port))
+        poster.say(token)
+        poster.say(LIVE)
+        return poster
+
+    stranger = await by_tcp(first)
+    assert await stranger.refused() == "post-token"
+    poster = await by_tcp(arm.token_file.read_bytes())
+    await poster.rest(3)
+    await until(lambda: trouble(arm) == "")
+    for second in (await by_tcp(first), await by_tcp(arm.token_file.read_bytes()), await Poster.at(arm)):
+        assert await second.refused() in ("post-token", "post-refused")
+    await arm.close()
+    assert not arm.token_file.exists()
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,10 @@ class RecordingInfo(msgspec.Struct, frozen=True):
     size_bytes: int
     sha256: str
     poses: int
+    """That count."""
     attempts: int
+    """Views of them and of those that were taken back, retakes included."""
+    taken_back: int
     topics: list[TopicInfo]
     """Ours first."""
     robot_states: RobotStatesInfo | None
@@ -66,6 +69,8 @@ class RecordingInfo(msgspec.Struct, frozen=True):
 def recording_info(recording: Recording) -> RecordingInfo:
     """Everything `recordings info` says."""
     facts = [fact for segment in recording.segments for fact in segment.image_facts()]
+    views = [view for segment in recording.segments for view in segment.views]
+    taken_back = sum(view.taken_back for view in views)
     bounds_s: dict[str, float] = {}
     for time in (fact.time for fact in facts if fact.time is not None):
         bounds_s[time.source] = max(time.bound_s, bounds_s.get(time.source, 0.0))
@@ -78,7 +83,8 @@ def recording_info(recording: Recording) -> RecordingInfo:
         size_bytes=sum(segment.size_bytes for segment in recording.segments),
         sha256=recording.sha256,
         poses=len(recording.views()),
-        attempts=sum(len(segment.views) for segment in recording.segments),
+        attempts=len(views) - taken_back,
+        taken_back=taken_back,
         topics=_topics(recording),
         robot_states=_robot_states(recording),
         images=len(facts),

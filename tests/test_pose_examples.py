@@ -116,7 +116,7 @@ def test_an_example_tells_the_flange_and_the_joints(name: str, tmp_path: Path) -
     growing.write_text("0,0,0,0,0,0,1\n")
     words = {
         "tell_ros2.py": ["base_link", "tool0", *(f"j{i}" for i in range(7))],
-        "tell_csv.py": [str(growing)],
+        "tell_csv.py": [str(growing), "live"],
     }
     with subprocess.Popen(
         [sys.executable, EXAMPLES / name, *words.get(name, ["192.0.2.1"])],

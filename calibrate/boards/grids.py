@@ -24,8 +24,9 @@ from calibrate.boards.corners import (
     square_contrast,
     square_means,
 )
-from calibrate.boards.model import FEWEST_ON_A_SIDE, board_points, looks_same_turns
+from calibrate.boards.model import board_points, looks_same_turns
 from calibrate.geometry import Array
+from recordings.schema.boards import FEWEST_ON_A_SIDE
 from recordings.schema.messages import BoardKind, BoardSpec
 
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE

@@ -13,20 +13,10 @@ import numpy as np
 
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, pose, rotation_exp
-from recordings.errors import Value
-from recordings.schema.messages import (
-    LARGEST_FLATNESS_M,
-    LARGEST_TOLERANCE,
-    SINGLE_TAGS,
-    BoardKind,
-    BoardSpec,
-)
+from recordings.schema.boards import board_problem
+from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 APRIL_DICTIONARY = "DICT_APRILTAG_36h11"
-FEWEST_ON_A_SIDE = 3
-"""Inner corners on a side of a chessboard that OpenCV finds."""
-_LARGEST_SIDE = 200
-_WITH_MARKERS = (BoardKind.CHARUCO, BoardKind.APRIL_GRID)
 
 
 class BoardError(CalibrationError):
@@ -44,38 +34,19 @@ def dictionary_id(name: str) -> int:
     return value
 
 
-def _require(right: bool, code: str, **values: Value) -> None:
-    if not right:
-        raise BoardError(code, **values)
-
-
 def check_board(spec: BoardSpec) -> None:
     """Raise BoardError where the numbers cannot belong to a real board."""
-    _require(spec.kind is not BoardKind.UNSEEN, "board-unseen")
-    tag, charuco, april = (spec.kind in SINGLE_TAGS, *(spec.kind is kind for kind in _WITH_MARKERS))
-    columns, rows, smallest = spec.columns, spec.rows, 1 if april or tag else 2
-    if spec.kind is BoardKind.CHESSBOARD:
-        smallest = FEWEST_ON_A_SIDE
-    possible = all(smallest <= side <= _LARGEST_SIDE for side in (columns, rows))
-    limits = {"smallest": smallest, "largest": _LARGEST_SIDE}
-    _require(possible, "board-columns-rows", columns=columns, rows=rows, **limits)
-    _require(1e-4 <= spec.square_m <= 10.0, "board-square", square_m=spec.square_m)
-    if (tolerance := spec.square_tolerance) is not None:
-        _require(0 < tolerance <= LARGEST_TOLERANCE, "board-tolerance", square_tolerance=tolerance)
-    if (flatness_m := spec.flatness_m) is not None:
-        _require(0 < flatness_m <= LARGEST_FLATNESS_M, "board-flatness", flatness_m=flatness_m)
-    if charuco or april:
-        _require(spec.marker_m is not None and 0 < spec.marker_m < spec.square_m, "board-marker")
-    elif tag:
-        _require((columns, rows) == (1, 1), "tag-columns-rows")
-        _require(spec.tag_id >= 0, "tag-id", tag_id=spec.tag_id)
-    if charuco or april or tag:
-        named = spec.kind in (BoardKind.APRIL_GRID, BoardKind.APRIL_TAG) or bool(spec.dictionary)
-        _require(named, "dictionary-missing", kind=spec.kind.value)
-        needed = spec.tag_id + 1 if tag else columns * rows // (2 if charuco else 1)
-        dictionary = tag_dictionary(spec)
+    if spec.kind is BoardKind.UNSEEN:
+        raise BoardError("board-unseen")
+    if problem := board_problem(spec):
+        raise BoardError("board-impossible", key=problem[0], problem=problem[1])
+    tag, markers = spec.kind in SINGLE_TAGS, spec.kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID)
+    if tag or markers:
+        tags = spec.columns * spec.rows // (2 if spec.kind is BoardKind.CHARUCO else 1)
+        needed, dictionary = spec.tag_id + 1 if tag else tags, tag_dictionary(spec)
         held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)).bytesList)
-        _require(needed <= held, "dictionary-too-small", needed=needed, held=held, dictionary=dictionary)
+        if needed > held:
+            raise BoardError("dictionary-too-small", needed=needed, held=held, dictionary=dictionary)
 
 
 def usual_markers(kind: BoardKind, square_m: float) -> tuple[float | None, str | None]:

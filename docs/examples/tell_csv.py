@@ -1,7 +1,8 @@
-"""Tells the poses that another program appends to a file: `python3 tell_csv.py poses.csv | station post`.
+"""Tells the poses that another program appends: `python3 tell_csv.py poses.csv live | station post`.
 
 Each line: x, y, z in metres, a quaternion x, y, z, w, then the joints in radians, if any. The time of a pose
-is when its line is seen, so the other program must write each at once.
+is when its line is seen, so the other program must write each at once. State what it writes: `live` for an
+arm that stands there now, else `playback` or `simulated`, which never install on a real cell.
 """
 
 import json
@@ -12,10 +13,10 @@ from pathlib import Path
 LOOK_S = 0.005
 
 
-def main(path: str) -> None:
+def main(path: str, source: str) -> None:
     with Path(path).open() as file:
         file.seek(0, 2)  # what was there before is old
-        print(json.dumps({"source": "live"}), flush=True)
+        print(json.dumps({"source": source}), flush=True)
         rest = ""
         while True:
             rest += file.read()
@@ -30,4 +31,4 @@ def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

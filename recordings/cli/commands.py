@@ -113,7 +113,9 @@ def _info_rows(facts: RecordingInfo) -> Iterator[tuple[str, str]]:
     device = " ".join(filter(None, [identity.vendor, identity.model, identity.serial]))
     yield "camera", f"{device} {camera.width}×{camera.height}, intrinsics {known}"
     yield "robot", f"{robot.model} {robot.serial}".strip()
-    yield "views", f"{facts.poses} poses, {facts.attempts - facts.poses} retaken"
+    retaken = facts.attempts - facts.poses - facts.taken_back
+    back = f", {facts.taken_back} taken back" if facts.taken_back else ""
+    yield "views", f"{facts.poses} poses, {retaken} retaken{back}"
     if states := facts.robot_states:
         rate = f"{states.rate_hz:.1f} Hz" if states.rate_hz else "a controller time that does not go on"
         gaps = f"gaps: {states.gaps}, largest {states.largest_gap_s * 1e3:.0f} ms"

@@ -18,11 +18,8 @@ from recordings import strict_yaml
 from recordings.errors import ImportSourceError, disk_error
 from recordings.files import read_file, session_name_from
 from recordings.images import SIDE_LIMIT_PX
+from recordings.schema.boards import board_problem
 from recordings.schema.messages import (
-    LARGEST_FLATNESS_M,
-    LARGEST_TOLERANCE,
-    SINGLE_TAGS,
-    BoardKind,
     BoardSpec,
     CameraIdentity,
     CameraModel,
@@ -111,39 +108,12 @@ def read_dataset(path: Path) -> tuple[Dataset, bytes]:
             "dataset", path=path, problems=said, line=first.line, key=first.where
         ) from None
     pairs = dataset.poses is not None and dataset.poses.board_convention  # no board, and no images
-    for problem in () if pairs else (_board_problem(dataset.board), _camera_problem(dataset.camera)):
+    board, camera = board_problem(dataset.board), _camera_problem(dataset.camera)
+    for section, problem in () if pairs else (("board", board), ("camera", camera)):
         if problem:
-            key, text = problem
+            key, text = f"{section}.{problem[0]}", problem[1]
             raise ImportSourceError("dataset", path=path, problems=f"{key}: {text}", line=0, key=key)
     return dataset, content
-
-
-def _board_problem(board: BoardSpec) -> tuple[str, str] | None:
-    """(key, what is wrong with it)."""
-    size, square_m, marker_m = f"{board.columns}×{board.rows} columns×rows", board.square_m, board.marker_m
-    if board.kind not in SINGLE_TAGS and not (2 <= board.columns <= 100 and 2 <= board.rows <= 100):
-        return "board.columns", f"{size}; each is 2 to 100"
-    if board.kind in SINGLE_TAGS and (board.columns, board.rows) != (1, 1):
-        return "board.columns", f"{size}; a single tag has none, leave them out"
-    if board.kind is BoardKind.ARUCO and not board.dictionary:
-        return "board.dictionary", "an aruco tag needs its dictionary, such as DICT_4X4_50"
-    if not 1e-4 <= square_m <= 10:
-        return "board.square_m", f"{square_m} is not a length in metres (25 mm = 0.025)"
-    if board.kind is BoardKind.CHARUCO and not (marker_m and board.dictionary):
-        return "board.marker_m", "a charuco board needs marker_m and dictionary"
-    if marker_m is not None and marker_m <= 0:
-        return "board.marker_m", f"{marker_m} is not a length in metres"
-    if board.kind is BoardKind.CHARUCO and marker_m and marker_m >= square_m:
-        return "board.marker_m", f"{marker_m} must be smaller than square_m = {square_m}"
-    if board.square_tolerance is not None and not 0 < board.square_tolerance <= LARGEST_TOLERANCE:
-        text = (
-            f"{board.square_tolerance} is no share of square_m (0.003 is 0.3 %, limit {LARGEST_TOLERANCE:g})"
-        )
-        return "board.square_tolerance", text
-    if board.flatness_m is not None and not 0 < board.flatness_m <= LARGEST_FLATNESS_M:
-        text = f"{board.flatness_m} is no flatness in metres (1 mm is 0.001, limit {LARGEST_FLATNESS_M:g})"
-        return "board.flatness_m", text
-    return None
 
 
 def _camera_problem(camera: CameraModel | None) -> tuple[str, str] | None:
@@ -151,17 +121,17 @@ def _camera_problem(camera: CameraModel | None) -> tuple[str, str] | None:
     if camera is None:
         return None
     if not (0 < camera.width <= SIDE_LIMIT_PX and 0 < camera.height <= SIDE_LIMIT_PX):
-        return "camera.width", f"{camera.width}×{camera.height} is no image size"
+        return "width", f"{camera.width}×{camera.height} is no image size"
     if not all(map(math.isfinite, camera.distortion)):
-        return "camera.distortion", "a number is not finite"
+        return "distortion", "a number is not finite"
     if camera.matrix is None:
-        wrong = "camera.matrix", "distortion without matrix; give both or neither"
+        wrong = "matrix", "distortion without matrix; give both or neither"
         return wrong if camera.distortion else None
     K = np.array(camera.matrix)
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
-        return "camera.matrix", "it must be 3×3 with positive focal lengths"
+        return "matrix", "it must be 3×3 with positive focal lengths"
     if K[2].tolist() != [0, 0, 1]:
-        return "camera.matrix", "its last row must be [0, 0, 1]"
+        return "matrix", "its last row must be [0, 0, 1]"
     return None
 
 

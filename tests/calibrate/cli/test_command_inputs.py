@@ -53,7 +53,7 @@ def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_
         ("--board", "board.yaml", "input-file", "line 1", "kind", "line 2", "colums", "columns"),
         ("--gates", "gates.yaml", "gate-limits", "gates.yaml", "view"),
         ("--camera", "camera.yaml", "input-file", "camera_info"),
-        ("--square-mm", "-4", "board-square", "square_m"),
+        ("--square-mm", "-4", "board-impossible", "square_m"),
         ("--profile", "nix", "", "robust"),
     ):
         refused(run("solve", session_file, option, value, cwd=tmp_path), 2, code, *named)

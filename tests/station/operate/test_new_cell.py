@@ -17,10 +17,11 @@ from recordings.schema.messages import BoardKind, BoardSpec, Mount
 from station.analysis.worker import sight
 from station.cell.config_file import load_config
 from station.cell.layout import layout_of
+from station.cli.new import RealHardware
 from station.operate import draft as drafts
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
-from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep, Draft
+from station.operate.draft import CellStep, Draft
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.cells import make_cell
 from station.simulation.renderer import Light, render
@@ -112,21 +113,8 @@ def test_a_board_is_typed_as_people_write_it() -> None:
     ):
         with raises("no-board-typed"):
             typed_board(wrong)
-    with raises("board-marker"):
+    with raises("board-impossible"):
         typed_board("charuco 8x6 30 40")
-
-
-class NoHardware:
-    """`draft.Hardware` where nothing is asked for."""
-
-    async def arm(self, host: str) -> ArmReader:
-        raise NotImplementedError
-
-    async def cameras(self) -> tuple[CameraChoice, ...]:
-        raise NotImplementedError
-
-    async def camera(self, found: CameraChoice) -> CameraReader:
-        raise NotImplementedError
 
 
 @pytest.mark.parametrize("wrong", ["192.168.1.300", "192.168.1", "1.2.3.4.5", "192.168..1"])
@@ -140,7 +128,7 @@ def test_an_address_that_is_none_is_refused_before_it_is_asked(wrong: str) -> No
 def test_a_corrected_square_keeps_the_views_and_another_board_does_not(
     done: tuple[Draft, object], tmp_path: Path
 ) -> None:
-    setup = CellSetup(NoHardware(), tmp_path, tmp_path / "station.yaml")
+    setup = CellSetup(RealHardware(), tmp_path, tmp_path / "station.yaml")
     setup.keep(done[0])
     board = done[0].board
     assert board is not None
@@ -153,7 +141,7 @@ def test_a_corrected_square_keeps_the_views_and_another_board_does_not(
 def test_views_that_fit_the_other_drawing_correct_the_mounting(
     done: tuple[Draft, object], tmp_path: Path
 ) -> None:
-    setup = CellSetup(NoHardware(), tmp_path, tmp_path / "station.yaml")
+    setup = CellSetup(RealHardware(), tmp_path, tmp_path / "station.yaml")
     setup.keep(done[0])
     setup.mount = done[0].mount or "eye-in-hand"
     assert not setup.correct_mount()

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from recordings.info import recording_info
 from station.cell.config import vector6
 from station.cell.status import StationState as S
 from station.protocol.verbs import Skip
@@ -67,7 +68,9 @@ async def test_views_are_taken_by_themselves_and_taken_back(guided: Rig) -> None
     await until(lambda: captured(rig) == len(stops) and rig.state is S.FREE_DRIVE)
     await rig.session.edit(1, Skip(0))
     await rig.session.finish(1)
-    kept = [view.index for view in sealed(rig).views()]
+    recording = sealed(rig)
+    info, kept = recording_info(recording), [view.index for view in recording.views()]
+    assert info.attempts - info.poses == info.taken_back == 2, "none was retaken"
     assert kept == [1, 2, 3, len(stops)], "the view that was taken back last is in the way of none"
     assert not [asked for asked in rig.arm.log if asked not in ("close",)], "the station moved nothing"
 

@@ -86,7 +86,7 @@ async def test_a_crowd_that_asks_delays_a_session_by_one_picture(
 
 
 async def test_what_cannot_be_looked_for_is_refused_before_a_picture(rig: Rig, new_rig: NewRig) -> None:
-    with raises("board-square"):
+    with raises("board-impossible"):
         await rig.session.previews.observe(BoardSpec(BoardKind.APRIL_TAG))
     played = await new_rig(with_plan=False, source="playback")
     await played.until(S.IDLE)

@@ -54,7 +54,7 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
         ("normal: [0, 0, 1]", "normal: [0, 0, 0]", "'table' is zero"),
         ("device: KJ001", "device: KJ001, trigger: hardware", "section 'trigger'"),
         ("host: 192.0.2.10", "host: ''", "robot.host"),
-        ("square_m: 0.025", "square_m: 25", "Write 25 mm as 0.025"),
+        ("square_m: 0.025", "square_m: 25", "25 mm is 0.025"),
         ("speed_m_s: 0.2", "speed_mm_s: 200", "did you mean 'speed_m_s'"),
         ("speed_m_s: 0.2", "board_clearance_m: -0.1", "limits.board_clearance_m: Expected `float` > 0.0"),
         ("speed_m_s: 0.2", f"solids: [{TOOL}, radius_m: 40}}]", "radius_m: Expected `float` <= 5"),

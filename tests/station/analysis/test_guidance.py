@@ -30,10 +30,6 @@ def seen(C: Array, index: int = 0, flange: Array | None = None) -> CapturedView:
     return CapturedView(index, np.eye(4) if flange is None else flange, np.arange(len(points)), pixels)
 
 
-def in_image(wanted: NextView) -> bool:
-    return bool((wanted.outline > 0).all() and (wanted.outline < [LENS.width, LENS.height]).all())
-
-
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_who_follows_it_from_nothing_finds_the_camera(mount: Mount) -> None:
     truth = make_cell("paper", seed=3, noise="mid", mount=mount)
@@ -41,7 +37,7 @@ def test_who_follows_it_from_nothing_finds_the_camera(mount: Mount) -> None:
     views: list[CapturedView] = []
     for k in range(FEWEST_BY_HAND):
         wanted = next_view(mount, BOARD, BLANK, False, views)
-        assert in_image(wanted)
+        assert (wanted.outline > 0).all() and (wanted.outline < [LENS.width, LENS.height]).all()
         C = wanted.camera_from_board
         now = seen(C, k, implied_flange(mount, X, Y, C))
         assert way_to(wanted, now).new and (wanted.found is None or not way_to(wanted, now).words)

@@ -132,26 +132,15 @@ def state(machine: Machine) -> Json:
     robot = machine.robot
     return {
         "model": robot.settings.model,
-        "version": ".".join(map(str, robot.settings.version)),
         "timestamp_s": robot.time_s,
-        "timestamp_monotonic_ns": machine.clock.due_ns(machine.clock.count),
         "controller_zero_monotonic_ns": machine.clock.start_ns,
         "robot_mode": robot.robot_mode.name,
-        "safety_mode": robot.safety_mode.name,
         "runtime_state": robot.runtime_state.name,
         "program": robot.program.name if robot.program is not None else None,
         "moving": robot.arm.moving,
         "joints_rad": robot.arm.actual,
         "joint_speeds_rad_s": robot.arm.actual_speed,
-        "target_joints_rad": robot.arm.command,
-        "tcp": robot.tcp,
-        "payload_kg": robot.payload_kg,
-        "slider": robot.slider,
-        "remote": robot.remote,
-        "watchdog_s": robot.watchdog_s,
         "claims": sorted(machine.rtde.claims),
-        "packets_skipped": machine.rtde.skipped,
-        "connections": {s.name: len(s.connections) for s in machine.services},
     }
 
 
@@ -169,14 +158,8 @@ def help_(_: Machine) -> Json:
 
 _SHORT: dict[str, tuple[str, Command]] = {
     "pstop": ("Protective stop now.", lambda m: m.robot.protective_stop("admin")),
-    "estop": (
-        "Emergency stop button pressed (on) or pulled out again; afterwards the arm has no power.",
-        lambda m, on=True: m.robot.emergency_stop(on),
-    ),
-    "safeguard": (
-        "Safeguard stop: the program pauses; released, it stays paused until `play`.",
-        lambda m, on=True: m.robot.safeguard(on),
-    ),
+    "estop": ("Emergency stop button pressed: the arm has no power.", lambda m: m.robot.emergency_stop()),
+    "safeguard": ("Safeguard stop: the program pauses.", lambda m: m.robot.safeguard()),
     "power_off": ("The arm loses power.", lambda m: m.robot.power_off()),
     "stall": (
         "RTDE links stay open but no data comes; everything else works.",

@@ -95,9 +95,7 @@ class Machine:
         self.rtde.send_states()
 
     def chosen(self, ports: list[str] | None) -> list[Service]:
-        """Services whose name begins with one of these words; all for None. ValueError for none, and while
-        the controller reboots."""
-        self._refuse_while_rebooting()
+        """Services whose name begins with one of these words; all for None. ValueError for none."""
         if ports is None:
             return self.services
         services = [s for s in self.services if any(s.name.startswith(p) for p in ports)]
@@ -112,14 +110,9 @@ class Machine:
         """All links reset, all ports closed for a while, then a fresh controller: time 0, empty registers.
 
         The installation (TCP, payload) survives, faults of links do not; the arm stays where it is, powered
-        off unless `running`. ValueError while it reboots already.
+        off unless `running`.
         """
-        self._refuse_while_rebooting()
         self._rebooting = asyncio.get_running_loop().create_task(self._reboot(down_s, running))
-
-    def _refuse_while_rebooting(self) -> None:
-        if self._rebooting is not None and not self._rebooting.done():
-            raise ValueError("the controller is rebooting")
 
     async def _reboot(self, down_s: float, running: bool) -> None:
         robot = self.robot

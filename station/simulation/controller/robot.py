@@ -180,20 +180,13 @@ class SimulatedRobot(ControllerState):
         else:
             self.runtime_state = RuntimeState.PAUSED
 
-    def safeguard(self, on: bool) -> None:
-        if on:
-            self.safety_mode = SafetyMode.SAFEGUARD_STOP
-            self.pause_program()
-        elif self.safety_mode == SafetyMode.SAFEGUARD_STOP:
-            self.safety_mode = SafetyMode.NORMAL
+    def safeguard(self) -> None:
+        self.safety_mode = SafetyMode.SAFEGUARD_STOP
+        self.pause_program()
 
-    def emergency_stop(self, on: bool) -> None:
-        if on:
-            self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
-            self.power_off(RobotMode.IDLE if self.settings.is_e_series else RobotMode.POWER_OFF)
-        elif self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
-            self.safety_mode = SafetyMode.NORMAL
-            self.robot_mode = RobotMode.POWER_OFF
+    def emergency_stop(self) -> None:
+        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
+        self.power_off(RobotMode.IDLE if self.settings.is_e_series else RobotMode.POWER_OFF)
 
     def power_off(self, mode: RobotMode = RobotMode.POWER_OFF) -> None:
         self.stop_program("power off")

@@ -35,7 +35,6 @@ class RtdeServer:
         """Links live, no data is sent."""
         self.frozen = False
         """The same packet again and again."""
-        self.skipped = 0
 
     def send_states(self) -> None:
         """Called once per cycle."""
@@ -141,9 +140,6 @@ class RtdeConnection(Connection):
         if not (server.frozen and self._last):
             assert self._output is not None
             self._last = self._output.pack(self._elements(self._robot.outputs.elements)[:-1])
-        if self.transport.is_closing():
-            return
-        if self.transport.get_write_buffer_size():  # the client does not read: nothing is queued
-            server.skipped += 1
-            return
+        if self.transport.is_closing() or self.transport.get_write_buffer_size():
+            return  # for a client that does not read nothing is queued
         self.transport.write(self._last)

@@ -5,9 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-LIMIT = 4_000_000
-"""Characters of one unfinished program."""
-
 _BEGIN = re.compile(r"^(?:def|sec)\s+(\w+)\s*\([^\n]*\)\s*:[ \t]*$", re.MULTILINE)
 _END = re.compile(r"^end[ \t]*\r?\n", re.MULTILINE)
 
@@ -22,7 +19,7 @@ class Upload:
 
 
 class UploadReader:
-    """Collects text until a program is complete. Raises ValueError beyond the limit."""
+    """Collects text until a program is complete."""
 
     def __init__(self) -> None:
         self._text = ""
@@ -45,6 +42,4 @@ class UploadReader:
             self._text = rest
             if line.strip() and not line.lstrip().startswith("#"):
                 uploads.append(Upload("", line.strip()))
-        if len(self._text) > LIMIT:
-            raise ValueError(f"a program of more than {LIMIT} characters without an end")
         return uploads

@@ -13,11 +13,10 @@ Imports nothing of the station and knows no robot.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping
-from traceback import walk_tb
 from types import GeneratorType
 from typing import Any
 
-from station.simulation.controller.urscript_parser import SCRIPT, ScriptError, parse
+from station.simulation.controller.urscript_parser import ScriptError, parse
 
 Value = Any
 """bool, int, float, str, list, Pose, Thread; None is what a function without `return` gives."""
@@ -25,8 +24,7 @@ Steps = Generator[None, None, Value]
 """Yields once for every cycle it takes, then returns a value."""
 Builtin = Callable[..., Any]
 
-LOOPS_PER_CYCLE = 10_000
-_REFUSED = (TypeError, ValueError, ArithmeticError, LookupError, NameError)
+_REFUSED = (TypeError, ValueError, ArithmeticError, LookupError, NameError, RecursionError)
 """What Python raises where URScript stops the program: 1 / 0, 1 + "a", a name that has no value."""
 
 
@@ -63,11 +61,10 @@ class ScriptRun:
         """The one whose turn it is."""
         self.halted = False
         self._threads: list[Thread] = []
-        self._spent = 0
-        code, program, self._lines = parse(text, builtins)
+        code, program = parse(text, builtins)
         names: dict[str, Any] = {
             "__builtins__": {}, "List": List, "Pose": Pose, "call": _call, "copied": copied,
-            "halt": self._halt, "join": _join, "kill": _kill, "spend": self._spend, "start": self._start,
+            "halt": self._halt, "kill": _kill, "start": self._start,
         } | {f"f_{name}": function for name, function in builtins.items()}  # fmt: skip
         exec(code, names)
         self._start(names[program])
@@ -77,16 +74,11 @@ class ScriptRun:
         main = self._threads[0]
         try:
             for thread in self._threads:  # one that starts meanwhile has its turn in the same cycle
-                self.thread, self._spent = thread, 0
+                self.thread = thread
                 if not thread.done and not self.halted:
                     thread.step()
-        except RecursionError as error:
-            raise ScriptRuntimeError("nested too deeply", self._line(error)) from None
-        except ScriptRuntimeError as error:
-            error.line = self._line(error)
-            raise
         except _REFUSED as error:
-            raise ScriptRuntimeError(str(error), self._line(error)) from None
+            raise ScriptRuntimeError(str(error)) from error
         finally:
             self.thread = None
         self._threads = [main, *(t for t in self._threads[1:] if not t.done)]
@@ -99,11 +91,6 @@ class ScriptRun:
             if not thread.done and thread is not self.thread:
                 thread.kill()
 
-    def _line(self, error: BaseException) -> int:
-        """Return the script's line that is the nearest to where it was raised."""
-        places = [at for frame, at in walk_tb(error.__traceback__) if frame.f_code.co_filename == SCRIPT]
-        return self._lines[places[-1] - 1] if places else 0
-
     def _halt(self) -> Steps:
         self.halted = True
         yield
@@ -111,12 +98,6 @@ class ScriptRun:
     def _start(self, function: Builtin, /, *arguments: Value, **named: Value) -> Thread:
         self._threads.append(Thread(_call(function, *arguments, **named)))
         return self._threads[-1]
-
-    def _spend(self) -> None:
-        """Called in every round of a loop. Raises ScriptRuntimeError for a program that never waits."""
-        self._spent += 1
-        if self._spent > LOOPS_PER_CYCLE:
-            raise ScriptRuntimeError("an infinite loop: it never waits")
 
 
 def _call(function: Builtin, /, *arguments: Value, **named: Value) -> Steps:
@@ -127,11 +108,6 @@ def _call(function: Builtin, /, *arguments: Value, **named: Value) -> Steps:
 def _kill(thread: Value) -> None:
     if isinstance(thread, Thread) and not thread.done:  # scripts keep a 0 where none started yet
         thread.kill()
-
-
-def _join(thread: Value) -> Steps:
-    while isinstance(thread, Thread) and not thread.done:
-        yield
 
 
 # -- values ---------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ _TOKEN = re.compile(
 )
 """`$ 2 "Robot Program"`, a line in which PolyScope names the node of a program it exports, is a comment."""
 _HEADS = ("def", "thread", "if", "elif", "else", "while")
-_CALLED = ("halt", "kill", "join")
+_CALLED = ("halt", "kill")
 _IGNORED = ("pass", "enter_critical", "exit_critical")
 """No thread is interrupted here."""
 _BEGINNINGS = (*_HEADS, *_CALLED, *_IGNORED, "end", "return", "break", "continue", "global", "local")
@@ -49,20 +49,16 @@ Statement = tuple[int, list[str]]
 class ScriptError(Exception):
     """Error for which the controller refuses or stops a program."""
 
-    def __init__(self, text: str, line: int = 0) -> None:
-        super().__init__(text)
-        self.text, self.line = text, line
-
-    def __str__(self) -> str:
-        return f"line {self.line}: {self.text}" if self.line else self.text
-
 
 class ScriptSyntaxError(ScriptError):
     """The text is no program that this interpreter can run."""
 
+    def __init__(self, text: str, line: int) -> None:
+        super().__init__(f"line {line}: {text}")
 
-def parse(text: str, builtins: Collection[str]) -> tuple[CodeType, str, list[int]]:
-    """Return code that defines the program, what it defines, and the script's line of each line of it.
+
+def parse(text: str, builtins: Collection[str]) -> tuple[CodeType, str]:
+    """Return code that defines the program, and what it defines.
 
     The program is a `def name(): … end`, or bare statements. Raises ScriptSyntaxError.
     """
@@ -77,9 +73,7 @@ def parse(text: str, builtins: Collection[str]) -> tuple[CodeType, str, list[int
         code = compile(ast.fix_missing_locations(tree), SCRIPT, "exec")
     except SyntaxError as error:
         raise ScriptSyntaxError(f"{error.msg}, or {NOT_SUPPORTED}", lines[(error.lineno or 1) - 1]) from None
-    except (RecursionError, MemoryError, ValueError) as error:
-        raise ScriptSyntaxError(str(error) or "nested too deeply") from None
-    return code, tree.body[0].name, lines
+    return code, tree.body[0].name
 
 
 def _statements(text: str) -> Iterator[Statement]:
@@ -180,11 +174,6 @@ class _Rewriter(ast.NodeTransformer):
         scope = [kind(names) for kind, names in ((ast.Global, shared), (ast.Nonlocal, outer)) if names]
         node.body = [*scope, *node.body, ast.Return(), ast.Expr(ast.Yield())]
         node.name = f"f_{node.name.removeprefix('v_')}"
-        return node
-
-    def visit_While(self, node: ast.While) -> ast.While:
-        self.generic_visit(node)
-        node.body.insert(0, ast.Expr(_call("spend")))
         return node
 
     def visit_Assign(self, node: ast.Assign) -> ast.Assign:

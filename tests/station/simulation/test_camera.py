@@ -84,16 +84,6 @@ async def test_frames_are_numbered_over_the_wrap_and_stamped_by_the_cameras_own_
     assert abs(middle_ns - true_middle_ns) / 1e9 < bound_s < 0.02
 
 
-async def test_a_glimpse_is_smaller_and_never_counts_as_a_frame_and_unknown_faults_are_refused(
-    camera: RenderedCamera,
-) -> None:
-    glimpse = await camera.glimpse()
-    assert glimpse.pixels.shape == (512, 640)
-    with raises("camera-refused"):
-        await camera.inject("gremlins")
-    assert (await camera.capture()).sequence == 0
-
-
 async def test_without_a_controller_the_camera_says_so(cell: CellTruth) -> None:
     rendered = RenderedCamera(cell, "127.254.253.252")
     await rendered.open()
@@ -103,14 +93,6 @@ async def test_without_a_controller_the_camera_says_so(cell: CellTruth) -> None:
                 await look()
     finally:
         await rendered.close()
-
-
-async def test_a_closed_camera_is_refused_and_can_be_opened_again(camera: RenderedCamera) -> None:
-    await camera.close()
-    with raises("not-open"):
-        await camera.capture()
-    await camera.open()
-    assert (await camera.capture()).pixels.mean() > 10
 
 
 async def test_while_it_starts_nothing_is_said_of_its_clock(

@@ -13,7 +13,6 @@ from calibrate.kinematics import MODELS, forward
 from station.cell.config import BLOG_BOARD, PAPER_BOARD
 from station.simulation.cells import board_centre, cell_config, make_cell
 from station.simulation.truth import CellTruth, read_truth, write_truth
-from tests.codes import raises
 
 
 def camera_from_board(cell: CellTruth, joints_rad: object) -> np.ndarray:
@@ -66,13 +65,6 @@ def test_the_same_arguments_give_the_same_cell_and_seeds_differ(tmp_path: Path) 
     assert read_truth(tmp_path / "truth.json") == make_cell(seed=4)
 
 
-def test_noise_levels_grow() -> None:
-    low, mid, high = (make_cell(noise=n) for n in ("low", "mid", "high"))  # type: ignore[arg-type]
-    assert low.robot_sigma_m < mid.robot_sigma_m < high.robot_sigma_m
-    assert low.pixel_noise < mid.pixel_noise < high.pixel_noise
-    assert not any(low.dh_delta_a_m) and any(mid.dh_delta_a_m)
-
-
 def test_the_guess_is_off_but_within_its_own_sigmas() -> None:
     for seed in range(1, 6):
         cell = make_cell(seed=seed)
@@ -82,11 +74,3 @@ def test_the_guess_is_off_but_within_its_own_sigmas() -> None:
         off = np.linalg.norm(t - np.array(cell.camera_mount)[:3, 3])
         assert 0 < off < 2 * np.sqrt(3) * guess.sigma_m
     assert cell_config(cell).camera.model_is_rough
-
-
-def test_a_missing_or_broken_truth_is_named(tmp_path: Path) -> None:
-    broken = tmp_path / "truth.json"
-    broken.write_text("{}")
-    for path in (broken, tmp_path / "none.json"):
-        with raises("no-truth"):
-            read_truth(path)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import socket
 import time
 
 import numpy as np
 import pytest
 
-from station.simulation.launch import AdminClient
 from tests.codes import raises
 
 pytestmark = pytest.mark.process
@@ -42,26 +40,3 @@ def test_truth_waits_for_the_near_future_and_refuses_the_rest(controller, admin)
     assert time.monotonic_ns() >= soon_ns
     with raises("simulation-refused"):
         ask.ask("truth", at_monotonic_ns=1)
-
-
-def test_the_admin_port_explains_itself_and_survives_nonsense(controller, admin) -> None:
-    running = controller("UR10")
-    ask = admin(running)
-    commands = ask.ask("help")["commands"]
-    assert all(commands.values()) and {"pstop", "truth", "drop", "hand_move"} <= set(commands)
-    for nonsense, words in (
-        ({"cmd": "explode"}, "lists the names"),
-        ({"cmd": "slider", "fraction": 3}, "$.fraction"),
-        ({"cmd": "hand_move"}, "`path`"),
-        ({"cmd": "slider", "share": 1}, "`share`"),
-        ({"cmd": "tcp", "pose": [1, 2]}, "$.pose"),
-        ({"cmd": "drop", "ports": ["moon"]}, "not ['moon']"),
-    ):
-        with raises("simulation-refused") as refusal:
-            ask.ask(**nonsense)
-        assert words in str(refusal.value)
-    with socket.create_connection((running.host, 29990), 3) as link:
-        link.sendall(b"[1]\n")
-        assert b'"ok": false' in link.recv(1000)
-    with AdminClient(running.host) as other:
-        other.ask("state")

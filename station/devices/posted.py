@@ -77,7 +77,8 @@ class PostedArm:
         """Age up to which a pose is the present one: at least `LEAST_SAMPLES` come in a window of rest."""
         self._slowest_s = config.stillness.window_s / LEAST_SAMPLES
         self._servers = list[asyncio.Server]()
-        self._links: set[asyncio.StreamWriter] = set()
+        self._links: dict[asyncio.StreamWriter, asyncio.Task[None]] = {}
+        """Connected programs, and what serves each."""
         self._poster = ""
         """The program that has the arm; empty: none."""
         self._late_posted_s = 0.0
@@ -152,6 +153,8 @@ class PostedArm:
                 self._servers.pop().close()
             for link in self._links:
                 link.transport.abort()
+            if self._links:
+                await asyncio.wait(self._links.values(), timeout=DECLARED_S)
             self.path.unlink(missing_ok=True)
             self.token_file.unlink(missing_ok=True)
 
@@ -178,7 +181,8 @@ class PostedArm:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, token: bytes = b""
     ) -> None:
         poster, holds = _name_of(writer.get_extra_info("socket")), False
-        self._links.add(writer)
+        if (serving := asyncio.current_task()) is not None:
+            self._links[writer] = serving
         try:
             if token and not await _gives(token, reader):
                 raise RobotError("post-token", file=self.token_file)
@@ -196,7 +200,7 @@ class PostedArm:
             if holds:
                 self._poster = ""
                 self._begin_anew()
-            self._links.discard(writer)
+            self._links.pop(writer, None)
             writer.close()
 
     async def _take(self, reader: asyncio.StreamReader) -> None:

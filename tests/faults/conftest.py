@@ -90,14 +90,27 @@ class Cell:
         """A move of several seconds, under way."""
         return asyncio.create_task(self.robot.move(self.near(0, FAR_RAD), 0.5, 1.0))
 
-    async def go_on(self, move: asyncio.Task[None]) -> None:
-        """Start control again, as a person would, after a move that late news ended; raise what else did."""
+    async def begin(self) -> None:
+        """Start control, as a person would: again, where late news of a busy computer prevented it."""
+        async with asyncio.timeout(PATIENCE_S):
+            while not await self._in_time(self.robot.start_control()):
+                pass
+
+    async def go_on(self, move: asyncio.Task[None]) -> bool:
+        """Begin again after a move that late news ended (True); raise what else ended it."""
+        if await self._in_time(move):
+            return False
+        await self.begin()
+        return True
+
+    async def _in_time(self, doing: Awaitable[object]) -> bool:
         try:
-            await move
+            await doing
         except StaleStateError as error:
             if error.code not in set(Delay):
                 raise
-            await self.robot.start_control()
+            return False
+        return True
 
     async def arrives(self, goal: Sequence[float], speed_rad_s: float = 0.5) -> None:
         """Move to joints, on however busy a computer."""
@@ -175,7 +188,7 @@ async def cell(
         cells.append(made)
         await robot.connect()
         if control:
-            await robot.start_control()
+            await made.begin()
         return made
 
     yield make

@@ -135,7 +135,7 @@ async def test_a_robot_switched_to_remote_after_connecting_can_be_driven(cell: M
     c = await cell("UR10e", control=False, options=("--local",))
     assert c.robot.remote is False
     await c.ask("remote", on=True)
-    await c.robot.start_control()
+    await c.begin()
     assert c.robot.control
 
 
@@ -167,7 +167,7 @@ async def test_the_link_comes_back_by_itself_but_control_does_not(cell: MakeCell
     await until(lambda: not c.robot.control)
     await until(lambda: c.robot.age_s() < 0.05)
     await c.stays_at_rest()
-    await c.robot.start_control()
+    await c.begin()
     await c.arrives(c.near())
 
 
@@ -202,7 +202,7 @@ async def test_a_tool_on_the_pendant_is_reported_and_not_mixed_in(cell: MakeCell
     await asyncio.sleep(0.1)
     identity = await c.robot.connect()
     assert identity.tcp_offset == pytest.approx((0.01, -0.02, 0.15, 0.0, 0.0, 0.5), abs=1e-6)
-    await c.robot.start_control()  # reads the offset from the controller and compares
+    await c.begin()  # reads the offset from the controller and compares
 
 
 async def test_an_impossible_goal_is_never_sent(cell: MakeCell) -> None:

@@ -53,7 +53,7 @@ async def cycle(c: Cell, number: int) -> None:
     """One drop and recovery; every fifth with control alive, every tenth with the arm in motion."""
     move = None
     if number % 5 == 0:
-        await c.robot.start_control()
+        await c.begin()
         if number % 10 == 0:
             move = c.far_move() if (await c.joints_rad())[0] < 2.0 else None
     await drop(c, "rst" if number % 2 else "fin")

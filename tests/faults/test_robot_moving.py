@@ -133,7 +133,7 @@ async def test_another_clients_program_in_the_place_of_ours_is_named(
     c = await cell(control=False)
     if not told:
         await c.ask("mute", ports=["script30001"])
-    await c.robot.start_control()
+    await c.begin()
 
     async def replace(c: Cell) -> None:
         await c.ask("mute", ports=["dashboard"])  # whose stop would end that program before it begins
@@ -187,7 +187,7 @@ async def test_control_that_ended_between_two_moves_is_no_trouble_once_it_was_to
         await ready(c.robot)
     await c.robot.end_control()
     await ready(c.robot)
-    await c.robot.start_control()
+    await c.begin()
 
 
 async def test_an_arm_that_goes_another_way_than_the_checked_one_is_stopped(

@@ -71,7 +71,7 @@ async def test_stop_is_welcome_in_any_state(cell: MakeCell, tmp_path: Path) -> N
     await stranger.close()
     c = await cell(control=False)
     await c.robot.stop("no control")
-    await c.robot.start_control()
+    await c.begin()
     await asyncio.gather(*(c.robot.stop(f"number {i}") for i in range(5)))
     await c.robot.stop("again")
     await c.stays_at_rest()
@@ -113,7 +113,7 @@ async def test_a_new_approval_right_after_a_stop(cell: MakeCell) -> None:
     await c.robot.stop("operator")
     with pytest.raises(RobotError):
         await move
-    await c.robot.start_control()  # waits for the old control to be gone
+    await c.begin()  # waits for the old control to be gone
     assert c.robot.control
     await c.arrives(c.near())
 

@@ -103,6 +103,8 @@ class FakeLink(Client):
         self._tell()
 
     async def open(self) -> Client:
+        if self._plain_status is None:
+            raise ConnectionRefusedError("no daemon")
         self._serves = True
         return self
 

@@ -87,7 +87,7 @@ async def arm(tmp_path: Path) -> AsyncIterator[PostedArm]:
     connecting.cancel()
     await arm.close()
     while Poster.all:
-        Poster.all.pop().writer.transport.abort()
+        Poster.all.pop().writer.close()
     await asyncio.sleep(0)
 
 

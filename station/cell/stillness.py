@@ -103,7 +103,7 @@ class StillnessMonitor:
 
     def rest(self, found: Stillness) -> float:
         """Rate how still everything is, 0…1, by powers of ten over the limits; 1: settled."""
-        over = max(1.0, *(value / limit for value, limit, *_ in self._checks(found) if value))
+        over = max([1.0, *(value / limit for value, limit, *_ in self._checks(found) if value)])
         return max(0.0, 1.0 - math.log10(over) / _DECADES)
 
     def _checks(self, found: Stillness) -> tuple[tuple[float | None, float, float, str, str, int], ...]:

@@ -39,7 +39,6 @@ class SimulatedHardware(RealHardware):
 
     def __init__(self, truth: CellTruth, host: str) -> None:
         self.truth, self.host = truth, host
-        self.readers: list[RenderedReader] = []
 
     async def cameras(self) -> tuple[CameraChoice, ...]:
         return (CAMERA,)
@@ -47,5 +46,4 @@ class SimulatedHardware(RealHardware):
     async def camera(self, found: CameraChoice) -> CameraReader:
         reader = RenderedReader(self.truth, self.host)
         await reader.camera.open()
-        self.readers.append(reader)
         return reader

@@ -51,6 +51,7 @@ def test_a_resting_arm_is_still() -> None:
     assert m.at_rest
     assert found.window_s == pytest.approx(0.3, abs=0.01)
     assert found.position_scatter_m < 1e-12 and found.max_joint_speed_rad_s == 0.0
+    assert m.rest(msgspec.structs.replace(found, position_scatter_m=0.0, rotation_scatter_rad=0.0)) == 1.0
 
 
 def test_a_shaking_arm_is_measured() -> None:

@@ -170,16 +170,6 @@ async def test_no_other_file_is_made_with_the_sockets_permissions(tmp_path: Path
     assert (tmp_path / "another").stat().st_mode & 0o700 == 0o700
 
 
-async def test_poses_are_read_in_the_convention_that_was_declared(arm: PostedArm) -> None:
-    poster = await Poster.at(arm, LIVE | {"convention": "abb-quaternion"})
-    states: list[RobotState] = []
-    arm.subscribe(states.append)
-    poster.post([400.0, -200.0, 300.0, POSE[6], *POSE[3:6]])
-    await until(lambda: states)
-    exact = pose_from_quaternion(POSE[:3], POSE[3:])
-    assert np.abs(flange_pose(states[0], arm.identity.tcp_offset) - exact).max() < 1e-12
-
-
 WRONG = {
     "millimetres": ({"base_from_flange": [400.0, -200.0, 300.0, *POSE[3:]]}, "post-too-far"),
     "a quaternion that is none": ({"base_from_flange": [*POSE[:3], 0.5, 0.1, 0.3, 0.8, ]}, "post-rotation"),

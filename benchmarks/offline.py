@@ -13,29 +13,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibrate.boards.model import board_points
-from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.job import JobOptions
 from calibrate.pipeline import solve_recording
-from recordings.images import Pixels
 from recordings.reader import open_recording
-from recordings.schema.messages import (
-    BoardSpec,
-    CameraIdentity,
-    CameraModel,
-    Image,
-    RobotIdentity,
-    SessionInfo,
-    Stamps,
-    View,
-)
-from recordings.writer import RecordingWriter
-from station.simulation.cells import make_cell
-from station.simulation.renderer import Light, render
-from station.simulation.truth import CellTruth
+from recordings.schema.messages import CameraModel
+from tests.calibrate.sessions import Scene, write_session
 
 REPEATS = 15
-_TILT_DEG, _AWAY_M = 25.0, 0.45
+LARGE = CameraModel(
+    1280, 1024, ((1653.0, 0.0, 648.8), (0.0, 1656.0, 504.8), (0.0, 0.0, 1.0)), (-0.12, 0.08, 5e-4, -3e-4, 0.0)
+)
+"""The tests' camera with more pixels."""
 _PEAK = """
 import json, resource, sys
 from pathlib import Path
@@ -47,7 +35,7 @@ print(json.dumps(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
 
 def run() -> str:
     with tempfile.TemporaryDirectory() as folder:
-        recording = make_recording(Path(folder) / "paper.mcap")
+        recording = write_session(Path(folder) / "paper.mcap", Scene(views=25, camera=LARGE))
         ours: list[float] = []
         floor: list[float] = []
         cpu_ms: list[tuple[float, float]] = []
@@ -77,41 +65,6 @@ def run() -> str:
         f"| peak memory of the solving process | {json.loads(peak.stdout):.0f} MiB (asked: ≤ 500) |",
     ]
     return "\n".join(lines)
-
-
-def make_recording(path: Path) -> Path:
-    """The paper's scene from random views that face the board; stored as the station stores pictures."""
-    truth: CellTruth = make_cell("paper", 1, "low", "eye-in-hand")
-    camera = truth.camera
-    X, P = np.array(truth.camera_mount), np.array(truth.board_place)
-    info = SessionInfo(
-        name=path.stem,
-        mount="eye-in-hand",
-        source="simulated",
-        board=truth.board,
-        camera=CameraModel(camera.width, camera.height),
-        robot=RobotIdentity("UR10"),
-        camera_identity=CameraIdentity("rendered", "context"),
-    )
-    with RecordingWriter(path, info) as writer:
-        for k in range(25):
-            image, seen = _picture(truth.board, camera, k)
-            stamps = Stamps(k * 10**9, 10**18 + k * 10**9)
-            writer.image(Image(image, stamps, frame_id=k, sequence=k))
-            flange = P @ np.linalg.inv(seen) @ np.linalg.inv(X)
-            writer.view(View(k, f"pose-{k}", k, tuple(tuple(row) for row in flange.tolist()), stamps=stamps))
-        return writer.finish()
-
-
-def _picture(spec: BoardSpec, camera: CameraModel, seed: int) -> tuple[Pixels, Array]:
-    """A picture, (h, w) uint8, and its camera_from_board: the board near the middle, turned at random."""
-    rng = np.random.default_rng(seed)
-    about, roll = rng.uniform(0, 2 * np.pi), rng.uniform(-0.7, 0.7)
-    tilt = np.radians(_TILT_DEG)
-    R = rotation_exp([tilt * np.cos(about), tilt * np.sin(about), 0]) @ rotation_exp([0, 0, roll])
-    centre = (board_points(spec).min(axis=0) + board_points(spec).max(axis=0)) / 2
-    seen = pose(R, np.array([*rng.uniform(-0.02, 0.02, 2), _AWAY_M]) - R @ centre)
-    return render(camera, spec, seen, Light(), rng).astype(np.uint8), seen
 
 
 def _opencv_ms(path: Path) -> float:

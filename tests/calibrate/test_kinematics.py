@@ -16,10 +16,8 @@ from calibrate.kinematics import (
     RobotModel,
     forward,
     inverse_all,
-    inverse_many,
     inverse_nearest,
     jacobian,
-    link_frames,
     singularity_measure,
 )
 
@@ -154,27 +152,3 @@ def test_jacobian_is_the_derivative_of_forward(q: Array, name: str) -> None:
 def test_singular_poses_measure_zero(q: list[float]) -> None:
     assert singularity_measure(UR10, q) < 1e-9
     assert singularity_measure(UR10, [0.3, -1.2, 1.6, -1.0, -1.3, 0.4]) > 0.05
-
-
-def test_a_wrist_over_the_shoulder_measures_zero() -> None:
-    """q2 and q3 chosen so that the wrist's centre lies on the base axis (but for d4)."""
-    a2, a3 = UR10.a_m[1], UR10.a_m[2]
-    q3 = 1.9
-    elbow = np.array([a2 + a3 * np.cos(q3), a3 * np.sin(q3)])
-    d5_x = UR10.d_m[4]  # q2 + q3 + q4 = π/2: frame 5 reaches sideways by d5
-    q2 = np.arccos(-d5_x / np.linalg.norm(elbow)) - np.arctan2(elbow[1], elbow[0])
-    q = [0.0, q2, q3, pi / 2 - q2 - q3, -1.2, 0.0]
-    wrist = link_frames(UR10, q)[5, :3, 3]
-    assert wrist[0] == pytest.approx(0.0, abs=1e-9)
-    assert singularity_measure(UR10, q) < 1e-9
-
-
-def test_the_inverses_of_many_poses_are_those_of_each() -> None:
-    model = MODELS["UR10"]
-    poses = forward(model, np.random.default_rng(3).uniform(-3, 3, (30, 6)))
-    poses[::7, :3, 3] *= 2.0  # some beyond the reach
-    rows, joints, _ = inverse_many(model, poses)
-    assert forward(model, joints) == pytest.approx(poses[rows], abs=1e-9)
-    each = [inverse_all(model, target) for target in poses]
-    assert np.bincount(rows, minlength=30).tolist() == [len(found) for found in each]
-    assert joints == pytest.approx(np.concatenate(each))

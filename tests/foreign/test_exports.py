@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibrate.files.calibration import Calibration, FramePose, Lens
-from calibrate.files.exports import FORMATS, FrameNames, export
+from calibrate.files.exports import FORMATS, export
 from calibrate.geometry import Transform
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.simulation.cells import make_cell
@@ -104,12 +104,3 @@ def test_every_format_has_a_reader_and_stands_in_the_table_of_conventions() -> N
     assert set(READERS) | BY_OTHERS == set(FORMATS)
     page = (Path(__file__).parents[2] / "docs/integrator/export.md").read_text()
     assert [name for name in FORMATS if f"`{name}`" not in page] == []
-
-
-@pytest.mark.parametrize("name", ["urdf", "halcon", "zivid"])
-def test_beside_a_table_it_is_said_for_which_arm_the_pose_is(name: str) -> None:
-    calibration = made("in-hand")
-    bare = msgspec.structs.replace(calibration, arm_table=None)
-    first, second = (export(c, name, FrameNames()) for c in (calibration, bare))
-    note = b"not for the corrected arm"
-    assert note in first and note not in second

@@ -11,8 +11,7 @@ from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedR
 from recordings.reader import Recording, open_recording
 from recordings.recover import recover_recording
 from recordings.schema.messages import RobotState, View
-from recordings.schema.topics import Topic
-from tests.recordings.small_recording import make_state, make_view, write_small
+from tests.recordings.small_recording import make_state, make_view
 
 
 def sampled(every: int) -> pytest.MarkDecorator:
@@ -82,18 +81,3 @@ def test_recovery_of_a_cut_file_saves_every_pose_that_is_in_it(small: Path, ever
         saved_before = saved
         output.unlink()
     assert saved_before == (3, 9)
-
-
-def test_one_damaged_pose_costs_only_that_pose(tmp_path: Path) -> None:
-    path = write_small(tmp_path / "a.mcap", poses=6)
-    data = bytearray(path.read_bytes())
-    offset = open_recording(path).segments[0].messages(Topic.RAW_IMAGE).addresses[3]
-    data[offset + 100] ^= 0xFF
-    path.write_bytes(data)
-    with pytest.raises(CorruptRecordingError):
-        open_recording(path)
-    (result,) = recover_recording(path)
-    assert [view.index for view in open_recording(path).views()] == [0, 1, 2, 4, 5]
-    assert any("pose 4 (" in loss for loss in result.losses)
-    assert result.kept_original == path.with_name("a.mcap.damaged")
-    assert result.kept_original.read_bytes() == data

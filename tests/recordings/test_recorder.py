@@ -294,14 +294,6 @@ async def test_a_task_that_stops_waiting_does_not_harm_the_recording(gate: Gate,
     assert open_recording(await asyncio.wrap_future(recorder.finish())).segments[0].image_sequences() == [0]
 
 
-def test_what_comes_after_the_end_is_not_kept_and_not_counted_as_lost(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "a.mcap", make_info())
-    assert recorder.robot_state(make_state(0))
-    recorder.finish().result(PATIENCE_S)
-    assert not recorder.robot_state(make_state(1))
-    assert recorder.dropped == 0
-
-
 def test_closing_leaves_the_part_file_for_recovery(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "a.mcap", make_info())
     recorder.image(make_picture(0))

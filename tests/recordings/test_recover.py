@@ -49,13 +49,6 @@ def test_an_unfinished_file_takes_its_name_and_the_damaged_one_is_kept(tmp_path:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "a.mcap.part.damaged"]
 
 
-def test_with_an_output_the_original_is_untouched(tmp_path: Path) -> None:
-    part = write_unfinished(tmp_path / "a.mcap")
-    (result,) = recover_recording(part, tmp_path / "b.mcap")
-    assert result.kept_original == part
-    assert len(open_recording(tmp_path / "b.mcap").views()) == 2
-
-
 def test_a_whole_file_that_only_missed_its_rename_is_renamed(small: Path) -> None:
     part = small.rename(small.with_name("small.mcap.part"))
     (result,) = recover_recording(part)
@@ -69,15 +62,6 @@ def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
         writer.image(make_picture(0))
         with refused("in-use"):
             recover_recording(writer.part_path)
-
-
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    part = write_unfinished(tmp_path / "a.mcap")
-    taken = write_small(tmp_path / "b.mcap")
-    before = taken.read_bytes()
-    with refused("exists"):
-        recover_recording(part, taken)
-    assert taken.read_bytes() == before
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"hello" * 100, bytes(5000), b"\x06" * 5000])
@@ -185,18 +169,6 @@ def test_a_recovery_that_still_runs_is_not_disturbed(small: Path) -> None:
     assert small.read_bytes() == data[:-9000]
 
 
-def broken_chunk(path: Path, pose: int, whole_head: bool = True) -> None:
-    """The chunk with this pose's picture gets a wrong head, or a wrong byte in the picture."""
-    data = bytearray(path.read_bytes())
-    at = open_recording(path).segments[0].messages(Topic.RAW_IMAGE).addresses[pose]
-    if whole_head:
-        head = data.rindex(b"\x06", 0, at - 700)
-        data[head : head + 9] = b"\xff" * 9
-    else:
-        data[at + 50] ^= 1
-    path.write_bytes(data)
-
-
 def test_what_was_attached_behind_a_destroyed_record_is_found_again(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         for index in range(2):
@@ -205,19 +177,15 @@ def test_what_was_attached_behind_a_destroyed_record_is_found_again(tmp_path: Pa
             writer.flush()
             writer.attach(f"plan-{index}.json", "application/json", b"{}" * 50)
         path = writer.finish()
-    broken_chunk(path, 0)
+    data = bytearray(path.read_bytes())
+    head = data.rindex(
+        b"\x06", 0, open_recording(path).segments[0].messages(Topic.RAW_IMAGE).addresses[0] - 700
+    )
+    data[head : head + 9] = b"\xff" * 9
+    path.write_bytes(data)
     (result,) = recover_recording(path)
     assert result.lost_bytes > 0
     assert open_recording(path).attachments() == {f"plan-{k}.json": b"{}" * 50 for k in range(2)}
-
-
-def test_the_first_picture_takes_nothing_with_it_that_the_end_of_the_file_repeats(tmp_path: Path) -> None:
-    """What kind of message a channel carries is said in the first chunk and once more in the summary."""
-    path = write_small(tmp_path / "a.mcap", poses=3)
-    broken_chunk(path, 0, whole_head=False)
-    (result,) = recover_recording(path)
-    assert (result.poses, result.pictures) == (2, 2)
-    assert [view.index for view in open_recording(path).views()] == [1, 2]
 
 
 @pytest.mark.parametrize("unfinished", [True, False], ids=["unfinished", "finished"])
@@ -225,8 +193,11 @@ def test_a_lost_first_page_of_the_disk_leaves_the_other_poses(tmp_path: Path, un
     make = write_unfinished if unfinished else write_small
     path = make(tmp_path / "a.mcap", poses=9)
     path.write_bytes(bytes(4096) + path.read_bytes()[4096:])
+    before, taken = path.read_bytes(), write_small(tmp_path / "taken.mcap")
+    with refused("exists"):
+        recover_recording(path, taken)
     (result,) = recover_recording(path, tmp_path / "saved.mcap")
-    assert result.poses >= 8
+    assert result.poses >= 8 and result.kept_original == path and path.read_bytes() == before
 
 
 def test_a_folder_with_parts_of_two_sessions_is_recovered_but_nothing_is_given_up(tmp_path: Path) -> None:

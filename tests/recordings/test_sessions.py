@@ -43,11 +43,6 @@ def test_a_resumed_session_is_one_recording(tmp_path: Path) -> None:
     assert len(recording.sha256) == 64
 
 
-def test_the_session_of_one_part_has_the_hash_of_its_file(tmp_path: Path) -> None:
-    path = write_part(tmp_path / "session.mcap", [(0, 1)])
-    assert open_recording(tmp_path).sha256 == open_recording(path).sha256
-
-
 def test_a_pose_taken_again_after_a_resume_supersedes_whatever_its_attempt(tmp_path: Path) -> None:
     write_part(tmp_path / "session.mcap", [(0, 1), (0, 2), (0, 3)])
     write_part(tmp_path / "session-2.mcap", [(0, 1)], part=2)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from calibrate.files.exports.frames import ExportError
 from calibrate.files.exports.robot import Urdf, origin_of
 from calibrate.files.proof import read_bounded
-from calibrate.geometry import quaternion_from_matrix, rotation_from_rpy
+from calibrate.geometry import quaternion_from_matrix
 from recordings import strict_yaml
 from recordings.importers.bags import open_bag
 from recordings.importers.frames import FrameTree
@@ -26,14 +26,11 @@ _NO_TRANSFORMS = (
     expat.ExpatError, ElementTree.ParseError, strict_yaml.StrictYamlError,
 )  # fmt: skip
 _BAGS = (".bag", ".db3", ".mcap")
-_PUBLISHER = re.compile(r"Node\(|<node|static_transform_publisher")
-_NUMBERS = ("x", "y", "z", "roll", "pitch", "yaw", "qx", "qy", "qz", "qw")
-_ARGUMENT = re.compile(r"""--([a-z-]+)[\s"',]+([^\s"',]+)""")
 
 
 def fixed_frames(paths: Iterable[Path]) -> FrameTree:
-    """Read static transforms: a bag's /tf_static, a URDF's fixed joints, the arguments of
-    static_transform_publisher in a launch file, or YAML as `ros2 topic echo /tf_static` prints it.
+    """Read static transforms: a bag's /tf_static, a URDF's fixed joints, or YAML as
+    `ros2 topic echo /tf_static` prints it.
 
     Raises ExportError for a file without any, or where a frame has two parents; ImportSourceError for a bag.
     """
@@ -73,14 +70,6 @@ def _of_text(path: Path) -> Iterator[FrameMessage]:
                 parent, child = (joint.find(tag).attrib["link"] for tag in ("parent", "child"))  # type: ignore[union-attr]
                 T = origin_of(joint)
                 yield _frame(parent, child, T[:3, 3], quaternion_from_matrix(T[:3, :3]))
-    elif "--child-frame-id" in text:
-        for part in _PUBLISHER.split(text):
-            said = dict(_ARGUMENT.findall(part))
-            if "child-frame-id" in said:
-                numbers = [float(said.get(name, 0)) for name in _NUMBERS]
-                told, by_angles = numbers[6:], quaternion_from_matrix(rotation_from_rpy(numbers[3:6]))
-                turn = told if any(told) else by_angles
-                yield _frame(said["frame-id"], said["child-frame-id"], numbers[:3], turn)
     else:
         for part in re.split(r"^---", text, flags=re.MULTILINE):
             yield from _told(strict_yaml.load_plain(part.encode()))

@@ -199,6 +199,8 @@ def test_the_cause_is_told_where_no_board_is_found() -> None:
             BoardSpec(BoardKind.ARUCO, square_m=0.1, dictionary="DICT_4X4_50", tag_id=50),
             "dictionary-too-small",
         ),
+        (BoardSpec(BoardKind.CHARUCO, 10, 11, 0.02, 0.015, "DICT_4X4_50"), "dictionary-too-small"),
+        (BoardSpec(BoardKind.APRIL_GRID, 5, 11, 0.02, 0.015, "DICT_4X4_50"), "dictionary-too-small"),
         (BoardSpec(BoardKind.ARUCO, square_m=0.1, dictionary="DICT_4X4_50", tag_id=-1), "tag_id"),
         (BoardSpec(BoardKind.APRIL_TAG, 2, 2, 0.1), "columns"),
     ],

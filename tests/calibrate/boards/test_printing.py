@@ -49,18 +49,6 @@ def page_mm(content: bytes) -> tuple[float, float]:
     return float(box[1]) / 72 * 25.4, float(box[2]) / 72 * 25.4
 
 
-@pytest.mark.parametrize(
-    ("kind", "columns", "rows", "held"), [(BoardKind.CHARUCO, 10, 10, 50), (BoardKind.APRIL_GRID, 5, 10, 50)]
-)
-def test_a_board_needs_no_more_markers_than_its_dictionary_holds(kind, columns, rows, held) -> None:  # type: ignore[no-untyped-def]
-    spec = BoardSpec(kind, columns, rows, 0.02, 0.015, "DICT_4X4_50")
-    assert len(board_sheet(spec).rectangles)
-    with pytest.raises(BoardError) as refused:
-        board_sheet(BoardSpec(kind, columns, rows + 1, 0.02, 0.015, "DICT_4X4_50"))
-    assert refused.value.code == "dictionary-too-small"
-    assert (refused.value.values["needed"], refused.value.values["held"]) == (held + 5, held)
-
-
 def test_a_tag_that_is_seen_on_two_boards_is_read_on_neither() -> None:
     """Its corners would be in two places at once, and the board's pose anywhere."""
     spec = next(board for board in BOARDS if board.kind is BoardKind.APRIL_GRID)

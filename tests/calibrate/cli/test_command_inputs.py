@@ -29,10 +29,6 @@ def test_recordings_that_are_not_whole(session_file: Path, tmp_path: Path) -> No
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(session_file.read_bytes()[:-5000])
     refused(run("solve", cut, cwd=tmp_path), 1, UNFINISHED, "cut.mcap")
-    flipped = bytearray(session_file.read_bytes())
-    flipped[len(flipped) // 2] ^= 4
-    (tmp_path / "flip.mcap").write_bytes(flipped)
-    assert run("solve", "flip.mcap", cwd=tmp_path).returncode == 1
     assert not list(tmp_path.glob("*.yaml"))
     assert not list(tmp_path.glob(".*tmp"))
 

@@ -35,18 +35,6 @@ def test_a_reason_is_words_in_any_script_and_no_keypress(said: str, accepted: bo
     assert (reason_problem(said) == "") is accepted
 
 
-def test_who_overrules_or_takes_back_says_it_in_words(make_file: MakeFile, tmp_path: Path) -> None:
-    install(make_file(), tmp_path)
-    doubted = make_file(0.001, verification=[HAND])
-    with raises("reason-too-short", InstallError):
-        install(doubted, tmp_path, override="x")
-    assert install(doubted, tmp_path, override="the board was bent").number == 2
-    with raises("reason-too-short", InstallError):
-        rollback(tmp_path, reason="x")
-    assert [g.current for g in installed_versions(tmp_path)] == [False, True]
-    rollback(tmp_path)  # nobody must say why he goes back
-
-
 def test_going_back_passes_the_checks_by_hand_of_the_same_solve(make_file: MakeFile, tmp_path: Path) -> None:
     """Who finds it off by hand and goes back must not get the same one without the finding."""
     first = make_file()

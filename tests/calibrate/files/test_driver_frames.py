@@ -65,16 +65,6 @@ def as_urdf(frames: Frames) -> str:
     return f"<robot name='driver'>{''.join(f'<link name={name!r}/>' for name in names)}{joints}</robot>"
 
 
-def as_launch(frames: Frames) -> str:
-    options = ("--x", "--y", "--z", "--roll", "--pitch", "--yaw")
-    nodes = []
-    for child, (parent, xyz, rpy) in frames.items():
-        numbers = [word for pair in zip(options, map(repr, (*xyz, *rpy)), strict=True) for word in pair]
-        words = ["--frame-id", parent, "--child-frame-id", child, *numbers]
-        nodes.append(f"Node(executable='static_transform_publisher', arguments={words})")
-    return f"LaunchDescription([{', '.join(nodes)}])"
-
-
 def as_echo(frames: Frames) -> str:
     """A message for each frame, as `ros2 topic echo` divides them."""
     messages = []
@@ -111,7 +101,7 @@ def written(frames: Frames, kind: str, folder: Path) -> Path:
     if kind == "bag folder":
         as_bag(frames, path)
     else:
-        path.write_text({"urdf": as_urdf, "launch.py": as_launch, "yaml": as_echo}[kind](frames))
+        path.write_text({"urdf": as_urdf, "yaml": as_echo}[kind](frames))
     return path
 
 
@@ -139,7 +129,7 @@ def joined(driver: Frames, parent: str, child: str, T: Array) -> dict[str, tuple
     return {name: (above, matrix(*place)) for name, (above, *place) in driver.items()} | {child: (parent, T)}
 
 
-@pytest.mark.parametrize("kind", ["urdf", "launch.py", "yaml", "bag folder"])
+@pytest.mark.parametrize("kind", ["urdf", "yaml", "bag folder"])
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_the_driver_s_lens_is_where_it_was_calibrated(
     calibration: Calibration, driver: str, kind: str, tmp_path: Path

@@ -85,8 +85,9 @@ def test_what_undoes_an_install_is_named_and_works(make_file, tmp_path: Path) ->
     assert load_installed(root).version == 2
     with raises("no-such-version", InstallError, generation=9):
         rollback(root, to=9)
-    with raises("reason-too-short", InstallError):
-        withdraw(root, "xxx")
+    for too_short in (withdraw, lambda root, reason: rollback(root, reason=reason)):
+        with raises("reason-too-short", InstallError):
+            too_short(root, "xxx")
     assert load_installed(root).version == 2
 
 
@@ -124,6 +125,8 @@ def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type:
     assert refused.value.exit_code == 4
     with pytest.raises(GateFailedError):
         install(path, tmp_path / "s", override="   ")
+    with raises("reason-too-short", InstallError):
+        install(path, tmp_path / "s", override="x")
     install(path, tmp_path / "s", override="line is down, checked with a pointer")
     override = installed_calibration(tmp_path / "s").override
     assert override is not None

@@ -51,11 +51,6 @@ def test_parameters_are_as_exact_as_the_corners_allow() -> None:
     assert float(np.sqrt(np.mean(np.square(errors)))) < 1.0
 
 
-def test_what_the_pictures_cannot_tell_stays_near_its_usual_value() -> None:
-    found = calibrate_intrinsics(views_of(CAMERA, nearly_frontal(0.3, 1.5), 0.2))
-    assert abs(found.camera.distortion[4]) < 1.0
-
-
 def nearly_frontal(tilt_rad: float, distance_m: float) -> list[Array]:
     return [
         pose(rotation_exp([tilt_rad * np.cos(a), tilt_rad * np.sin(a), 0]), [-0.075, -0.06, distance_m])
@@ -72,18 +67,6 @@ def test_pictures_that_face_the_board_fix_no_principal_point(model: LensModel) -
         assert abs(centre - middle) < 0.2 * 480, name
 
 
-def test_one_view_with_wrong_corners_is_left_out_and_named() -> None:
-    views = views_of(CAMERA, around(10))
-    bad = replace(
-        views.views[4], pixels=views.views[4].pixels[::-1] + np.random.default_rng(0).normal(0, 8, (42, 2))
-    )
-    broken = replace(views, views=(*views.views[:4], bad, *views.views[5:]))
-    found = calibrate_intrinsics(broken)
-    assert set(found.dropped) == {4}
-    assert "the median is" in found.dropped[4]
-    assert np.array(found.camera.matrix)[0, 0] == pytest.approx(620.0, rel=0.01)
-
-
 def test_worse_views_do_not_hide_the_less_bad_ones() -> None:
     """Each round of leaving out lowers the median, by which the next are found: here in the third."""
     noise_px = np.repeat([0.0, 0.6, 2.5, 12.0, 60.0], [5, 2, 3, 3, 2])
@@ -94,7 +77,7 @@ def test_worse_views_do_not_hide_the_less_bad_ones() -> None:
     )
     found = calibrate_intrinsics(replace(views, views=tuple(shaken)))
     assert set(found.dropped) == set(range(5, 15))
-    assert found.rms_px < 0.1
+    assert found.rms_px < 0.1 and "the median is" in found.dropped[14]
 
 
 def test_fisheye_and_rational_lenses() -> None:
@@ -123,20 +106,12 @@ def replace_distortion(camera: CameraModel) -> CameraModel:
     return CameraModel(camera.width, camera.height, camera.matrix)
 
 
+@pytest.mark.filterwarnings("error")
 def test_too_few_and_impossible_views_are_refused() -> None:
     with pytest.raises(TooFewViewsError):
         calibrate_intrinsics(views_of(CAMERA, around(2)))
-    noise = views_of(CAMERA, around(6), 120.0)
-    with pytest.raises(BadViewsError) as refused:
-        calibrate_intrinsics(noise)
-    assert refused.value.code in {"no-lens-fits", "intrinsics-open"}
-
-
-@pytest.mark.filterwarnings("error")
-def test_corners_that_are_none_are_refused() -> None:
     for seed in range(4):
-        rng = np.random.default_rng(seed)
-        views = views_of(CAMERA, around(6, seed))
-        anywhere = tuple(replace(v, pixels=rng.uniform(0, 480, v.pixels.shape)) for v in views)
-        with pytest.raises(BadViewsError):
-            calibrate_intrinsics(replace(views, views=anywhere))
+        noise = views_of(CAMERA, around(6, seed), 120.0, seed)
+        with pytest.raises(BadViewsError) as refused:
+            calibrate_intrinsics(noise)
+        assert refused.value.code in {"no-lens-fits", "intrinsics-open"}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -80,25 +79,6 @@ def test_a_fifth_of_wrong_robot_poses_does_not_turn_the_others() -> None:
     assert len(set(right.tolist())) == 1
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_pictures_counted_from_different_corners_are_counted_alike(mount: Mount) -> None:
-    """A detector that begins at any corner of a square board; corners and poses still belong together."""
-    seen, flanges = scene(FOUR_WAYS, 8, mount, 3, 1e-5)
-    points = board_points(FOUR_WAYS)
-    turns = [k % 4 for k in range(8)]
-    views = [
-        BoardView(k, str(k), F, points, project_pixels(CAMERA, _moved(C, _turned(turn, points))))
-        for k, (C, F, turn) in enumerate(zip(seen, flanges, turns, strict=True))
-    ]
-    solved = solve_pnp(ViewSet(mount, tuple(views), CAMERA), FOUR_WAYS)
-    for view in solved:
-        assert view.camera_from_board is not None
-        again = project_pixels(CAMERA, _moved(view.camera_from_board, view.board_points))
-        np.testing.assert_allclose(again, view.pixels, atol=1e-3)
-    places = inverse(seen) @ solved.camera_from_board
-    np.testing.assert_allclose(places, np.broadcast_to(places[0], places.shape), atol=1e-5)
-
-
 def test_one_sure_picture_does_not_decide_for_the_doubtful_ones() -> None:
     """A small board far away may be tilted to either side; the robot's motion says to which."""
     rng = np.random.default_rng(4)
@@ -118,10 +98,6 @@ def test_one_sure_picture_does_not_decide_for_the_doubtful_ones() -> None:
         right.append(readings[int(np.argmin(off))])
     solved = solve_pnp(ViewSet("eye-in-hand", tuple(views), CAMERA), MARKED)
     np.testing.assert_allclose(solved.camera_from_board, right, atol=1e-4)
-
-
-def _turned(turn: int, points: Array) -> Array:
-    return transform_points(board_from_turned(FOUR_WAYS, turn), points)
 
 
 def _moved(camera_from_board: Array, points: Array) -> Array:

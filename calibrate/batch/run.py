@@ -27,7 +27,10 @@ RESULTS = "results.jsonl"
 
 
 class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One recording of a batch: its camera pose and how good it is, or why it could not be solved."""
+    """One recording of a batch: its camera pose and how good it is, or why it could not be solved.
+
+    All else is in its calibration file.
+    """
 
     recording: str
     key: str
@@ -36,16 +39,10 @@ class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
     passed: bool = False
     error: str = ""
     session: str = ""
-    robot: str = ""
-    camera: str = ""
-    recorded_wall_ns: int = 0
-    mount: str = ""
     translation_m: tuple[float, ...] = ()
     rotation_xyzw: tuple[float, ...] = ()
-    covariance: tuple[tuple[float, ...], ...] = ()
     sigma_mm: float | None = None
     sigma_deg: float | None = None
-    e_t_mm: float | None = None
     rms_px: float | None = None
     views: int = 0
     rejected: int = 0
@@ -127,7 +124,7 @@ def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> tup
 
 def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchResult:
     calibration = job.calibration
-    quality, robot, camera = calibration.quality, calibration.robot, calibration.camera
+    quality = calibration.quality
     plain = msgspec.json.decode(msgspec.json.encode(calibration))
     return BatchResult(
         recording=recording,
@@ -135,16 +132,10 @@ def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchR
         solved=True,
         passed=job.passed,
         session=calibration.provenance.session,
-        robot=f"{robot.model} {robot.serial}".strip(),
-        camera=f"{camera.model} {camera.serial}".strip(),
-        recorded_wall_ns=calibration.provenance.recorded_wall_ns,
-        mount=calibration.mount,
         translation_m=calibration.result.translation_m,
         rotation_xyzw=calibration.result.rotation_xyzw,
-        covariance=calibration.covariance,
         sigma_mm=calibration.sigma.translation_mm,
         sigma_deg=calibration.sigma.rotation_deg,
-        e_t_mm=None if quality.holdout is None else quality.holdout.e_t_m * 1000,
         rms_px=quality.rms_px,
         views=len(calibration.views.used),
         rejected=len(calibration.views.rejected),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from rich.text import Text
 
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override, source_stamp
-from calibrate.files.touch import Touch, agrees, touch_text
+from calibrate.files.touch import agrees, touch_text
 from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.geometry import roll_pitch_yaw
 from calibrate.results import BoardShape
@@ -34,7 +34,7 @@ def predicted_error(error_mm: float | None, distance_m: float | None) -> ShownFi
     return ShownFigure("predicted error", value, f"at {1000 * distance_m:.0f} mm" if distance_m else "")
 
 
-def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str, ShownFigure]:
+def figures(calibration: Calibration) -> dict[str, ShownFigure]:
     """Collect the figures that a calibration is judged by, most important first, without unknown ones."""
     quality, gates, views = calibration.quality, calibration.quality.gates, calibration.views
     error = predicted_error(quality.predicted_error_mm, quality.working_distance_m)
@@ -46,7 +46,7 @@ def figures(calibration: Calibration, touches: Sequence[Touch] = ()) -> dict[str
     passed = len(gates) - len(quality.failed)
     shown["gates"] = ShownFigure("quality gates", f"{passed} of {len(gates)}", "passed")
     shown["views"] = ShownFigure("views", f"{len(views.used)}", f"used, {len(views.rejected)} rejected")
-    if touches:
+    if touches := calibration.verification:
         agreed = f"{sum(map(agrees, touches))} of {len(touches)}"
         shown["touch"] = ShownFigure("corners of the touch test", agreed, "as predicted")
     return shown
@@ -137,7 +137,7 @@ def _result_table(calibration: Calibration) -> Table:
     table.add_row(f"{result.parent_frame}_from_{result.child_frame}", position)
     table.add_row("rotation", f"{rotation.strip()}  (fixed axes)")
     table.add_row("1σ", f"{calibration.sigma.translation_mm:.3f} mm  {calibration.sigma.rotation_deg:.4f}°")
-    for figure in figures(calibration, calibration.verification).values():
+    for figure in figures(calibration).values():
         table.add_row(figure.label, f"{figure.value} {figure.about}")
     if quality.board_spread_mm is not None:
         spread_deg = quality.board_spread_deg or 0.0

@@ -68,7 +68,7 @@ def verdict_lines(result: Result) -> Content:
     if calibration.source != "real":
         rows.append(Content.styled(f"{calibration.source.upper()}: never for a real cell.", "$sim"))
     narrow = sum(gate.narrow for gate in quality.gates)
-    shown = figures(calibration, calibration.verification)
+    shown = figures(calibration)
     counted = {key: f"{f.value} {f.label} {f.about}" for key, f in shown.items()}
     told = (
         counted["gates"] + f", {narrow} narrowly" * bool(narrow),

@@ -15,7 +15,7 @@ import yaml
 
 from benchmarks.imperfect_cells import table_errors
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
+from calibrate.geometry import difference, inverse, pose, rotation_exp
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
@@ -28,6 +28,7 @@ from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Image, Stamps, View
 from recordings.writer import RecordingWriter
 from station.simulation.renderer import render
+from tests.calibrate.cells import error_mm_deg
 from tests.calibrate.sessions import (
     CAMERA,
     LIGHT,
@@ -41,11 +42,6 @@ from tests.calibrate.sessions import (
 from tests.codes import raises
 
 SolveSet = Callable[[Path], SolvedRecording]
-
-
-def error_mm_deg(X: Array, truth: Array) -> tuple[float, float]:
-    delta = difference(X, truth)
-    return float(np.linalg.norm(delta[:3]) * 1e3), float(np.degrees(np.linalg.norm(delta[3:])))
 
 
 def test_the_camera_is_found_with_an_unknown_lens(solved: SolvedRecording) -> None:

@@ -16,9 +16,6 @@ from tests.recordings.small_recording import make_state, make_view, write_small
 WAYS: dict[str, dict[str, Any]] = {
     "zstd": {"compression": CompressionType.ZSTD, "chunk_size": 4096},
     "lz4": {"compression": CompressionType.LZ4, "chunk_size": 4096},
-    "one chunk": {"compression": CompressionType.ZSTD},
-    "no chunks": {"use_chunking": False},
-    "no checksums": {"enable_crcs": False, "compression": CompressionType.NONE},
 }
 
 
@@ -56,18 +53,11 @@ def repacked(source: Path, target: Path, **options: Any) -> Path:
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_it_reads_like_the_original(tmp_path: Path, way: str) -> None:
-    path = repacked(write_small(tmp_path / "a.mcap", poses=5), tmp_path / "b.mcap", **WAYS[way])
-    recording = open_recording(path)
-    assert recording.views() == [make_view(index) for index in range(5)]
-    assert list(recording.robot_states()) == [make_state(count) for count in range(15)]
-    assert len(list(recording.images())) == 5
-    assert "/diagnostics" in recording.segments[0].topics
-
-
-@pytest.mark.parametrize("way", ["zstd", "lz4"])
 def test_one_damaged_chunk_of_a_packed_recording_costs_no_more_than_itself(tmp_path: Path, way: str) -> None:
     path = repacked(write_small(tmp_path / "a.mcap", poses=20), tmp_path / "b.mcap", **WAYS[way])
+    whole = open_recording(path)
+    assert list(whole.robot_states()) == [make_state(count) for count in range(60)]
+    assert "/diagnostics" in whole.segments[0].topics
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data[:-1000])

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,8 @@ class Seen:
     camera: CameraModel
     camera_known: bool
     looked: int
+    images: list[Grey] = field(default_factory=list)
+    """The images, reduced; a view's index is its place."""
     convention: Convention | None = None
     """How the poses that were told are read; None: images show the board."""
     told: str = ""
@@ -85,7 +87,17 @@ def told_boards(table: Table) -> Iterator[Seen]:
         before = [bool(np.mean(each[:, 2, 3] > 0) > 0.9) for each in (poses, inverse(poses))]
         board, blank = BoardSpec(BoardKind.UNSEEN), CameraModel(0, 0)
         yield Seen(
-            board, True, views, candidates, blank, False, len(views), how, evidence, (before[0], before[1])
+            board,
+            True,
+            views,
+            candidates,
+            blank,
+            False,
+            len(views),
+            [],
+            how,
+            evidence,
+            (before[0], before[1]),
         )
 
 
@@ -128,7 +140,7 @@ def see_board(lies: Lies, given: BoardSpec | None, paths: list[Path], progress: 
         camera = _camera(lies, CameraModel(width, height), tuple(views.values()))
         if camera is not None:
             candidates = {path: candidate_poses(view, camera[0], board) for path, view in views.items()}
-            return Seen(board, known, views, candidates, *camera, len(images))
+            return Seen(board, known, views, candidates, *camera, len(images), greys)
     return None
 
 

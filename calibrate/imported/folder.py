@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from calibrate.imported.board import FEWEST, GUESSED_M, Key, see_board, told_boards
-from calibrate.imported.mounting import Ask, mounting
+from calibrate.imported.mounting import Ask, joints_of, joints_rad, mounting
 from calibrate.imported.readings import Reading, decide, is_good, readings
 from recordings.errors import ImportSourceError
 from recordings.importers.conventions import NAMED, Convention, convention
@@ -141,7 +141,8 @@ def _as_before(lies: Lies, told: Dataset, poses: PosesTold) -> Believed:
     if table is None or not (pairs := _pairs(table, board or lies.images.get(poses.images, []))):
         raise ImportSourceError("no-pairs", source=lies.root, images=poses.images, tables=poses.table)
     seen = None if board is None else (board, convention(poses.board_convention))
-    return Believed(told, _rows(lies, table, convention(poses.convention), pairs, seen))
+    joints = tables.get(poses.joints)
+    return Believed(told, _rows(lies, table, convention(poses.convention), pairs, seen, joints))
 
 
 def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
@@ -169,7 +170,9 @@ def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
 
 def _believed(lies: Lies, given: Given, best: Reading, pairs: dict[Key, int], ask: Ask | None) -> Believed:
     seen = best.seen
-    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, given.tells_direction, ask)
+    joints, by_joints = joints_of(lies, best) or (None, None)
+    told_so = given.tells_direction
+    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, told_so, by_joints, ask)
     how = replace(best.convention, inverse=best.convention.inverse != inverted)
     board, square = _board(best)
     facts = {
@@ -184,15 +187,19 @@ def _believed(lies: Lies, given: Given, best: Reading, pairs: dict[Key, int], as
         "camera": ("matrix as told" if seen.camera_known else "to be estimated", ""),
     }
     camera = seen.camera if seen.camera_known else CameraModel(seen.camera.width, seen.camera.height)
+    if joints:
+        facts["joints"] = f"{len(joints.numbers)} rows of {joints.name}", "they move as the poses do"
     saw = None
     if seen.convention is not None:
         how_board = replace(seen.convention, inverse=seen.convention.inverse != board_inverted)
         saw = next(t for t in lies.tables if t.name == best.family), how_board
         del facts["images"], facts["camera"]
         facts["board"] = f"{len(pairs)} rows of {best.family}", f"{how_board.name}; {seen.told}"
-    told = PosesTold(best.table.name, best.family, how.name, saw[1].name if saw else "")
+    told = PosesTold(
+        best.table.name, best.family, how.name, saw[1].name if saw else "", joints.name if joints else ""
+    )
     dataset = Dataset(mount, board, camera, lies.root.resolve().name, poses=told)
-    return Believed(dataset, _rows(lies, best.table, how, pairs, saw), facts)
+    return Believed(dataset, _rows(lies, best.table, how, pairs, saw, joints), facts)
 
 
 def _board(best: Reading) -> tuple[BoardSpec, str]:
@@ -211,7 +218,12 @@ def _board(best: Reading) -> tuple[BoardSpec, str]:
 
 
 def _rows(
-    lies: Lies, table: Table, how: Convention, pairs: dict[Key, int], saw: tuple[Table, Convention] | None
+    lies: Lies,
+    table: Table,
+    how: Convention,
+    pairs: dict[Key, int],
+    saw: tuple[Table, Convention] | None,
+    joints: Table | None,
 ) -> list[PoseRow]:
     """Rows in the order of the robot's table; `saw`: where the board was, instead of images."""
     keys = sorted(pairs, key=lambda key: pairs[key])
@@ -222,7 +234,8 @@ def _rows(
             n + 1,
             f"row {key + 1}" if isinstance(key, int) else str(key.relative_to(lies.root)),
             _matrix(flanges[n]),
-            camera_from_board=None if boards is None else _matrix(boards[n]),
+            None if joints is None else tuple(joints_rad(joints)[pairs[key]].tolist()),
+            None if boards is None else _matrix(boards[n]),
         )
         for n, key in enumerate(keys)
     ]

@@ -1,8 +1,9 @@
-"""How the camera is mounted, and which way round poses are: what joints and names say of it.
+"""How the camera is mounted, and which way round poses are.
 
 Three things are asked: the mounting, and whether the robot's and the board's poses are inverted. A camera in
 hand fits exactly as well as a fixed one with inverted poses, so the motion gives one of the three once the
-other two are known: from recorded joints (the robot's poses), names in the data, or the user.
+other two are known. Measured are recorded joints and what the images show around the board; else names count.
+Distances of camera and board from flange and base count with either, and no two may contradict each other.
 """
 
 from __future__ import annotations
@@ -14,15 +15,21 @@ from contextlib import suppress
 import numpy as np
 
 from calibrate.chain import learn_chain
-from calibrate.geometry import inverse
+from calibrate.geometry import Array, inverse
 from calibrate.imported.readings import Reading
+from calibrate.imported.scenery import count_points
 from recordings.errors import ImportSourceError
-from recordings.importers.tables import Lies
+from recordings.importers.tables import Lies, Table
 from recordings.schema.messages import Mount
 
 Ask = Callable[[str], Mount]
 _MOST_ROWS = 100
 """Most joints and poses from which axes are learned."""
+_FEWEST_POINTS, _TIMES = 30, 10
+"""Points around the board of the one kind that decide, and how many times as many as of the other."""
+_NEARER = 3.0
+"""So many times as far from the base as from the flange, and beyond the reach over this, stands what the arm
+does not carry: a looser bound would leave rigs with long tools to guesses."""
 _IN_HAND = re.compile(
     r"eye_?(in|on)_?hand|hand_?(in|on)_?eye|hand_in\b|\beih\b|cam\w*2(gripper|end|ee|tool|flange|hand)"
     r"|attached on robot|in_hand|inhand|flange2cam|hand_camera|static_camera false",
@@ -44,59 +51,102 @@ _CAMERA_IN_BOARD = re.compile(r"cam\w*?_?(2|to|in|wrt)_?(board|target|marker|obj
 
 
 def mounting(
-    lies: Lies, given: Mount | None, best: Reading, as_told: bool, ask: Ask | None
+    lies: Lies, given: Mount | None, best: Reading, as_told: bool, by_joints: bool | None, ask: Ask | None
 ) -> tuple[Mount, bool, bool, str]:
     """(mounting, whether the robot's poses are inverted, whether the board's are, why).
 
-    `as_told`: by the user's convention the direction is told, too. `ask`: asks a person. Raises
-    ImportSourceError (`which-mount`) where nothing decides, or the user contradicts names.
+    `as_told`: by the user's convention the direction is told, too. `by_joints`: whether joints say that the
+    robot's poses are inverted. `ask`: asks a person. Raises ImportSourceError
+    (`which-mount`) where nothing decides, or one contradicts another.
     """
     name, seen = best.table.name, best.seen
     named_so = seen.convention is not None and bool(_CAMERA_IN_BOARD.search(best.family))
-    turned_board = named_so if all(seen.in_front) else not seen.in_front[0]
+    turned_board = named_so if all(seen.in_front) else seen.in_front[1]
     fits = _OTHER[best.mount] if turned_board else best.mount
+    by_turn: dict[bool | None, set[Mount]] = {None: set(), False: {fits}, True: {_OTHER[fits]}}
+    measured = {
+        "joints": by_turn[by_joints],
+        "the scene around the board": _by_scenery(best),
+    }
+    by_distances, far_apart = _inverted_by_distances(best)
     straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
-    turned = by_joints = _inverted_by_joints(lies, best)
-    if by_joints is None and (as_told or straight != inverted):
-        turned = not (as_told or straight)
-    by_direction = set() if turned is None else {_OTHER[fits] if turned else fits}
     named = _named(f"{name} {best.family}") or _named(
         f"{lies.words} {' '.join(f'{k} {str(v).lower()}' for k, v in lies.facts.items())}"
     )
-    possible = by_direction | ({given} if given else named)
+    supposed = {
+        far_apart: by_turn[by_distances],
+        "names": by_turn[inverted if straight != inverted and not as_told else None]
+        | (set() if given else named),
+    }
+    told = ({given} if given else set()) | by_turn[False if as_told else None]
+    if any(measured.values()):
+        del supposed["names"]
+    evidence = measured if given and as_told else measured | supposed
+    possible = told.union(*evidence.values())
     if len(possible) != 1 and not given and ask is not None:
         given = ask(f"{name} fits as {fits} as it stands, or the other mounting with inverted poses")
         possible = {given}
+    why = [(what, says) for what, says in evidence.items() if says]
     if len(possible) != 1:
-        raise ImportSourceError("which-mount", source=lies.root, mount=fits, table=name)
+        said = "; ".join(f"{' or '.join(sorted(says))} by {what}" for what, says in why)
+        raise ImportSourceError(
+            "which-mount", source=lies.root, mount=fits, table=name, said=said or "nothing tells which"
+        )
     (mount,) = possible
-    evidence = "joints, " * (by_joints is not None) + "names, " * bool(named)
-    why = "as told" if given else f"by {evidence}the board's motion; {name}"
-    return mount, mount != fits, turned_board, why
+    by = "as told" if given else f"by {', '.join(what for what, _ in why)}; {name}"
+    return mount, mount != fits, turned_board, by
 
 
-def _inverted_by_joints(lies: Lies, best: Reading) -> bool | None:
-    """Tell whether a table of joints moves axes as the inverses of the poses do; None: no table tells.
+def _by_scenery(best: Reading) -> set[Mount]:
+    if not best.seen.images:
+        return set()
+    images = [(best.seen.images[view.index], view) for view in best.views]
+    still, moved = count_points(images, best.views.camera)
+    if max(still, moved) < _FEWEST_POINTS or min(still, moved) * _TIMES > max(still, moved):
+        return set()
+    return {"eye-to-hand" if still > moved else "eye-in-hand"}
+
+
+def _inverted_by_distances(best: Reading) -> tuple[bool | None, str]:
+    """(whether the poses, inverted, place what the arm carries nearer to it than what stands; None: hard to
+    tell, distances in words). An inverted pose exchanges flange and base."""
+    X, Y = (float(np.linalg.norm(T[0, :3, 3])) for T in (best.fit.X, best.fit.Y))
+    carried, stands = (X, Y) if best.mount == "eye-in-hand" else (Y, X)
+    near, far = sorted([carried, stands])
+    reach = np.linalg.norm(best.convention.poses(best.table.numbers)[:, :3, 3], axis=1).max()
+    clear = far > _NEARER * near and far > reach / _NEARER
+    return (carried > stands if clear else None), f"{near:.2f} m from the flange, {far:.2f} m from the base"
+
+
+def joints_of(lies: Lies, best: Reading) -> tuple[Table, bool] | None:
+    """(table of the arm's joints, whether they move axes as the inverses of the poses do); None: none tells.
 
     An arm's flange is a product of turns in the order of its joints; of its inverse the order is reversed.
     """
     flanges = best.convention.poses(best.table.numbers[:_MOST_ROWS])
     for table in lies.tables:
-        joints = table.numbers[:_MOST_ROWS]
-        rows, count = joints.shape
+        rows, count = joints_rad(table)[:_MOST_ROWS].shape
         if count > 7 or rows < 2 * count or len(table.numbers) != len(best.table.numbers):
             continue
-        joints_rad = np.radians(joints) if np.abs(joints).max() > 2 * np.pi else joints
         with suppress(np.linalg.LinAlgError, ValueError):
-            straight, inverted = (learn_chain(joints_rad, F, 3).explains for F in (flanges, inverse(flanges)))
+            joints = joints_rad(table)[:_MOST_ROWS]
+            straight, inverted = (learn_chain(joints, F, 3).explains for F in (flanges, inverse(flanges)))
             if straight != inverted:
-                return inverted
+                return table, inverted
     return None
 
 
+def joints_rad(table: Table) -> Array:
+    """A table of joints (n, k) in radians."""
+    return np.radians(table.numbers) if np.abs(table.numbers).max() > 2 * np.pi else table.numbers
+
+
 def _named(words: str) -> set[Mount]:
-    ways: dict[Mount, re.Pattern[str]] = {"eye-in-hand": _IN_HAND, "eye-to-hand": _TO_HAND}
-    return {mount for mount, way in ways.items() if way.search(words)}
+    """The mounting that words name; words of both say nothing."""
+    in_hand, to_hand = _IN_HAND.search(words), _TO_HAND.search(words)
+    if bool(in_hand) == bool(to_hand):
+        return set()
+    return {"eye-in-hand" if in_hand else "eye-to-hand"}
 
 
 _OTHER: dict[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}

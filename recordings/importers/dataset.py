@@ -55,6 +55,8 @@ class PosesTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     convention: str
     board_convention: str = ""
     """How poses of the board are read, where they are told instead of images."""
+    joints: str = ""
+    """Table of the arm's joints, of as many rows as that of the poses."""
 
 
 class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -26,7 +26,7 @@ from recordings.importers.tables import look
 from recordings.reader import open_recording
 from recordings.schema.messages import Mount
 from tests.calibrate.chains import arm_cell
-from tests.calibrate.sessions import Scene, write_session
+from tests.calibrate.sessions import BOARD_PLACE, Scene, write_session
 from tests.codes import raises
 from tests.command_line import call
 
@@ -183,26 +183,38 @@ def unnamed(folder: Path, T: np.ndarray) -> None:
     np.savetxt(folder / "poses.txt", euler("ZYX", 1e3, True)(T))
 
 
-def test_what_no_motion_can_tell_is_asked(put: Callable[..., Path], images: tuple[Path, np.ndarray]) -> None:
+def of_a_frame_at_the_table(T: np.ndarray) -> np.ndarray:
+    """As arms with a user frame tell them: board and camera are as near to both frames."""
+    return np.linalg.inv(BOARD_PLACE) @ T
+
+
+def test_what_nothing_tells_is_asked(put: Callable[..., Path], images: tuple[Path, np.ndarray]) -> None:
     """A camera in hand looks like a fixed one with inverted poses."""
-    lies = look(put(unnamed))
+    lies, told = look(put(unnamed, of_a_frame_at_the_table)), of_a_frame_at_the_table(images[1])
     with raises("which-mount", mount="eye-in-hand"):
         believe(lies)
     with raises("which-mount"):
         believe(lies, Given("euler-ZYX-deg-mm"))
     assert believe(lies, Given("kuka-abc")).dataset.mount == "eye-in-hand"  # always the tool in the base
     straight = believe(lies, Given(mount="eye-in-hand"))
-    np.testing.assert_allclose([row.base_from_flange for row in straight.rows], images[1], atol=1e-6)
+    np.testing.assert_allclose([row.base_from_flange for row in straight.rows], told, atol=1e-6)
     turned = np.array([row.base_from_flange for row in believe(lies, Given(mount="eye-to-hand")).rows])
-    np.testing.assert_allclose(turned, np.linalg.inv(images[1]), atol=1e-6)
+    np.testing.assert_allclose(turned, np.linalg.inv(told), atol=1e-6)
 
 
-def test_names_that_contradict_the_motion_are_no_answer(put: Callable[..., Path]) -> None:
-    """`robot_pose` says tool in base; then the motion says in hand, and no name may say otherwise."""
-    folder = put(kuka)
+@pytest.mark.parametrize("change", [lambda T: T, np.linalg.inv])
+def test_a_camera_near_the_flange_and_a_board_far_from_the_base_tell_the_mounting(
+    change: Callable[[np.ndarray], np.ndarray], put: Callable[..., Path], images: tuple[Path, np.ndarray]
+) -> None:
+    folder = put(unnamed, change)
+    found = believe(look(folder))
+    assert found.dataset.mount == "eye-in-hand"
+    np.testing.assert_allclose([row.base_from_flange for row in found.rows], images[1], atol=1e-6)
     (folder / "eye_to_hand.txt").write_text("of a fixed camera")
     with raises("which-mount"):
         believe(look(folder))
+    with raises("which-mount"):
+        believe(look(folder), Given(mount="eye-to-hand"))
 
 
 def test_a_folder_of_images_named_like_poses_says_nothing_of_the_board(put: Callable[..., Path]) -> None:
@@ -231,7 +243,7 @@ def test_the_boards_own_poses_are_not_taken_for_the_robots(put: Callable[..., Pa
 
 
 def test_what_was_believed_needs_no_flags_again(put: Callable[..., Path], tmp_path: Path) -> None:
-    folder, out = put(unnamed), tmp_path / "mine.mcap"
+    folder, out = put(unnamed, of_a_frame_at_the_table), tmp_path / "mine.mcap"
     assert call(main, "import", folder, "-o", out).returncode == 1
     told = call(main, "import", folder, "-o", out, "--mount", "eye-in-hand", "--json")
     assert told.returncode == 0, told.stderr
@@ -310,14 +322,14 @@ def test_recorded_joints_tell_the_mounting(
     """Their axes belong to the arm: to its poses and not to the inverses."""
     views = arm_cell(arm, mount, 0.1, 1, views=16).views
     in_two_tables(tmp_path, told(views.base_from_flange), views.camera_from_board)
-    with raises("which-mount"):
-        believe(look(tmp_path))
     joints = np.array([view.joints_rad for view in views])
     np.savetxt(tmp_path / "joints.csv", unit * joints, fmt="%.4f", delimiter=",")
     found = believe(look(tmp_path))
     assert found.dataset.mount == mount
     poses = np.array([row.base_from_flange for row in found.rows])
     np.testing.assert_allclose(poses, views.base_from_flange, atol=1e-6)
+    np.testing.assert_allclose([row.joints_rad for row in found.rows], joints, atol=1e-4)
+    assert found.facts["mount"][1].startswith("by joints")
 
 
 MOVEIT = Path(__file__).parents[3] / "shared/datasets/pose-pairs/moveit50.csv"

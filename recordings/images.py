@@ -6,6 +6,7 @@ import re
 import struct
 import zlib
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -196,15 +197,31 @@ def eight_bits(pixels: Pixels, pixel_format: str) -> NDArray[np.uint8]:
     return np.asarray(np.minimum(pixels >> max(bits - 8, 0), 255), np.uint8)
 
 
-def raw_array(data: bytes, encoding: str, width: int, height: int) -> Pixels:
-    """The array (read-only, no copy) that a RawImage's bytes are. Raises ImageError."""
-    shape: tuple[int, ...] = (height, width)
-    kind: np.dtype[np.uint8 | np.uint16] = np.dtype("<u2") if encoding == "mono16" else np.dtype("u1")
-    if encoding == "bgr8":
-        shape = (height, width, 3)
-    elif encoding not in ("mono8", "mono16") and not encoding.startswith("bayer_"):
-        raise ImageError(f"unknown raw layout '{encoding}'")
-    expected = int(np.prod(shape)) * kind.itemsize
-    if len(data) != expected:
-        raise ImageError(f"holds {len(data)} bytes where {width}×{height} {encoding} needs {expected}")
-    return np.frombuffer(data, kind).reshape(shape)
+_LAYOUTS: dict[str, tuple[int, Any, int | None]] = {
+    "mono8": (1, np.uint8, None), "8UC1": (1, np.uint8, None), "mono16": (1, "<u2", None),
+    "bgr8": (3, np.uint8, None), "8UC3": (3, np.uint8, None), "rgb8": (3, np.uint8, cv2.COLOR_RGB2BGR),
+    "bgra8": (4, np.uint8, cv2.COLOR_BGRA2BGR), "rgba8": (4, np.uint8, cv2.COLOR_RGBA2BGR),
+    "bayer_rggb8": (1, np.uint8, None), "bayer_bggr8": (1, np.uint8, None),
+    "bayer_gbrg8": (1, np.uint8, None), "bayer_grbg8": (1, np.uint8, None),
+    "yuv422": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY), "uyvy": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": (2, np.uint8, cv2.COLOR_YUV2BGR_YUYV), "yuyv": (2, np.uint8, cv2.COLOR_YUV2BGR_YUYV),
+}  # fmt: skip
+"""Encoding → channels, number type, conversion."""
+
+
+def raw_array(data: bytes, encoding: str, width: int, height: int, step: int = 0) -> Pixels:
+    """The array as recordings hold it of a raw image's bytes, read-only where nothing is converted.
+
+    `encoding`: foxglove's and ROS's name. `step`: bytes of a row; 0: no more than it needs. ImageError.
+    """
+    if encoding not in _LAYOUTS:
+        raise ImageError(f"is encoded as '{encoding}' (known: {', '.join(_LAYOUTS)}, PNG, JPEG)")
+    channels, kind, conversion = _LAYOUTS[encoding]
+    row = width * channels * np.dtype(kind).itemsize
+    step = step or row
+    if step < row or len(data) != step * height or not height:
+        raise ImageError(f"holds {len(data)} bytes where {width}×{height} {encoding} needs {step * height}")
+    pixels = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(height, step)[:, :row]).view(kind)
+    if channels > 1:
+        pixels = pixels.reshape(height, width, channels)
+    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))

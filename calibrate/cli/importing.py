@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import os
 import shlex
-import sys
-from contextlib import ExitStack
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -14,13 +14,13 @@ import msgspec
 import typer
 
 from calibrate.boards.model import typed_board
-from calibrate.imported import Ask, Given, believe, is_described
+from calibrate.imported import Given, believe, is_described
 from calibrate.pipeline import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.files import write_atomically
-from recordings.importers.bag import PAIR_WITHIN_S, BagPlan, import_bag
+from recordings.importers.bag import PAIR_WITHIN_S, import_bag
 from recordings.importers.dataset import DATASET_FILE, read_dataset
-from recordings.importers.folder import import_folder, write_views
+from recordings.importers.folder import Imported, import_folder, write_views
 from recordings.importers.messages import Progress
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import StandstillLimits
@@ -90,20 +90,19 @@ def import_command(
     target = None if dry_run else output
     console = plain_console(stderr=True)
     shown = console.is_terminal and not as_json
-    with ExitStack() as bar:
-        progress: Progress = bar.enter_context(progress_bar("", console)) if shown else lambda *_: None
+    with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
         if is_described(source, dataset, poses, convention, mount, board):
             done = import_folder(source, target, progress)
-            facts = ImportJson(str(target or ""), done.images, done.size_bytes)
         elif source.is_dir() and not _is_bag(source):
             told = dataset or _told(source, output)
             given = Given(convention, mount, None if board is None else typed_board(board))
-            facts = _import_found(look(source, poses), target, told, given, progress, _ask(bar, shown))
+            done = _import_found(look(source, poses), target, told, given, progress)
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
             limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg), every_image)
-            plan = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
-            facts = ImportJson(str(target or ""), plan.stops, plan.bytes_written, plan)
+            done = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
+    size_bytes = target.stat().st_size if target else 0
+    facts = ImportJson(str(target or ""), done.images, size_bytes, done.facts)
     if as_json:
         print_json(facts)
     else:
@@ -122,28 +121,17 @@ def _told(source: Path, output: Path | None) -> Path | None:
 
 @single_threaded_opencv()
 def _import_found(
-    lies: Lies, target: Path | None, told: Path | None, given: Given, progress: Progress, ask: Ask | None
-) -> ImportJson:
+    lies: Lies, target: Path | None, told: Path | None, given: Given, progress: Progress
+) -> Imported:
     """Import a folder of anyone; what is believed of it is stated, and written beside the recording."""
     described = None if told is None else read_dataset(told)[0]
-    believed = believe(lies, given, described, progress, ask)
+    believed = believe(lies, given, described, progress)
     dataset = believed.dataset
     content = msgspec.yaml.encode(dataset)
     done = write_views(lies.root, target, dataset, believed.rows, {DATASET_FILE: content}, progress)
     if target is not None and dataset != described:
         write_atomically(target.with_suffix("." + DATASET_FILE), content)
-    return ImportJson(str(target or ""), done.images, done.size_bytes, found=believed.facts)
-
-
-def _ask(bar: ExitStack, shown: bool) -> Ask | None:
-    """Ask a person how the camera is mounted, once the bar is gone; None: nobody can answer."""
-
-    def ask(why: str) -> Mount:
-        bar.close()
-        on_arm = typer.confirm(f"{why}.\nIs the camera on the arm?", default=None, err=True)
-        return "eye-in-hand" if on_arm else "eye-to-hand"
-
-    return ask if shown and sys.stdin.isatty() else None
+    return replace(done, facts=believed.facts)
 
 
 class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -153,27 +141,14 @@ class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
     """Empty with --dry-run."""
     views: int
     bytes: int
-    bag: BagPlan | None = None
-    """Options of a bag or an MCAP file."""
     found: dict[str, tuple[str, str]] = {}
-    """Of a folder: what → (what is believed, its evidence)."""
+    """What → (what is believed, its evidence)."""
 
 
 def _print_import(facts: ImportJson) -> None:
     """Print what `recordings import` took, or would take."""
     for what, (believed, evidence) in facts.found.items():
         print(plain_text(f"{what:<11}{believed:<42}{evidence}".rstrip()))
-    if bag := facts.bag:
-        print(plain_text(f"images    {bag.image_topic} ({bag.images}), {bag.camera}"))
-        print(plain_text(f"poses     {bag.poses_from}, paired by stamp within {bag.bound_ms:.2f} ms"))
-        print(plain_text(f"joints    {bag.joints_from or 'none of an arm of five to seven'}"))
-        passed = ", ".join(f"{count} {reason}" for reason, count in bag.passed_over.items() if count)
-        print(plain_text(f"stops     {bag.stops}" + (f"; images passed over: {passed}" if passed else "")))
-        if wider := bag.wider:
-            flags = f"--still-mm {wider['still_mm']:.2g} --still-deg {wider['still_deg']:.2g}"
-            print(f"          {flags} gives {wider['stops']:.0f} stops")
-        if bag.other_topics:
-            print(plain_text(f"not used  {', '.join(bag.other_topics)}"))
     if not facts.recording:
         print(plain_text(f"{facts.views} views would be taken; nothing was written"))
         return

@@ -5,6 +5,5 @@ fitted to where the board was, and the evidence decides.
 """
 
 from calibrate.imported.folder import Believed, Given, believe, is_described
-from calibrate.imported.mounting import Ask
 
-__all__ = ["Ask", "Believed", "Given", "believe", "is_described"]
+__all__ = ["Believed", "Given", "believe", "is_described"]

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -84,21 +84,11 @@ def told_boards(table: Table) -> Iterator[Seen]:
         candidates: dict[Key, list[Candidate]] = {
             row: [Candidate(T, 0)] for row, T in zip(rows, poses, strict=True)
         }
-        before = [bool(np.mean(each[:, 2, 3] > 0) > 0.9) for each in (poses, inverse(poses))]
-        board, blank = BoardSpec(BoardKind.UNSEEN), CameraModel(0, 0)
-        yield Seen(
-            board,
-            True,
-            views,
-            candidates,
-            blank,
-            False,
-            len(views),
-            [],
-            how,
-            evidence,
-            (before[0], before[1]),
+        in_front, behind = (bool(np.mean(each[:, 2, 3] > 0) > 0.9) for each in (poses, inverse(poses)))
+        seen = Seen(
+            BoardSpec(BoardKind.UNSEEN), True, views, candidates, CameraModel(0, 0), False, len(views)
         )
+        yield replace(seen, convention=how, told=evidence, in_front=(in_front, behind))
 
 
 def _spread(count: int, most: int) -> list[int]:

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from calibrate.imported.board import FEWEST, GUESSED_M, Key, see_board, told_boards
-from calibrate.imported.mounting import Ask, joints_of, joints_rad, mounting
+from calibrate.imported.mounting import joints_of, joints_rad, mounting
 from calibrate.imported.readings import Reading, decide, is_good, readings
 from recordings.errors import ImportSourceError
 from recordings.importers.conventions import NAMED, Convention, convention
@@ -60,11 +60,9 @@ def believe(
     given: Given = Given(),
     told: Dataset | None = None,
     progress: Progress = lambda done, total, text: None,
-    ask: Ask | None = None,
 ) -> Believed:
     """Decide how a folder is to be read. ImportSourceError names the nearest reading and the flag.
 
-    `ask`: asks a person for the mounting where nothing else tells it.
     `told`: a description of before; where it names table and convention it is taken as it is, unless more is
     given.
     """
@@ -73,54 +71,40 @@ def believe(
             return _as_before(lies, told, told.poses)
         given = Given(given.convention, given.mount or told.mount, given.board or told.board)
     robots = [t for t in lies.tables if t.whose == "robot"] or [t for t in lies.tables if not t.whose]
-    pairings: list[tuple[Table, str, dict[Key, int]]] = [
-        (table, family, pairs)
-        for table in robots
-        for family, paths in lies.images.items()
-        if len(pairs := _pairs(table, paths)) >= FEWEST
-    ]
     boards = [
         (robot, board, pairs)
         for robot in robots
         for board in lies.tables
         if board.whose == "board" and len(pairs := _pairs(robot, board)) >= FEWEST
     ]
-    if not pairings and not boards:
-        images = [f"{len(paths)} {name}" for name, paths in lies.images.items()]
-        there = [f"{len(table.numbers)} {table.name}" for table in lies.tables]
-        said = [", ".join(each[:8]) or "none" for each in (images, there)]
-        raise ImportSourceError("no-pairs", source=lies.root, images=said[0], tables=said[1])
     tried: list[Reading] = []
-    families = sorted(
-        {family for _, family, _ in pairings}, key=lambda name: (bool(_MADE.search(name)), name)
-    )
-    for family in families:
-        of_family = [(table, pairs) for table, each, pairs in pairings if each == family]
-        paths = {path for _, pairs in of_family for path in pairs if isinstance(path, Path)}
-        seen = see_board(lies, given.board, sorted(paths, key=natural), progress)
-        if seen is not None:
-            tried += [
-                r
-                for table, pairs in of_family
-                for r in readings(table, family, pairs, [seen], given.convention)
-            ]
+    families: list[str] = []
+    for family in sorted(lies.images, key=lambda name: (bool(_MADE.search(name)), name)):
+        paired = [(table, _pairs(table, lies.images[family])) for table in robots]
+        paths = {path for _, pairs in paired if len(pairs) >= FEWEST for path in pairs}
+        if not paths:
+            continue
+        families.append(family)
+        images = sorted((path for path in paths if isinstance(path, Path)), key=natural)
+        if (seen := see_board(lies, given.board, images, progress)) is not None:
+            for table, pairs in paired:
+                tried += readings(table, family, pairs, [seen], given.convention)
         if any(map(is_good, tried)):
             break
     else:
         for n, (robot, board, pairs) in enumerate(boards):
             progress(n, len(boards), "comparing tables of poses")
             tried += readings(robot, board.name, pairs, list(told_boards(board)), given.convention)
+    if not families and not boards:
+        there = [f"{len(paths)} {name}" for name, paths in lies.images.items()]
+        tables = [f"{len(table.numbers)} {table.name}" for table in lies.tables]
+        said = [", ".join(each[:8]) or "none" for each in (there, tables)]
+        raise ImportSourceError("no-pairs", source=lies.root, images=said[0], tables=said[1])
     if not tried and not boards:
         raise ImportSourceError("no-board-found", source=lies.root, images=", ".join(families))
     if given.convention and not any(map(is_good, tried)):
         _name_convention(lies, given, progress)
-    best = decide(lies, tried)
-    pairs = next(
-        p
-        for t, f, p in (*pairings, *((r, b.name, p) for r, b, p in boards))
-        if (t, f) == (best.table, best.family)
-    )
-    return _believed(lies, given, best, pairs, ask)
+    return _believed(lies, given, decide(lies, tried))
 
 
 def _name_convention(lies: Lies, given: Given, progress: Progress) -> None:
@@ -168,11 +152,11 @@ def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
     return shared if unique and len(shared) > 0.8 * max(len(rows), len(paths)) else {}
 
 
-def _believed(lies: Lies, given: Given, best: Reading, pairs: dict[Key, int], ask: Ask | None) -> Believed:
-    seen = best.seen
+def _believed(lies: Lies, given: Given, best: Reading) -> Believed:
+    seen, pairs = best.seen, best.pairs
     joints, by_joints = joints_of(lies, best) or (None, None)
     told_so = given.tells_direction
-    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, told_so, by_joints, ask)
+    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, told_so, by_joints)
     how = replace(best.convention, inverse=best.convention.inverse != inverted)
     board, square = _board(best)
     facts = {

@@ -9,7 +9,6 @@ Distances of camera and board from flange and base count with either, and no two
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -22,7 +21,6 @@ from recordings.errors import ImportSourceError
 from recordings.importers.tables import Lies, Table
 from recordings.schema.messages import Mount
 
-Ask = Callable[[str], Mount]
 _MOST_ROWS = 100
 """Most joints and poses from which axes are learned."""
 _FEWEST_POINTS, _TIMES = 30, 10
@@ -51,41 +49,31 @@ _CAMERA_IN_BOARD = re.compile(r"cam\w*?_?(2|to|in|wrt)_?(board|target|marker|obj
 
 
 def mounting(
-    lies: Lies, given: Mount | None, best: Reading, as_told: bool, by_joints: bool | None, ask: Ask | None
+    lies: Lies, given: Mount | None, best: Reading, as_told: bool, by_joints: bool | None
 ) -> tuple[Mount, bool, bool, str]:
     """(mounting, whether the robot's poses are inverted, whether the board's are, why).
 
     `as_told`: by the user's convention the direction is told, too. `by_joints`: whether joints say that the
-    robot's poses are inverted. `ask`: asks a person. Raises ImportSourceError
-    (`which-mount`) where nothing decides, or one contradicts another.
+    robot's poses are inverted. Raises ImportSourceError (`which-mount`) where nothing decides, or one
+    contradicts another.
     """
     name, seen = best.table.name, best.seen
     named_so = seen.convention is not None and bool(_CAMERA_IN_BOARD.search(best.family))
     turned_board = named_so if all(seen.in_front) else seen.in_front[1]
     fits = _OTHER[best.mount] if turned_board else best.mount
     by_turn: dict[bool | None, set[Mount]] = {None: set(), False: {fits}, True: {_OTHER[fits]}}
-    measured = {
-        "joints": by_turn[by_joints],
-        "the scene around the board": _by_scenery(best),
-    }
+    measured = {"joints": by_turn[by_joints], "the scene around the board": _by_scenery(best)}
     by_distances, far_apart = _inverted_by_distances(best)
     straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
-    named = _named(f"{name} {best.family}") or _named(
-        f"{lies.words} {' '.join(f'{k} {str(v).lower()}' for k, v in lies.facts.items())}"
-    )
-    supposed = {
-        far_apart: by_turn[by_distances],
-        "names": by_turn[inverted if straight != inverted and not as_told else None]
-        | (set() if given else named),
-    }
+    turned = inverted if straight != inverted and not as_told else None
+    facts = " ".join(f"{key} {str(value).lower()}" for key, value in lies.facts.items())
+    named = _named(f"{name} {best.family}") or _named(f"{lies.words} {facts}")
+    supposed = {far_apart: by_turn[by_distances], "names": by_turn[turned] | (set() if given else named)}
     told = ({given} if given else set()) | by_turn[False if as_told else None]
     if any(measured.values()):
         del supposed["names"]
     evidence = measured if given and as_told else measured | supposed
     possible = told.union(*evidence.values())
-    if len(possible) != 1 and not given and ask is not None:
-        given = ask(f"{name} fits as {fits} as it stands, or the other mounting with inverted poses")
-        possible = {given}
     why = [(what, says) for what, says in evidence.items() if says]
     if len(possible) != 1:
         said = "; ".join(f"{' or '.join(sorted(says))} by {what}" for what, says in why)
@@ -125,11 +113,11 @@ def joints_of(lies: Lies, best: Reading) -> tuple[Table, bool] | None:
     """
     flanges = best.convention.poses(best.table.numbers[:_MOST_ROWS])
     for table in lies.tables:
-        rows, count = joints_rad(table)[:_MOST_ROWS].shape
+        joints = joints_rad(table)[:_MOST_ROWS]
+        rows, count = joints.shape
         if count > 7 or rows < 2 * count or len(table.numbers) != len(best.table.numbers):
             continue
         with suppress(np.linalg.LinAlgError, ValueError):
-            joints = joints_rad(table)[:_MOST_ROWS]
             straight, inverted = (learn_chain(joints, F, 3).explains for F in (flanges, inverse(flanges)))
             if straight != inverted:
                 return table, inverted

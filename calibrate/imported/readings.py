@@ -38,6 +38,8 @@ class Reading:
     convention: Convention
     family: str
     """Images by folder and name, or the table of the board's poses."""
+    pairs: dict[Key, int]
+    """Image, or row of the board's table → row of the robot's."""
     seen: Seen
     mount: Mount
     views: ViewSet
@@ -56,45 +58,24 @@ def readings(
     table: Table, family: str, pairs: dict[Key, int], seens: list[Seen], named: str | None
 ) -> Iterator[Reading]:
     """Yield the best readings that the views can judge; `named`: the convention that the user gives."""
-    likely: list[tuple[float, Convention, str, Array, Seen, list[Key]]] = []
+    likely: list[tuple[float, int, Convention, str, Array, Seen, list[Key], Mount]] = []
     for seen in seens:
         keys = [key for key in seen.views if key in pairs]
         if len(keys) < FEWEST:
             continue
         numbers = table.numbers[[pairs[key] for key in keys]]
-        turns = _turns(seen, keys)
         told = [(convention(named), "as told")] if named else possible(numbers)
         spelt = [each for each in told if table.rotation and each[0].rotation == table.rotation]
         for how, evidence in spelt or told:
             flange = how.poses(numbers)
-            likely.append((_turn_miss(flange, turns), how, evidence, flange, seen, keys))
-    least = min((each[0] for each in likely), default=0.0)
-    moves = [
-        (_moves(seen, keys, flange, mount), n, mount)
-        for n, (miss, _, _, flange, seen, keys) in enumerate(likely)
-        for mount in _MOUNTS
-        if miss <= 3 * least + 0.05
-    ]
-    for _, n, mount in sorted(moves)[:_MOST]:
-        _, how, evidence, flange, seen, keys = likely[n]
+            likely += [
+                (_moves(seen, keys, flange, mount), len(likely), how, evidence, flange, seen, keys, mount)
+                for mount in _MOUNTS
+            ]
+    for _, _, how, evidence, flange, seen, keys, mount in sorted(likely, key=lambda each: each[:2])[:_MOST]:
         fitted = _fitted(seen, keys, flange, mount)
         if fitted is not None:
-            yield Reading(table, how, family, seen, mount, *fitted, evidence)
-
-
-def _turns(seen: Seen, keys: list[Key]) -> list[tuple[int, int, Array]]:
-    """Angles by which the board may have turned from each view to the three after it."""
-    R = [np.array([each.camera_from_board[:3, :3] for each in seen.candidates[key]]) for key in keys]
-    steps = [(i, i + step) for step in (1, 2, 3) for i in range(len(R) - step)]
-    return [(i, k, rotation_angle(R[i][:, None] @ np.swapaxes(R[k], 1, 2))) for i, k in steps]
-
-
-def _turn_miss(flange: Array, turns: list[tuple[int, int, Array]]) -> float:
-    """Median difference, rad, of the angles by which arm and board turn."""
-    i, k = (np.array([turn[end] for turn in turns]) for end in (0, 1))
-    turned = rotation_angle(np.swapaxes(flange[i, :3, :3], 1, 2) @ flange[k, :3, :3])
-    misses = [np.abs(angles - angle).min() for (_, _, angles), angle in zip(turns, turned, strict=True)]
-    return float(np.median(misses))
+            yield Reading(table, how, family, pairs, seen, mount, *fitted, evidence)
 
 
 def _moves(seen: Seen, keys: list[Key], flange: Array, mount: Mount) -> float:
@@ -168,22 +149,18 @@ def is_good(reading: Reading) -> bool:
 def decide(lies: Lies, readings: list[Reading]) -> Reading:
     good = [reading for reading in readings if is_good(reading)] or readings
     ranked = sorted(good, key=lambda r: -r.fit.log_evidence)
-    if not ranked:
-        raise ImportSourceError(
-            "no-reading", source=lies.root, nearest="none", stays_m=0.0, stays_rad=0.0, cause="", text=""
-        )
-    best = ranked[0]
-    if not is_good(best):
-        best, cause, text = _cause(ranked[:_EXPLAINED])
+    if not ranked or not is_good(ranked[0]):
+        nearest, cause, text = _cause(ranked[:_EXPLAINED]) if ranked else (None, "", "")
         raise ImportSourceError(
             "no-reading",
             source=lies.root,
-            nearest=best.text,
-            stays_m=best.stays_m,
-            stays_rad=best.stays_rad,
+            nearest=nearest.text if nearest else "none",
+            stays_m=nearest.stays_m if nearest else 0.0,
+            stays_rad=nearest.stays_rad if nearest else 0.0,
             cause=cause,
             text=text,
         )
+    best = ranked[0]
     for other in ranked[1:]:
         if best.fit.log_evidence - other.fit.log_evidence > clear_gain(len(best.fit.full)):
             break

@@ -7,7 +7,6 @@ time.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
@@ -23,10 +22,12 @@ from recordings.images import (
     decode_image,
     encode_png,
     pixel_format_of,
+    raw_array,
     read_header,
 )
 from recordings.importers.bags import open_bag
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset
+from recordings.importers.folder import Imported
 from recordings.importers.messages import ImageMessage, Progress
 from recordings.importers.selection import Selection, Wanted, select
 from recordings.importers.stops import Standstill, StandstillLimits, find_stops, proposed_limits
@@ -35,35 +36,6 @@ from recordings.writer import RecordingWriter, derived_recording
 
 PAIR_WITHIN_S = 0.05
 STOPS_LEAST = 3
-_LAYOUTS = {
-    "mono8": (1, np.uint8, None), "8UC1": (1, np.uint8, None), "mono16": (1, np.uint16, None),
-    "bgr8": (3, np.uint8, None), "8UC3": (3, np.uint8, None), "rgb8": (3, np.uint8, cv2.COLOR_RGB2BGR),
-    "bgra8": (4, np.uint8, cv2.COLOR_BGRA2BGR), "rgba8": (4, np.uint8, cv2.COLOR_RGBA2BGR),
-    "bayer_rggb8": (1, np.uint8, None), "bayer_bggr8": (1, np.uint8, None),
-    "bayer_gbrg8": (1, np.uint8, None), "bayer_grbg8": (1, np.uint8, None),
-    "yuv422": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY), "uyvy": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY),
-    "yuv422_yuy2": (2, np.uint8, cv2.COLOR_YUV2BGR_YUYV), "yuyv": (2, np.uint8, cv2.COLOR_YUV2BGR_YUYV),
-}  # fmt: skip
-"""Encoding → channels, number type, conversion."""
-
-
-@dataclass(frozen=True)
-class BagPlan:
-    """Summary of an import, which `--dry-run` prints."""
-
-    image_topic: str
-    images: int
-    poses_from: str
-    joints_from: str
-    camera: str
-    stops: int
-    passed_over: dict[str, int]
-    bound_ms: float
-    """Largest time between an image and the arm's nearest report."""
-    other_topics: list[str]
-    bytes_written: int = 0
-    wider: dict[str, float] = field(default_factory=dict)
-    """With --dry-run: still_mm and still_deg by which the arm stands more often, and the stops they give."""
 
 
 def import_bag(
@@ -74,7 +46,7 @@ def import_bag(
     limits: StandstillLimits = StandstillLimits(),  # noqa: B008 - frozen
     pair_within_s: float = PAIR_WITHIN_S,
     progress: Progress = lambda done, total, text: None,
-) -> BagPlan:
+) -> Imported:
     """`output` None: says what would be taken and writes nothing. Raises ImportSourceError or RecordingError.
 
     `description`: a dataset.yaml with mount and board (default: the one in or beside the source).
@@ -89,23 +61,25 @@ def import_bag(
         if joints is not None and joints.speeds_rad_s is not None:
             speeds = joints.stamps_ns, np.abs(joints.speeds_rad_s).max(axis=1)
         stops, passed = find_stops(chosen.track, images_ns, speeds, limits, pair_within_s)
-        plan = BagPlan(
-            image_topic=chosen.image.name,
-            images=len(images_ns),
-            poses_from=chosen.poses_from,
-            joints_from=joints.topic if joints else "",
-            camera=_camera_text(described, chosen),
-            stops=len(stops),
-            passed_over=passed,
-            bound_ms=1e3 * max((stop.bound_s for stop in stops), default=0.0),
-            other_topics=bag.others,
-        )
+        why = ", ".join(f"{count} {reason}" for reason, count in passed.items() if count)
+        bound_ms = 1e3 * max((stop.bound_s for stop in stops), default=0.0)
+        known = (described and described.camera) or chosen.camera
+        lens = "intrinsics known" if known and known.matrix else "intrinsics to be estimated"
+        facts = {
+            "images": (f"{len(images_ns)} {chosen.image.name}", lens),
+            "poses": (chosen.poses_from, f"paired by stamp within {bound_ms:.2f} ms"),
+            "joints": (joints.topic if joints else "none of an arm of five to seven", ""),
+            "stops": (str(len(stops)), f"images passed over: {why or 'none'}"),
+            "not used": (", ".join(bag.others) or "nothing", ""),
+        }
         if output is None:
-            return replace(
-                plan, wider=proposed_limits(chosen.track, images_ns, speeds, limits, pair_within_s)
-            )
+            if wider := proposed_limits(chosen.track, images_ns, speeds, limits, pair_within_s):
+                found, count = wider
+                degrees = float(np.degrees(found.rotation_rad))
+                flags = f"--still-mm {1e3 * found.position_m:.2g} --still-deg {degrees:.2g}"
+                facts["wider"] = flags, f"gives {count} stops"
+            return Imported(source, len(stops), facts)
         if len(stops) < STOPS_LEAST:
-            why = ", ".join(f"{count} {reason}" for reason, count in passed.items() if count)
             raise ImportSourceError(
                 "no-stops",
                 source=source,
@@ -117,12 +91,12 @@ def import_bag(
         assert described is not None
         images = bag.images(chosen.image.name, {stop.place for stop in stops})
         first = next(images)
-        camera = _camera(described, chosen.camera, *_size(first))
-        note = f"imported from {source.name}: {plan.image_topic}, {plan.poses_from}"
+        camera = _camera(described, chosen.camera, _pixels(first, min(stop.place for stop in stops))[0])
+        note = f"imported from {source.name}: {chosen.image.name}, {chosen.poses_from}"
         info = described.session(source, camera, max(0, min(stop.stamp_ns for stop in stops)), note)
         with derived_recording(output, info) as writer:
             writer.attach(DATASET_FILE, "application/yaml", description_bytes)
-            writer.attach("import.json", "application/json", msgspec.json.encode(asdict(plan)))
+            writer.attach("import.json", "application/json", msgspec.json.encode(facts))
             _write_states(writer, chosen)
             in_file_order = sorted(enumerate(stops), key=lambda numbered: numbered[1].place)
             pairs = zip(in_file_order, chain([first], images), strict=True)
@@ -130,7 +104,7 @@ def import_bag(
                 at_stop = joints.at(stop.stamp_ns, pair_within_s) if joints else None
                 _write_view(writer, index, stop, image, at_stop)
                 progress(done, len(stops), "importing")
-            return replace(plan, bytes_written=writer.finish().stat().st_size)
+            return Imported(writer.finish(), len(stops), facts)
     finally:
         bag.close()
 
@@ -145,15 +119,9 @@ def _description(source: Path, given: Path | None, needed: bool) -> tuple[Datase
     return None, b""
 
 
-def _camera_text(described: Dataset | None, chosen: Selection) -> str:
-    if described is not None and described.camera is not None:
-        return "of the description"
-    known = chosen.camera is not None and chosen.camera.matrix is not None
-    return "intrinsics of the bag" if known else "size of the images, intrinsics to be estimated"
-
-
-def _camera(described: Dataset, found: CameraModel | None, width: int, height: int) -> CameraModel:
+def _camera(described: Dataset, found: CameraModel | None, first: Pixels) -> CameraModel:
     """The description's, else the bag's, else the size alone. ImportSourceError for another size."""
+    height, width = first.shape[:2]
     camera = described.camera or found or CameraModel(width, height)
     if (camera.width, camera.height) != (width, height):
         raise wrong_size_error("The first image", (width, height), (camera.width, camera.height))
@@ -203,35 +171,13 @@ def _write_view(
     )
 
 
-def _size(image: ImageMessage) -> tuple[int, int]:
-    if image.width:
-        return image.width, image.height
-    try:
-        header = read_header(image.data)
-    except ImageError as error:
-        raise ImportSourceError("bad-image", place="the bag", image="first", reason=str(error)) from error
-    return header.width, header.height
-
-
 def _pixels(image: ImageMessage, place: int) -> tuple[Pixels, bytes | None]:
     """(array as recordings hold it, file bytes to keep). ImportSourceError for what no camera here writes."""
     try:
-        if not image.width:
-            header = read_header(image.data)
-            decoded = decode_image(image.data, header.width, header.height)
-            return decoded, image.data if header.format in KEPT_FORMATS else encode_png(decoded)
-        if image.encoding not in _LAYOUTS:
-            raise ImageError(f"is encoded as '{image.encoding}' (known: {', '.join(_LAYOUTS)}, PNG, JPEG)")
-        channels, kind, conversion = _LAYOUTS[image.encoding]
-        row = image.width * channels * np.dtype(kind).itemsize
-        if image.step < row or len(image.data) < image.step * image.height or not image.height:
-            raise ImageError(f"has {len(image.data)} bytes where {image.width}×{image.height} needs more")
-        rows = np.frombuffer(image.data, np.uint8, image.step * image.height).reshape(
-            image.height, image.step
-        )
-        pixels = np.ascontiguousarray(rows[:, :row]).view(kind)
-        if channels > 1:
-            pixels = pixels.reshape(image.height, image.width, channels)
-        return (pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))), None
+        if image.width:
+            return raw_array(image.data, image.encoding, image.width, image.height, image.step), None
+        header = read_header(image.data)
+        decoded = decode_image(image.data, header.width, header.height)
+        return decoded, image.data if header.format in KEPT_FORMATS else encode_png(decoded)
     except ImageError as error:
         raise ImportSourceError("bad-image", place="the bag", image=place + 1, reason=str(error)) from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,8 @@ _MEDIA = {".yaml": "application/yaml", ".csv": "text/csv", ".json": "application
 class Imported:
     path: Path
     images: int
-    size_bytes: int
+    facts: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """What → (what is believed, its evidence), for people."""
 
 
 def import_folder(
@@ -95,7 +96,7 @@ def write_views(
     for row in (row for row in rows if row.camera_from_board is None):
         _beginning(folder, row, size, _HEADER_BYTES)
     if output is None:
-        return Imported(folder, len(rows), 0)
+        return Imported(folder, len(rows))
     with derived_recording(output, dataset.session(folder, camera)) as writer:
         for name, content in beside.items():
             writer.attach(name, _MEDIA[Path(name).suffix], content)
@@ -104,8 +105,7 @@ def write_views(
             progress(index + 1, len(rows), "importing")
         stamps = Stamps(host_wall_ns=writer.info.created_wall_ns)
         writer.event(CaptureEvent(stamps, "imported", detail=f"{len(rows)} views"))
-        path = writer.finish()
-        return Imported(path, len(rows), path.stat().st_size)
+        return Imported(writer.finish(), len(rows))
 
 
 def read_image(folder: Path, row: PoseRow, size: tuple[int, int]) -> tuple[str, bytes, Pixels]:

@@ -103,8 +103,8 @@ def proposed_limits(
     speeds: tuple[NDArray[np.int64], Array] | None,
     limits: StandstillLimits,
     pair_within_s: float,
-) -> dict[str, float]:
-    """still_mm and still_deg by which this arm stands more often, and the stops they give; {}: none.
+) -> tuple[StandstillLimits, int] | None:
+    """Limits by which this arm stands more often, and the stops they give; None: none do.
 
     An arm at rest reports with about the same noise everywhere, and one that moves with far more: the widest
     gap between images, by the logarithm of their motion, lies between the two.
@@ -113,19 +113,14 @@ def proposed_limits(
     motion = np.sort([_motion(view.stillness, limits) for view in views])
     motion = motion[np.isfinite(motion) & (motion > 0)]
     if len(motion) < 3:
-        return {}
+        return None
     widest = int(np.argmax(np.diff(np.log(motion)))) if motion[-1] > 2 * motion[0] else len(motion) - 1
     factor = float(f"{1.3 * motion[widest]:.1g}")
     wider = replace(limits, position_m=factor * limits.position_m, rotation_rad=factor * limits.rotation_rad)
     now, then = (
         len(find_stops(track, images_ns, speeds, each, pair_within_s)[0]) for each in (limits, wider)
     )
-    told = {
-        "still_mm": 1e3 * wider.position_m,
-        "still_deg": float(np.degrees(wider.rotation_rad)),
-        "stops": then,
-    }
-    return told if factor > 1 and then > now else {}
+    return (wider, then) if factor > 1 and then > now else None
 
 
 def _stillness(

@@ -45,8 +45,6 @@ class RenderedCamera:
         self._gain_db = truth.gain_db if config is None else config.gain_db
         self._process: subprocess.Popen[bytes] | None = None
         self._thread = DeviceThread("rendered camera")
-        self._surplus = 0
-        """Frames that came with the last one although one was asked for."""
         self._asking = asyncio.Lock()
         self._clock = FrameClock()
         self.counter = FrameCounter()
@@ -69,7 +67,6 @@ class RenderedCamera:
 
     async def open(self) -> CameraIdentity:
         """Start the process and read its clock a few times."""
-        self._surplus = 0
         self.counter.restart()
         try:
             async with self._asking:  # so that images are taken only after the clock was read
@@ -85,22 +82,13 @@ class RenderedCamera:
         return self.identity
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        """Trigger once and return that frame; a frame from before the trigger is an error."""
+        """Trigger once and return that frame."""
         async with self._asking:
             await self._place()
             await self._read_clock()
-            if surplus := self._surplus:
-                self._surplus = 0
-                raise self.counter.surplus(surplus)
             asked_ns = time.monotonic_ns()
-            frames = await self._call("trigger", timeout_s=timeout_s)
-            if not frames:
-                await asyncio.sleep(timeout_s)
-                self.counter.lost()
-                raise CameraError("no-image", limit_s=timeout_s)
-            frame, self._surplus = frames[0], len(frames) - 1
+            frame = await self._call("trigger", timeout_s=timeout_s)
             sequence = self.counter.accept(frame.frame_id)
-            self._check_settings(frame)
             told = msgspec.structs.replace(_dated(frame), sequence=sequence)
             return self._clock.timed(told, asked_ns=asked_ns)
 
@@ -118,11 +106,6 @@ class RenderedCamera:
             await self._place()
             return _dated(await self._call("preview"))
 
-    async def inject(self, fault: str, value: object = None) -> None:
-        """Inject a fault of `CameraFaults`."""
-        async with self._asking:
-            await self._call("inject", fault, value)
-
     async def close(self) -> None:
         process, self._process = self._process, None
         if process is not None:
@@ -138,12 +121,6 @@ class RenderedCamera:
         except RobotError as error:
             raise CameraError.from_data(error.data) from None
         await self._call("place", place)
-
-    def _check_settings(self, frame: Image) -> None:
-        found, wanted = (frame.exposure_us, frame.gain_db), (self._exposure_us, self._gain_db)
-        if found != wanted:
-            found_text, wanted_text = (f"{us:g} µs and {db:g} dB" for us, db in (found, wanted))
-            raise CameraError("settings-changed", found=found_text, wanted=wanted_text)
 
     async def _read_clock(self) -> None:
         asked_ns = time.monotonic_ns()

@@ -15,23 +15,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import pytest_asyncio
 
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, StaleStateError
 from station.devices.news import Delay
 from station.devices.ur import UrRobot
-from station.simulation.camera import RenderedCamera
-from station.simulation.cells import make_cell
-from station.simulation.launch import SimulatedController, start_controller
-from station.simulation.truth import write_truth
+from station.simulation.launch import SimulatedController
 from tests.conftest import AT_REST_RAD_S, asked, rests_short_of_its_goal
 from tests.patience import PATIENCE_S, until
 
 FAR_RAD = 1.5
 BEAT_S, POLL_S = 0.03, 0.005
 Json = dict[str, Any]
-LOOP = pytest.mark.asyncio(loop_scope="module")
 
 
 class Cell:
@@ -194,15 +189,3 @@ async def cell(
     yield make
     for made in cells:
         await made.end()
-
-
-@pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def camera(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[RenderedCamera]:
-    """Opened, before the published cell's arm; one for the tests of a module, which are of the loop LOOP."""
-    cell, truth = make_cell("paper-binned"), tmp_path_factory.mktemp("cell") / "truth.json"
-    write_truth(cell, truth)
-    with start_controller(truth=truth) as arm:
-        rendered = RenderedCamera(cell, arm.host)
-        await rendered.open()
-        yield rendered
-        await rendered.close()

@@ -24,8 +24,7 @@ from tests.gige_vision import description as at
 from tests.gige_vision.pixels import encode, numbered_picture
 
 CONTROL_PORT = 3956
-_DISCOVERY, _RESEND, _READ_REGISTER, _WRITE_REGISTER = 0x0002, 0x0040, 0x0080, 0x0082
-_READ_MEMORY, _WRITE_MEMORY = 0x0084, 0x0086
+_RESEND, _TICK_HZ = 0x0040, 125_000_000
 _NOT_IMPLEMENTED, _INVALID_PARAMETER, _INVALID_ADDRESS = 0x8001, 0x8002, 0x8003
 _WRITE_PROTECT, _ACCESS_DENIED, _UNAVAILABLE, _RESENT = 0x8004, 0x8006, 0x800C, 0x0100
 _PRIVILEGE, _HEARTBEAT, _CAPABILITY = 0xA00, 0x938, 0x934
@@ -63,33 +62,26 @@ class EmulatedCamera:
         picture: Picture = numbered_picture,
         ids: Iterable[int] | None = None,
         extended_ids: bool = False,
-        tick_hz: int = 125_000_000,
     ) -> None:
-        """`ids`: of the frames; by default 1 … 65535 and again, with `extended_ids` 0, 1, 2 …"""
+        """`ids`: of the frames; by default 1 … 65535 and again."""
         self.address, self.serial, self.size = address, serial, size
         self.picture = picture
         self.ids = iter(itertools.cycle(range(1, 65_536)) if ids is None else ids)
-        if extended_ids and ids is None:
-            self.ids = itertools.count()
-        self.device_ns: Callable[[int], int] = lambda host_ns: host_ns + 7_000_000_000_000
-        """The free-running clock at a host monotonic time, ns"""
         self.mangle: Callable[[Packets], Iterable[bytes]] = lambda packets: packets
         """Lose, reorder or copy a frame's packets as they are sent first."""
         self.stamp_error_ns = 0
         """Added to every stamp"""
         self.mtu = 9000
         """Larger packets do not arrive."""
-        self.readout_s = 0.002
         self.acknowledges_only = False
         """Triggers are acknowledged and ignored."""
         self.frozen = False
         """It hears nothing and sends nothing."""
         self.forgets = False
         """Nothing can be sent again."""
-        self.frames = self.resent = self.unavailable = self.refused = self.ignored_triggers = 0
+        self.frames = self.resent = self.unavailable = self.refused = 0
         self.exposed_ns: list[tuple[int, int]] = []
         """Host monotonic start and end of every exposure"""
-        self._tick_hz = tick_hz
         self._memory = bytearray(at.XML_AT)
         self._xml = at.zipped()
         self._controller: tuple[str, int] | None = None
@@ -149,8 +141,8 @@ class EmulatedCamera:
         return self._controller is not None
 
     def _ticks(self, host_ns: int) -> int:
-        """The clock as stamps and latch show it."""
-        return self.device_ns(host_ns) * self._tick_hz // 1_000_000_000
+        """The free-running clock as stamps and latch show it."""
+        return (host_ns + 7_000_000_000_000) * _TICK_HZ // 1_000_000_000
 
     def _fill(self, extended_ids: bool) -> None:
         width, height = self.size
@@ -164,9 +156,9 @@ class EmulatedCamera:
             (at.GAIN_AUTO, 2), (at.LINE_SELECTOR, 1),
         ):  # fmt: skip
             self.set_register(address, value)
-        for address, number in ((at.EXPOSURE, 5000.0), (at.GAIN, 0.0), (at.FRAME_RATE, 25.0)):
+        for address, number in ((at.EXPOSURE, 5000.0), (at.GAIN, 0.0)):
             self.set_number(address, number)
-        self.set_register(at.TICK_HZ, self._tick_hz, 8)
+        self.set_register(at.TICK_HZ, _TICK_HZ, 8)
         last = int(self.address.rsplit(".", 1)[1])
         self.set_register(0x00C, 0x0000_0000 | last)
         self._memory[0x24:0x28] = socket.inet_aton(self.address)
@@ -287,42 +279,29 @@ class EmulatedCamera:
 
     def _trigger(self) -> None:
         armed = self.register(at.ACQUISITION) and self.register(at.TRIGGER_MODE)
-        if not armed or self._exposing or self.acknowledges_only:
-            self.ignored_triggers += 1
-            return
-        self._triggered.set()
+        if armed and not self._exposing and not self.acknowledges_only:
+            self._triggered.set()
 
     def _expose(self) -> None:
-        due_s = time.monotonic()
         while not self._ended.is_set():
             if not self.register(at.ACQUISITION) or self.frozen:
-                due_s = time.monotonic()
                 self._ended.wait(0.005)
-                continue
-            if self.register(at.TRIGGER_MODE):
-                if not self._triggered.wait(0.05):
-                    continue
+            elif self._triggered.wait(0.05) and not self._ended.is_set():
                 self._exposing = True
                 self._triggered.clear()
-            else:
-                due_s = max(due_s + 1 / self.number(at.FRAME_RATE), time.monotonic() - 1.0)
-                if self._ended.wait(max(0.0, due_s - time.monotonic())):
-                    return
-            if not self._ended.is_set():
                 self._frame()
-            self._exposing = False
+                self._exposing = False
 
     def _frame(self) -> None:
         exposure_us = self.number(at.EXPOSURE)
-        time.sleep(self.number(at.TRIGGER_DELAY) * 1e-6 * bool(self.register(at.TRIGGER_MODE)))
         start_ns = time.monotonic_ns()
         ticks = self._ticks(start_ns)
         width, height = self.register(at.WIDTH), self.register(at.HEIGHT)
         grey = self.picture(self.frames, width, height)
         self._ended.wait(max(0.0, exposure_us * 1e-6 - (time.monotonic_ns() - start_ns) / 1e9))
         self.exposed_ns.append((start_ns, start_ns + round(exposure_us * 1e3)))
-        self._ended.wait(self.readout_s)
-        ticks += self.stamp_error_ns * self._tick_hz // 1_000_000_000
+        self._ended.wait(0.002)
+        ticks += self.stamp_error_ns * _TICK_HZ // 1_000_000_000
         frame_id = next(self.ids)
         self.frames += 1
         packets = self._packets(frame_id, ticks, encode(np.ascontiguousarray(grey), self._format()))
@@ -352,7 +331,7 @@ class EmulatedCamera:
         return [_packet(0, frame_id, kind, n, part, extended) for n, (kind, part) in enumerate(parts)]
 
     def _send(self, packets: Iterable[bytes]) -> None:
-        client, delay_s = self._client(), self.register(at.PACKET_DELAY) / self._tick_hz
+        client, delay_s = self._client(), self.register(at.PACKET_DELAY) / _TICK_HZ
         owed_s = 0.0
         for packet in packets:
             if not client[1] or self._ended.is_set():

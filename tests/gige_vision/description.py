@@ -29,11 +29,9 @@ WIDTH, HEIGHT, OFFSET_X, OFFSET_Y = map(_address, ("Width", "Height", "OffsetX",
 SENSOR_WIDTH, SENSOR_HEIGHT = _address("SensorWidth"), _address("SensorHeight")
 PIXEL_FORMAT, PAYLOAD_SIZE = _address("PixelFormat"), _address("PayloadSize")
 ACQUISITION, ACQUISITION_MODE = _address("AcquisitionStart"), _address("AcquisitionMode")
-EXPOSURE, EXPOSURE_AUTO, GAIN, GAIN_AUTO, FRAME_RATE = map(
-    _address, ("ExposureTime", "ExposureAuto", "Gain", "GainAuto", "AcquisitionFrameRate")
-)
-TRIGGER_MODE, TRIGGER_SOURCE, TRIGGER_ACTIVATION, TRIGGER_DELAY, TRIGGER_SOFTWARE = map(
-    _address, ("TriggerMode", "TriggerSource", "TriggerActivation", "TriggerDelay", "TriggerSoftware")
+EXPOSURE, EXPOSURE_AUTO, GAIN, GAIN_AUTO = map(_address, ("ExposureTime", "ExposureAuto", "Gain", "GainAuto"))
+TRIGGER_MODE, TRIGGER_SOURCE, TRIGGER_ACTIVATION, TRIGGER_SOFTWARE = map(
+    _address, ("TriggerMode", "TriggerSource", "TriggerActivation", "TriggerSoftware")
 )
 LINE_SELECTOR, LINE_MODE, LINE_SOURCE = map(_address, ("LineSelector", "LineMode", "LineSource"))
 TICK_HZ, TIMESTAMP = _address("GevTimestampTickFrequency"), _address("GevTimestampValue")

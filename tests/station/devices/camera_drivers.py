@@ -54,13 +54,7 @@ def rendered(request: pytest.FixtureRequest) -> Driver:
     arm: SimulatedController = request.getfixturevalue("arm")
     lens = CameraModel(*SIZE, matrix=((300.0, 0.0, 160.0), (0.0, 300.0, 120.0), (0.0, 0.0, 1.0)))
     camera = RenderedCamera(msgspec.structs.replace(truth, camera=lens), arm.host)
-
-    @asynccontextmanager
-    async def silence() -> AsyncIterator[None]:
-        await camera.inject("missed-trigger")
-        yield
-
-    return Driver(camera, silence=silence)
+    return Driver(camera)
 
 
 def playback(request: pytest.FixtureRequest) -> Driver:

@@ -127,7 +127,7 @@ async def test_looks_take_no_number_and_do_not_disturb_a_capture(driver: Driver)
 
 async def test_a_picture_that_does_not_come_is_an_error_in_time_and_the_next_one_good(driver: Driver) -> None:
     if driver.silence is None:
-        pytest.skip("what is played is never late")
+        pytest.skip("what is played or rendered is never late")
     async with opened(driver) as camera:
         await camera.capture()
         beats = 0

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from recordings.schema.messages import ClockReading, FrameTime, Image, Stamps
 from station.cell.clock_fit import DRIFT
+from station.cell.errors import CameraError
 from station.cell.status import FrameTiming
 from station.devices.frame_time import DeviceClock, by_arrival, by_clock
 from station.devices.frames import FrameClock, FrameCounter, TriggerPulse, frames_between
@@ -135,3 +136,34 @@ def test_after_a_loss_any_number_may_be_the_next_and_the_pulses_go_on_from_there
     counter.lost(pulse_count=11)
     assert counter.accept(7, pulse_count=12) == 1
     assert counter.counts().paired == 2 and counter.missing == 1
+
+
+def test_18_a_gap_in_the_frame_ids_is_an_error_even_where_a_picture_came() -> None:
+    counter = FrameCounter()
+    counter.accept(65_531)
+    with raises("frames-lost"):
+        counter.accept(65_534)
+    assert counter.missing == 2 and counter.accept(65_535) == 1
+    with raises("frame-twice"):
+        counter.accept(65_535)
+    assert counter.accept(1) == 2
+
+
+@given(st.integers(1, 65_535), st.lists(st.sampled_from(["good", "lost", "extra pulse"]), max_size=40))
+def test_whatever_happens_only_undisturbed_pictures_are_accepted(first_id: int, events: list[str]) -> None:
+    """A camera and a box that miscount at random: no accepted picture follows an unnoticed disturbance."""
+    counter, frame_id, pulse = FrameCounter(), first_id, 50
+    counter.accept(frame_id, pulse)
+    accepted = 1
+    for event in events:
+        frame_id, pulse = frame_id % 65_535 + 1, pulse + 1
+        if event == "lost":  # this trigger's frame never comes; the driver says so and goes on
+            counter.lost(pulse)
+            continue
+        if event == "extra pulse":
+            pulse += 1
+            with pytest.raises(CameraError):
+                counter.accept(frame_id, pulse)
+            continue
+        assert counter.accept(frame_id, pulse) == accepted
+        accepted += 1

@@ -34,8 +34,8 @@ class WeakArm(SimulatedArm):
     weakness = ""
     ignored = braked = False
 
-    def start(self, goals: tuple[Vector, ...], speed: float, acceleration: float) -> JointMotion:
-        return super().start(goals, speed * (FASTER if self.weakness == "too-fast" else 1), acceleration)
+    def start(self, goal: Vector, speed: float, acceleration: float) -> JointMotion:
+        return super().start(goal, speed * (FASTER if self.weakness == "too-fast" else 1), acceleration)
 
     def brake(self, deceleration_rad_s2: float) -> None:
         self._weakly(lambda: super(WeakArm, self).brake(deceleration_rad_s2))
@@ -81,7 +81,7 @@ class WeakRobot(SimulatedRobot):
         q = arm.command
         if self.weakness == "swings-back":
             arm.braked = False
-            arm.start(((q[0] - BACK_RAD * self._way, *q[1:]),), 0.1, 1.4)
+            arm.start((q[0] - BACK_RAD * self._way, *q[1:]), 0.1, 1.4)
         elif self.weakness == "drifts-at-rest":
             arm.command = (q[0] + DRIFT_RAD_S * self.dt_s, *q[1:])
 

@@ -15,6 +15,7 @@ import pytest
 import station
 from calibrate.cli import main as calibrate
 from calibrate.files.calibration import read_calibration
+from calibrate.files.formatting import predicted_error
 from calibrate.files.install import installed_calibration
 from calibrate.files.versions import installed_versions
 from calibrate.geometry import difference
@@ -113,7 +114,7 @@ async def test_what_the_wizard_wrote_is_rehearsed_until_it_is_installed(tmp_path
     off = difference(np.array(answer["result"]["matrix"]), simulated)
     # 22.5: the 99.9 % quantile of chi-square with 6 degrees of freedom.
     assert answer["verdict"] == "pass" and off @ np.linalg.solve(np.array(answer["covariance"]), off) < 22.5
-    reached = f"{read_calibration(result).quality.predicted_error_mm:.2f} mm"
+    reached = predicted_error(read_calibration(result).quality.predicted_error_mm, None).value
     assert f"The real run should reach {reached}" in report.read_text()
     assert call(calibrate, "install", result, "--cell", "simulated", "--root", root).returncode == 0
     assert installed_calibration(root).created == read_calibration(result).created

@@ -61,7 +61,7 @@ class Operator:
 
         def lead() -> None:
             with self.controller.admin() as admin:
-                admin.ask("hand_move", path=[joints.tolist()], speed_rad_s=1.0)
+                admin.ask("hand_move", joints=joints.tolist(), speed_rad_s=1.0)
                 while admin.ask("state")["moving"]:
                     time.sleep(0.05)
 

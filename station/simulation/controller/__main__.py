@@ -27,7 +27,6 @@ ports
 
 examples
   station-controller --model UR10e --host 127.0.0.2
-  echo '{"cmd": "help"}'  | nc -N 127.0.0.2 29990      every admin command
   echo '{"cmd": "pstop"}' | nc -N 127.0.0.2 29990      a protective stop, now
   echo '{"cmd": "truth"}' | nc -N 127.0.0.2 29990      where the arm truly is
   python -c 'import rtde_control; rtde_control.RTDEControlInterface("127.0.0.2").moveJ([0,-1,1,-1,-1,0])'

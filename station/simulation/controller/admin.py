@@ -1,6 +1,6 @@
 """Port 29990: faults, hands and questions, as JSON lines {"cmd": name, …} → {"ok": true, …}.
 
-`{"cmd": "help"}` lists every command. This port exists only on the simulation.
+This port exists only on the simulation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Annotated, Any, get_type_hints
 import msgspec
 from msgspec import Meta
 
-from station.simulation.controller.arm import JointPath, UnreachableError
+from station.simulation.controller.arm import UnreachableError
 from station.simulation.controller.interpreted import InterpretedProgram
 from station.simulation.controller.machine import Machine
 from station.simulation.controller.network import Cut
@@ -99,14 +99,11 @@ def payload(machine: Machine, kg: NotNegative, cog_m: Three = (0.0, 0.0, 0.0)) -
     machine.robot.payload_cog = cog_m
 
 
-def hand_move(machine: Machine, path: list[Six], speed_rad_s: JointSpeed = 0.5) -> Json:
-    """A person leads the arm through these joints (free-drive, or the pendant's arrows), the fastest joint at
+def hand_move(machine: Machine, joints: Six, speed_rad_s: JointSpeed = 0.5) -> None:
+    """A person leads the arm to these joints (free-drive, or the pendant's arrows), the fastest joint at
     speed_rad_s."""
-    robot = machine.robot
-    length_rad = JointPath(robot.arm.command, *path).length
-    if not robot.lead(tuple(path), speed_rad_s, HAND_RAD_S2):
+    if not machine.robot.lead(joints, speed_rad_s, HAND_RAD_S2):
         raise ValueError("the arm is not free: a program plays, a safety stop holds it, or it has no power")
-    return {"length_rad": length_rad}
 
 
 async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> Json:
@@ -151,43 +148,32 @@ def log(machine: Machine, since_monotonic_ns: int = 0) -> Json:
     return {"entries": journal.entries(since_monotonic_ns), "counts": journal.counts}
 
 
-def help_(_: Machine) -> Json:
-    """This list."""
-    return {"commands": {name: text for name, (text, _) in COMMANDS.items()}}
-
-
-_SHORT: dict[str, tuple[str, Command]] = {
-    "pstop": ("Protective stop now.", lambda m: m.robot.protective_stop("admin")),
-    "estop": ("Emergency stop button pressed: the arm has no power.", lambda m: m.robot.emergency_stop()),
-    "safeguard": ("Safeguard stop: the program pauses.", lambda m: m.robot.safeguard()),
-    "power_off": ("The arm loses power.", lambda m: m.robot.power_off()),
-    "stall": (
-        "RTDE links stay open but no data comes; everything else works.",
-        lambda m, on=True: setattr(m.rtde, "stalled", on),
-    ),
-    "freeze": (
-        "RTDE sends the same packet for ever: the timestamp stands still on a live link.",
-        lambda m, on=True: setattr(m.rtde, "frozen", on),
-    ),
-    "stop_program": ("Stop pressed on the pendant.", lambda m: m.robot.stop_program("pendant")),
-    "pause": ("Pause pressed on the pendant.", lambda m: {"paused": m.robot.pause_program()}),
-    "play": (
-        "Play pressed on the pendant: a paused program goes on.",
-        lambda m: {"playing": m.robot.play_program()},
-    ),
+_SHORT: dict[str, Command] = {
+    "pstop": lambda m: m.robot.protective_stop("admin"),
+    "estop": lambda m: m.robot.emergency_stop(),
+    "safeguard": lambda m: m.robot.safeguard(),
+    "power_off": lambda m: m.robot.power_off(),
+    # RTDE links stay open but no data comes; everything else works.
+    "stall": lambda m, on=True: setattr(m.rtde, "stalled", on),
+    # RTDE sends the same packet for ever: the timestamp stands still on a live link.
+    "freeze": lambda m, on=True: setattr(m.rtde, "frozen", on),
+    "stop_program": lambda m: m.robot.stop_program("pendant"),
+    "pause": lambda m: {"paused": m.robot.pause_program()},
+    "play": lambda m: {"playing": m.robot.play_program()},
 }
-COMMANDS = _SHORT | {
-    name.rstrip("_"): (" ".join(str(function.__doc__).split()), function)
+"""Of a person at the pendant, and of the safety system."""
+COMMANDS: dict[str, Command] = _SHORT | {
+    name: function
     for name, function in list(globals().items())
     if inspect.isfunction(function) and function.__module__ == __name__
 }
-"""Name → what it does, and a function: what this takes besides the machine is what a client sends."""
+"""Name → function: what this takes besides the machine is what a client sends."""
 
 
 @cache
 def _arguments(name: str) -> type[msgspec.Struct]:
     """Return a struct of what a command takes."""
-    _, function = COMMANDS[name]
+    function = COMMANDS[name]
     hints = get_type_hints(function, include_extras=True)
     _, *parameters = inspect.signature(function).parameters.values()
     types = {p.name: hints.get(p.name, type(p.default)) for p in parameters}
@@ -217,9 +203,9 @@ class AdminServer:
         try:
             request = msgspec.json.decode(line, type=Json)
             name = request.pop("cmd")
-            _, command = COMMANDS[name]
+            command = COMMANDS[name]
         except (msgspec.MsgspecError, KeyError, TypeError):
-            return {"ok": False, "error": 'expected {"cmd": name, …}; {"cmd": "help"} lists the names'}
+            return {"ok": False, "error": f'expected {{"cmd": name, …}} with one of {", ".join(COMMANDS)}'}
         try:
             given = msgspec.structs.astuple(msgspec.convert(request, _arguments(name)))
             result = command(self._machine, *given)

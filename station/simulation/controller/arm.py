@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from math import exp, sqrt
 
 from station.simulation.controller.kinematics import JOINT_LIMIT_RAD, ArmGeometry, Vector, between
@@ -25,27 +24,19 @@ class UnreachableError(Exception):
 
 
 class JointPath:
-    """Through given joints one after the other, all joints together, each in proportion to its own way.
+    """To given joints, all together, each in proportion to its own way.
 
     Its parameter `s` is the leading joint's angle [rad], from 0 to `length`.
     """
 
-    def __init__(self, start: Vector, *goals: Vector) -> None:
-        if any(not abs(q) <= JOINT_LIMIT_RAD for goal in goals for q in goal):
-            raise UnreachableError(f"joints {goals} are outside ±2π")
-        self._corners = (start, *goals)
-        self._ends = [0.0]
-        for first, second in pairwise(self._corners):
-            step = max(abs(b - a) for a, b in zip(first, second, strict=True))
-            self._ends.append(self._ends[-1] + step)
-        self.length = self._ends[-1]
+    def __init__(self, start: Vector, goal: Vector) -> None:
+        if any(not abs(q) <= JOINT_LIMIT_RAD for q in goal):
+            raise UnreachableError(f"joints {goal} are outside ±2π")
+        self._start, self._goal = start, goal
+        self.length = max(abs(b - a) for a, b in zip(start, goal, strict=True))
 
     def at(self, s: float) -> Vector:
-        for i, end in enumerate(self._ends[1:]):
-            if s < end:
-                begin = self._ends[i]
-                return between(self._corners[i], self._corners[i + 1], (s - begin) / (end - begin))
-        return self._corners[-1]
+        return between(self._start, self._goal, s / self.length) if s < self.length else self._goal
 
 
 @dataclass(frozen=True)
@@ -102,10 +93,10 @@ Profile = Trapezoid | Braking
 
 
 class JointMotion:
-    """One way through joints. `done` once the arm's command rests at its end."""
+    """One way to joints. `done` once the arm's command rests at its end."""
 
-    def __init__(self, goals: tuple[Vector, ...], speed: float, acceleration: float) -> None:
-        self.goals = goals
+    def __init__(self, goal: Vector, speed: float, acceleration: float) -> None:
+        self.goal = goal
         self.speed = speed
         self.acceleration = acceleration
         self.path: JointPath | None = None
@@ -136,19 +127,19 @@ class SimulatedArm:
     def moving(self) -> bool:
         return self.motion is not None
 
-    def start(self, goals: tuple[Vector, ...], speed: float, acceleration: float) -> JointMotion:
+    def start(self, goal: Vector, speed: float, acceleration: float) -> JointMotion:
         """Goes there; from a running motion it comes to rest first. Raises UnreachableError."""
-        motion = JointMotion(goals, speed, acceleration)
+        motion = JointMotion(goal, speed, acceleration)
         if self.motion is None:
             self._begin(motion)
         else:
-            JointPath(self.command, *goals)  # an impossible goal is refused now, not after the braking
+            JointPath(self.command, goal)  # an impossible goal is refused now, not after the braking
             self.brake(PROGRAM_END_RAD_S2)
             self._next = motion
         return motion
 
     def _begin(self, motion: JointMotion) -> None:
-        motion.path = JointPath(self.command, *motion.goals)
+        motion.path = JointPath(self.command, motion.goal)
         motion.profile = Trapezoid(motion.path.length, motion.speed, motion.acceleration)
         self.motion = motion
         self._misses = (self.miss, self._draw_miss())

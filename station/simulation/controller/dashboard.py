@@ -13,7 +13,6 @@ from station.simulation.controller.network import Connection, Service
 from station.simulation.controller.robot import SimulatedRobot
 
 PORT = 29999
-LINE_LIMIT = 4096
 GREETING = "Connected: Universal Robots Dashboard Server"
 LOCAL_REFUSAL = (
     "Command is not allowed due to safety reasons, please switch robot to Remote Control mode "
@@ -43,8 +42,6 @@ class DashboardConnection(Connection):
 
     def received(self, data: bytes) -> None:
         *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) > LINE_LIMIT:
-            self.transport.close()
         for line in lines:
             text = line.decode("utf-8", errors="replace").strip()
             if text:

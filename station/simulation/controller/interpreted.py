@@ -88,14 +88,13 @@ class InterpretedProgram:
                 raise ScriptRuntimeError(f"{value!r} is no integer of 32 bits")
             out.set(register("output", "int", address), value)
 
-        def set_watchdog(variable_name: str, min_frequency: float = 10.0, action: str = "pause") -> None:
-            if variable_name not in robot.inputs.types or not 0 < min_frequency < math.inf:
-                raise ScriptRuntimeError(f"no watchdog on {variable_name} at {min_frequency} Hz")
-            action = action.lower()  # Universal Robots' own example writes it in capitals
-            if action not in ("ignore", "pause", "stop"):
-                raise ScriptRuntimeError(f"a watchdog's action is no {action}")
-            robot.watchdog_s = 0.0 if action == "ignore" else 1.0 / min_frequency
-            robot.watched, robot.watchdog_pauses = variable_name, action == "pause"
+        def set_watchdog(variable_name: str, min_frequency: float, action: str) -> None:
+            known = variable_name in robot.inputs.types and action.lower() == "stop"
+            if not known or not 0 < min_frequency < math.inf:
+                raise ScriptRuntimeError(
+                    f"watchdog on {variable_name}, {min_frequency} Hz: {NOT_SUPPORTED}"
+                )
+            robot.watchdog_s, robot.watched = 1.0 / min_frequency, variable_name
 
         return {
             "norm": lambda a: math.hypot(*a) if isinstance(a, list) else abs(a),
@@ -123,7 +122,7 @@ class InterpretedProgram:
             raise ScriptRuntimeError(f"movej to {q} with a={a}, v={v}, t={t}")
         self._take_arm("movej")
         self._robot.journal.note("script", "movej", goal=list(goal), a=a, v=v)
-        yield from self._hold(self._robot.arm.start((goal,), v, a))
+        yield from self._hold(self._robot.arm.start(goal, v, a))
 
     def _stopj(self, a: float = 2.0) -> Steps:
         if not (math.isfinite(a) and a > 0):

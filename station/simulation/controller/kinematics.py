@@ -10,7 +10,7 @@ of every model is in `arms.csv`.
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import atan2, copysign, cos, pi, sin, sqrt
 from operator import add
 from pathlib import Path
@@ -30,8 +30,6 @@ class ArmGeometry:
     d_m: Vector
     alpha_rad: Vector = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
     theta_rad: Vector = (0.0,) * 6
-    published: ArmGeometry | None = field(default=None, compare=False)
-    """The table it was made from; None: it is one itself."""
 
     def plus(self, *differences: Vector) -> ArmGeometry:
         """differences: of a_m, d_m, alpha_rad and theta_rad."""
@@ -39,7 +37,7 @@ class ArmGeometry:
             return self
         columns = zip((self.a_m, self.d_m, self.alpha_rad, self.theta_rad), differences, strict=True)
         a, d, alpha, theta = (tuple(map(add, column, by)) for column, by in columns)
-        return ArmGeometry(a, d, alpha, theta, self.published or self)
+        return ArmGeometry(a, d, alpha, theta)
 
 
 def read_table(name: str) -> list[dict[str, str]]:

@@ -39,8 +39,8 @@ def state(robot: SimulatedRobot, first: bool) -> bytes:
 
 
 def _kinematics(robot: SimulatedRobot) -> bytes:
-    """The factory calibration that is stated, never the true arm's lengths."""
-    table = robot.stated_table
+    """The factory calibration, never the true arm's lengths."""
+    table = robot.table
     numbers = (*table.theta_rad, *table.a_m, *table.d_m, *table.alpha_rad)
     joints = zip(table.theta_rad, table.a_m, table.d_m, table.alpha_rad, strict=True)
     checksums = (zlib.crc32(struct.pack(">4d", *joint)) for joint in joints)
@@ -55,12 +55,8 @@ class ScriptConnection(Connection):
         self._uploads = UploadReader()
 
     def received(self, data: bytes) -> None:
-        try:
-            for upload in self._uploads.feed(data):
-                self._robot.upload(upload)
-        except ValueError as error:
-            self._robot.journal.note("upload", "refused", error=str(error))
-            self.transport.close()
+        for upload in self._uploads.feed(data):
+            self._robot.upload(upload)
 
     def opened(self) -> None:
         if self._port != REAL_TIME_PORT:

@@ -72,11 +72,7 @@ class SimulatedRobot(ControllerState):
         if self.watchdog_s > 0 and not late:
             self._silence_s += self.dt_s
             if self._silence_s > self.watchdog_s:
-                self._silence_s = 0.0
-                if self.watchdog_pauses:
-                    self.pause_program()
-                else:
-                    self.stop_program(f"watchdog: {self.watched} was silent")
+                self.stop_program(f"watchdog: {self.watched} was silent")
                 return
         try:
             if not late and not self.program.step():
@@ -108,13 +104,13 @@ class SimulatedRobot(ControllerState):
         playing = self.runtime_state == RuntimeState.PLAYING
         return self.safe and self.robot_mode == RobotMode.RUNNING and not playing
 
-    def lead(self, path: tuple[Vector, ...], speed_rad_s: float, acceleration_rad_s2: float) -> bool:
+    def lead(self, joints_rad: Vector, speed_rad_s: float, acceleration_rad_s2: float) -> bool:
         """A person moves the arm; a paused program's motion is lost. False while it is not free."""
         if not self.free_for_hands:
             return False
         if self.arm.moving:
             self.arm.freeze()
-        self._hands = self.arm.start(path, speed_rad_s, acceleration_rad_s2)
+        self._hands = self.arm.start(joints_rad, speed_rad_s, acceleration_rad_s2)
         return True
 
     def upload(self, upload: Upload) -> None:

@@ -29,7 +29,6 @@ from station.simulation.controller.arm import History, SimulatedArm
 from station.simulation.controller.kinematics import (
     TABLES,
     ArmGeometry,
-    Rigid,
     Vector,
     compose,
     forward,
@@ -50,7 +49,6 @@ _SAFETY_BITS = {
     | SafetyStatus.EMERGENCY_STOPPED
     | SafetyStatus.STOPPED_DUE_TO_SAFETY,
 }
-_JOINT_MODE = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255}
 
 
 Six = Annotated[Vector, Meta(min_length=6, max_length=6)]
@@ -75,8 +73,6 @@ class ArmTruth(msgspec.Struct, frozen=True, kw_only=True):
     factory_d_m: Six = ZEROS
     factory_alpha_rad: Six = ZEROS
     factory_theta_rad: Six = ZEROS
-    states_factory: bool = True
-    """True: port 30001 states the factory-calibrated table; False: the published one."""
 
 
 class Settings(ArmTruth, frozen=True, kw_only=True):
@@ -200,9 +196,8 @@ class ControllerState:
         self.settings = settings
         self.journal = journal
         self.dt_s = 1.0 / settings.rate_hz
-        published = TABLES[settings.model]
-        self.table = published.plus(*settings.differences("factory"))
-        self.stated_table = self.table if settings.states_factory else published
+        self.table = TABLES[settings.model].plus(*settings.differences("factory"))
+        """Factory-calibrated, as port 30001 states it."""
         self.true_table: ArmGeometry = self.table.plus(*settings.differences("dh_delta"))
         self._random = random.Random(settings.seed)
         self.arm = SimulatedArm(self.table, settings.start_joints_rad, self._draw_miss)
@@ -216,7 +211,6 @@ class ControllerState:
         self.watchdog_s = 0.0
         """Longest silence of `watched`, an input variable, that is allowed; 0 = none."""
         self.watched = ""
-        self.watchdog_pauses = False
         self.tell: Callable[[str, str], None] = lambda title, program: None
         """Says to the clients of the primary interface that a program started or stopped."""
         self.clear()
@@ -225,8 +219,8 @@ class ControllerState:
         """Time 0, empty registers; installation and the arm's place survive."""
         self.ticks, self.time_s, self.slider = 0, 0.0, 1.0
         self.history = History(self.dt_s)
-        self._seen: dict[str, tuple[Vector, Vector, Rigid]] = {}
-        """Per tool pose: joints, TCP and pose it was last computed for."""
+        self._posed: tuple[Vector, Vector] = ((), ())
+        """Joints and TCP for which the tool's pose was computed last."""
         self.inputs, self.outputs = (
             VariableStore(VARIABLES[side], self.settings.is_e_series) for side in ("input", "output")
         )
@@ -246,8 +240,10 @@ class ControllerState:
         out.set("actual_q", *arm.actual)
         out.set("target_qd", *arm.command_speed)
         out.set("actual_qd", *arm.actual_speed)
-        self._publish_tool("target_TCP", arm.command)
-        self._publish_tool("actual_TCP", arm.actual)
+        if self._posed[0] is not arm.actual or self._posed[1] is not self.tcp:
+            self._posed = arm.actual, self.tcp
+            tool = compose(forward(self.table, arm.actual), from_pose(self.tcp))
+            out.set("actual_TCP_pose", *to_pose(tool))
         out.set("target_speed_fraction", self.slider)
         out.set("speed_scaling", min(1.0, arm.scale / self.slider) if self.slider > 0 else 1.0)
         out.set("payload", self.payload_kg)
@@ -264,25 +260,3 @@ class ControllerState:
             RobotStatusBits.PROGRAM_RUNNING if playing else 0
         )
         out.set("robot_status_bits", bits)
-        out.set("joint_mode", *(_JOINT_MODE.get(self.robot_mode, 239),) * 6)
-
-    def _publish_tool(self, name: str, joints: Vector) -> None:
-        """Pose and speed of the tool; computed only when joints or TCP changed."""
-        before = self._seen.get(name)
-        if before is not None and before[0] is joints and before[1] is self.tcp:
-            self.outputs.set(f"{name}_speed", *(0.0,) * 6)
-            return
-        T = compose(forward(self.table, joints), from_pose(self.tcp))
-        self.outputs.set(f"{name}_pose", *to_pose(T))
-        self._seen[name] = (joints, self.tcp, T)
-        if before is not None and before[1] is self.tcp:
-            per_s = 1 / (self.dt_s * self.settings.time_scale)
-            self.outputs.set(f"{name}_speed", *twist_between(before[2], T, per_s))
-
-
-def twist_between(last: Rigid, now: Rigid, per_s: float) -> Vector:
-    """Velocity (6,) between two neighbouring poses: m/s, then rad/s, both in base."""
-    l0, l1, l2, lx, l4, l5, l6, ly, l8, l9, l10, lz = last
-    turn = compose(now, (l0, l4, l8, 0.0, l1, l5, l9, 0.0, l2, l6, l10, 0.0))
-    rx, ry, rz = (turn[9] - turn[6]) / 2, (turn[2] - turn[8]) / 2, (turn[4] - turn[1]) / 2
-    return tuple(per_s * v for v in (now[3] - lx, now[7] - ly, now[11] - lz, rx, ry, rz))

@@ -132,7 +132,7 @@ async def link(controller: Start) -> AsyncIterator[UrLink]:
 
 async def test_the_pose_at_a_moment(link: UrLink) -> None:
     with AdminClient(link.config.host) as admin:
-        admin.ask("hand_move", path=[[1.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]], speed_rad_s=0.8)
+        admin.ask("hand_move", joints=[1.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0], speed_rad_s=0.8)
         await asyncio.sleep(0.8)
         asked_ns = time.monotonic_ns() - 60_000_000
         found = link.at(asked_ns)

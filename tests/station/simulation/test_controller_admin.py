@@ -18,7 +18,7 @@ def test_truth_is_where_the_arm_was_at_that_host_time(controller, rtde, admin) -
     ask = admin(running)
     client = rtde(running)
     client.start("timestamp", "actual_q")
-    ask.ask("hand_move", path=[[1.0, *HOME[1:]]], speed_rad_s=1.0)
+    ask.ask("hand_move", joints=[1.0, *HOME[1:]], speed_rad_s=1.0)
     samples = [client.sample() for _ in range(500)]
     zero_ns = ask.ask("state")["controller_zero_monotonic_ns"]
     moving = [s for s in samples if 0.1 < s["actual_q"][0] < 0.9]

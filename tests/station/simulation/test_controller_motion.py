@@ -36,7 +36,7 @@ def seconds_to_rest(arm: SimulatedArm) -> float:
 
 
 def go(arm: SimulatedArm, goal: Vector, speed: float = 1.0, acceleration: float = 2.0) -> None:
-    arm.start((goal,), speed, acceleration)
+    arm.start(goal, speed, acceleration)
 
 
 @given(length=positive, speed=positive, acceleration=positive, share=st.floats(0, 1))

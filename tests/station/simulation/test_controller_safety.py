@@ -69,7 +69,7 @@ def test_hands_move_the_arm_only_when_it_is_free(started) -> None:
     made = started("  movej([3.0, -1.5, 1.5, -1.5, -1.5, 0.0], a=1.0, v=0.2)")
 
     def lead() -> bool:
-        return made.robot.lead((GOAL,), 0.5, 2.0)
+        return made.robot.lead(GOAL, 0.5, 2.0)
 
     assert lead() is False
     made.run(0.5)

@@ -40,22 +40,18 @@ def test_the_true_flange_has_the_true_lengths_and_the_miss(stepped) -> None:
     assert np.allclose(found, expected[:3], atol=1e-12)
 
 
-@pytest.mark.parametrize("true", [True, False])
-def test_a_factory_calibration_is_what_poses_follow_and_is_stated_or_not(stepped, true) -> None:
+def test_a_factory_calibration_is_what_poses_follow(stepped) -> None:
     far = (
         (0.0, 5e-4, 0, 0, 0, 0),
         (0, 0.6, -0.2, -0.4, 0, 0),
         (0, 1e-4, 2e-4, 0, 0, 0),
         (0, 1e-3, 0, 0, 0, 0),
     )
-    made = stepped(**differ("factory", *far), states_factory=true, dh_delta_a_m=(0.0, 1e-3, 0, 0, 0, 0))
+    made = stepped(**differ("factory", *far), dh_delta_a_m=(0.0, 1e-3, 0, 0, 0, 0))
     made.run(0.1)
     own = MODELS["UR10"].calibrated(*far)
     reported = made.robot.outputs.vector("actual_TCP_pose")[:3]
     assert reported == pytest.approx(station_forward(own, made.robot.arm.actual)[:3, 3], abs=1e-12)
-    expected = own if true else MODELS["UR10"]
-    assert made.robot.stated_table.d_m == pytest.approx(expected.d_m)
-    assert made.robot.stated_table.a_m == pytest.approx(expected.a_m)
     flange = np.array(made.robot.true_flange(Q, (0.0,) * 6)).reshape(3, 4)
     worn = own.calibrated(a_m=(0.0, 1e-3, 0, 0, 0, 0))
     assert np.allclose(flange, station_forward(worn, Q)[:3], atol=1e-12)

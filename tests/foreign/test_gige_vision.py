@@ -17,7 +17,7 @@ import pytest
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
-from station.devices.pixels import decode
+from station.devices.aravis_device import decode
 from tests.codes import raises
 from tests.gige_vision import description
 from tests.gige_vision.camera import EmulatedCamera, Packets

@@ -91,9 +91,7 @@ class InterpretedProgram:
         def set_watchdog(variable_name: str, min_frequency: float, action: str) -> None:
             known = variable_name in robot.inputs.types and action.lower() == "stop"
             if not known or not 0 < min_frequency < math.inf:
-                raise ScriptRuntimeError(
-                    f"watchdog on {variable_name}, {min_frequency} Hz: {NOT_SUPPORTED}"
-                )
+                raise ScriptRuntimeError(f"watchdog on {variable_name}, {min_frequency} Hz: {NOT_SUPPORTED}")
             robot.watchdog_s, robot.watched = 1.0 / min_frequency, variable_name
 
         return {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recordings.images import eight_bits, viewable
-from station.devices.pixels import FORMATS, decode
+from station.devices.aravis_device import FORMATS, decode
 from tests.codes import raises
 from tests.gige_vision.pixels import encode
 

@@ -27,7 +27,7 @@ from station.cell.session_folder import list_sessions
 from station.cell.status import MotionPreview, StationState
 from station.operate.motion import prepared_motion
 from station.protocol import verbs
-from station.protocol.client import Client
+from station.protocol.client import Client, who_am_i
 from station.protocol.states import RUNNING
 from station.protocol.verbs import PreviewImage, Purpose
 from station.tui.attendance import Attendance
@@ -43,6 +43,7 @@ from station.tui.plan_screen import PlanScreen
 from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
+from station.tui.stop_key import run_behind_stop_key
 from station.tui.task import DIGITS
 from station.tui.widgets.preview import PreviewPane, sharp_widget
 
@@ -328,7 +329,12 @@ class StationApp(KnowingApp):
                 )
 
 
-def run(socket: Path, who: str = "") -> None:
-    """Open the screen on the daemon that serves `socket` and returns when it is closed."""
-    PreviewPane.sharp = sharp_widget()
-    StationApp(Client(socket, who)).run()
+def run(socket: Path) -> None:
+    """Open the screen on the daemon that serves `socket` and return when it is closed."""
+    client = Client(socket, who_am_i())  # by the person's terminal
+
+    def show() -> None:
+        PreviewPane.sharp = sharp_widget()
+        StationApp(client).run()
+
+    run_behind_stop_key(show, socket)

@@ -1,0 +1,104 @@
+"""F12 in a process of its own between terminal and screen: a process that draws hears keys late.
+
+It passes every byte on as it is, and sends STOP at once. On a computer at load 20 the drawing process alone
+took up to 0.9 s.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import select
+import signal
+import sys
+import termios
+import traceback
+import tty
+from collections.abc import Callable
+from pathlib import Path
+
+from station.cell.process import die_with_parent
+from station.protocol.stop_client import send_stop
+
+_F12 = re.compile(rb"\x1b\[24[;~]")
+_SHORT_OF_F12 = 4
+"""Bytes of the key that may have come before the others."""
+_CHUNK_BYTES = 65536
+
+
+def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
+    """Run `show` in a child with a terminal of its own; return when it ended, SystemExit if it failed.
+
+    In the child's place where this process is not in the foreground of a terminal: nobody presses keys there.
+    """
+    if not _in_foreground():
+        show()
+        return
+    child, glass = pty.fork()
+    if child == 0:
+        os._exit(_shown(show))
+    parent = os.getpid()
+    picture = os.fork()  # no thread: the key would wait for it
+    if picture == 0:
+        die_with_parent(parent)  # it holds the child's terminal open
+        os._exit(_pass_picture(glass))
+    before = termios.tcgetattr(0)
+    signal.signal(signal.SIGWINCH, lambda *_: _resize(glass))
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        tty.setraw(0)
+        _resize(glass)
+        _pass_keys(glass, control, os.pidfd_open(picture))
+    finally:
+        os.kill(picture, signal.SIGKILL)
+        os.waitpid(picture, 0)
+        termios.tcsetattr(0, termios.TCSADRAIN, before)
+        os.close(glass)  # which ends a child that is still there: its terminal is gone
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if code:
+        sys.exit(code)
+
+
+def _in_foreground() -> bool:
+    try:
+        return os.isatty(1) and os.tcgetpgrp(0) == os.getpgrp()
+    except OSError:  # it is no terminal, or another session's
+        return False
+
+
+def _shown(show: Callable[[], None]) -> int:
+    try:
+        show()
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    finally:
+        sys.stdout.flush()
+    return 0
+
+
+def _resize(glass: int) -> None:
+    fcntl.ioctl(glass, termios.TIOCSWINSZ, fcntl.ioctl(0, termios.TIOCGWINSZ, bytes(8)))
+
+
+def _pass_keys(glass: int, control: Path, end: int) -> None:
+    """Pass keys on, unless the screen has not read those before: then only STOP is heard."""
+    before = b""
+    while end not in select.select([0, end], [], [])[0] and (data := os.read(0, _CHUNK_BYTES)):
+        if _F12.search(before + data):
+            send_stop(control)
+        before = data[-_SHORT_OF_F12:]
+        if select.select([], [glass], [], 0)[1]:
+            os.write(glass, data)
+
+
+def _pass_picture(glass: int) -> int:
+    try:
+        while data := os.read(glass, _CHUNK_BYTES):
+            while data:
+                data = data[os.write(1, data) :]
+    except OSError:  # the child ended, or the person's terminal did
+        pass
+    return 0

@@ -23,6 +23,7 @@ from PIL import Image
 from textual.pilot import Pilot
 
 from station.cell.status import StationState
+from station.protocol import verbs
 from station.protocol.client import Client
 from station.tui.app import StationApp
 from station.tui.result import ResultScreen
@@ -123,7 +124,7 @@ async def photograph(cameras: list[Camera], socket: Path) -> None:
         await camera.picture("motion")
         if camera is not cameras[-1]:
             await camera.pilot.press("escape")
-            await camera.pilot.press("f4")
+            await camera.app.desk.ask(verbs.Release())
             await camera.pilot.pause(0.5)
     await cameras[-1].pilot.press("3", "tab", "enter")
     for camera in cameras:

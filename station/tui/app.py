@@ -22,8 +22,6 @@ from textual.binding import Binding, BindingType
 from textual.screen import Screen
 
 from station.cell.errors import StationError
-from station.cell.process import freeze_startup
-from station.cell.session_folder import list_sessions
 from station.cell.status import MotionPreview, StationState
 from station.operate.motion import prepared_motion
 from station.protocol import verbs
@@ -52,9 +50,7 @@ LOOK_S = 2.0
 PREVIEW_PERIOD_S = 0.25
 LIVE_PERIOD_S = 0.1
 """Between two pictures for a browser while the arm rests."""
-SETTLED_S = 2.0
 ACKNOWLEDGE = "Leave STOPPED or FAULT after looking"
-DECELERATES = "It decelerates at once, and the session pauses."
 
 
 SCREENS: tuple[type[StationScreen], ...] = (
@@ -89,7 +85,6 @@ class StationApp(KnowingApp):
         Binding(
             "o", "open_live", "Live picture", show=False, tooltip="The live picture, large, in a browser"
         ),
-        Binding("f4", "release", "Release", show=False, tooltip="Release control of the arm"),
         *(
             Binding(DIGITS[s.MODE], f"switch_mode('{s.MODE}')", s.MODE.title(), group=GO_TO, tooltip=s.TIP)
             for s in SCREENS
@@ -110,7 +105,6 @@ class StationApp(KnowingApp):
     def on_mount(self) -> None:
         self.run_worker(self.desk.follow(), group="follow", exit_on_error=False)
         self.fetch_previews()
-        self.set_timer(SETTLED_S, freeze_startup)
         self.follow_disk()
         self.attendance.begin()
 
@@ -161,18 +155,8 @@ class StationApp(KnowingApp):
         if not self._greeted:
             self._greeted = True
             self.known = replace(self.known, configuration=self.desk.client.config)
-            self.greet()
-
-    @work(exit_on_error=False)
-    async def greet(self) -> None:
-        """Show what is missing to who starts for the first time."""
-        status = self.known.shown
-        if status.playback:
-            return
-        missing, root = status.state is StationState.DISCONNECTED, self.desk.client.root
-        first = root is not None and not await asyncio.to_thread(list_sessions, root)
-        if (missing or (first and not status.session.poses)) and self.current_mode == self.DEFAULT_MODE:
-            await self.switch_mode("connect")
+            if status.state is StationState.DISCONNECTED and not status.playback:
+                self.switch_mode("connect")
 
     @work(exclusive=True, group="checks", exit_on_error=False)
     async def action_look_at_checks(self) -> None:
@@ -279,24 +263,12 @@ class StationApp(KnowingApp):
             self.clear_notifications()  # what they said of the stop is over
 
     @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_release(self) -> None:
-        """Release control, so that another screen or a command may take it."""
-        if (live := self.known.live) is None or not self.desk.has_control():
-            holder = "" if live is None else live.lease.holder
-            self.notify(f"This screen does not have control: {holder or 'nobody'} does.", markup=False)
-            return
-        asked = Confirm("Release control?", f"The arm works. {DECELERATES}", yes="Release")
-        if live.state not in RUNNING or await self.desk.question(asked):
-            await self.desk.ask(verbs.Release())
-            self.notify("Control released: another screen or command may take it.")
-
-    @work(exclusive=True, group="command", exit_on_error=False)
     async def action_leave(self) -> None:
         state = None if self.known.live is None else self.known.live.state
         if state not in (None, StationState.IDLE, StationState.DISCONNECTED):
             held = state in RUNNING and self.desk.has_control()
             text = (
-                f"The arm works, commanded from here. {DECELERATES}"
+                "The arm works, commanded from here. It decelerates at once, and the session pauses."
                 if held
                 else "The daemon and its session stay as they are; `station` opens this screen again."
             )

@@ -15,7 +15,6 @@ from station.protocol.states import LATCHED, RUNNING
 from station.tui.capture_panels import coverage_lines, error_lines, hand_lines, quality_line
 from station.tui.desk import KnowingApp
 from station.tui.frame import Line
-from station.tui.log_screen import newest_events
 from station.tui.progress import LEGEND, progress_lines
 from station.tui.screen import Box, Panel, StationScreen
 from station.tui.stopped import Stopped
@@ -40,11 +39,9 @@ class CaptureScreen(StationScreen):
 
     def body(self) -> ComposeResult:
         with Horizontal(id="live"):
-            with Vertical(id="live-left"):
-                with Box("Camera", id="picture", below="+ found corners  o: in a browser"):
-                    yield PreviewPane(id="preview")
-                    yield Line(lambda known, _: quality_line(known.shown.detection), id="quality")
-                yield Panel("What happened", newest_events, id="events", below="6 all")
+            with Box("Camera", id="picture", below="+ found corners  o: in a browser"):
+                yield PreviewPane(id="preview")
+                yield Line(lambda known, _: quality_line(known.shown.detection), id="quality")
             with Vertical(id="live-right"):
                 with Box("Poses", id="progress", below=LEGEND):
                     yield Panel("", _progress, id="poses")

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import ClassVar
 
 from textual.app import ComposeResult
-from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, VerticalScroll
 from textual.content import Content
 
@@ -25,8 +23,6 @@ STATES: dict[str, tuple[Mark, str]] = {
     "failed": ("failed", "MISSING"),
     "skipped": ("todo", "no need"),
 }
-READY = "Nothing is missing."
-NOT_READY = "This list refreshes every few seconds."
 
 
 def checklist_text(checks: Sequence[Check], width: int) -> Content:
@@ -49,7 +45,11 @@ def checklist_text(checks: Sequence[Check], width: int) -> Content:
         if check.remedy and check.state != "ok":
             rows.append(Content.styled(f"{'':11}→ {hanging(check.remedy, 13)}", "$foreground"))
     missing = any(check.state == "failed" for check in checks)
-    end = mark("look", NOT_READY) if missing else mark("done", READY)
+    end = (
+        mark("look", "This list refreshes every few seconds.")
+        if missing
+        else mark("done", "Nothing is missing.")
+    )
     return lines(*rows, Content(""), end)
 
 
@@ -58,9 +58,6 @@ class ConnectScreen(StationScreen):
 
     MODE, TIP = "connect", "What is missing, and its remedy"
     LOOK = "look_at_checks"
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("r", "app.look_at_checks", "Look again", tooltip="Look at every item again")
-    ]
 
     def on_mount(self) -> None:
         self.query_one("#checklist-scroll").border_title = "What a capture needs"

@@ -33,7 +33,6 @@ STATUS_PERIOD_S = 0.25
 """Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
 RECONNECT_S = 1.0
 GONE = "The daemon ended: the controller stops the arm. This screen goes on when a daemon serves again."
-NOT_OURS = "The station cannot stop this arm: press STOP or the EMERGENCY STOP on its own pendant."
 STOP_NOBODY = "STOP reached nobody: no station runs. If the arm moves, press the EMERGENCY STOP."
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
 REMEDIES = {
@@ -187,9 +186,6 @@ class Desk:
 
     async def stop(self) -> None:
         """STOP, whatever is shown, and also where nobody answers or no connection is left."""
-        if self.known.live is not None and self.known.live.robot.by_hand:
-            self.app.notify(NOT_OURS, severity="error", timeout=10)
-            return
         if not self.client.connected:
             if self.client.send_stop():
                 self.app.notify("STOP was sent without a connection: look at the arm.", severity="warning")

@@ -16,8 +16,8 @@ from textual.widgets import Footer, Static
 
 from station.cell.status import StationStatus
 from station.protocol.states import LATCHED
-from station.tui.task import STEPS, UNTOLD, Action, Known, Step, next_action, steps
-from station.tui.words import MARKS, UNKNOWN, dim, duration, shortened, size, state_of
+from station.tui.task import STEPS, Action, Known, Step, next_action, steps
+from station.tui.words import MARKS, dim, duration, shortened, size, state_of
 
 R = TypeVar("R")
 STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
@@ -196,8 +196,7 @@ def rail_line(made: tuple[Step, ...], mode: str, width: int) -> Content:
         back = _BACK[step.mark] if step.mark in ("now", "stopped") else ""
         head = f" {MARKS[step.mark][0]} {number} {step.mode.title()}".ljust(cell - 1)
         names += [_step_name(step, mode, head), Content.styled("│", "$line")]
-        text = UNKNOWN if step.text == UNTOLD else step.text
-        below = f" {shortened(text, cell - 2, parts=True)}".ljust(cell - 1)
+        below = f" {shortened(step.text, cell - 2, parts=True)}".ljust(cell - 1)
         texts += [Content.styled(below, back or ("$dim" if step.mark != "todo" else "$faint"))]
         texts.append(Content.styled("│", "$line"))
     return Content("").join([*names[:-1], Content("\n"), *texts[:-1]])

@@ -1,4 +1,4 @@
-"""The event log: all that the daemon told, and its newest lines for the capture screen."""
+"""The event log: all that the daemon told."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from textual.widgets import RichLog
 from station.cell.status import Event
 from station.tui.screen import StationScreen
 from station.tui.task import Known
-from station.tui.words import clock, lines, rich_text
+from station.tui.words import clock, rich_text
 
 _LEVELS = {"debug": "$dim", "info": "", "warning": "$warn", "error": "bold $bad"}
 _SIGNS = {"debug": "", "info": "", "warning": "▲ ", "error": "✗ "}
@@ -19,12 +19,6 @@ def event_text(event: Event) -> Content:
     pose = "" if event.pose_index is None else f"pose {event.pose_index + 1} "
     said = _SIGNS[event.level] + pose + event.text
     return Content.assemble((clock(event.wall_ns), "$faint"), "  ", (said, _LEVELS[event.level]))
-
-
-def newest_events(known: Known, width: int, height: int) -> Content:
-    """The newest events, as many as fit."""
-    shown = reversed(known.shown.events[-max(1, height) :])
-    return lines(*(event_text(event) for event in shown))
 
 
 class LogScreen(StationScreen):

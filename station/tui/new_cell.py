@@ -26,7 +26,6 @@ from station.cell.errors import StationError
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
-from station.tui.desk import NOT_OURS
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
 from station.tui.new_cell_steps import DRAWINGS, PAGES, about, accept, file_text, live_lines, next_of, typed
 from station.tui.task import Step
@@ -181,7 +180,7 @@ class NewCell(ThemedApp[Ending]):
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
         if self.setup.draft.posted:
-            self.notify(NOT_OURS, severity="error")
+            self.notify("The station cannot stop this arm: use STOP on its own pendant.", severity="error")
             return
         try:
             await self.setup.stop()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, Vertical
+from textual.containers import Horizontal
 from textual.content import Content
 
 from station.cell.status import PoseStatus
@@ -16,14 +16,13 @@ from station.tui.frame import Line
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
-from station.tui.words import MARKS, Mark, dim, error_facts, facts, lines, many, mark
+from station.tui.words import MARKS, Mark, dim, error_facts, facts, mark
 
 COLUMNS = ("#", "error after", "state", "reason")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves)."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
 NEW = "Plan 25 poses from the configured initial poses (seconds)"
-NEW_FOR_ARM = "Plan 25 poses that also tell the errors of the arm's table, board and lens"
 POSE_VERBS = {"retake": Retake, "skip": Skip}
 _STATES: dict[str, tuple[Mark, str]] = {
     "planned": ("todo", "planned"),
@@ -58,21 +57,7 @@ def facts_line(known: Known) -> Content:
     line += error_facts("predicted error at the end", end_mm, session.working_distance_m)
     if end_mm is not None and goal_mm is not None:
         line += Content("   ") + mark("done" if end_mm <= goal_mm else "look", f"goal {goal_mm:g} mm")
-    left_out = sum(pose.state == "skipped" for pose in poses)
-    return line + dim(f"   {many(left_out, 'pose')} skipped" * bool(left_out))
-
-
-def detail_of(pose: PoseStatus, before: PoseStatus | None) -> Content:
-    """Describe one pose: its reason, what it brings, and what went wrong."""
-    rows = [Content.assemble((f"{pose.name}  ", "bold $strong"), pose.why or "added by hand")]
-    if before is not None and pose.predicted_sigma_mm is not None:
-        gain = [error_facts("", p.predicted_sigma_mm, None) for p in (before, pose)]
-        rows.append(dim("brings ") + dim(" → ").join(gain))
-    seen = "" if pose.corners is None else f"{many(pose.corners, 'corner')} in attempt {pose.attempt}"
-    if pose.reason or seen:
-        kind: Mark = "failed" if pose.state == "failed" else "look" if pose.reason else "done"
-        rows.append(mark(kind, ". ".join(words for words in (pose.reason, seen) if words)))
-    return lines(*rows)
+    return line
 
 
 class PlanScreen(StationScreen):
@@ -80,8 +65,7 @@ class PlanScreen(StationScreen):
 
     MODE, TIP = "plan", "All poses, their gain and reason"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("n", "make('camera')", "New", tooltip=NEW),
-        Binding("m", "make('both')", "New+arm", tooltip=NEW_FOR_ARM),
+        Binding("n", "make", "New", tooltip=NEW),
         Binding("r", "pose('retake')", "Retake", tooltip=RETAKE),
         Binding("s", "pose('skip')", "Skip", tooltip=SKIP),
     ]
@@ -89,10 +73,8 @@ class PlanScreen(StationScreen):
     def body(self) -> ComposeResult:
         yield Line(lambda known, _: facts_line(known), id="plan-facts")
         with Horizontal(id="plan"):
-            with Vertical(id="plan-left"):
-                with Box("Poses", id="plan-poses", below="predicted error after each"):
-                    yield Rows(*COLUMNS, id="plan-table")
-                yield Panel("Why", self._why, id="plan-detail")
+            with Box("Poses", id="plan-poses", below="predicted error after each  Enter tells all"):
+                yield Rows(*COLUMNS, id="plan-table")
             yield Panel("The cell", self._cell, id="plan-cell", below=LEGEND)
 
     def show(self, known: Known) -> None:
@@ -103,18 +85,18 @@ class PlanScreen(StationScreen):
         self.table.show([row_of(pose) for pose in status.session.poses])
         self.draw_panels(known)
 
-    def _why(self, known: Known, width: int, height: int) -> Content:
-        poses, line = known.shown.session.poses, self.table.cursor_row
-        if not line < len(poses):
-            return dim(NO_PLAN)
-        return detail_of(poses[line], poses[line - 1] if line else None)
-
     def _cell(self, known: Known, width: int, height: int) -> Content:
         scene = cell_scene(known.configuration, known.shown)
         if scene is None:
             return dim("To draw the cell, the configuration needs initial camera and board poses.")
         chosen = self.table.cursor_row if known.shown.session.poses else None
         return draw(scene, known.shown, chosen, width, height)
+
+    def on_data_table_row_selected(self) -> None:
+        """Tell all of a pose, of which the table may show the beginning."""
+        pose = self.known.shown.session.poses[self.table.cursor_row]
+        told = ". ".join(words for words in (pose.name, pose.why, pose.reason) if words)
+        self.notify(told, timeout=10, markup=False)
 
     def action_pose(self, verb: str) -> None:
         status = self.known.live
@@ -123,5 +105,5 @@ class PlanScreen(StationScreen):
         else:
             self.ask(POSE_VERBS[verb](status.session.poses[self.table.cursor_row].index))
 
-    def action_make(self, aim: Literal["camera", "both"]) -> None:
-        self.ask(MakePlan(25, seed=1, aim=aim), PREPARE_S)
+    def action_make(self) -> None:
+        self.ask(MakePlan(25, seed=1), PREPARE_S)

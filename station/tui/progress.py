@@ -26,10 +26,10 @@ _WIDE = 46
 
 def pose_line(status: StationStatus, width: int = _WIDE) -> Content:
     """Draw the steps of the pose under way; at rest say what comes next."""
-    session = status.session
     pose = pose_under_way(status)
     if pose is None:
-        return counted_line(session)
+        again = sum(pose.kept for pose in status.session.poses)
+        return dim(f"{again} to be captured again" if again else "resting")
     if pose.state == "failed":
         return mark("failed", f"{pose.name}: {pose.reason}")
     at = list(_STEPS).index(pose.state) if pose.state in _STEPS else (4 if pose.state == "done" else -1)
@@ -50,20 +50,6 @@ def pose_under_way(status: StationStatus) -> PoseStatus | None:
     pose = session.poses[session.current]
     resting = status.state in (StationState.IDLE, StationState.PAUSED)
     return None if pose.state == "done" and resting else pose
-
-
-def counted_line(session: SessionStatus) -> Content:
-    """Say what comes next while no pose is under way."""
-    if not session.poses:
-        return dim("No plan yet: 2, then n makes one.")
-    if not session.name:
-        return dim("Not begun: F5 shows the motion and asks first.")
-    again = sum(pose.kept for pose in session.poses)
-    if session.calibration:
-        return mark("done", "finished and solved: 4 shows the result")
-    if session.recording:
-        return mark("done", "finished: k on 5 judges it" if session.check else "finished: F9 solves it")
-    return dim(f"{again} to be captured again" if again else "resting")
 
 
 def progress_lines(known: Known, width: int, height: int) -> Content:

@@ -99,17 +99,12 @@ def check_rows(result: Result, calibration: Calibration) -> list[Row]:
         sigmas, name = touch_sigmas(touch), f"touch, corner {touch.corner}"
         kind: Mark = "done" if agrees(touch) else "failed"
         rows.append(_row(kind, name, f"{sigmas:.1f} σ", sigmas, LIMIT_SIGMAS, "≤ 3.0 σ", touch_text(touch)))
-    if not calibration.verification:
-        told = "h: a pointer's tip is brought onto corners of the board, by hand, and the arm is read."
-        rows.append(_row("todo", "touch test", text=told))
     for entry in reversed(result.state.drift if result.installed else ()):
         end = after_drift_check(entry)
         kind = "failed" if not entry.passed else "done" if end.way is Way.KEEP else "look"
         name = time.strftime("drift check %d %b", time.localtime(entry.wall_s))
         value = f"{1000 * float(np.linalg.norm(entry.shift[:3])):.2f} mm"
         rows.append(_row(kind, name, value, entry.statistic, entry.threshold, text=str(end)))
-    if result.installed and not result.state.drift:
-        rows.append(_row("todo", "drift check", text="d captures one: eight poses, two minutes."))
     return rows
 
 

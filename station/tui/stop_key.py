@@ -23,8 +23,6 @@ from station.cell.process import die_with_parent
 from station.protocol.stop_client import send_stop
 
 _F12 = re.compile(rb"\x1b\[24[;~]")
-_SHORT_OF_F12 = 4
-"""Bytes of the key that may have come before the others."""
 _CHUNK_BYTES = 65536
 
 
@@ -38,7 +36,12 @@ def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
         return
     child, glass = pty.fork()
     if child == 0:
-        os._exit(_shown(show))
+        try:
+            show()
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
     parent = os.getpid()
     picture = os.fork()  # no thread: the key would wait for it
     if picture == 0:
@@ -52,10 +55,8 @@ def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
         _resize(glass)
         _pass_keys(glass, control, os.pidfd_open(picture))
     finally:
-        os.kill(picture, signal.SIGKILL)
-        os.waitpid(picture, 0)
         termios.tcsetattr(0, termios.TCSADRAIN, before)
-        os.close(glass)  # which ends a child that is still there: its terminal is gone
+        os.kill(child, signal.SIGHUP)  # unless it ended: its terminal goes
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if code:
         sys.exit(code)
@@ -68,17 +69,6 @@ def _in_foreground() -> bool:
         return False
 
 
-def _shown(show: Callable[[], None]) -> int:
-    try:
-        show()
-    except BaseException:
-        traceback.print_exc()
-        return 1
-    finally:
-        sys.stdout.flush()
-    return 0
-
-
 def _resize(glass: int) -> None:
     fcntl.ioctl(glass, termios.TIOCSWINSZ, fcntl.ioctl(0, termios.TIOCGWINSZ, bytes(8)))
 
@@ -89,7 +79,7 @@ def _pass_keys(glass: int, control: Path, end: int) -> None:
     while end not in select.select([0, end], [], [])[0] and (data := os.read(0, _CHUNK_BYTES)):
         if _F12.search(before + data):
             send_stop(control)
-        before = data[-_SHORT_OF_F12:]
+        before = data[-4:]  # a key may come in two parts
         if select.select([], [glass], [], 0)[1]:
             os.write(glass, data)
 

@@ -11,7 +11,7 @@ from station.operate.ending import Way, after_solve
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Check
 from station.tui.installed import Kept, Result
-from station.tui.words import Mark, duration, many, sentence
+from station.tui.words import UNKNOWN, Mark, duration, many, sentence
 
 STEPS = ("connect", "plan", "capture", "result")
 DIGITS = {mode: str(place) for place, mode in enumerate((*STEPS, "sessions", "log"), start=1)}
@@ -107,7 +107,7 @@ def steps(known: Known) -> tuple[Step, ...]:
     """The rail, from left to right."""
     status = known.live
     if status is None:
-        return tuple(Step(mode, "todo", UNTOLD) for mode in STEPS)
+        return tuple(Step(mode, "todo", UNKNOWN) for mode in STEPS)
     made = [_connect(known, status), _plan(status), _capture(status), _result(known)]
     now = _now(made, status, known)
     return tuple(
@@ -116,9 +116,6 @@ def steps(known: Known) -> tuple[Step, ...]:
         else step
         for place, step in enumerate(made)
     )
-
-
-UNTOLD = "not known"
 
 
 def _now(made: list[Step], status: StationStatus, known: Known) -> int:

@@ -81,23 +81,15 @@ class Glass:
 
 
 class ScreenProcess:
-    """`station tui` in a terminal of its own; `command`: another one of `station`'s."""
+    """`station tui` in a terminal of its own, or another program in Python."""
 
-    def __init__(
-        self, socket: Path, columns: int = 100, rows: int = 34, command: tuple[str, ...] = ()
-    ) -> None:
+    def __init__(self, socket: Path, program: str = "", columns: int = 100, rows: int = 34) -> None:
         self._master, slave = pty.openpty()
+        own = ("-m", "station.cli", "tui", "--socket", str(socket))
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
         self.process = subprocess.Popen(
             # The terminal controls it, as a person's does: the daemon asks for that before a real arm moves.
-            [
-                "setsid",
-                "--ctty",
-                sys.executable,
-                "-m",
-                "station.cli",
-                *(command or ("tui", "--socket", str(socket))),
-            ],
+            ["setsid", "--ctty", sys.executable, *(("-c", program) if program else own)],
             stdin=slave,
             stdout=slave,
             stderr=slave,
@@ -122,12 +114,12 @@ class ScreenProcess:
     def press_now(self, key: str) -> None:
         os.write(self._master, KEYS.get(key, key).encode())
 
-    def wait_for(self, pattern: str, give_up_after_s: float = PATIENCE_S) -> str:
+    def wait_for(self, pattern: str, give_up_after_s: float = PATIENCE_S, ended: bool = False) -> str:
         """The glass when `pattern` is on it."""
         give_up_s = time.monotonic() + give_up_after_s
         while not re.search(pattern, text := self.glass.text):
             assert time.monotonic() < give_up_s, f"'{pattern}' never came:\n{text}"
-            assert self.process.poll() is None, f"the screen ended:\n{text}"
+            assert ended or self.process.poll() is None, f"the screen ended:\n{text}"
             time.sleep(0.05)
         return text
 

@@ -11,21 +11,13 @@ from station.cell.config import matrix4
 from station.cell.layout import layout_of
 from station.cell.status import ArmCondition, EstimateStatus, PoseStatus, StationState
 from station.tui.capture_panels import coverage_lines, error_lines
-from station.tui.progress import chips, counted_line, pose_line
+from station.tui.progress import chips, pose_line
 from station.tui.stopped import stopped_text
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
 from station.tui.widgets.cell_drawing import draw
 from tests.recordings.small_recording import make_state
 from tests.tui.conftest import CELL, FakeLink, idle, in_session, opened, until
-
-
-def test_what_comes_next_fits_what_was_recorded() -> None:
-    assert "F5" in counted_line(in_session(idle(), name="").session).plain
-    assert "F9" in counted_line(in_session(idle(), recording="/r").session).plain
-    assert "4 shows" in counted_line(in_session(idle(), recording="/r", calibration="/c").session).plain
-    check = counted_line(in_session(idle(), recording="/r", check=True).session).plain
-    assert "k on 5" in check and "F9" not in check
 
 
 def test_steps_of_a_pose_are_marked_one_after_the_other() -> None:

@@ -18,7 +18,7 @@ from textual.pilot import Pilot
 from station.cell.status import StationState
 from station.protocol import verbs
 from station.tui.dialogs import ConfirmMotion
-from station.tui.widgets.preview import SWITCH, PreviewPane, sharp_widget
+from station.tui.widgets.preview import PreviewPane, sharp_widget
 from tests.tui.conftest import FakeLink, app_on, idle, opened, until
 
 VT340, PLAIN = b"\x1b[?63;1;2;4;6;9;15;22c", b"\x1b[?62;22c"
@@ -65,7 +65,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     with os.fdopen(slave) as keys, os.fdopen(os.dup(slave), "w") as glass:
         monkeypatch.setattr(sys, "__stdin__", keys)
         monkeypatch.setattr(sys, "__stdout__", glass)
-        for name in ("SSH_TTY", "SSH_CONNECTION", SWITCH, "TEXTUAL_THEME"):
+        for name in ("SSH_TTY", "SSH_CONNECTION", "TEXTUAL_THEME"):
             monkeypatch.delenv(name, raising=False)
         monkeypatch.setenv("TERM", "xterm-256color")
         for name in [name for name in sys.modules if name.startswith("textual_image")]:
@@ -79,7 +79,6 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     [
         ({}, VT340, "SixelImage"),
         ({}, PLAIN, ""),
-        ({"SSH_TTY": "/dev/pts/3", SWITCH: "sharp"}, VT340, "SixelImage"),
     ],
 )
 def test_the_terminal_is_asked(
@@ -102,7 +101,7 @@ def test_the_terminal_is_asked(
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [(SWITCH, "blocks"), ("SSH_TTY", "/dev/pts/3"), ("TERM", "linux"), ("TEXTUAL_THEME", "terminal")],
+    [("SSH_TTY", "/dev/pts/3"), ("TERM", "linux"), ("TEXTUAL_THEME", "terminal")],
 )
 def test_where_half_blocks_are_wanted_it_is_not_even_asked(
     terminal: int, name: str, value: str, monkeypatch: pytest.MonkeyPatch

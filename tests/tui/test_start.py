@@ -62,7 +62,7 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink, tmp_path: Path
     link.answers |= {"doctor": THERE}
     link.root = tmp_path
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConnectScreen))  # before the first session
+        await pilot.press("1")
         await until(pilot, lambda: "Nothing&#160;is&#160;missing" in pilot.app.export_screenshot())
         for screen, key, words in reasons:
             await pilot.press(screen)
@@ -94,12 +94,12 @@ async def test_the_highlighted_pose_is_told_in_full(link: FakeLink) -> None:
     reason = "no board in the picture: " + "look at the light " * 4
     poses[1] = msgspec.structs.replace(poses[1], state="failed", reason=reason, attempt=2)
     link.show(in_session(status, poses=tuple(poses)))
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await pilot.pause()
-        await pilot.press("2", "down")
-        await until(pilot, lambda: reason in text_of(pilot.app, "#plan-detail"))
+        await pilot.press("2", "down", "enter")
+        await until(pilot, lambda: reason in said(pilot))
         link.show(in_session(status, poses=()))
-        await until(pilot, lambda: text_of(pilot.app, "#plan-detail") == NO_PLAN)
+        await until(pilot, lambda: text_of(pilot.app, "#plan-facts") == NO_PLAN)
 
 
 def test_every_key_has_a_tooltip() -> None:

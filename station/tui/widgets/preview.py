@@ -28,8 +28,6 @@ from station.protocol import verbs
 from station.protocol.client import Client
 from station.tui.themes import TERMINAL, chosen_theme
 
-SWITCH = "STATION_PICTURES"
-"""`blocks`: never sharp; `sharp`: over ssh too, where STOP's key and every picture share one line."""
 SHARP_S = 1.0
 """Between two sharp images at least: drawing one takes up to 0.1 s of the processor."""
 LEVELS = 20
@@ -59,10 +57,9 @@ def sharp_widget() -> Any:
 
     The library asks the terminal when it is imported: only before the screen reads its keys.
     """
-    wish = os.environ.get(SWITCH, "")
     remote = "SSH_TTY" in os.environ or "SSH_CONNECTION" in os.environ
     keys, glass = sys.__stdin__, sys.__stdout__
-    if wish == "blocks" or (remote and wish != "sharp") or chosen_theme() == TERMINAL:
+    if remote or chosen_theme() == TERMINAL:  # over ssh STOP's key and every picture share one line
         return None
     if keys is None or glass is None or not keys.isatty() or not glass.isatty():
         return None

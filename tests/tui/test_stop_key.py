@@ -1,0 +1,47 @@
+"""F12 is heard by a process that does not draw; keys and picture pass through it."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+from station.cell.socket_folder import stop_socket
+from tests.patience import PATIENCE_S
+from tests.tui.terminal import ScreenProcess
+
+BUSY = "sys.stdout.write('drawing' + chr(10)); sys.stdout.flush()\nwhile True: pass"
+ECHO = "print('size', *os.get_terminal_size()); print('read', sys.stdin.readline())"
+
+
+def behind(control: Path, show: str) -> ScreenProcess:
+    program = f"import os, sys\ndef show(): exec({show!r})\n"
+    program += "from pathlib import Path\nfrom station.tui.stop_key import run_behind_stop_key\n"
+    program += f"run_behind_stop_key(show, Path({str(control)!r}))"
+    return ScreenProcess(control, program)
+
+
+def test_a_screen_that_reads_no_key_ever_does_not_hold_up_stop(tmp_path: Path) -> None:
+    control = tmp_path / "c.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as daemon:
+        daemon.bind(str(stop_socket(control)))
+        daemon.settimeout(PATIENCE_S)
+        screen = behind(control, BUSY)
+        try:
+            screen.wait_for("drawing")
+            screen.press_now("x" * 10_000)  # more than a terminal keeps for a program that does not read
+            screen.press_now("\x1b[2")
+            screen.press_now("4~")
+            assert daemon.recv(16) == b"STOP"
+        finally:
+            screen.end()
+
+
+def test_keys_size_and_picture_pass_and_its_end_is_the_screen_s(tmp_path: Path) -> None:
+    screen = behind(tmp_path / "c.sock", ECHO)
+    try:
+        screen.wait_for("size 100 34")
+        screen.press_now("hello\n")
+        screen.wait_for("read hello", ended=True)
+        assert screen.process.wait(PATIENCE_S) == 0
+    finally:
+        screen.end()

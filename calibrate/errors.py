@@ -29,21 +29,9 @@ def require_choice(name: str, given: object, choices: Iterable[str]) -> None:
 
 
 class TooFewViewsError(CalibrationError):
-    """Fewer usable views than the method needs."""
+    """Fewer usable views than the method needs; code `squares-counted` or `mirrored` where that is why."""
 
     code = "too-few-views"
-
-
-class SquaresCountedError(TooFewViewsError):
-    """A chessboard was declared in squares, not in inner corners; values: `columns`, `rows` seen."""
-
-    code = "squares-counted"
-
-
-class MirroredImagesError(TooFewViewsError):
-    """The board's markers can be read only in the mirror image."""
-
-    code = "mirrored"
 
 
 class DegenerateMotionError(CalibrationError):

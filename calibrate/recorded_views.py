@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
-from calibrate.errors import BadViewsError, MirroredImagesError, SquaresCountedError, TooFewViewsError
+from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import pose, rotation_from_rpy
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.kinematics import MODELS, RobotModel, table_of_axes
@@ -249,7 +249,8 @@ def _too_few(
     causes = Counter(detection.cause for detection in seen.values())
     often = max(1, len(missing) / 2)
     if causes["squares-counted"] >= often:
-        return SquaresCountedError(
+        return TooFewViewsError(
+            "squares-counted",
             path=recording.path,
             counted=causes["squares-counted"],
             images=images,
@@ -258,7 +259,7 @@ def _too_few(
             rows=spec.rows - 1,
         )
     if causes["mirrored"] >= often:
-        return MirroredImagesError(path=recording.path, mirrored=causes["mirrored"], images=images)
+        return TooFewViewsError("mirrored", path=recording.path, mirrored=causes["mirrored"], images=images)
     counted = f"{recording.path}: the board is seen in {found} of {images} images"
     advice = "Check the board's kind, columns and rows; solve again with --board to try another."
     if images == 0:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from calibrate.annotate import annotate as draw
-from calibrate.cli.output import AsJson, detection_progress, out, print_json
+from calibrate.cli.output import detection_progress, out
 from calibrate.files.calibration import read_calibration
 from recordings.reader import open_recording
 
@@ -17,7 +17,6 @@ def annotate(
     recording: Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's folder")],
     calibration: Annotated[Path, typer.Argument(help="The calibration file to draw into it")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The recording to write (.mcap)")],
-    as_json: AsJson = False,
 ) -> None:
     """Draw a calibration into a recording, for Foxglove, Lichtblick or rerun.
 
@@ -28,8 +27,4 @@ def annotate(
     with detection_progress() as progress:
         found = draw(source, read_calibration(calibration), output, progress)
     rejected = [view.index + 1 for view in found if view.rejected]
-    if as_json:
-        views = [{"index": v.index, "rms_px": v.rms_px, "rejected": v.rejected} for v in found]
-        print_json({"output": str(output), "views": views})
-        return
     out.print(f"{output}: {len(found)} views" + (f", rejected: {rejected}" if rejected else ""))

@@ -91,7 +91,7 @@ def drift_check(
     if production:
         result = _check_pictures(source, prepared, calibration)
         text = production_text(result, len(prepared.views))
-        if noted and not result.passed:  # none passed proves nothing
+        if noted and not result.passed:  # no alarm is no proof
             validity = _judge(result, source.name, datetime.now(UTC), root, camera)
     else:
         _require_this_cell(source, info, calibration, root, camera, noted)

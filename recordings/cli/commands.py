@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -45,13 +44,11 @@ def export_command(
         Target,
         typer.Option("--to", help="folder: images and poses, for `import`; ros2: a bag."),
     ],
-    as_json: AsJson = False,
 ) -> None:
     """Write images and poses, or a ROS 2 bag."""
     from recordings.exporters.export import export_recording
 
-    path = export_recording(open_recording(recording), output, to)
-    print(json.dumps({"output": str(path)}) if as_json else f"{path} written")
+    print(f"{export_recording(open_recording(recording), output, to)} written")
 
 
 def recover_command(

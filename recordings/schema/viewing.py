@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -21,6 +20,7 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from recordings.images import Pixels, raw_encoding
 from recordings.schema.messages import (
@@ -180,19 +180,9 @@ def log_line(event: CaptureEvent, time_ns: int) -> Any:
 
 
 def quaternion_xyzw(transform: Matrix4) -> tuple[float, float, float, float]:
-    """Quaternion of a rigid transform, w ≥ 0, from its largest component (Shepperd 1978)."""
-    (a, b, c, _), (d, e, f, _), (g, h, i, _) = transform[:3]
-    largest = max(a, e, i, a + e + i)
-    if largest == a:
-        x, y, z, w = 1 + a - e - i, b + d, c + g, h - f
-    elif largest == e:
-        x, y, z, w = b + d, 1 - a + e - i, f + h, c - g
-    elif largest == i:
-        x, y, z, w = c + g, f + h, 1 - a - e + i, d - b
-    else:
-        x, y, z, w = h - f, c - g, d - b, 1 + a + e + i
-    norm = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), w)
-    return x / norm, y / norm, z / norm, w / norm
+    """Quaternion of a rigid transform, w ≥ 0."""
+    x, y, z, w = Rotation.from_matrix(np.array(transform)[:3, :3]).as_quat(canonical=True).tolist()
+    return x, y, z, w
 
 
 Colour = tuple[float, float, float, float]

@@ -88,36 +88,26 @@ def _write(name: str, text: str) -> None:
 
 
 def page() -> str:
-    """The rows in SHOWN of every result; of a benchmark that is not named there, the first three."""
+    """The rows in SHOWN of every result."""
     sections = [HEAD]
-    for result in sorted(RESULTS.glob("*.md"), key=_order):
-        text = result.read_text()
+    for name, wanted in SHOWN.items():
+        text = (RESULTS / f"{name}.md").read_text()
         title = text.partition("\n")[0].removeprefix("# ")
-        rows = "\n".join(_shown(text, SHOWN.get(result.stem)))
-        sections.append(f"\n## {result.stem}\n{title}\n{rows}\n")
+        sections.append(f"\n## {name}\n{title}\n" + "\n".join(_shown(text, wanted)) + "\n")
     return "".join(sections)
 
 
-def _order(result: Path) -> tuple[int, str]:
-    """Order results as in SHOWN, others behind."""
-    names = list(SHOWN)
-    return (names.index(result.stem) if result.stem in names else len(names), result.stem)
-
-
-def _shown(text: str, wanted: str | None) -> Iterator[str]:
+def _shown(text: str, wanted: str) -> Iterator[str]:
     """Rows that match, each table with its head (the head's rule is short), and short lines that match."""
     head: list[str] = []
-    first = 3
     for line, after in itertools.pairwise([*text.splitlines()[2:], ""]):
         row = line.startswith("|")
         if re.fullmatch(r"\|([- ]+\|)+", after):
             head = ["", line, "|-" * (after.count("|") - 1) + "|"]
-        elif not line or re.fullmatch(r"\|([- ]+\|)+", line) or (not row and (not wanted or len(line) > 80)):
-            continue
-        elif re.search(wanted, line) if wanted is not None else first:
+        elif re.search(wanted, line) and (row or len(line) <= 80) and not re.fullmatch(r"\|([- ]+\|)+", line):
             yield from head if row else [""]
             yield line
-            head, first = [], first - 1
+            head = []
 
 
 def _replace(path: Path, text: str) -> None:

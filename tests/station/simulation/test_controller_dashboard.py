@@ -7,7 +7,6 @@ import socket
 import pytest
 
 from station.simulation.controller.dashboard import GREETING, LOCAL_REFUSAL
-from tests.patience import wait_until
 
 pytestmark = pytest.mark.process
 
@@ -55,13 +54,3 @@ def test_remote_control_frees_the_next_connection_only(controller, admin) -> Non
         lines.flush()
         assert lines.readline().strip() == LOCAL_REFUSAL
     assert dashboard(running.host, "stop")[1] == "Stopped"
-
-
-def test_a_bare_line_on_a_script_port_replaces_the_program(controller, admin) -> None:
-    running = controller("UR10")
-    ask = admin(running)
-    ask.ask("foreign", name="job.urp")
-    with socket.create_connection((running.host, 30001), 3) as link:
-        link.sendall(b"textmsg(1)\n")
-        wait_until(lambda: "upload: textmsg(1)" in ask.ask("log")["counts"])
-    wait_until(lambda: ask.ask("state")["program"] != "job.urp")

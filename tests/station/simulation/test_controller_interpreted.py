@@ -21,13 +21,6 @@ GO = f"  thread go():\n    movej({GOAL}, a=1.0, v=0.5)\n  end\n  h = run go()\n{
 # -- moves ----------------------------------------------------------------------------------------------
 
 
-def test_a_move_takes_its_time_and_ends_the_program(started) -> None:
-    made = started(f"  movej({GOAL}, a=1.0, v=0.5)")
-    took = made.run_until(lambda: not made.plays)
-    assert took == pytest.approx(0.4 / 0.5 + 0.5 / 1.0, abs=0.03)
-    assert list(made.robot.arm.command) == pytest.approx([0.4, -1.5, 1.5, -1.5, -1.5, 0.1])
-
-
 # -- stops and errors -----------------------------------------------------------------------------------
 
 
@@ -86,26 +79,7 @@ def test_numbers_from_a_client_that_are_none_move_nothing(started) -> None:
 # -- time -----------------------------------------------------------------------------------------------
 
 
-def test_a_program_starts_after_its_delay(stepped) -> None:
-    made = stepped()
-    made.upload("def prog():\n  sleep(1)\nend\n")
-    made.run(0.03)
-    assert not made.plays
-    made.run(0.05)
-    assert made.plays
-
-
 COUNTS = "  n = 0\n  while n < 50:\n    n = n + 1\n    sync()\n  end"
-
-
-def test_a_paused_program_waits_and_goes_on(started) -> None:
-    made = started(COUNTS)
-    made.run(0.1)
-    assert made.robot.pause_program()
-    made.run(2.0)
-    assert made.robot.program is not None and not made.plays
-    assert made.robot.play_program()
-    assert made.run_until(lambda: not made.plays) == pytest.approx(0.3, abs=0.05)
 
 
 def test_cycles_that_run_at_once_are_one_to_the_program(started) -> None:

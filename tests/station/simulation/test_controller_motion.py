@@ -64,18 +64,6 @@ def test_stopping_takes_speed_over_deceleration(deceleration: float) -> None:
     assert arm.command[0] < 2.9
 
 
-def test_a_stop_at_a_low_slider_starts_from_the_low_speed() -> None:
-    arm = make_arm()
-    go(arm, (3.0, *HOME[1:]), 1.0, 10.0)
-    run(arm, 1.0, scale=0.25)
-    before = arm.command[0]
-    arm.brake(2.0)
-    arm.step(DT, 0.25)
-    assert arm.command_speed[0] < 0.25
-    run(arm, 0.5, scale=0.25)
-    assert arm.command[0] - before == pytest.approx(0.25**2 / (2 * 2.0), rel=0.02)
-
-
 def test_every_stop_misses_differently_and_never_jumps() -> None:
     draws = iter(float(i) for i in range(1, 100))
 

@@ -94,18 +94,3 @@ def test_the_wheel_moves_stops_and_ends(controller: Start, model: str) -> None:
     assert result["moveJ"] and result["accepted"] and not result["there"]
     assert result["waits"] == 0 and result["short"] > 0.1 and result["finished"]
     assert result["replaced"] == [True, True] and result["running"] is False
-
-
-def test_what_the_station_never_asks_for_is_refused_and_moves_nothing(controller: Start) -> None:
-    running = controller("UR10e")
-    result = wheel(
-        running,
-        """
-        control = rtde_control.RTDEControlInterface(host)
-        result["moved"] = control.moveL([0.5, 0.2, 0.5, 0, 3, 0], 0.1, 0.5)
-        """,
-    )
-    with running.admin() as admin:
-        log, state = admin.ask("log"), admin.ask("state")
-    assert not result["moved"] and log["counts"]["script: movel"] == 1
-    assert state["program"] is None and not state["moving"]

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 
@@ -14,7 +13,6 @@ from calibrate.boards.detect import detect
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
 from station.simulation.cells import make_cell
-from station.simulation.gige import DESCRIPTION
 from station.simulation.launch import SimulatedController, start_gige
 from station.simulation.netns import is_isolated, isolated_command
 from station.simulation.truth import write_truth
@@ -46,12 +44,6 @@ async def test_its_pictures_show_the_board_from_where_the_arm_stands(
             await camera.close()
 
 
-@pytest.mark.gige
-def test_a_second_camera_on_the_same_address_is_refused(lonely_network: None) -> None:
-    with start_gige(), raises("simulation-not-started"):
-        start_gige()
-
-
 def test_a_command_can_be_run_with_nothing_but_lo() -> None:
     code = "from station.simulation.netns import is_isolated; print(is_isolated())"
     done = subprocess.run(
@@ -60,11 +52,3 @@ def test_a_command_can_be_run_with_nothing_but_lo() -> None:
     if done.returncode != 0:
         pytest.skip(f"no network namespaces here: {done.stderr.strip()}")
     assert done.stdout.strip() == "True"
-
-
-def test_the_description_is_whole_and_every_reference_leads_somewhere() -> None:
-    root = ElementTree.parse(DESCRIPTION).getroot()
-    names = {node.get("Name") for node in root.iter() if node.get("Name")}
-    for tag in ("pFeature", "pValue", "pPort", "pMax", "pVariable"):
-        for node in root.iter(f"{{http://www.genicam.org/GenApi/Version_1_1}}{tag}"):
-            assert node.text in names, f"{tag} {node.text}"

@@ -117,11 +117,12 @@ async def test_a_posted_arm_is_there_with_its_first_pose_and_its_states_carry_po
     exact = pose_from_quaternion(POSE[:3], POSE[3:])
     poster.post(joints_rad=[0.1] * 7)
     poster.post(exact.tolist())
-    await until(lambda: len(states) == 2)
+    poster.post([*POSE[:3], *(-x for x in POSE[3:])])  # the same rotation
+    await until(lambda: len(states) == 3)
     assert (await arm.connect()).model == "arm of three words"
     for state in states:
         assert np.abs(flange_pose(state, arm.identity.tcp_offset) - exact).max() < 1e-14
-    assert [len(state.joints_rad) for state in states] == [7, 0]
+    assert [len(state.joints_rad) for state in states] == [7, 0, 0]
 
 
 async def test_rest_and_the_state_of_a_moment_are_found_without_joints(arm: PostedArm) -> None:

@@ -80,6 +80,8 @@ class _Bounded(AbstractContextManager[None]):
             signal.signal(signal.SIGALRM, self._handler_before)
             self._last.cancel()
         resource.setrlimit(resource.RLIMIT_DATA, self._memory_before)
+        if problem is not None and problem.__context__ is self._late_error:
+            raise self._late_error from None  # a handler failed at the alarm, as that of `Thread.start` may
         if problem is not None and _is_out_of_memory(problem):
             raise SolveLimitError("memory-limit", limit_mib=self._limits.memory_mib) from None
 

@@ -43,6 +43,15 @@ def test_a_handler_that_swallows_the_first_alarm_meets_the_next() -> None:
         _work(PATIENCE_S)
 
 
+def test_a_handler_that_fails_at_the_alarm_does_not_hide_it() -> None:
+    """As `Thread.start` does, in whose midst an alarm may come."""
+    with pytest.raises(SolveLimitError), bounded(0.05, 0):
+        try:
+            _work(PATIENCE_S)
+        except CalibrationError:
+            raise KeyError("its own thread") from None
+
+
 def test_an_alarm_while_the_block_ends_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     """The thread that ends a hanging process must not outlive the block."""
     set_timer, before, others = signal.setitimer, signal.getsignal(signal.SIGALRM), _timers()

@@ -147,7 +147,11 @@ def way_to(wanted: NextView, seen: CapturedView) -> Way:
     except CalibrationError:
         return Way("Show the whole board", False)
     target = wanted.camera_from_board
-    turns = np.array([rotation_log(target[:3, :3] @ C[:3, :3].T) for C in readings])
+    # The first view may be turned anyhow about the optical axis.
+    rolls = [np.eye(3) if len(wanted.seen) else rotation_exp([0.0, 0.0, _roll(C)]) for C in readings]
+    turns = np.array(
+        [rotation_log(roll @ target[:3, :3] @ C[:3, :3].T) for roll, C in zip(rolls, readings, strict=True)]
+    )
     nearest = int(np.argmin(np.linalg.norm(turns, axis=1)))  # of readings that look the same
     middle = board_points(board).mean(axis=0)
     new = min(_least_difference(C, wanted.seen, middle) for C in readings) >= 1.0
@@ -238,8 +242,7 @@ def _candidates(views: ViewSet, board: BoardSpec, given_up: Sequence[Array]) -> 
     away_m = np.linalg.norm(transform_points(at, middle[None])[:, 0], axis=1)
     reach_m = away_m.min() / _WIDER, max(min(away_m.max() * _WIDER, far_m), away_m.min())
     rng, first = np.random.default_rng([len(at), len(given_up)]), at[0]
-    # Rotation about the optical axis that is left when the first view's tilt is removed.
-    roll = np.arctan2(first[1, 0] - first[0, 1], first[0, 0] + first[1, 1])
+    roll = _roll(first)
     tilt, axis = _TILT_RAD * np.sqrt(rng.uniform(0, 1, _DRAWN)), rng.uniform(-np.pi, np.pi, _DRAWN)
     tilts, rolls = np.zeros((2, _DRAWN, 3))
     tilts[:, 0], tilts[:, 1] = tilt * np.cos(axis), tilt * np.sin(axis)
@@ -259,6 +262,11 @@ def _candidates(views: ViewSet, board: BoardSpec, given_up: Sequence[Array]) -> 
         if _least_difference(C, at, middle) >= 1.0 and _least_difference(C, tried, middle) >= _OTHER
     ]
     return np.array(new or near.tolist() or pool)[:_WEIGHED]
+
+
+def _roll(C: Array) -> float:
+    """Compute the rotation about the optical axis that is left when the tilt is removed from a pose."""
+    return float(np.arctan2(C[1, 0] - C[0, 1], C[0, 0] + C[1, 1]))
 
 
 def _least_difference(C: Array, at: Array, middle: Array) -> float:

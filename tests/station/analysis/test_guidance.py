@@ -97,8 +97,10 @@ def test_sides_are_those_of_the_image(
 
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_a_turn_is_told_of_what_moves(mount: Mount) -> None:
-    wanted = NextView(mount, BOARD, LENS, np.zeros((0, 4, 4)), around((0, 0, 0.5)))
+    wanted = NextView(mount, BOARD, LENS, STRAIGHT[None], around((0, 0, 0.5)))
     right_edge = transform_points(wanted.camera_from_board, MIDDLE + np.array([0.1, 0, 0]))
     assert right_edge[1] > 0  # lower: the board has turned clockwise in the image
     words = way_to(wanted, seen(STRAIGHT)).words
     assert ("anticlockwise" in words) == (mount == "eye-in-hand")
+    first = next_view(mount, BOARD, BLANK, False, [])
+    assert "clockwise" not in way_to(first, seen(around((0.1, 0, 2.9)))).words, "any will do"

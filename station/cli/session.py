@@ -14,10 +14,10 @@ import typer
 from rich.text import Text
 
 from station.cell.pose_plan import Plan
-from station.cell.status import StationState, StationStatus
+from station.cell.status import CHECK_VIEWS, StationState, StationStatus
 from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, Socket, err, out, print_json
-from station.operate.drift_check import POSES, check_arguments, judged, start_drift_check
+from station.operate.drift_check import check_arguments, judged, start_drift_check
 from station.operate.ending import after_capture
 from station.plan.files import load_plan
 from station.protocol.verbs import LoadPlan, Purpose
@@ -60,7 +60,7 @@ def resume_command(
 
 
 def drift_check_command(
-    poses: Annotated[int, typer.Option(min=4, max=50, help="Poses to capture")] = POSES,
+    poses: Annotated[int, typer.Option(min=4, max=50, help="Poses to capture")] = CHECK_VIEWS,
     headless: Headless = False,
     approve: Approve = "",
     socket: Socket = None,

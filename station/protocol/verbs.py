@@ -290,6 +290,8 @@ class Freedrive(Verb[Done], frozen=True):
     wire = "free_drive"
     states = RESTING | {S.FREE_DRIVE}
     on: bool
+    check: bool = False
+    """A session that begins is a drift check."""
 
 
 class Record(Verb[PoseNumber], frozen=True):

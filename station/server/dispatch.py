@@ -115,7 +115,7 @@ class SessionDispatcher:
             case verbs.Retake() | verbs.Skip():
                 await session.edit(client, verb)
             case verbs.Freedrive():
-                await self._to_the_end(session.switch_free_drive(client, verb.on))
+                await self._to_the_end(session.switch_free_drive(client, verb.on, verb.check))
             case verbs.Record():
                 return verbs.PoseNumber(await session.record(client))
             case verbs.Preview():

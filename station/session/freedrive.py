@@ -14,7 +14,7 @@ from station.analysis.hand_guide import HandGuide
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StaleStateError
 from station.cell.pose_plan import Plan, PlannedPose
-from station.cell.status import FEWEST_BY_HAND, GuidanceStatus, StationState
+from station.cell.status import GuidanceStatus, StationState
 from station.cell.stillness import NotStillError
 from station.devices.base import fresh
 from station.protocol.verbs import Freedrive, Record
@@ -68,7 +68,8 @@ class FreedriveCapture:
         guidance = await guide.look(cell, views, *looked)
         if store.state is not StationState.FREE_DRIVE:
             return
-        enough = len(context.seen) >= FEWEST_BY_HAND and store.status.estimate.enough
+        session, precise = store.status.session, store.status.estimate.enough
+        enough = len(context.seen) >= session.least_by_hand and (precise or session.check)
         store.update(guidance=msgspec.structs.replace(guidance, enough=enough))
         if guide.take:
             guide.taken(await self.record(asked=False) in context.seen)
@@ -79,11 +80,13 @@ class FreedriveCapture:
         if state not in (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING):
             self._context.cell.robot.guided = state is StationState.FREE_DRIVE
 
-    async def begin(self) -> None:
-        """Begin freedrive; open a recording if none is open."""
+    async def begin(self, check: bool = False) -> None:
+        """Begin freedrive; open a recording if none is open, of a drift check where `check`."""
         if self.taking:
             raise RefusedError("still-ending", what="the last image")
         context, store = self._context, self._context.store
+        if check and context.recording is not None:
+            raise RefusedError("session-open")
         await context.arm()
         await look_back(context)
         if (refusal := Freedrive.refusal(store.state)) is not None:
@@ -94,7 +97,7 @@ class FreedriveCapture:
         store.enter(StationState.FREE_DRIVE, "The recording is being opened.")
         async with self._taking:
             try:
-                await self._open_recording()
+                await self._open_recording(check)
             except BaseException:
                 if store.state in (StationState.FREE_DRIVE, StationState.PAUSED):
                     store.enter(context.resting)
@@ -106,15 +109,15 @@ class FreedriveCapture:
         store.enter(StationState.FREE_DRIVE, _GUIDE)
         context.show_poses()
 
-    async def _open_recording(self) -> None:
+    async def _open_recording(self, check: bool) -> None:
         context, new = self._context, self._context.recording is None
         config = context.cell.config
         if context.queue is None:
             context.queue = PoseQueue(Plan(config.robot.model, config.mount, ()))
         queue = context.queue.anew(guided=False) if new else context.queue
-        await context.open_recording(queue)
+        await context.open_recording(queue, check=check)
         if new:
-            context.forget_session()
+            context.forget_session(check=check)
         context.queue = queue
 
     def end(self) -> None:

@@ -331,12 +331,12 @@ class Session:
             except RecordingError as error:
                 raise RecordingError("change-not-saved", reason=str(error)) from None
 
-    async def switch_free_drive(self, client_id: int, on: bool) -> None:
+    async def switch_free_drive(self, client_id: int, on: bool, check: bool = False) -> None:
         self.permit(verbs.Freedrive, client_id)
         self._void()
         if on:
             await self._run_ended()
-            await self.freedrive.begin()
+            await self.freedrive.begin(check)
         else:
             self.freedrive.end()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from textual.content import Content
 
-from station.cell.status import FEWEST_BY_HAND, DetectionStatus, GuidanceStatus
+from station.cell.status import DetectionStatus, GuidanceStatus
 from station.tui.task import Known
 from station.tui.widgets.canvas import Series, curve
 from station.tui.words import degrees, dim, error_facts, facts, limit_bar, lines, mark, mm
@@ -52,7 +52,7 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
     guidance = status.guidance
     now_mm, after_mm = status.estimate.predicted_error_mm, guidance.after_mm
     rows = [*still_lines(guidance, max(6, width - 14))]
-    rows.append(facts(("view", str(status.session.captured), f"of {FEWEST_BY_HAND} or more")))
+    rows.append(facts(("view", str(status.session.captured), f"of {status.session.least_by_hand} or more")))
     if after_mm is not None and (now_mm is None or after_mm < now_mm):
         rows.append(error_facts("with the next view", after_mm, None))
     if guidance.warning:

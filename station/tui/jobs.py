@@ -25,7 +25,7 @@ OVERRIDABLE = ("gate-failed", "objection")
 """Codes of refusals that a person may override with a reason."""
 OVERRIDES = "Your name and the reason go into the file. Enter installs, Escape does not."
 WITHDRAWS = "Your name and the reason are kept. Enter takes it out of use, Escape does not."
-NO_VERDICT = "Another plan was loaded: the drift check has no verdict. Its views, if any, are on 5 (k)."
+NO_VERDICT = "Another session began: the drift check has no verdict. Its views, if any, are on 5 (k)."
 
 
 async def solve_session(desk: Desk, recording: str, folder: str) -> None:
@@ -49,14 +49,13 @@ async def check_session(desk: Desk, recording: str, folder: str) -> None:
 
 
 async def check_drift(desk: Desk, approves: Approve) -> None:
-    """Plan, ask, capture (pauses and new approvals included), then check for drift."""
+    """Plan and ask, or guide by hand; capture (pauses included), then check for drift."""
     if (status := desk.known.live) is None:
         return
-    plan_sha256 = await desk.start(start_drift_check(desk.client, status, approves))
-    if not plan_sha256:
+    if not await desk.start(start_drift_check(desk.client, status, approves)):
         return
     await desk.app.switch_mode("capture")
-    session = await recorded(desk.client, plan_sha256)
+    session = await recorded(desk.client, status.session.name)
     if session is None:
         desk.app.notify(NO_VERDICT, timeout=10)
         return

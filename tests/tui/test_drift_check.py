@@ -13,8 +13,8 @@ from calibrate.check.history import CheckEntry, append_check
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
 from station.cell.pose_plan import Plan, PlannedPose
-from station.cell.status import StationState, StationStatus
-from station.operate.drift_check import POSES, SEED
+from station.cell.status import CHECK_VIEWS, StationState, StationStatus
+from station.operate.drift_check import SEED
 from station.protocol import verbs
 from station.tui import jobs
 from station.tui.desk import REMEDIES, busy_words
@@ -26,7 +26,7 @@ from tests.tui.test_plan_screen import SlowPlanner
 
 CHECK_PLAN = "cd" * 32
 LOADED = Plan("UR10", "eye-in-hand", (PlannedPose("p1", (0.0,) * 6),) * 3)
-PLANNING = busy_words(verbs.MakePlan(POSES, SEED, lens_known=True))
+PLANNING = busy_words(verbs.MakePlan(CHECK_VIEWS, SEED, lens_known=True))
 JOB = """
 import json, pathlib, sys
 (pathlib.Path(__file__).parent / "asked").write_text(json.dumps(sys.argv[1:]))
@@ -56,7 +56,7 @@ def installed(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def check_session(root: Path, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:
     folder = str(root / "root/sessions/s-2")
-    return in_session(idle(state), plan_sha256=CHECK_PLAN, folder=folder, recording=recording)
+    return in_session(idle(state), name="s-2", check=True, folder=folder, recording=recording)
 
 
 async def ask_for_it(pilot: Pilot[None]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from calibrate.errors import CalibrationError
@@ -69,7 +70,7 @@ async def test_a_plan_that_was_never_run_is_named_before_it_is_replaced(
     attempts: tuple[int, ...], named: bool
 ) -> None:
     link, person = FakeLink(), Person()
-    assert await start_drift_check(link, loaded(*attempts), person.approves) == PREVIEW.plan_sha256
+    assert await start_drift_check(link, loaded(*attempts), person.approves)
     assert bool(person.shown.changes) is named
     assert link.asked[-1] == verbs.Go("t", PREVIEW.plan_sha256)
 
@@ -79,7 +80,7 @@ async def test_it_is_loaded_again_where_nothing_was_started(refused: type[verbs.
     link, person = FakeLink(), Person(yes=refused is not None)
     link.refuse = refused
     if refused is None:
-        assert await start_drift_check(link, loaded(0), person.approves) == ""
+        assert not await start_drift_check(link, loaded(0), person.approves)
         assert verbs.Go not in map(type, link.asked)
     else:
         with pytest.raises(RefusedError):
@@ -98,18 +99,25 @@ async def test_nothing_is_planned_where_nothing_is_installed(monkeypatch: pytest
     assert link.asked == []
 
 
-def during(sha256: str, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:
-    return StationStatus(state=state, session=SessionStatus(plan_sha256=sha256, recording=recording))
+def during(name: str, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:
+    check = name == "check"
+    return StationStatus(state=state, session=SessionStatus(name=name, check=check, recording=recording))
 
 
 async def test_its_finished_recording_ends_it_after_pauses_too() -> None:
-    moments = [("old", ""), ("check", StationState.MOVING), ("check", StationState.PAUSED)]
-    told = [during(sha256, state=StationState(state or "idle")) for sha256, state in moments]
+    told = [during("old"), during("check"), during("check", state=StationState.PAUSED)]
+    last = during("check", "r.mcap")
     sealing = during("check", "r.mcap", StationState.SEALING)
-    done = await recorded(FakeLink(*told, sealing, during("check", "r.mcap")), "check")
-    assert done == SessionStatus(plan_sha256="check", recording="r.mcap")
+    assert await recorded(FakeLink(*told, sealing, last), "old") == last.session
 
 
-async def test_another_plan_ends_it_without_a_recording() -> None:
-    assert await recorded(FakeLink(during("check"), during("new", "r.mcap")), "check") is None
-    assert await recorded(FakeLink(during("check")), "check") is None
+async def test_another_session_ends_it_without_a_recording() -> None:
+    assert await recorded(FakeLink(during("check"), during("new", "r.mcap")), "") is None
+    assert await recorded(FakeLink(during("check", "r.mcap"), during("new")), "check") is None
+
+
+async def test_an_arm_that_a_person_moves_is_guided() -> None:
+    link, status = FakeLink(), loaded()
+    by_hand = msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, by_hand=True))
+    assert await start_drift_check(link, by_hand, Person().approves)
+    assert link.asked == [verbs.Freedrive(True, check=True)]

@@ -57,13 +57,17 @@ async def test_every_motion_is_refused_and_stop_sends_nothing(rig: Rig, small_pl
 async def test_views_by_hand_carry_the_told_pose_and_joints(rig: Rig, told: tuple[float, ...]) -> None:
     assert isinstance(rig.arm, ReadArm)
     rig.arm.told = told
-    await rig.session.switch_free_drive(1, True)
+    await rig.session.switch_free_drive(1, True, check=bool(told))
     for turn in (0.0, 0.2):
         rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + turn)
         rig.arm.rest()
         await rig.session.record(1)
+    await rig.session.switch_free_drive(1, False)
+    with raises("session-open"):
+        await rig.session.switch_free_drive(1, True, check=True)
     await rig.session.finish(1)
     recording = sealed(rig)
+    assert rig.session.store.status.session.check is bool(told)
     assert [view.joints_rad for view in recording.views()] == [told or None] * 2
     assert {state.joints_rad for state in recording.robot_states()} == {told}
     assert recording.robot_samples().joints_rad.shape[1] == len(told)

@@ -116,7 +116,6 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
         with controller.admin() as admin:
             counts = admin.ask("log")["counts"]
     assert not [what for what in counts if what.startswith(("upload", "script"))], counts
-    print(f"{person.keys} keys, {person.guided} views guided")
     config, content = load_config(tmp_path / "station.yaml")
     assert config.board == truth.board and config.mount == truth.mount
     assert config.camera_guess is not None and config.board_guess is not None
@@ -128,10 +127,16 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
     assert load_draft(tmp_path).written
 
 
-class GreyReader:
-    """A camera before a grey wall."""
+class GreyCamera(RealHardware):
+    """No controller, and a camera before a grey wall."""
 
     exposure_us = 10_000.0
+
+    async def cameras(self) -> tuple[CameraChoice, ...]:
+        return (CAMERA,)
+
+    async def camera(self, found: CameraChoice) -> CameraReader:
+        return self
 
     async def glimpse(self) -> Image:
         return Image(np.full((480, 640), 110, np.uint8), Stamps(), 0, 0)
@@ -141,16 +146,8 @@ class GreyReader:
     async def close(self) -> None: ...
 
 
-class NoController(RealHardware):
-    async def cameras(self) -> tuple[CameraChoice, ...]:
-        return (CAMERA,)
-
-    async def camera(self, found: CameraChoice) -> CameraReader:
-        return GreyReader()
-
-
 async def test_an_arm_that_a_program_posts_needs_a_name_a_camera_and_a_board(tmp_path: Path) -> None:
-    app = NewCell(NoController(), tmp_path, tmp_path / "station.yaml")
+    app = NewCell(GreyCamera(), tmp_path, tmp_path / "station.yaml")
     async with app.run_test(size=(120, 36)) as pilot:
 
         async def at(step: CellStep, *keys: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from station.cell.status import StationState as S
-from station.protocol.verbs import Purpose, Skip
+from station.protocol.verbs import Purpose
 from tests.patience import until
 from tests.station.session_rig import POSES, Rig, sealed
 
@@ -25,16 +25,6 @@ async def test_the_sealed_session_stays_shown_until_the_go(rig: Rig) -> None:
     begun = rig.session.store.status.session
     assert (begun.captured, begun.elapsed_s, begun.recording) == (0, 0.0, "")
     assert set(rig.pose_states) == {"planned"}
-
-
-async def test_a_pose_that_was_left_out_stays_left_out(rig: Rig) -> None:
-    """Before the first run, and in the next one."""
-    await rig.session.edit(1, Skip(1))
-    for _ in range(2):
-        assert (await rig.session.prepare(1, Purpose.RUN)).poses == POSES - 1
-        await _sealed_session(rig)
-        assert rig.pose_states == ["done", "skipped", *["done"] * (POSES - 2)]
-    assert len(list(sealed(rig).views())) == POSES - 1
 
 
 async def test_pictures_by_hand_after_a_sealed_session_are_a_session_of_their_own(rig: Rig) -> None:

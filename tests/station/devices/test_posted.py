@@ -255,10 +255,8 @@ async def test_a_program_by_tcp_gives_the_token_first_and_is_one_as_any_other(
         poster.say(LIVE)
         return poster
 
-    stranger = await by_tcp(first)
-    assert await stranger.refused() == "post-token"
-    poster = await by_tcp(arm.token_file.read_bytes())
-    await poster.rest(3)
+    assert await (await by_tcp(first)).refused() == "post-token"
+    await (await by_tcp(arm.token_file.read_bytes())).rest(3)
     await until(lambda: trouble(arm) == "")
     assert await (await by_tcp(first)).refused() == "post-token", "and not that another has the arm"
     assert await (await by_tcp(arm.token_file.read_bytes())).refused() == "post-refused"

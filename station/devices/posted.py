@@ -105,7 +105,11 @@ class PostedArm:
             unix = await asyncio.start_unix_server(self._serve, sock=listening, limit=READ_BYTES)
             self._servers.append(unix)
             if self._tcp_port is not None:
-                self._servers.append(await self._listen(self._tcp_port))
+                try:
+                    self._servers.append(await self._listen(self._tcp_port))
+                except StationError:
+                    await self.close()  # or the next attempt would wait without that port
+                    raise
         await self._came.wait()
         return self.identity
 

@@ -24,6 +24,7 @@ from station.cell.errors import RobotError
 from station.cell.layout import flange_pose
 from station.cell.stillness import StillnessMonitor
 from station.devices.posted import PAUSE_S, PostedArm
+from tests.codes import raises
 from tests.patience import until
 from tests.station.session_rig import memory_config
 
@@ -262,6 +263,14 @@ async def test_a_program_by_tcp_gives_the_token_first_and_is_one_as_any_other(
     assert await (await by_tcp(arm.token_file.read_bytes())).refused() == "post-refused"
     await arm.close()
     assert not arm.token_file.exists()
+
+
+async def test_a_port_that_another_program_has_is_named_at_every_attempt(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        arm = PostedArm(config(other.getsockname()[1]), "real", tmp_path / "control.sock")
+        for _ in range(2):
+            with raises("socket"):
+                await arm.connect()
 
 
 @pytest.mark.parametrize(

@@ -109,12 +109,6 @@ def replace_size(camera: CameraModel, width: int, height: int) -> CameraModel:
     return CameraModel(width, height, camera.matrix, camera.distortion)
 
 
-def test_three_views_are_too_few(tmp_path: Path) -> None:
-    path = write_session(tmp_path / "few.mcap", Scene(views=3), known_lens=True)
-    with raises("too-few-views", TooFewViewsError, views=3, needed=4):
-        solve_recording(path)
-
-
 DATASETS = {
     # name: (views used at least, spread of the board in mm at most, truth error in mm or None)
     "ur5-chessboard": (19, 6.0, None),

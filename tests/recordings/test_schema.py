@@ -28,7 +28,7 @@ from recordings.schema.messages import (
     View,
 )
 from recordings.schema.topics import Topic, schema_bytes
-from tests.recordings.small_recording import make_state, make_view
+from tests.recordings.small_recording import make_state
 
 FROZEN = {
     Stamps: "host_monotonic_ns host_wall_ns controller_s device_ns",
@@ -83,12 +83,6 @@ levels = st.sampled_from(["debug", "info", "warning", "error"])
 @given(st.one_of(views, st.builds(CaptureEvent, stamps, texts, st.none() | counts, texts, levels), stamps))
 def test_every_message_survives_the_file(message: msgspec.Struct) -> None:
     assert decode(type(message), encode(message)) == message
-
-
-def test_none_and_zero_stay_apart() -> None:
-    for value in (None, 0.0):
-        view = msgspec.structs.replace(make_view(0), time_bound_s=value)
-        assert decode(View, encode(view)).time_bound_s == value
 
 
 @given(st.binary(max_size=200))

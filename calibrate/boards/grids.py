@@ -127,8 +127,25 @@ def seen_size(grey: Grey) -> tuple[int, int] | None:
 
 _CELLS = 16
 """Samples from the middle of a circle to the edge of its patch."""
+_AS_LARGE = 1.4
+"""Circles of one grid differ by less than this factor in size, unless seen from very near."""
 _GUESSED_PX = 1.5
 """Farther than this from the middle of the ink a centre was guessed, not found."""
+
+
+def count_circles(grey: Grey) -> int:
+    """Count the dark blobs, or the light ones, that are about as large as most: circles of a grid there."""
+    counts = [0]
+    for image in (grey, cv2.bitwise_not(grey)):
+        size = np.array([blob.size for blob in _blobs(grey.size / 16).detect(image)])
+        counts.extend(((size > each / _AS_LARGE) & (size < each * _AS_LARGE)).sum() for each in size)
+    return int(max(counts))
+
+
+def _blobs(largest_px: float) -> cv2.SimpleBlobDetector:
+    blobs = cv2.SimpleBlobDetector.Params()
+    blobs.minArea, blobs.minDistBetweenBlobs, blobs.maxArea = 12.0, 4.0, largest_px
+    return cv2.SimpleBlobDetector.create(blobs)
 
 
 def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
@@ -138,16 +155,14 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
         if spec.kind is BoardKind.ASYMMETRIC_CIRCLES
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
-    blobs = cv2.SimpleBlobDetector.Params()
-    blobs.minArea, blobs.minDistBetweenBlobs = 12.0, 4.0
-    blobs.maxArea = grey.size / (spec.columns * spec.rows)
+    blobs = _blobs(grey.size / (spec.columns * spec.rows))
     for image in (grey, cv2.bitwise_not(grey)):
         for clustering in (0, cv2.CALIB_CB_CLUSTERING):
             found, centres = cv2.findCirclesGrid(
                 image,
                 (spec.columns, spec.rows),
                 flags=kind | clustering,
-                blobDetector=cv2.SimpleBlobDetector.create(blobs),
+                blobDetector=blobs,
             )
             if found:
                 ordered = _best_order(np.asarray(centres, dtype=float).reshape(-1, 2), spec)

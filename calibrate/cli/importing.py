@@ -19,6 +19,7 @@ from calibrate.pipeline import single_threaded_opencv
 from recordings.cli.console import AsJson, plain_console, print_json, progress_bar
 from recordings.files import write_atomically
 from recordings.importers.bag import PAIR_WITHIN_S, import_bag
+from recordings.importers.bags import BAGS
 from recordings.importers.dataset import DATASET_FILE, read_dataset
 from recordings.importers.folder import Imported, import_folder, write_views
 from recordings.importers.messages import Progress
@@ -93,7 +94,7 @@ def import_command(
     with progress_bar("", console) if shown else nullcontext(lambda *_: None) as progress:
         if is_described(source, dataset, poses, convention, mount, board):
             done = import_folder(source, target, progress)
-        elif source.is_dir() and not _is_bag(source):
+        elif source.is_dir() and not any(path.suffix in BAGS for path in source.iterdir()):
             told = dataset or _told(source, output)
             given = Given(convention, mount, None if board is None else typed_board(board))
             done = _import_found(look(source, poses), target, told, given, progress)
@@ -107,10 +108,6 @@ def import_command(
         print_json(facts)
     else:
         _print_import(facts)
-
-
-def _is_bag(folder: Path) -> bool:
-    return any(path.suffix in (".mcap", ".bag", ".db3", ".zstd") for path in folder.iterdir())
 
 
 def _told(source: Path, output: Path | None) -> Path | None:
@@ -148,7 +145,7 @@ class ImportJson(msgspec.Struct, frozen=True, omit_defaults=True):
 def _print_import(facts: ImportJson) -> None:
     """Print what `recordings import` took, or would take."""
     for what, (believed, evidence) in facts.found.items():
-        print(plain_text(f"{what:<11}{believed:<42}{evidence}".rstrip()))
+        print(plain_text(f"{what:<11}{believed:<41} {evidence}".rstrip()))
     if not facts.recording:
         print(plain_text(f"{facts.views} views would be taken; nothing was written"))
         return

@@ -17,7 +17,7 @@ import numpy as np
 
 from calibrate.boards.corners import Grey, to_grey
 from calibrate.boards.detect import Detection, detect
-from calibrate.boards.grids import seen_size
+from calibrate.boards.grids import count_circles, seen_size
 from calibrate.boards.markers import marker_detector
 from calibrate.boards.model import board_points, usual_markers
 from calibrate.errors import CalibrationError
@@ -241,7 +241,7 @@ def _described(facts: dict[str, Any]) -> Iterator[tuple[BoardSpec, None]]:
 
 
 def _shown(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
-    """Boards of unknown size that images suggest: a tag that most of a few show, chessboards."""
+    """Boards of unknown size that images suggest: a tag that most of a few show, chessboards, circles."""
     few = greys[:: max(1, len(greys) // _TRIED)]
     for dictionary in _DICTIONARIES:
         detector = marker_detector(dictionary, 1)
@@ -258,6 +258,12 @@ def _shown(greys: list[Grey]) -> Iterator[tuple[BoardSpec, Grey]]:
         sizes.setdefault(whole, sizes[max(sizes, key=lambda size: size[0] * size[1])])
     for size in sorted(sizes, key=lambda size: -size[0] * size[1])[: _TRIED + 2]:
         yield BoardSpec(BoardKind.CHESSBOARD, *size), sizes[size]
+    counted = {count_circles(grey): grey for grey in few}
+    for count, times in Counter(map(count_circles, few)).most_common(2):
+        for columns in range(3, count // 3 + 1) if times > 1 else ():
+            if count % columns == 0:
+                for kind in (BoardKind.CIRCLES, BoardKind.ASYMMETRIC_CIRCLES):
+                    yield BoardSpec(kind, columns, count // columns), counted[count]
 
 
 _DICTIONARIES = [

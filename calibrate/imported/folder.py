@@ -155,8 +155,7 @@ def _pairs(table: Table, paths: list[Path] | Table) -> dict[Key, int]:
 def _believed(lies: Lies, given: Given, best: Reading) -> Believed:
     seen, pairs = best.seen, best.pairs
     joints, by_joints = joints_of(lies, best) or (None, None)
-    told_so = given.tells_direction
-    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, told_so, by_joints)
+    mount, inverted, board_inverted, why = mounting(lies, given.mount, best, given.tells_direction, by_joints)
     how = replace(best.convention, inverse=best.convention.inverse != inverted)
     board, square = _board(best)
     facts = {
@@ -179,9 +178,8 @@ def _believed(lies: Lies, given: Given, best: Reading) -> Believed:
         saw = next(t for t in lies.tables if t.name == best.family), how_board
         del facts["images"], facts["camera"]
         facts["board"] = f"{len(pairs)} rows of {best.family}", f"{how_board.name}; {seen.told}"
-    told = PosesTold(
-        best.table.name, best.family, how.name, saw[1].name if saw else "", joints.name if joints else ""
-    )
+    seen_how, moved_by = saw[1].name if saw else "", joints.name if joints else ""
+    told = PosesTold(best.table.name, best.family, how.name, seen_how, moved_by)
     dataset = Dataset(mount, board, camera, lies.root.resolve().name, poses=told)
     return Believed(dataset, _rows(lies, best.table, how, pairs, saw, joints), facts)
 

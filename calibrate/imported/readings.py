@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -150,16 +151,7 @@ def decide(lies: Lies, readings: list[Reading]) -> Reading:
     good = [reading for reading in readings if is_good(reading)] or readings
     ranked = sorted(good, key=lambda r: -r.fit.log_evidence)
     if not ranked or not is_good(ranked[0]):
-        nearest, cause, text = _cause(ranked[:_EXPLAINED]) if ranked else (None, "", "")
-        raise ImportSourceError(
-            "no-reading",
-            source=lies.root,
-            nearest=nearest.text if nearest else "none",
-            stays_m=nearest.stays_m if nearest else 0.0,
-            stays_rad=nearest.stays_rad if nearest else 0.0,
-            cause=cause,
-            text=text,
-        )
+        raise ImportSourceError("no-reading", source=lies.root, **_nearest(ranked[:_EXPLAINED]))
     best = ranked[0]
     for other in ranked[1:]:
         if best.fit.log_evidence - other.fit.log_evidence > clear_gain(len(best.fit.full)):
@@ -170,16 +162,20 @@ def decide(lies: Lies, readings: list[Reading]) -> Reading:
     return best
 
 
-def _cause(nearest: list[Reading]) -> tuple[Reading, str, str]:
-    """(the reading nearest to right, code of what would make it right, sentence), as a solve names them."""
+def _nearest(readings: list[Reading]) -> dict[str, Any]:
+    """The reading nearest to right, and what would make it right, as a solve names it."""
     ranked = []
-    for n, reading in enumerate(nearest):
+    for n, reading in enumerate(readings):
         found = explain_recording(_pose_views(reading.views, reading.seen))
         gain = found.log_evidence_gain if found.reading in _CAUSES else 0.0
         ranked.append((-reading.fit.log_evidence - gain, n, reading, found))
+    if not ranked:
+        return {"nearest": "none", "stays_m": 0.0, "stays_rad": 0.0, "cause": "", "text": ""}
     _, _, best, found = min(ranked, key=lambda each: each[:2])
-    named = found.reading in _CAUSES
-    return best, found.reading.value if named else "", explain_text(found, best.views) if named else ""
+    near = {"nearest": best.text, "stays_m": best.stays_m, "stays_rad": best.stays_rad}
+    if found.reading not in _CAUSES:
+        return {**near, "cause": "", "text": ""}
+    return {**near, "cause": found.reading.value, "text": explain_text(found, best.views)}
 
 
 _CAUSES = (NamedReading.SHIFTED, NamedReading.MIRRORED, NamedReading.BOARD_MOVED, NamedReading.CAMERA_MOVED)

@@ -74,20 +74,13 @@ def import_bag(
         }
         if output is None:
             if wider := proposed_limits(chosen.track, images_ns, speeds, limits, pair_within_s):
-                found, count = wider
-                degrees = float(np.degrees(found.rotation_rad))
-                flags = f"--still-mm {1e3 * found.position_m:.2g} --still-deg {degrees:.2g}"
-                facts["wider"] = flags, f"gives {count} stops"
+                still_mm, still_deg = 1e3 * wider[0].position_m, np.degrees(wider[0].rotation_rad)
+                flags = f"--still-mm {still_mm:.2g} --still-deg {still_deg:.2g}"
+                facts["wider"] = flags, f"gives {wider[1]} stops"
             return Imported(source, len(stops), facts)
         if len(stops) < STOPS_LEAST:
-            raise ImportSourceError(
-                "no-stops",
-                source=source,
-                stops=len(stops),
-                images=len(images_ns),
-                passed_over=why,
-                limit=STOPS_LEAST,
-            )
+            counts = {"stops": len(stops), "images": len(images_ns), "limit": STOPS_LEAST}
+            raise ImportSourceError("no-stops", source=source, passed_over=why, **counts)
         assert described is not None
         images = bag.images(chosen.image.name, {stop.place for stop in stops})
         first = next(images)

@@ -18,6 +18,8 @@ from recordings.mcap.scan import scan_file
 from recordings.mcap.source import Source
 from recordings.schema.definitions import SESSION_RECORDS
 
+BAGS = (".mcap", ".bag", ".db3", ".zstd")
+"""Suffixes of files of bags."""
 _RESCUE = "mcap recover FILE, with the mcap command line tool"
 _SHOWN_EVERY = 64
 """Messages between two reports of progress."""

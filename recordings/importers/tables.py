@@ -28,7 +28,8 @@ from recordings.importers.messages import Array
 
 _FILES_LIMIT, _BYTES_LIMIT, _ARRAY_LIMIT_BYTES = 5000, 4 * 1024 * 1024, 128 * 1024
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
-_SUFFIXES = (".json", ".yaml", ".yml", ".xml", ".csv", ".txt", ".dat", ".toml", ".tsv", ".script")
+_YAML = (".yaml", ".yml", ".samples", ".calib")
+_SUFFIXES = (*_YAML, ".json", ".xml", ".csv", ".txt", ".dat", ".toml", ".tsv", ".script")
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
 _IMAGE = re.compile(rf"[^\s,;'\"\[\]]+(?:{'|'.join(map(re.escape, IMAGE_SUFFIXES))})\b", re.I)
 _POSE_SIZES = (6, 7, 12, 16)
@@ -112,7 +113,7 @@ def look(source: Path, poses: Path | None = None) -> Lies:
     images = defaultdict[str, list[Path]](list)
     for path in files if poses is None or poses.is_relative_to(source) else [*files, poses]:
         if path.suffix.lower() in IMAGE_SUFFIXES:
-            images[_family(path.relative_to(source))].append(path)
+            images[str(path.relative_to(source).parent / _pattern(path.name))].append(path)
             continue
         tree = None if path.name.startswith((".", "README", "CMake")) else read_tree(path)
         if tree is None:
@@ -167,10 +168,6 @@ def natural(path: Path | str) -> list[Any]:
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", str(path))]
 
 
-def _family(path: Path) -> str:
-    return str(path.parent / _pattern(path.name))
-
-
 def _pattern(path: Path | str) -> str:
     return re.sub(r"\d+", "#", str(path))
 
@@ -188,7 +185,7 @@ def read_tree(path: Path) -> Any:
         content = read_file(path, _BYTES_LIMIT)
         if suffix == ".json":
             return json.loads(content)
-        if suffix in (".yaml", ".yml"):
+        if suffix in _YAML:
             plain = re.sub(rb"^%YAML.*\n|!!opencv-matrix|!!python/\S+", b"", content)
             return strict_yaml.load_plain(plain)
         if suffix == ".toml":
@@ -335,7 +332,8 @@ def _pose(value: Any) -> tuple[list[float], str, str] | None:
     at, turn = parts["position"], parts["rotation"]
     if len(turn) == 9:
         return [n for row in range(3) for n in (*turn[3 * row : 3 * row + 3], at[row])], "", named
-    return at + turn, "", named
+    ordered = any(isinstance(each, dict) and len(each) == 4 for each in told.values())
+    return at + turn, "xyzw" if ordered else "", named
 
 
 def _half_named(key: str) -> re.Pattern[str] | None:

@@ -24,7 +24,7 @@ from calibrate.report.page import report_page
 from recordings.cli import main
 from recordings.importers.tables import look
 from recordings.reader import open_recording
-from recordings.schema.messages import Mount
+from recordings.schema.messages import BoardKind, BoardSpec, Mount
 from tests.calibrate.chains import arm_cell
 from tests.calibrate.sessions import BOARD_PLACE, Scene, write_session
 from tests.codes import raises
@@ -275,21 +275,26 @@ def test_a_folder_without_poses_says_what_is_there(put: Callable[..., Path]) -> 
         believe(look(put(lambda folder, T: None)))
 
 
-def board_pairs(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
-    """As easy_handeye tells its samples."""
-    samples = {}
-    for name, T in (("hand_world_samples", robot), ("camera_marker_samples", board)):
-        rows = [dict(zip("xyzXYZW", row, strict=True)) for row in quaternions(T).tolist()]
-        samples[name] = {
-            "transforms": [
-                {
-                    "translation": {axis: row[axis] for axis in "xyz"},
-                    "rotation": {axis: row[axis.upper()] for axis in "xyzw"},
-                }
-                for row in rows
-            ]
+def named_parts(T: np.ndarray) -> list[dict[str, dict[str, float]]]:
+    return [
+        {
+            "translation": dict(zip("xyz", row[:3], strict=True)),
+            "rotation": dict(zip("xyzw", row[3:], strict=True)),
         }
+        for row in quaternions(T).tolist()
+    ]
+
+
+def easy_handeyes(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
+    tables = (("hand_world_samples", robot), ("camera_marker_samples", board))
+    samples = {name: {"transforms": named_parts(T)} for name, T in tables}
     (folder / "samples.yaml").write_text(json.dumps(samples))
+
+
+def easy_handeye2s(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
+    pairs = zip(named_parts(robot), named_parts(board), strict=True)
+    rows = [{"robot": F, "tracking": C} for F, C in pairs]
+    (folder / "cell.samples").write_text(json.dumps({"parameters": {"name": ""}, "samples": rows}))
 
 
 def in_two_tables(folder: Path, robot: np.ndarray, board: np.ndarray) -> None:
@@ -332,10 +337,20 @@ def test_recorded_joints_tell_the_mounting(
     assert found.facts["mount"][1].startswith("by joints")
 
 
+def test_circles_that_nobody_described_are_found(tmp_path: Path) -> None:
+    circles = BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 7, 0.012)
+    recording = open_recording(write_session(tmp_path / "s.mcap", Scene(circles, views=8)))
+    for view, image in recording.images():
+        cv2.imwrite(str(tmp_path / f"{view.index}.png"), image.pixels)
+    seen = board.see_board(look(tmp_path), None, sorted(tmp_path.glob("*.png")), lambda *_: None)
+    assert seen is not None
+    assert (seen.board.kind, seen.board.columns, seen.board.rows) == (circles.kind, 4, 7)
+
+
 MOVEIT = Path(__file__).parents[3] / "shared/datasets/pose-pairs/moveit50.csv"
 
 
-@pytest.mark.parametrize("write", [board_pairs, in_two_tables, moveits, in_one_csv])
+@pytest.mark.parametrize("write", [easy_handeyes, easy_handeye2s, in_two_tables, moveits, in_one_csv])
 def test_pairs_of_poses_are_a_recording_without_pictures(
     write: Callable[[Path, np.ndarray, np.ndarray], None], tmp_path: Path
 ) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from calibrate.errors import UsageError
+from calibrate.files.formatting import figures
 from calibrate.gates import GateInputs, GateLimits, judge, read_limits
 from calibrate.handeye.solution import Explanation, Finding, NoiseScales, Reading, Solution
 from calibrate.job import SolvedRecording
@@ -165,6 +166,16 @@ def test_an_error_without_the_arm_s_own_is_a_warning_unless_the_integrator_says_
     assert failed(gates) == []
     assert [gate.name for gate in gates if gate.remedy] == ["arm"]
     assert all(gate.narrow for gate in gates if gate.remedy)
+
+
+@pytest.mark.parametrize("without", [True, False])
+def test_the_predicted_error_says_whether_it_is_without_the_arm_s_own(
+    solved_real: SolvedRecording, without: bool
+) -> None:
+    gate = Gate("arm", True, None, None, "Arm's own error", remedy="Record joints." if without else "")
+    made = solved_real.calibration
+    told = msgspec.structs.replace(made, quality=msgspec.structs.replace(made.quality, gates=[gate]))
+    assert ("without the arm" in figures(told)["error"].about) is without
 
 
 def test_the_pose_to_retake_is_numbered_as_on_the_screen(solution: Solution) -> None:

@@ -64,7 +64,7 @@ def test_terminal_and_screen_say_the_same_figures() -> None:
     printed = io.StringIO()
     Console(file=printed, width=200).print(summary(DOUBTED))
     screen = verdict_lines(Result("", DOUBTED)).plain + evidence(Result("", DOUBTED), DOUBTED).plain
-    told = figures(DOUBTED, DOUBTED.verification)
+    told = figures(DOUBTED)
     assert {"error", "gates", "views", "touch"} <= set(told)
     for figure in told.values():
         assert figure.value in printed.getvalue()

@@ -125,7 +125,11 @@ class StationApp(KnowingApp):
     @work(exclusive=True, group="live page", exit_on_error=False)
     async def action_open_live(self) -> None:
         """Open the live page, and feed it for as long as a browser asks."""
-        page = self._live_page = self._live_page or LivePage()
+        try:
+            page = self._live_page = self._live_page or LivePage()
+        except OSError as problem:
+            self.notify(f"No live picture in a browser: {problem}.", severity="error", markup=False)
+            return
         self.notify(page.open(), timeout=60, markup=False)
         picture = PreviewImage()
         while True:
@@ -157,6 +161,8 @@ class StationApp(KnowingApp):
             self.known = replace(self.known, configuration=self.desk.client.config)
             if status.state is StationState.DISCONNECTED and not status.playback:
                 self.switch_mode("connect")
+            if not self.known.works:
+                self.action_look_at_checks()
 
     @work(exclusive=True, group="checks", exit_on_error=False)
     async def action_look_at_checks(self) -> None:

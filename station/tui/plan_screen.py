@@ -16,7 +16,7 @@ from station.tui.frame import Line
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
-from station.tui.words import MARKS, Mark, dim, error_facts, facts, mark
+from station.tui.words import ERROR_SHOWN_MM, MARKS, UNKNOWN, Mark, dim, error_facts, facts, mark
 
 COLUMNS = ("#", "error after", "state", "reason")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves)."
@@ -34,6 +34,8 @@ _STATES: dict[str, tuple[Mark, str]] = {
 
 def row_of(pose: PoseStatus) -> tuple[Content, ...]:
     """Make a row of the table."""
+    error_mm = pose.estimated_sigma_mm or pose.predicted_sigma_mm
+    shown = f"{error_mm:6.2f}" if error_mm and error_mm <= ERROR_SHOWN_MM else f"{UNKNOWN:>6}"
     kind, word = _STATES.get(pose.state, ("now", pose.state))
     if pose.kept:
         kind, word = "look", "to be captured again"
@@ -41,7 +43,7 @@ def row_of(pose: PoseStatus) -> tuple[Content, ...]:
         word = f"failed: {pose.reason}"
     return (
         Content.styled(f"{pose.index + 1:>3} ", "$foreground") + mark(kind),
-        error_facts("", pose.estimated_sigma_mm or pose.predicted_sigma_mm, None),
+        facts(("", shown, "mm")),
         Content.styled(word, MARKS[kind][1]),
         Content.styled(pose.why or pose.name, "$foreground"),
     )
@@ -73,7 +75,7 @@ class PlanScreen(StationScreen):
     def body(self) -> ComposeResult:
         yield Line(lambda known, _: facts_line(known), id="plan-facts")
         with Horizontal(id="plan"):
-            with Box("Poses", id="plan-poses", below="predicted error after each  Enter tells all"):
+            with Box("Poses", id="plan-poses", below="predicted error after each, 1σ  Enter tells all"):
                 yield Rows(*COLUMNS, id="plan-table")
             yield Panel("The cell", self._cell, id="plan-cell", below=LEGEND)
 

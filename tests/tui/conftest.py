@@ -39,7 +39,7 @@ from station.cell.status import (
     StationStatus,
 )
 from station.protocol.client import Client
-from station.protocol.verbs import VERBS, Done, Preview, PreviewImage, Verb, Watch
+from station.protocol.verbs import VERBS, Doctor, Done, Preview, PreviewImage, Verb, Watch
 from station.simulation.cells import TABLE
 from station.tui.app import StationApp
 from tests.patience import PATIENCE_S
@@ -114,7 +114,7 @@ class FakeLink(Client):
 
     @property
     def verbs(self) -> list[str]:
-        return [verb.verb() for verb in self.asked if not isinstance(verb, (Preview, Watch))]
+        return [verb.verb() for verb in self.asked if not isinstance(verb, (Preview, Watch, Doctor))]
 
     async def request(self, verb: str, *, timeout_s: float = 0.0, **args: object) -> object:
         self.asked.append(msgspec.convert(args, VERBS[verb]))

@@ -112,18 +112,14 @@ class Desk:
             try:
                 while not (await asyncio.wait({answer}, timeout=LISTEN_S))[0]:
                     if (waited_s := time.monotonic() - asked_s) >= SILENT_S:
-                        self.hear(waited_s)
+                        self.app.known = replace(self.known, silent_s=waited_s)
                 problem = answer.exception()
             finally:
                 answer.cancel()
             if problem is not None and not isinstance(problem, RefusedError):
                 return
-            self.hear(None)
+            self.app.known = replace(self.known, silent_s=None)
             await asyncio.sleep(LISTEN_S)
-
-    def hear(self, silent_s: float | None) -> None:
-        """Hear for how long the daemon has not answered; None: it does."""
-        self.app.known = replace(self.known, silent_s=silent_s)
 
     # --- the screen → the daemon ---
 

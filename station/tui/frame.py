@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import ClassVar, TypeVar
 
+from rich.filesize import decimal
 from textual import events
 from textual.app import ComposeResult
 from textual.containers import Container, Horizontal, Vertical
@@ -17,7 +18,7 @@ from textual.widgets import Footer, Static
 from station.cell.status import StationStatus
 from station.protocol.states import LATCHED
 from station.tui.task import STEPS, Action, Known, Step, next_action, steps
-from station.tui.words import MARKS, dim, duration, shortened, size, state_of
+from station.tui.words import MARKS, dim, duration, shortened, state_of
 
 R = TypeVar("R")
 STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
@@ -170,7 +171,7 @@ def _robot_parts(status: StationStatus) -> Iterator[Content]:
     )
     yield Content.styled(f"  {robot.model or 'no robot'}", "bold $strong")
     if status.recorder.free_bytes is not None:
-        yield dim(f"  {size(status.recorder.free_bytes)} free")
+        yield dim(f"  {decimal(status.recorder.free_bytes)} free")
     if robot.remote is not None:
         yield dim(f"  {'remote' if robot.remote else 'LOCAL'}")
     if status.lease.holder:

@@ -33,8 +33,7 @@ from station.tui.touch_corners import run_touch_test
 from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, sentence, shortened
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 5, Enter shows older ones."
-STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
-SIGNS: dict[str, str] = {"PASS": "✓", "PASS WITH A REASON": "▲", "FAIL": "✗"}
+SHOWN = {"PASS": ("✓", "-pass"), "PASS WITH A REASON": ("▲", "-reason"), "FAIL": ("✗", "-fail")}
 BAR_CELLS, NAME_CELLS = 14, 27
 JOBS = {"install": install_result, "touch test": run_touch_test, "undo": undo_install}
 Row = tuple[tuple[Content, ...], str]
@@ -56,7 +55,7 @@ def verdict_lines(result: Result) -> Content:
     said = use_text(calibration)
     if result.verdict == "PASS WITH A REASON" and not failed:
         said = accuracy_text(calibration)
-    rows = [Content.styled(f"{SIGNS[result.verdict]} {result.verdict}, {state}\n{said}", "bold")]
+    rows = [Content.styled(f"{SHOWN[result.verdict][0]} {result.verdict}, {state}\n{said}", "bold")]
     if result.installed and (validity := result.state.validity) is not None:
         doubted = validity.state is not ValidityState.VALID
         rows.append(Content.styled(sentence(validity_text(validity)), "bold $warn" if doubted else ""))
@@ -208,7 +207,7 @@ class ResultScreen(StationScreen):
             return
         self._drawn = result
         verdict = self.query_one("#verdict", Static)
-        verdict.set_classes("" if result is None else STYLES[result.verdict])
+        verdict.set_classes("" if result is None else SHOWN[result.verdict][1])
         verdict.update(Content(NO_RESULT) if result is None else verdict_lines(result))
         calibration = None if result is None else result.calibration
         self.query_one("#result").display = calibration is not None

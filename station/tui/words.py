@@ -112,15 +112,6 @@ def state_of(status: StationStatus) -> tuple[str, str]:
     return f"▶ {STATE_WORDS[state]}", "bold $onaccent on $accent"
 
 
-def size(count: float) -> str:
-    """Bytes for people: 212 GB, 3.4 MB."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000:
-            return f"{count:.0f} {unit}" if count >= 10 or unit == "B" else f"{count:.1f} {unit}"
-        count /= 1000
-    return f"{count:.1f} TB"
-
-
 def duration(seconds: float | None) -> str:
     return "-:--" if seconds is None else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 

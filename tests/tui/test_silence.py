@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import pytest
 from textual.widgets import DataTable
@@ -105,7 +107,7 @@ async def test_news_that_arrive_while_the_screen_closes_do_no_harm(
     heard: list[bool] = []
 
     def on_unmount(screen: CaptureScreen) -> None:
-        app.desk.hear(5.0)
+        app.known = replace(app.known, silent_s=5.0)
         heard.append(True)
 
     monkeypatch.setattr(CaptureScreen, "on_unmount", on_unmount, raising=False)

@@ -1,8 +1,8 @@
 """Gates: named conditions that a calibration must meet before it may be installed.
 
 A gate is, under one name, a limit in `GateLimits`, a rule in `_RULES`, and a value that `_measured` yields.
-The value is the solution's, or a field of `GateInputs` that `pipeline.solve_recording` fills. A gate without
-a value has a function of its own that `judge` calls, such as `_session_gate`.
+The value is the solution's, or a field of `GateInputs`, filled by who solves (`pipeline`, `pictures`). A gate
+without a value has a function of its own that `judge` calls, such as `_session_gate`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     axis_spread: float | None = 0.1
     """Smallest spread of the rotation axes; 0: all about one axis, 1: all axes alike."""
     view_rms_px: float | None = 1.5
-    """Reprojection error of the worst view."""
+    """Largest of the views' rms reprojection errors."""
     holdout_share: float | None = 0.01
     """Held-out translation error over the working distance."""
     cross_validation: float | None = 1.0
@@ -109,7 +109,7 @@ _RULES = {
     "views": _Rule("View count", "≥", "", "Capture more poses that show the board."),
     "rotation_deg": _Rule("Rotation range", "≥", "deg", "Add poses with more tilt and roll."),
     "axis_spread": _Rule("Rotation diversity", "≥", ""),
-    "view_rms_px": _Rule("Worst reprojection error", "≤", "px"),
+    "view_rms_px": _Rule("Largest rms error of a view", "≤", "px"),
     "holdout_share": _Rule("Held-out error", "≤", "share", "Check robot accuracy and corner detection."),
     "cross_validation": _Rule(
         "Cross-validated error over the largest that was claimed",

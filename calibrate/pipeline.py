@@ -30,7 +30,7 @@ from calibrate.views import ViewSet
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 
-_WORST_VIEW_PX = 20.0
+_MEDIAN_VIEW_PX = 20.0
 
 
 @contextmanager
@@ -84,8 +84,8 @@ def with_board_poses(
         views = replace(views, camera=intrinsics.camera)
     views = solve_pnp(views, board)
     median = float(np.median([view_rms_px(v, views.camera, v.camera_from_board) for v in views]))  # type: ignore[arg-type]
-    if not median <= _WORST_VIEW_PX:
-        raise BadViewsError("lens-misfit", median_px=median, limit_px=_WORST_VIEW_PX)
+    if not median <= _MEDIAN_VIEW_PX:
+        raise BadViewsError("lens-misfit", median_px=median, limit_px=_MEDIAN_VIEW_PX)
     return views, intrinsics
 
 

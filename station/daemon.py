@@ -66,7 +66,7 @@ class Daemon:
         self.session = Session(cell, root)
         dispatcher = SessionDispatcher(self.session)
         self._control = ControlServer(control, dispatcher, newest=lambda: self.session.store.status)
-        self._stop = StopServer(control, dispatcher.stop_from, self._latched, self._speed_rad_s)
+        self._stop = StopServer(control, dispatcher.stop_by_datagram, self._latched, self._speed_rad_s)
         self.session.supervisor.first = self._stop.round
         self.session.supervisor.ticked = self._ping
         self._watchdog_s, self._pinged_s = watchdog_period_s(), 0.0

@@ -21,6 +21,8 @@ from recordings.schema.stillness import LEAST_SAMPLES, scatter
 from station.cell.config import StillnessConfig
 from station.cell.errors import StationError
 
+RESTING_RAD_S = 0.01
+"""An arm slower than this rests after a stop: joint speeds of a resting UR read up to some mrad/s."""
 JOGGED_RAD = 0.01
 
 _DEG = math.degrees(1.0)

@@ -1,4 +1,4 @@
-"""A Universal Robots arm behind `devices.base.Robot`: one control process per approval, two stop paths.
+"""A Universal Robots arm, an `Arm` and a `Mover`: one control process per approval, two stop paths.
 
 Runs in one event loop and never blocks it for more than milliseconds; the state stream has its own thread,
 ur_rtde its own process. Rules: docs/operator/safety.md, faults: docs/contributor/fault-tests.md.
@@ -20,6 +20,7 @@ from recordings.schema.messages import RobotState
 from station.cell.arm_acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
+from station.cell.stillness import RESTING_RAD_S
 from station.devices.base import fresh, ready
 from station.devices.news import RESTING_S
 from station.devices.rtde import RuntimeState
@@ -37,7 +38,6 @@ log = logging.getLogger(__name__)
 TOOL_S = 0.04
 """Period of the checks of TCP and payload during a move; each takes up to a millisecond."""
 ONE_WAY_S = 1.0
-RESTING_RAD_S = 0.005
 STOP_WAIT_S = 0.05
 PROGRAM_START_S = 0.2
 LEFTOVER_WAIT_S = 2.0

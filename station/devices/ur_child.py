@@ -24,6 +24,7 @@ from recordings.files import open_regular
 from station.cell.config import ControlPath
 from station.cell.errors import RobotError, StaleStateError
 from station.devices.news import Delay
+from station.devices.ur_moves import STOP_RAD_S2
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -36,8 +37,6 @@ ACKNOWLEDGE_S = 1.0
 END_S = 1.0
 REAP_S = 2.0
 LOG_LIMIT_BYTES = 1_000_000
-STOP_DECELERATION = 4.0
-"""Deceleration of the joints, rad/s². From full speed the arm rests after 0.26 s."""
 KEPT = 64
 """Number of watchdog resets that are remembered: more than a second of them."""
 
@@ -178,7 +177,7 @@ class ControlChild:
 
     def stop(self) -> None:
         """Send the stop request to the child now. Never raises."""
-        self._send({"do": "stop", "deceleration": STOP_DECELERATION})
+        self._send({"do": "stop", "deceleration": STOP_RAD_S2})
 
     def check(self, patience_s: float = ACKNOWLEDGE_S) -> None:
         """Raise RobotError when the process died or hangs, or its program accepts no watchdog resets."""

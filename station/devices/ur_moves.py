@@ -28,6 +28,8 @@ SLIDER_ZERO_S = 10.0
 SLIDER_STILL = 0.005
 JOINT_SPEED_LIMIT_RAD_S = 1.05
 JOINT_ACCELERATION_LIMIT_RAD_S2 = 1.5
+STOP_RAD_S2 = 4.0
+"""Deceleration of the joints at STOP. From full speed the arm rests after 0.26 s."""
 
 
 def check_goal(

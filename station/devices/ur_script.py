@@ -20,14 +20,13 @@ from typing import NamedTuple
 
 from station.cell.errors import RobotError
 from station.devices.rtde import HANDSHAKE_S, PORT, PacketType, RtdeError, RtdeLink, RuntimeState
-from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
+from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S, STOP_RAD_S2
 
 SCRIPT_PORT = 30002
 FIRST_REGISTER = 24
 """First register used: the upper half is for RTDE clients, the lower for field buses."""
 SILENCE_S = 0.2
 """Time without a new keepalive after which the script stops the arm and ends."""
-STOP_RAD_S2 = 4.0
 RATE_HZ = 125.0
 START_S = 5.0
 SETTLE_SAMPLES = 5

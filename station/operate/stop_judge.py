@@ -13,9 +13,8 @@ import numpy as np
 from calibrate.geometry import Array
 from recordings.schema.messages import RobotState
 from station.cell.arm_acceptance import Figure, StopTestMove, StopWay
+from station.cell.stillness import RESTING_RAD_S
 
-RESTING_RAD_S = 0.01
-"""An arm slower than this rests: joint speeds of a resting UR read up to some mrad/s."""
 REST_S = 0.1
 """Time for which the arm must be slower than `RESTING_RAD_S` to count as at rest."""
 SLOWER = 0.9

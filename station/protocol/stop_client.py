@@ -98,7 +98,9 @@ class Outcome(Enum):
 
     RESTS = "stopped, the arm rests; latched: look at the cell, then `station acknowledge`"
     MOVES = "STOP was heard, but the arm still moves. Press the emergency stop."
-    UNKNOWN = "STOP is latched, but no motion is told. If the arm moves, press its emergency stop."
+    UNKNOWN = (
+        "STOP is latched, but the robot does not tell whether it moves. If it does, press its emergency stop."
+    )
     SILENT = "STOP was sent, but the station did not confirm it. Press the emergency stop."
     NO_DAEMON = "No station daemon serves {socket}: STOP reached nobody. Press the emergency stop."
     DENIED = "{socket}: not allowed (group station-operator is). Press the emergency stop."

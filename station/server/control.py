@@ -196,7 +196,7 @@ class _Connection:
     def _take(self, request: Request) -> None:
         if request.verb == "stop":
             # Before any limit is checked and any later line is read.
-            stopping = self._handler.stop_now(self.peer)
+            stopping = self._handler.stop_by_client(self.peer)
             self._spawn(self._answer_stop(request.id, stopping))
         elif request.verb not in VERBS:
             self.refuse(request.id, RefusedError("unknown-verb", verb=request.verb))

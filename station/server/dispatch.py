@@ -31,11 +31,11 @@ class SessionDispatcher:
         self._names: dict[int, str] = {}
         """User id → name, once looked up."""
 
-    def stop_now(self, peer: Peer) -> Awaitable[object]:
+    def stop_by_client(self, peer: Peer) -> Awaitable[object]:
         """Begin STOP at once; return an awaitable for its end."""
         return self._to_the_end(self._session.stop(peer.who))
 
-    def stop_from(self, sender: Peer) -> None:
+    def stop_by_datagram(self, sender: Peer) -> None:
         """Begin STOP for a sender without a connection, named by the connection of its process if any."""
         known = (c for c in self._callers.values() if (c.pid, c.uid) == (sender.pid, sender.uid))
         caller = next(known, None)

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from station.cell.errors import StationError
 from station.cell.socket_folder import bind, make_folder, motion_page, stop_socket
+from station.cell.stillness import RESTING_RAD_S
 from station.protocol.stop_client import Motion, Page, create_page, write_page
 from station.server.approval import Peer
 
@@ -29,7 +30,6 @@ PAUSE_S = 0.02
 """Pause after a datagram before the next ones are read together, so that a flood costs little."""
 REPEAT_S = 0.1
 """Shortest period at which a latched STOP is sent again to a resting arm."""
-RESTING_RAD_S = 0.01
 SETTLE_S = 0.05
 """Time after STOP before an arm can count as resting, as a move may just have begun."""
 _CREDENTIALS = struct.Struct("3i")

@@ -1,8 +1,9 @@
 """Exports of a calibration to the file formats of other programs.
 
 A format is a function from Calibration and FrameNames to the file's text, and its row in `FORMATS`. The
-functions are in `ros`, `models` (URDF) and `vision`, where `zivid` is a short example. Every file begins with
-`frames.comment`. `tests/foreign` reads it with another library, and compares with known points.
+functions are in `ros`, `models` and `robot` (URDF), and `vision`, where `zivid` is a short example. Every
+file begins with `frames.comment`. `tests/foreign` reads it with another library, and compares with known
+points.
 """
 
 from __future__ import annotations
@@ -51,6 +52,11 @@ def export(
     if frames.validity is not None:
         anyway = "a calibration file that is named is exported all the same"
         require_usable(frames.validity, "The installed calibration", anyway)
+    if name in ("opencv", "halcon", "zivid") and (frames.base, frames.flange) != (
+        FrameNames.base,
+        FrameNames.flange,
+    ):
+        raise ExportError("frames-of", format=name)
     if frames.attach and name not in ("ros-launch", "urdf"):
         raise ExportError("attach-of", format=name)
     if arm is not None:

@@ -160,6 +160,12 @@ def test_points_are_where_the_readers_rule_puts_them(
     np.testing.assert_allclose(found["camera"], points, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["opencv", "halcon", "zivid"])
+def test_names_of_robot_frames_are_refused_where_none_is_written(calibration: Calibration, name: str) -> None:
+    with raises("frames-of", ExportError):
+        export(calibration, name, FrameNames(base="base_link"))
+
+
 def test_frame_names_of_any_kind_stay_names(calibration: Calibration, tmp_path: Path) -> None:
     """In Python; a node's name may hold letters, digits and underscores only."""
     odd = FrameNames(camera='cell 1/cam\'s "eye"')

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from station.cell import limits, status
-from station.devices import news, ur_child, ur_control, ur_moves, ur_script
+from station.devices import news, ur_child, ur_control, ur_moves
 from station.session import motion, supervisor
 
 PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
@@ -30,8 +30,7 @@ PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
         (news.RESTING_S, 1.0, "(1 s at rest)"),
         (ur_moves.STRAYED_RAD, 0.05, "(by 0.05 rad)"),
         (ur_moves.SLIDER_ZERO_S, 10.0, "after 10 s the move is given up"),
-        (ur_child.STOP_DECELERATION, 4.0, "the joints brake with 4 rad/s²"),
-        (ur_script.STOP_RAD_S2, 4.0, "the joints brake with 4 rad/s²"),
+        (ur_moves.STOP_RAD_S2, 4.0, "the joints brake with 4 rad/s²"),
         (status.APPROVAL_LIFETIME_S, 120.0, "It is for one use"),
         (motion.START_TOLERANCE_RAD, 0.005, "from where the arm stood"),
     ],

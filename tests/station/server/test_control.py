@@ -41,7 +41,7 @@ class RecordingHandler(SessionDispatcher):
         self.lost: list[int] = []
         self.release = asyncio.Event()
 
-    def stop_now(self, peer: Peer) -> Awaitable[object]:
+    def stop_by_client(self, peer: Peer) -> Awaitable[object]:
         self.order.append("stop")
         return asyncio.sleep(0)
 

@@ -90,7 +90,7 @@ async def test_files_and_names_that_hang_hold_up_no_approved_motion_and_no_stop(
         session.load_plan(1, small_plan)
         await served.rig.give_go()
         await until(lambda: bool(session.store.status.session.recording))
-        await see.stop_now(Peer(8, 0, 0))
+        await see.stop_by_client(Peer(8, 0, 0))
         assert not any(task.done() for task in asking)
     finally:
         answers.set()
@@ -299,7 +299,7 @@ def test_a_process_is_seen_at_its_terminal_only_in_the_foreground() -> None:
 
 async def test_who_is_turned_away_is_not_kept(served: Served) -> None:
     dispatcher = SessionDispatcher(served.rig.session)
-    await dispatcher.stop_now(Peer(client_id=99, pid=1, uid=0))
+    await dispatcher.stop_by_client(Peer(client_id=99, pid=1, uid=0))
     assert not dispatcher._callers and "uid 0 (pid 1)" in served.rig.session.store.status.reason
 
 

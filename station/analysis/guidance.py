@@ -31,7 +31,7 @@ from calibrate.views import ViewSet, implied_flange
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.analysis.estimation import as_views
 from station.analysis.found_cell import FoundCell, find_cell
-from station.analysis.worker import CapturedView
+from station.analysis.worker import BoardDetection, CapturedView
 from station.plan.choose import Objective
 from station.plan.visibility import distances_that_fill, outline, visible
 
@@ -92,11 +92,12 @@ class Way:
     """The view differs from all so far."""
 
 
-def motion_px(before: Array, now: Array) -> float | None:
-    """Measure how far the board moved between two images, corners (k, 2) and (k, 2); None: not comparable."""
-    if before.shape != now.shape or not len(now):
+def motion_px(before: BoardDetection, now: BoardDetection) -> float | None:
+    """Measure how far the board moved between two images, by corners seen in both; None: there are none."""
+    _, first, second = np.intersect1d(before.indices, now.indices, return_indices=True)
+    if not len(first):
         return None
-    return float(np.median(np.linalg.norm(now - before, axis=1)))
+    return float(np.median(np.linalg.norm(now.pixels[second] - before.pixels[first], axis=1)))
 
 
 def rim(board: BoardSpec) -> Array:

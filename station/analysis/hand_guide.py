@@ -91,7 +91,7 @@ class HandGuide:
         self.way = way
         if seen is not self._seen:
             before, self._seen = self._seen, seen
-            self._motion_px = None if before is None else motion_px(before.pixels, seen.pixels)
+            self._motion_px = None if before is None else motion_px(before, seen)
         found, moves, still = self._stillness.measure(self._motion_px), "too few robot states", 0.0
         try:
             self._latest()

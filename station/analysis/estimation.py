@@ -14,7 +14,7 @@ import numpy as np
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, inverse, pose
+from calibrate.geometry import Array, inverse, pose, project_to_rotation
 from calibrate.handeye.information import USUAL_NOISE, covariance_of, prior_information, view_information
 from calibrate.handeye.metrics import median_distance_m, point_error_m
 from calibrate.handeye.priors import BoardTolerance
@@ -103,9 +103,10 @@ def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
         list(board[:, :3, 3]),
         method=cv2.CALIB_HAND_EYE_PARK,
     )
-    X = pose(np.asarray(R), np.asarray(t).ravel())
-    if not np.isfinite(X).all():
+    if not np.isfinite(R).all() or not np.isfinite(t).all():
         raise np.linalg.LinAlgError("no finite solution")
+    # Of views that contradict each other OpenCV's R may be a mirror, which is no pose to record.
+    X = pose(project_to_rotation(np.asarray(R)), np.asarray(t).ravel())
     return X, np.asarray(gripper[0] @ X @ board[0])
 
 

@@ -68,9 +68,9 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     poses = session.poses
     head = error_facts("", estimate.predicted_error_mm, estimate.working_distance_m)
     if goal:
-        head += Content.assemble(("   goal ", "$dim"), (f"{goal:g} mm", "$warn"))
+        head += Content.assemble(("  goal ", "$dim"), (f"{goal:g} mm", "$warn"))
     if estimate.enough:
-        head += Content("   ") + mark("done", "reached")
+        head += Content("  ") + mark("done", "reached")
     measured = [(i + 1.0, p.estimated_sigma_mm) for i, p in enumerate(poses) if p.estimated_sigma_mm]
     planned = [
         (i + 1.0, p.predicted_sigma_mm)
@@ -79,7 +79,7 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     ]
     rows = [head]
     if poses and poses[-1].predicted_sigma_mm is not None and height > 6:
-        end = error_facts("by the plan", poses[-1].predicted_sigma_mm, session.working_distance_m)
+        end = error_facts("by the plan", poses[-1].predicted_sigma_mm, None)
         rows.append(end + dim(f" after {len(poses)} poses"))
     rows.append(
         curve(

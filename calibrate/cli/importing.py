@@ -46,7 +46,7 @@ def import_command(
         Path | None, typer.Option(help="dataset.yaml: mount, board. Default: in or beside the source.")
     ] = None,
     poses: Annotated[
-        Path | None, typer.Option(help="File or folder of the robot's poses, where others may be meant.")
+        Path | None, typer.Option(help="The robot's poses: a file, a folder, or the end of a table's name.")
     ] = None,
     convention: Annotated[
         str | None,

@@ -131,10 +131,9 @@ def joints_rad(table: Table) -> Array:
 
 def _named(words: str) -> set[Mount]:
     """The mounting that words name; words of both say nothing."""
-    in_hand, to_hand = _IN_HAND.search(words), _TO_HAND.search(words)
-    if bool(in_hand) == bool(to_hand):
-        return set()
-    return {"eye-in-hand" if in_hand else "eye-to-hand"}
+    ways: dict[Mount, re.Pattern[str]] = {"eye-in-hand": _IN_HAND, "eye-to-hand": _TO_HAND}
+    found = {mount for mount, way in ways.items() if way.search(words)}
+    return found if len(found) == 1 else set()
 
 
 _OTHER: dict[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}

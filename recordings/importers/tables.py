@@ -106,12 +106,13 @@ class _Row:
 
 
 def look(source: Path, poses: Path | None = None) -> Lies:
-    """Read what lies in `source`; numbers only of `poses`, a file or a folder, where it is given."""
+    """Read what lies in `source`; tables only of `poses`, a file, a folder or the end of their names."""
+    file = poses if poses is not None and poses.exists() else None
     found, rows = Lies(source), defaultdict[tuple[str, ...], list[_Row]](list)
     words = ["/".join(source.resolve().parts[-3:])]
     files = sorted(islice(_files(source), _FILES_LIMIT), key=natural)
     images = defaultdict[str, list[Path]](list)
-    for path in files if poses is None or poses.is_relative_to(source) else [*files, poses]:
+    for path in files if file is None or file.is_relative_to(source) else [*files, file]:
         if path.suffix.lower() in IMAGE_SUFFIXES:
             images[str(path.relative_to(source).parent / _pattern(path.name))].append(path)
             continue
@@ -126,7 +127,7 @@ def look(source: Path, poses: Path | None = None) -> Lies:
             words.extend(node.keys[-1:])
             if isinstance(node.value, str):
                 words.append(node.value[:60])
-            if poses is not None and path != poses and poses not in path.parents:
+            if file is not None and path != file and file not in path.parents:
                 continue
             place = (*map(int, re.findall(r"\d+", name)), *node.place)
             if (row := _pose(node.value)) is not None:
@@ -139,7 +140,7 @@ def look(source: Path, poses: Path | None = None) -> Lies:
     found.words = " ".join(dict.fromkeys(words))
     for (name, rotation, _), each in rows.items():
         for part, some in _two_by_two(each).items():
-            if len(some) >= 3:
+            if len(some) >= 3 and (poses is file or name.endswith(str(poses))):
                 beside = [row.image for row in some], [row.place for row in some]
                 table = np.array([row.numbers for row in some])
                 found.tables.append(Table(f"{name}{part}", rotation, table, *beside))

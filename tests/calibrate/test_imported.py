@@ -207,6 +207,7 @@ def test_a_camera_near_the_flange_and_a_board_far_from_the_base_tell_the_mountin
     change: Callable[[np.ndarray], np.ndarray], put: Callable[..., Path], images: tuple[Path, np.ndarray]
 ) -> None:
     folder = put(unnamed, change)
+    assert look(folder, Path("poses.txt")).tables and not look(folder, Path("others")).tables
     found = believe(look(folder))
     assert found.dataset.mount == "eye-in-hand"
     np.testing.assert_allclose([row.base_from_flange for row in found.rows], images[1], atol=1e-6)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -14,10 +13,10 @@ import typer
 
 from calibrate.kinematics import MODELS
 from recordings.files import state_root
-from recordings.schema.messages import Image, RobotIdentity, RobotState
+from recordings.schema.messages import Image
 from station.cell.config import CameraConfig, RobotConfig
-from station.cell.errors import RobotError, StaleStateError, StationError
-from station.cell.socket_folder import default_socket, post_socket
+from station.cell.errors import RobotError, StationError
+from station.cell.socket_folder import default_socket
 from station.cli.console import err
 from station.cli.daemon import answers, ensure_daemon, own_daemon, tell_what_goes_on, user_config
 from station.devices.aravis import AravisCamera
@@ -26,7 +25,7 @@ from station.devices.ur_dashboard import STOP
 from station.devices.ur_link import UrLink, not_connected
 from station.devices.ur_probe import identify, open_dashboard, unsupported_model
 from station.devices.webcam import WebcamCamera, discover_webcams
-from station.operate.draft import POSTED, ArmReader, CameraChoice, CameraReader
+from station.operate.draft import ArmReader, CameraChoice, CameraReader
 
 
 class GuidedArm(UrLink):
@@ -42,29 +41,6 @@ class GuidedArm(UrLink):
         if self.dashboard is None:
             raise not_connected(self.config.host)
         await self.dashboard.ask(STOP)
-
-
-class PostedReader:
-    """`draft.ArmReader` of an arm that is only named: its pose is posted once the cell is open."""
-
-    remote = None
-
-    def __init__(self, name: str) -> None:
-        self.identity = RobotIdentity(model=name)
-
-    def latest(self) -> RobotState:
-        raise StaleStateError("post-nobody", robot=self.identity.model, socket=post_socket(default_socket()))
-
-    def subscribe(self, callback: Callable[[RobotState], None]) -> None:
-        """Its states come to the daemon."""
-
-    def trouble(self) -> str:
-        return ""
-
-    async def stop(self) -> None:
-        """The station cannot stop this arm."""
-
-    async def close(self) -> None: ...
 
 
 _DRIVERS: dict[str, type[AravisCamera | WebcamCamera]] = {"aravis": AravisCamera, "webcam": WebcamCamera}
@@ -107,8 +83,6 @@ class RealHardware:
 
     async def arm(self, host: str) -> ArmReader:
         """`host` may be followed by the model, for a controller that does not tell it."""
-        if host.startswith(POSTED):
-            return PostedReader(host.removeprefix(POSTED).strip())
         address, _, told = host.partition(" ")
         dashboard = await open_dashboard(address)
         found = await identify(dashboard)

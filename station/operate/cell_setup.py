@@ -13,7 +13,7 @@ import numpy as np
 from calibrate.boards.corners import to_grey
 from calibrate.boards.grids import seen_size
 from recordings.images import viewable
-from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotState
+from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotIdentity, RobotState
 from station.analysis.hand_guide import HandGuide
 from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.config import StillnessConfig
@@ -22,7 +22,7 @@ from station.cell.layout import flange_pose
 from station.cell.status import GuidanceStatus
 from station.cell.stillness import StillnessMonitor
 from station.operate import draft as drafts
-from station.operate.draft import ArmReader, CameraChoice, CameraReader, CellStep, Draft, Hardware
+from station.operate.draft import POSTED, ArmReader, CameraChoice, CameraReader, CellStep, Draft, Hardware
 
 GREY_WANTED = 110.0
 """Mean grey of a well exposed image of paper and table, of 255."""
@@ -65,14 +65,17 @@ class CellSetup:
         self.keep(msgspec.structs.replace(self.draft, **values))
 
     async def connect(self, host: str) -> None:
-        """Read the arm at this address from now on. Raises RobotError."""
-        arm = await self._hardware.arm(host)
+        """Read the arm at this address from now on; none where a program will post its pose. RobotError."""
+        arm = None if host.startswith(POSTED) else await self._hardware.arm(host)
         if self.arm is not None:
             await self.arm.close()
         self.arm, self._stillness = arm, StillnessMonitor(StillnessConfig())
-        arm.subscribe(self._stillness.add)
-        same = self.draft.robot is not None and self.draft.robot.serial == arm.identity.serial
-        self._found(same, host=host, robot=arm.identity)
+        robot = RobotIdentity(model=host.removeprefix(POSTED).strip())
+        if arm is not None:
+            robot = arm.identity
+            arm.subscribe(self._stillness.add)
+        same = self.draft.robot is not None and self.draft.robot.serial == robot.serial
+        self._found(same, host=host, robot=robot)
 
     async def look_for_cameras(self) -> bool:
         """Search for cameras; True when the list changed. A single one is opened at once."""

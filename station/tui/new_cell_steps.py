@@ -114,7 +114,7 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
     """Choose the next action; `text`: what is typed, as it is understood so far."""
     draft = setup.draft
     match step:
-        case CellStep.ROBOT if setup.arm is None:
+        case CellStep.ROBOT if setup.arm is None and not draft.posted:
             wrong = any(part.isdecimal() and int(part) > 255 for part in text.split(".")[:4])
             why = "Numbers of an address go up to 255." if wrong else "then Enter."
             return Action("", "Type the address", why, look=wrong)
@@ -197,7 +197,7 @@ async def accept(setup: CellSetup, step: CellStep, text: str) -> bool:
             if text and (setup.arm is None or text != draft.host):
                 flow.check_address(text)
                 await setup.connect(text)
-            return setup.arm is not None
+            return setup.arm is not None or bool(setup.draft.posted)
         case CellStep.CAMERA:
             return setup.camera is not None
         case CellStep.MOUNTING:

@@ -56,10 +56,8 @@ def running_estimate(
         return blank
     distance_m = median_distance_m(views.camera_from_board)
     error_m = point_error_m(X, quick_covariance(views, config.board, X, Y, not lens_is_known), distance_m)
-    x, y, z = (float(v) for v in 1000 * X[:3, 3])
     return msgspec.structs.replace(
         blank,
-        translation_mm=(round(x, 2), round(y, 2), round(z, 2)),
         camera_pose=matrix4(X),
         board_pose=matrix4(Y),
         predicted_error_mm=round(1000 * error_m, 3),

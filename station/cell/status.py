@@ -75,8 +75,6 @@ class ArmCondition(msgspec.Struct, frozen=True, omit_defaults=True):
     """'RUNNING', 'POWER OFF' …"""
     safety: str = ""
     """'NORMAL', 'PROTECTIVE STOP' …"""
-    program: str = ""
-    """State of the robot's program: stopped, playing, paused."""
     held: str = ""
     """Why the arm cannot move now, and the remedy at the pendant; empty: it can."""
 
@@ -190,7 +188,6 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Running estimate after each pose, not the result of the session."""
 
     views: int = 0
-    translation_mm: tuple[float, float, float] | None = None
     predicted_error_mm: float | None = None
     """1σ of a point at the working distance, as the calibration file states it."""
     working_distance_m: float | None = None

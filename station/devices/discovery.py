@@ -26,8 +26,8 @@ _DISCOVERY = struct.pack(">BBHHH", 0x42, 0x11, 0x0002, 0, 1)
 _ANSWER = struct.Struct(">HHHH")
 _DISCOVERY_ANSWER, _READ_ANSWER = 0x0003, 0x0081
 _ADDRESS, _MASK = 0x24, 0x34
-_TEXTS = ((0x48, 32), (0x68, 32), (0x88, 32), (0xD8, 16))
-"""Address and length of vendor, model, firmware and serial number"""
+_TEXTS = ((0x68, 32), (0x88, 32), (0xD8, 16))
+"""Address and length of model, firmware and serial number"""
 _LENGTH = 248
 _PRIVILEGE, _PRIMARY_ADDRESS = 0xA00, 0xA14
 _GET_ADDRESS, _GET_MASK = 0x8915, 0x891B
@@ -39,7 +39,6 @@ USB3_MBIT_S = 5000
 
 
 class FoundCamera(msgspec.Struct, frozen=True):
-    vendor: str
     model: str
     serial: str
     firmware: str
@@ -95,14 +94,14 @@ def _camera(answer: bytes, here: IPv4Interface) -> FoundCamera | None:
     if len(data) < _LENGTH or _ANSWER.unpack(head)[:2] != (0, _DISCOVERY_ANSWER):
         return None
     ip, mask = (socket.inet_ntoa(data[at : at + 4]) for at in (_ADDRESS, _MASK))
-    vendor, model, firmware, serial = (
+    model, firmware, serial = (
         data[at : at + length].split(b"\0")[0].decode("ascii", "replace") for at, length in _TEXTS
     )
     try:
         address = str(IPv4Interface(f"{ip}/{mask}"))
     except ValueError:  # a mask whose ones are not contiguous
         address = f"{ip}/32"
-    return FoundCamera(vendor, model, serial, firmware, address, str(here))
+    return FoundCamera(model, serial, firmware, address, str(here))
 
 
 def _with_user(camera: FoundCamera) -> FoundCamera:
@@ -147,7 +146,6 @@ def _interfaces() -> list[tuple[str, IPv4Interface]]:
 
 
 class UsbCamera(msgspec.Struct, frozen=True):
-    vendor: str
     model: str
     serial: str
     firmware: str
@@ -170,7 +168,6 @@ def discover_usb(devices: Path = _DEVICES, nodes: Path = _NODES) -> list[UsbCame
         speed = kernel_text(camera / "speed")
         found.append(
             UsbCamera(
-                kernel_text(camera / "manufacturer"),
                 kernel_text(camera / "product"),
                 kernel_text(camera / "serial"),
                 kernel_text(camera / "bcdDevice"),

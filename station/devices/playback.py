@@ -206,7 +206,7 @@ class PlaybackRobot:
 
     def condition(self, state: RobotState) -> ArmCondition:
         """Describe it as running, as the recorded arm holds nobody up."""
-        return ArmCondition("RUNNING", "NORMAL", "stopped", "")
+        return ArmCondition("RUNNING", "NORMAL")
 
     def stop_one_way(self, way: StopWay) -> None:
         raise RobotError("playback")

@@ -58,7 +58,7 @@ def condition(state: RobotState) -> ArmCondition:
     held = arm_held(state)
     mode = _word(RobotMode, state.robot_mode, "MODE")
     what = f"{held.text}: {held.remedy.removesuffix(_ACKNOWLEDGE)}" if held is not None else ""
-    return ArmCondition(mode, safety_word(state), program_word(state), what)
+    return ArmCondition(mode, safety_word(state), what)
 
 
 def not_powered(state: RobotState) -> RobotError | None:
@@ -96,12 +96,8 @@ def foreign_program(state: RobotState, name: str) -> RobotError | None:
     """Make the error where starting control would replace another program; None where none runs."""
     if state.runtime_state == RuntimeState.STOPPED:
         return None
-    return RobotError("foreign-program", program=name, state=program_word(state))
-
-
-def program_word(state: RobotState) -> str:
-    """Name the program's state: 'playing', 'paused' …"""
-    return _word(RuntimeState, state.runtime_state, "IN STATE").lower()
+    word = _word(RuntimeState, state.runtime_state, "IN STATE").lower()
+    return RobotError("foreign-program", program=name, state=word)
 
 
 def safety_word(state: RobotState) -> str:

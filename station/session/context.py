@@ -189,21 +189,15 @@ class StatusStore:
     def state(self) -> StationState:
         return self.status.state
 
-    def watch(self, changed: Callable[[], None]) -> Callable[[], None]:
-        """Call `changed` after every change; return an idempotent function that ends it."""
+    def watch(self, changed: Callable[[], None]) -> None:
+        """Call `changed` after every change."""
         self._watchers.append(changed)
-
-        def end() -> None:
-            if changed in self._watchers:
-                self._watchers.remove(changed)
-
-        return end
 
     def update(self, **sections: object) -> None:
         changed = {k: v for k, v in sections.items() if getattr(self.status, k) != v}
         if changed:
             self.status = msgspec.structs.replace(self.status, **changed)
-            for watcher in list(self._watchers):
+            for watcher in self._watchers:
                 try:
                     watcher()
                 except Exception:  # an observer's error must not prevent STOP

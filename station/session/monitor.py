@@ -132,10 +132,8 @@ def _read_files(context: SessionContext, folder: str) -> _Files:
 
 
 def _free_bytes(root: Path) -> int | None:
-    """Measure free space in steps of 100 MB, the last 1 GB in steps of 1 MB; None where the disk is gone."""
+    """Measure free space in steps of 1 MB; None where the disk is gone."""
     try:
-        free = shutil.disk_usage(root).free
+        return shutil.disk_usage(root).free // 1_000_000 * 1_000_000
     except OSError:
         return None
-    step = 100_000_000 if free >= 1_000_000_000 else 1_000_000
-    return free // step * step

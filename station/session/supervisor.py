@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.02
 STATUS_TICKS = 5
-LAGS_KEPT = 3000
+LAGS_KEPT = 50
 
 
 class SessionSupervisor:
@@ -42,7 +42,7 @@ class SessionSupervisor:
         self._late_since_s = 0.0
         """Since when states are late (host monotonic); 0: they are not."""
         self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
-        """Delay of each round."""
+        """Delay of each round of the last second."""
 
     async def run(self) -> None:
         """Run for the daemon's life."""
@@ -76,8 +76,7 @@ class SessionSupervisor:
 
     def lag_ms(self) -> float:
         """Return the largest delay of the last second, ms."""
-        recent = list(self.lags_s)[-50:]
-        return 1000 * max(recent, default=0.0)
+        return 1000 * max(self.lags_s, default=0.0)
 
     def _watch_link(self) -> None:
         """Switch between idle and disconnected; during a run the run itself detects a lost robot."""

@@ -27,17 +27,17 @@ ADDRESS_TAKEN = 1
 """Exit code of a controller that cannot listen on its address."""
 STOP_TIMEOUT_S = 3.0
 END_TIMEOUT_S = 0.5
-GIGE_TIMEOUT_S = 30.0
+CONTROLLER_TIMEOUT_S, GIGE_TIMEOUT_S, ANSWER_S = 15.0, 30.0, 5.0
 
 
 class AdminClient:
     """Connection to a simulated controller's admin port; blocking with time-outs, for one thread."""
 
-    def __init__(self, host: str, timeout_s: float = 5.0) -> None:
+    def __init__(self, host: str) -> None:
         """Raises RobotError when nothing listens there."""
         self.host = host
         try:
-            self._socket = socket.create_connection((host, ADMIN_PORT), timeout_s)
+            self._socket = socket.create_connection((host, ADMIN_PORT), ANSWER_S)
         except OSError as error:
             raise self._gone(str(error)) from error
         self._lines = self._socket.makefile("rb")
@@ -112,17 +112,15 @@ class SimulatedController(ChildProcess):
 def start_controller(
     model: str = "UR10",
     *,
-    host: str | None = None,
     truth: Path | None = None,
     time_scale: float = 1.0,
-    timeout_s: float = 15.0,
     log: Path | None = None,
     options: tuple[str, ...] = (),
     module: str = "station.simulation.controller",
 ) -> SimulatedController:
     """Start a controller and wait until all its ports listen; blocking, so call it outside an event loop.
 
-    host: None: a random free 127.x.y.z. log: file for its standard error. options: further arguments of the
+    It gets a random free 127.x.y.z. log: file for its standard error. options: further arguments of the
     command line. module: another program with the same command line. Raises RobotError with the child's last
     output.
     """
@@ -131,12 +129,12 @@ def start_controller(
     if truth is not None:
         command += ["--truth", str(truth)]
     for attempt in range(ATTEMPTS, 0, -1):
-        address = host or f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
-        child, problem = _start([*command, "--host", address], timeout_s, log)
+        host = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
+        child, problem = _start([*command, "--host", host], CONTROLLER_TIMEOUT_S, log)
         if not problem:
             give_own_priority(child.pid)
-            return SimulatedController(address, child)
-        if host is not None or child.returncode != ADDRESS_TAKEN or attempt == 1:
+            return SimulatedController(host, child)
+        if child.returncode != ADDRESS_TAKEN or attempt == 1:
             break
     raise RobotError("simulation-not-started", device=model, reason=problem, exit_code=child.returncode)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.boards.printing import draw_pattern, origin_mm
-from calibrate.geometry import Array, is_rigid
+from calibrate.geometry import Array
 from recordings.schema.messages import BoardSpec, CameraModel
 
 Floats = NDArray[np.float32]
@@ -112,11 +112,8 @@ def render(
 ) -> NDArray[np.uint8]:
     """Render a mono8 image (height, width); `camera_from_board` (4, 4) at mid-exposure.
 
-    Without `rng` the image is free of noise. ValueError for a transform that is not rigid or a camera
-    without a matrix.
+    Without `rng` the image is free of noise. ValueError for a camera without a matrix.
     """
-    if not is_rigid(camera_from_board):
-        raise ValueError(f"camera_from_board is not a rigid transform:\n{camera_from_board}")
     light = light or Light()
     lens = _lens(camera)
     gain = 10 ** (light.gain_db / 20)

@@ -107,7 +107,7 @@ async def test_doctor_sees_every_camera_on_the_wire_and_what_keeps_it_from_use(l
     emulated = emulator()
     async with opened(emulated) as camera:
         (found,) = discover()
-        assert (found.vendor, found.model, found.serial) == ("Judge", "Emulated", "EMU7")
+        assert (found.model, found.serial) == ("Emulated", "EMU7")
         assert found.address.startswith("127.0.0.1/") and found.reachable and found.controlled
         await camera.close()
         assert not discover()[0].controlled

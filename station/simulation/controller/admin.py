@@ -25,7 +25,6 @@ from station.simulation.controller.rtde_server import ADMIN
 from station.simulation.controller.state import Six
 
 PORT = 29990
-LINE_LIMIT = 1_000_000
 TRUTH_WAIT_S = 2.0
 HAND_RAD_S2 = 2.0
 
@@ -37,9 +36,10 @@ JointSpeed = Annotated[float, Meta(ge=1e-3, le=100)]
 Three = tuple[float, float, float]
 
 
-def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> Json:
+def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> None:
     """Cuts every connection of these ports (rtde, script, dashboard; all if none named) by fin or rst."""
-    return {"cut": machine.cut(how, ports)}
+    for service in machine.chosen(ports):
+        service.cut(how)
 
 
 def mute(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
@@ -64,10 +64,7 @@ def restart(
 def in_use(machine: Machine, inputs: list[str]) -> None:
     """Another RTDE client owns these input variables (e.g. "input_int_register_0")."""
     for name in inputs:
-        if name not in machine.robot.inputs.types:
-            raise ValueError(f"there is no input variable {name}")
-        if not machine.rtde.claim(name, ADMIN):
-            raise ValueError(f"{name} is owned by a client already")
+        machine.rtde.claim(name, ADMIN)
 
 
 def foreign(machine: Machine, name: str = "palletising.urp") -> None:
@@ -131,7 +128,6 @@ def state(machine: Machine) -> Json:
         "model": robot.settings.model,
         "timestamp_s": robot.time_s,
         "controller_zero_monotonic_ns": machine.clock.start_ns,
-        "robot_mode": robot.robot_mode.name,
         "runtime_state": robot.runtime_state.name,
         "program": robot.program.name if robot.program is not None else None,
         "moving": robot.arm.moving,
@@ -186,7 +182,7 @@ class AdminServer:
         self._machine = machine
 
     async def open(self) -> asyncio.Server:
-        return await asyncio.start_server(self._serve, self._machine.host, PORT, limit=LINE_LIMIT)
+        return await asyncio.start_server(self._serve, self._machine.host, PORT)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:

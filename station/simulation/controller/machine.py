@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 
 from station.simulation.controller.dashboard import dashboard_service
-from station.simulation.controller.network import Cut, Service
+from station.simulation.controller.network import Service
 from station.simulation.controller.primary import script_services
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.rtde_server import RtdeServer
@@ -102,9 +102,6 @@ class Machine:
         if not services:
             raise ValueError(f"ports are any of {[s.name for s in self.services]}, not {ports}")
         return services
-
-    def cut(self, how: Cut, ports: list[str] | None) -> int:
-        return sum(service.cut(how) for service in self.chosen(ports))
 
     def reboot(self, down_s: float, running: bool) -> None:
         """All links reset, all ports closed for a while, then a fresh controller: time 0, empty registers.

@@ -98,12 +98,10 @@ class Service:
         connection.service = self
         return connection
 
-    def cut(self, how: Cut) -> int:
-        """Ends every connection; new ones are welcome. Returns how many there were."""
-        count = len(self.connections)
+    def cut(self, how: Cut) -> None:
+        """Ends every connection; new ones are welcome."""
         for connection in list(self.connections):
             connection.cut(how)
-        return count
 
     def black_hole(self, on: bool) -> None:
         """On: existing links carry nothing, new ones hang without an answer (the accept queue is full)."""

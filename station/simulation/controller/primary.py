@@ -1,7 +1,7 @@
 """Ports 30001–30003: programs as text come in; of the first two, the robot's state goes out.
 
 A state message holds the TCP; the first one of a connection the factory calibration, too. The first port also
-tells which program started or stopped. Every message is an int32 size (of all of it) and more, big-endian.
+tells which program started. Every message is an int32 size (of all of it) and more, big-endian.
 Source: Universal Robots, "Remote Control via TCP/IP" and its tables of the client interfaces.
 """
 
@@ -26,9 +26,10 @@ def _frame(kind: int, payload: bytes) -> bytes:
     return struct.pack(">iB", 5 + len(payload), kind) + payload
 
 
-def key_message(robot: SimulatedRobot, title: str, text: str) -> bytes:
+def program_started(robot: SimulatedRobot, name: str) -> bytes:
+    title = b"PROGRAM_XXX_STARTED"
     head = struct.pack(">QbBii", int(robot.time_s * 1e6), _SOURCE_CONTROLLER, _KEY, 0, 0)
-    return _frame(_ROBOT_MESSAGE, head + bytes([len(title)]) + title.encode() + text.encode())
+    return _frame(_ROBOT_MESSAGE, head + bytes([len(title)]) + title + name.encode())
 
 
 def state(robot: SimulatedRobot, first: bool) -> bytes:
@@ -82,10 +83,10 @@ def script_services(host: str, robot: SimulatedRobot) -> list[Service]:
 
     services = [service(port) for port in (PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT)]
 
-    def tell(title: str, program: str) -> None:
+    def tell(program: str) -> None:
         for connection in services[0].connections:
             assert isinstance(connection, ScriptConnection)
-            connection.say(key_message(robot, title, program))
+            connection.say(program_started(robot, program))
 
     robot.tell = tell
     return services

@@ -65,7 +65,7 @@ class SimulatedRobot(ControllerState):
         self._starting = None
         self.program = program
         self.runtime_state = RuntimeState.PLAYING
-        self.tell("PROGRAM_XXX_STARTED", program.name)
+        self.tell(program.name)
 
     def _step_program(self, late: bool) -> None:
         assert self.program is not None
@@ -145,7 +145,6 @@ class SimulatedRobot(ControllerState):
             self.journal.note("controller", "program stopped", name=name, reason=reason)
         if self.program is not None:
             self.program.end()
-            self.tell("PROGRAM_XXX_STOPPED", self.program.name)
         self.program = self._starting = None
         self.runtime_state = RuntimeState.STOPPED
         self.watchdog_s = self._silence_s = 0.0

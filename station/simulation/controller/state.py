@@ -211,8 +211,8 @@ class ControllerState:
         self.watchdog_s = 0.0
         """Longest silence of `watched`, an input variable, that is allowed; 0 = none."""
         self.watched = ""
-        self.tell: Callable[[str, str], None] = lambda title, program: None
-        """Says to the clients of the primary interface that a program started or stopped."""
+        self.tell: Callable[[str], None] = lambda program: None
+        """Says to the clients of the primary interface that a program started."""
         self.clear()
 
     def clear(self) -> None:

@@ -146,7 +146,7 @@ def test_the_controllers_statements_are_understood() -> None:
     made = SimulatedRobot(Settings(model="UR10", factory_a_m=factory), Journal())
     made.tcp = TOOL
     said = read_state(state_of(made))
-    table = made.stated_table
+    table = made.table
     assert said.tcp_offset == TOOL
     assert said.dh == (table.theta_rad, table.a_m, table.d_m, table.alpha_rad)
 

@@ -9,7 +9,6 @@ from station.devices.discovery import UsbCamera, discover_usb
 CAMERA = {
     "busnum": "2",
     "devnum": "7",
-    "manufacturer": "Maker",
     "product": "Area scan",
     "serial": "0123",
     "bcdDevice": "0100",
@@ -38,8 +37,8 @@ def test_cameras_are_told_from_other_devices(tmp_path: Path) -> None:
     (nodes / "002").mkdir(parents=True)
     (nodes / "002" / "007").touch()
     assert discover_usb(devices, nodes) == [
-        UsbCamera("", "", "", "", "1-3", 0.0, False),
-        UsbCamera("Maker", "Area scan", "0123", "0100", "2-1.4", 5000.0, True),
+        UsbCamera("", "", "", "1-3", 0.0, False),
+        UsbCamera("Area scan", "0123", "0100", "2-1.4", 5000.0, True),
     ]
 
 

@@ -75,19 +75,3 @@ def test_stop_is_always_possible_and_a_go_only_at_rest() -> None:
     assert not RUNNING & Go.states
     assert Acknowledge.states == {S.STOPPED, S.FAULT}
     assert Go.control and Prepare.control and not Stop.control
-
-
-def test_a_watcher_that_ends_itself_while_another_changes_the_status_ends_nothing_else() -> None:
-    store = StatusStore(StationStatus())
-    store.watch(lambda: store.update(reason="two"))
-    calls: list[str] = []
-
-    def once() -> None:
-        calls.append(store.status.reason)
-        end()
-
-    end = store.watch(once)
-    store.update(reason="one")
-    assert calls == ["two", "two"], "the inner change first, then the one that was under way"
-    store.update(reason="three")
-    assert len(calls) == 2

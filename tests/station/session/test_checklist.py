@@ -78,8 +78,8 @@ async def test_clocks_are_ok_only_where_frames_have_a_time(
     assert found.state == state and bool(found.remedy) == (state != "ok")
 
 
-FOUND = FoundCamera("V", "M", "S", "1", "10.0.0.5/24", "10.0.0.1/24")
-PLUGGED = UsbCamera("V", "M", "S", "1", "2-1", 5000.0, True)
+FOUND = FoundCamera("M", "S", "1", "10.0.0.5/24", "10.0.0.1/24")
+PLUGGED = UsbCamera("M", "S", "1", "2-1", 5000.0, True)
 
 
 @pytest.mark.parametrize(

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import time
+from typing import Any
 
 import msgspec
 import pytest
 
 from recordings.errors import MissingSegmentError, RecordingError
 from recordings.reader import open_recording
-from station.cell.errors import SafetyStopError
+from recordings.schema.messages import Image
+from station.cell.errors import CameraError, SafetyStopError, TriggerError
 from station.cell.status import StationState as S
-from station.protocol.verbs import Purpose
+from station.protocol.verbs import Purpose, Retake
 from station.session.recording import SessionRecording
 from tests.codes import raises
 from tests.patience import until
@@ -134,3 +137,92 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
     (recording.path / "session-2.mcap").unlink()
     with pytest.raises(MissingSegmentError):
         open_recording(recording.path)
+
+
+async def test_a_lost_trigger_box_is_a_fault_of_the_session_until_the_next_go(rig: Rig) -> None:
+    """The session's own devices in memory; the camera's box is gone at the first picture."""
+    capture = rig.camera.capture
+    gone = [TriggerError()]
+
+    async def with_box(timeout_s: float = 5.0) -> Image:
+        if gone:
+            raise gone.pop()
+        return await capture(timeout_s)
+
+    rig.camera.capture = with_box  # type: ignore[method-assign]
+    await rig.give_go()
+    await rig.until(S.FAULT)
+    assert rig.session.store.status.cause == "trigger"
+    assert "done" not in rig.pose_states
+    await rig.session.acknowledge(1)
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert rig.pose_states == ["done"] * len(rig.pose_states)
+
+
+async def test_17_a_camera_that_loses_the_first_frame_after_a_pause_is_woken(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in Aravis' issue 818; waiting in vain for a frame is a pause, too."""
+    capture, glimpse = rig.camera.capture, rig.camera.glimpse
+    awake_until_s, lost = 0.0, 0
+
+    def triggered() -> bool:
+        nonlocal awake_until_s
+        was_awake = time.monotonic() < awake_until_s
+        awake_until_s = time.monotonic() + 0.2
+        return was_awake
+
+    async def dozing_capture(timeout_s: float = 5.0) -> Image:
+        nonlocal lost
+        if lost and triggered():
+            return await capture(timeout_s)
+        lost += 1  # the very first one however soon after a glimpse
+        await asyncio.sleep(0.3)
+        raise CameraError()
+
+    async def dozing_glimpse() -> Image:
+        if not triggered():
+            raise CameraError()
+        return await glimpse()
+
+    monkeypatch.setattr(rig.camera, "capture", dozing_capture)
+    monkeypatch.setattr(rig.camera, "glimpse", dozing_glimpse)
+    await rig.give_go()
+    await rig.until(S.IDLE, S.PAUSED)
+    assert rig.pose_states == ["done"] * len(rig.pose_states) and lost == 1
+
+
+async def test_25_a_pose_whose_time_is_too_uncertain_is_refused(rig: Rig) -> None:
+    cell = rig.session.context.cell
+    capture = msgspec.structs.replace(cell.config.capture, time_bound_s=0.001)  # no clock: ±25 ms
+    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    values = rig.told("time-unsure")[0].values
+    assert (values["bound_s"], values["limit_s"]) == (0.025, 0.001)
+    assert "done" not in rig.pose_states
+
+
+async def test_a_pose_that_does_not_come_to_rest_is_offered_to_a_person(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pose 2 rings at its first attempt."""
+    glimpse = rig.camera.glimpse
+
+    async def ringing() -> Any:
+        session = rig.session.store.status.session
+        rig.camera.jumps = 3 if session.current == 1 and session.poses[1].attempt == 1 else 0
+        return await glimpse()
+
+    monkeypatch.setattr(rig.camera, "glimpse", ringing)
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    assert rig.pose_states == ["done", "failed", "done", "done"]
+    assert rig.cause == "unsettled"
+    moves = rig.arm.log.count("move")
+    await rig.session.edit(1, Retake(1))
+    assert rig.arm.log.count("move") == moves
+    await rig.give_go(Purpose.RESUME)
+    await rig.until(S.IDLE)
+    assert rig.pose_states == ["done"] * POSES

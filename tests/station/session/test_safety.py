@@ -46,9 +46,8 @@ async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: 
         raise ZeroDivisionError("a defect")
 
     await rig.go_until_it_moves()
-    end = rig.session.store.watch(fails)
+    rig.session.store.watch(fails)
     await rig.session.stop("bert")
-    end()
     assert rig.state is S.STOPPED and "stop" in rig.arm.log
 
 

@@ -125,12 +125,3 @@ def test_what_this_simulator_cannot_run_is_said_so_and_starts_nothing(stepped, t
     assert made.robot.program is None and not made.plays
     (said,) = [entry for entry in made.robot.journal.entries() if entry["verb"] == "syntax error"]
     assert NOT_SUPPORTED in str(said["error"])
-
-
-def test_clients_are_told_which_program_started_and_stopped(started) -> None:
-    made = started("  sync()")
-    told: list[tuple[str, str]] = []
-    made.robot.tell = lambda *words: told.append(words)
-    made.robot.stop_program("test")
-    made.start("  sync()")
-    assert told == [("PROGRAM_XXX_STOPPED", "prog"), ("PROGRAM_XXX_STARTED", "prog")]

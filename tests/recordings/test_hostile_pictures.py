@@ -33,9 +33,10 @@ from tests.recordings.small_recording import (
 )
 
 
-def picture_file(tmp_path: Path, image: object, topic: Topic, **facts: object) -> Path:
-    settings_: dict[str, object] = {"width": WIDTH, "height": HEIGHT} | facts
-    described = PictureFacts(stamps=make_state(0).stamps, frame_id=1, sequence=0, **settings_)  # type: ignore[arg-type]
+def picture_file(tmp_path: Path, image: object, topic: Topic, width: int, height: int) -> Path:
+    """`width`, `height`: as its facts state them."""
+    stamps = make_state(0).stamps
+    described = PictureFacts(stamps=stamps, frame_id=1, sequence=0, width=width, height=height)
     names = [Topic.PICTURE_FACTS, topic, Topic.VIEW]
     declared = b"".join(schema(n, t) + channel(n, n, t.value) for n, t in enumerate(names, start=1))
     data = chunk(
@@ -57,6 +58,7 @@ def huge_png() -> bytes:
     return bytes(data)
 
 
+ONE_PIXEL = RawImage(width=1, height=1, encoding="mono8", data=b"x")
 PICTURES: dict[str, tuple[object, Topic, str]] = {
     "header of 30000×30000": (CompressedImage(data=huge_png()), Topic.COMPRESSED_IMAGE, "impossible size"),
     "another size": (CompressedImage(data=png(40, 30)), Topic.COMPRESSED_IMAGE, "is 40×30, expected 32×24"),
@@ -67,15 +69,12 @@ PICTURES: dict[str, tuple[object, Topic, str]] = {
         Topic.RAW_IMAGE,
         "holds 1 bytes where 32×24 mono8 needs 768",
     ),
-    "raw of another size": (
-        RawImage(width=1, height=1, encoding="mono8", data=b"x"),
-        Topic.RAW_IMAGE,
-        "is 1×1, expected 32×24",
-    ),
+    "raw of another size": (ONE_PIXEL, Topic.RAW_IMAGE, "is 1×1, expected 32×24"),
+    "facts of another size": (ONE_PIXEL, Topic.RAW_IMAGE, "image 0 is 1×1, the camera 32×24"),
     "raw of unknown layout": (
-        RawImage(width=WIDTH, height=HEIGHT, encoding="yuv422", data=bytes(WIDTH * HEIGHT * 2)),
+        RawImage(width=WIDTH, height=HEIGHT, encoding="yuv444", data=bytes(WIDTH * HEIGHT * 3)),
         Topic.RAW_IMAGE,
-        "unknown raw layout 'yuv422'",
+        "encoded as 'yuv444'",
     ),
 }
 
@@ -83,17 +82,11 @@ PICTURES: dict[str, tuple[object, Topic, str]] = {
 @pytest.mark.parametrize("name", PICTURES)
 def test_a_picture_is_checked_before_it_is_decoded(tmp_path: Path, name: str) -> None:
     image, topic, reason = PICTURES[name]
-    recording = open_recording(picture_file(tmp_path, image, topic))
+    width, height = (1, 1) if name == "facts of another size" else (WIDTH, HEIGHT)
+    recording = open_recording(picture_file(tmp_path, image, topic, width, height))
     with pytest.raises(BadImageError) as caught:
         recording.image(recording.views()[0])
     assert caught.value.values["image"] == 0 and reason in caught.value.text
-
-
-def test_facts_of_another_size_than_the_camera(tmp_path: Path) -> None:
-    raw = RawImage(width=1, height=1, encoding="mono8", data=b"x")
-    recording = open_recording(picture_file(tmp_path, raw, Topic.RAW_IMAGE, width=1, height=1))
-    with pytest.raises(BadImageError):
-        recording.image(recording.views()[0])
 
 
 def test_memory_stays_below_256_mib_for_the_largest_allowed_picture(tmp_path: Path) -> None:

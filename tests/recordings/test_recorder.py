@@ -241,13 +241,14 @@ def test_the_first_write_error_is_final_and_said_to_everyone(
     assert recorder.error is not None
     monkeypatch.undo()  # space is free again, and still nothing more is written
     assert not recorder.image(make_picture(2))
-    for call in (lambda: recorder.view(make_view(2)), lambda: recorder.event(event())):
+    for call in (
+        lambda: recorder.view(make_view(2)),
+        lambda: recorder.event(event()),
+        lambda: recorder.sync().result(PATIENCE_S),
+        lambda: recorder.finish().result(PATIENCE_S),
+    ):
         with refused("disk", errno=errno.ENOSPC):
             call()
-    with refused("disk", errno=errno.ENOSPC):
-        recorder.sync().result(PATIENCE_S)
-    with refused("disk", errno=errno.ENOSPC):
-        recorder.finish().result(PATIENCE_S)
     assert recorder.part_path.read_bytes() == safe
     assert not (tmp_path / "a.mcap").exists()
 
@@ -277,11 +278,9 @@ def test_an_error_of_the_sync_itself_is_as_final(
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(os, call, fail)
-    if call == "fdatasync":
+    for end in [recorder.sync] * (call == "fdatasync") + [recorder.finish]:
         with refused("disk", errno=errno.EIO):
-            recorder.sync().result(PATIENCE_S)
-    with refused("disk", errno=errno.EIO):
-        recorder.finish().result(PATIENCE_S)
+            end().result(PATIENCE_S)
     assert not (tmp_path / "a.mcap").exists()
 
 

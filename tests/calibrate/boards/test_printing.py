@@ -16,25 +16,15 @@ from recordings.schema.messages import BoardKind, BoardSpec
 
 PX_MM = 4.0
 BOARDS = [
-    BoardSpec(kind=BoardKind.CHESSBOARD, columns=7, rows=6, square_m=0.025),
-    BoardSpec(kind=BoardKind.CHESSBOARD, columns=9, rows=6, square_m=0.030),
-    BoardSpec(kind=BoardKind.CIRCLES, columns=7, rows=5, square_m=0.03),
-    BoardSpec(kind=BoardKind.ASYMMETRIC_CIRCLES, columns=4, rows=11, square_m=0.02),
-    BoardSpec(
-        kind=BoardKind.CHARUCO, columns=7, rows=5, square_m=0.03, marker_m=0.022, dictionary="DICT_6X6_250"
-    ),
-    BoardSpec(
-        kind=BoardKind.CHARUCO,
-        columns=6,
-        rows=8,
-        square_m=0.03,
-        marker_m=0.022,
-        dictionary="DICT_5X5_100",
-        legacy=True,
-    ),
-    BoardSpec(kind=BoardKind.APRIL_GRID, columns=4, rows=3, square_m=0.04, marker_m=0.012),
-    BoardSpec(kind=BoardKind.ARUCO, square_m=0.1, dictionary="DICT_6X6_250", tag_id=42),
-    BoardSpec(kind=BoardKind.APRIL_TAG, square_m=0.12, tag_id=5),
+    BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025),
+    BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.030),
+    BoardSpec(BoardKind.CIRCLES, 7, 5, 0.03),
+    BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 11, 0.02),
+    BoardSpec(BoardKind.CHARUCO, 7, 5, 0.03, 0.022, "DICT_6X6_250"),
+    BoardSpec(BoardKind.CHARUCO, 6, 8, 0.03, 0.022, "DICT_5X5_100", legacy=True),
+    BoardSpec(BoardKind.APRIL_GRID, 4, 3, 0.04, 0.012),
+    BoardSpec(BoardKind.ARUCO, square_m=0.1, dictionary="DICT_6X6_250", tag_id=42),
+    BoardSpec(BoardKind.APRIL_TAG, square_m=0.12, tag_id=5),
 ]
 
 

@@ -13,12 +13,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from calibrate.files.calibration import Calibration, FramePose
+from calibrate.files.calibration import Calibration
 from calibrate.files.exports import FrameNames, export
 from calibrate.files.exports.drivers import fixed_frames
-from calibrate.geometry import Array, Transform, pose, rotation_exp
-from calibrate.job import SolvedRecording
+from calibrate.geometry import Array, pose
 from recordings.schema.messages import RobotIdentity
+from tests.calibrate.files.test_exports import calibration as calibration
 from tests.codes import raises
 
 OPTICAL = (-np.pi / 2, 0, -np.pi / 2)
@@ -40,15 +40,6 @@ DRIVERS: dict[str, tuple[str, str, Frames]] = {
     }),
 }  # fmt: skip
 """The topmost frame, the calibrated lens, and the frames, as the drivers' descriptions have them."""
-
-
-@pytest.fixture(params=["eye-in-hand", "eye-to-hand"])
-def calibration(request: pytest.FixtureRequest, solved_real: SolvedRecording) -> Calibration:
-    parent = "flange" if request.param == "eye-in-hand" else "base"
-    X = pose(rotation_exp([0.4, -2.1, 1.3]), [0.123456789, -0.5, 1.75])
-    result = FramePose.of(Transform(parent, "camera", X))
-    robot = RobotIdentity("UR10e")
-    return msgspec.structs.replace(solved_real.calibration, mount=request.param, result=result, robot=robot)
 
 
 def matrix(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Array:

@@ -30,6 +30,7 @@ from calibrate.geometry import Array, FrameMismatchError, Transform, pose, rotat
 from calibrate.job import SolvedRecording
 from calibrate.kinematics import MODELS, RobotModel, forward, table_of_axes, with_near_axes
 from calibrate.recorded_views import arm_of_ros
+from recordings.schema.messages import RobotIdentity
 from tests.codes import raises
 from tests.foreign.export_readers import READERS
 
@@ -48,6 +49,7 @@ def calibration(request: pytest.FixtureRequest, solved_real: SolvedRecording) ->
     return msgspec.structs.replace(
         solved_real.calibration,
         mount=request.param,
+        robot=RobotIdentity("UR10e"),
         result=FramePose.of(Transform(parent, "camera", X)),
         arm_table=offered_arm(FramePose.of(Transform(f"corrected_{parent}", "camera", own))),
     )
@@ -130,9 +132,8 @@ def test_a_table_that_is_not_offered_is_not_exported(calibration: Calibration) -
     refused = msgspec.structs.replace(
         calibration.arm_table, offered=False, refused="no-joints", corrected=None, result=None
     )
-    with pytest.raises(CalibrationError) as caught:
+    with raises("table-not-offered", CalibrationError, reason="no-joints"):
         export(msgspec.structs.replace(calibration, arm_table=refused), "ur-kinematics")
-    assert caught.value.code == "table-not-offered" and caught.value.values["reason"] == "no-joints"
     with raises("no-arm-table", ExportError):
         export(msgspec.structs.replace(calibration, arm_table=None), "ur-kinematics")
 

@@ -46,8 +46,7 @@ class CaptureScreen(StationScreen):
                 with Box("Poses", id="progress", below=LEGEND):
                     yield Panel("", _progress, id="poses")
                 yield Panel("Predicted error", error_lines, id="error")
-                title = "Where the board was seen"
-                yield Panel(title, coverage_lines, id="coverage", below="images per part")
+                yield Panel("Where the board was seen", coverage_lines, id="coverage", below="images")
         yield Stopped(id="stopped")
 
     def action_take_back(self) -> None:

@@ -6,6 +6,7 @@ took up to 0.9 s.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import pty
@@ -42,6 +43,7 @@ def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
             traceback.print_exc()
             os._exit(1)
         os._exit(0)
+    os.set_blocking(glass, False)
     parent = os.getpid()
     picture = os.fork()  # no thread: the key would wait for it
     if picture == 0:
@@ -74,19 +76,19 @@ def _resize(glass: int) -> None:
 
 
 def _pass_keys(glass: int, control: Path, end: int) -> None:
-    """Pass keys on, unless the screen has not read those before: then only STOP is heard."""
+    """Pass keys on; what a screen that reads none cannot take is dropped, so that STOP is heard."""
     before = b""
     while end not in select.select([0, end], [], [])[0] and (data := os.read(0, _CHUNK_BYTES)):
         if _F12.search(before + data):
             send_stop(control)
-        before = data[-4:]  # a key may come in two parts
-        if select.select([], [glass], [], 0)[1]:
+        before = (before + data)[-4:]  # a key may come in parts
+        with contextlib.suppress(BlockingIOError):
             os.write(glass, data)
 
 
 def _pass_picture(glass: int) -> int:
     try:
-        while data := os.read(glass, _CHUNK_BYTES):
+        while select.select([glass], [], [])[0] and (data := os.read(glass, _CHUNK_BYTES)):
             while data:
                 data = data[os.write(1, data) :]
     except OSError:  # the child ended, or the person's terminal did

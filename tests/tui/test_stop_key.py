@@ -9,7 +9,7 @@ from station.cell.socket_folder import stop_socket
 from tests.patience import PATIENCE_S
 from tests.tui.terminal import ScreenProcess
 
-BUSY = "sys.stdout.write('drawing' + chr(10)); sys.stdout.flush()\nwhile True: pass"
+BUSY = "import tty; tty.setraw(0); print('drawing', flush=True)\nwhile True: pass"
 ECHO = "print('size', *os.get_terminal_size()); print('read', sys.stdin.readline())"
 
 
@@ -28,9 +28,8 @@ def test_a_screen_that_reads_no_key_ever_does_not_hold_up_stop(tmp_path: Path) -
         screen = behind(control, BUSY)
         try:
             screen.wait_for("drawing")
-            screen.press_now("x" * 10_000)  # more than a terminal keeps for a program that does not read
-            screen.press_now("\x1b[2")
-            screen.press_now("4~")
+            screen.press_now("x" * 300_000)  # more than a terminal keeps for a program that does not read
+            screen.press(*"\x1b[24~")
             assert daemon.recv(16) == b"STOP"
         finally:
             screen.end()

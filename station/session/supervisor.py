@@ -23,7 +23,6 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.02
 STATUS_TICKS = 5
-LAGS_KEPT = 50
 
 
 class SessionSupervisor:
@@ -41,7 +40,7 @@ class SessionSupervisor:
         """Code of what is wrong while the robot's states are later than allowed; empty: they are not."""
         self._late_since_s = 0.0
         """Since when states are late (host monotonic); 0: they are not."""
-        self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
+        self.lags_s: deque[float] = deque(maxlen=50)
         """Delay of each round of the last second."""
 
     async def run(self) -> None:

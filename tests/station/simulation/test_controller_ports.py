@@ -1,4 +1,4 @@
-"""The ports of a running controller: handshake, rates, claims."""
+"""The RTDE port of a running controller: versions and rates."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import pytest
 
 from station.devices.rtde import PacketType
 from station.simulation.launch import SimulatedController, start_controller
-from tests.codes import raises
-from tests.patience import wait_until
 
 pytestmark = pytest.mark.process
 
@@ -41,15 +39,3 @@ def test_versions_and_samples_at_the_rate_that_was_asked_for(
     client.start("timestamp", "actual_q", frequency_hz=asked_hz)
     stamps = [client.sample()["timestamp"] for _ in range(8)]
     assert [b - a for a, b in pairwise(stamps)] == pytest.approx([step_s] * 7, abs=1e-9)
-
-
-def test_inputs_are_claimed_until_the_link_ends(arm, rtde, admin) -> None:
-    running = arm("UR10")
-    first, second, ask = rtde(running), rtde(running), admin(running)
-    assert first.inputs("input_int_register_0", "input_double_register_0").id == 1
-    assert first.inputs("input_int_register_0").id == 2, "one client may use a register in many recipes"
-    with raises("rtde-variables"):
-        second.inputs("input_int_register_0", "input_int_register_1")
-    first.close()
-    wait_until(lambda: "input_int_register_0" not in ask.ask("state")["claims"])
-    assert second.inputs("input_int_register_0").id == 1

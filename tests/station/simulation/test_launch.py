@@ -59,15 +59,6 @@ def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe(number: signal.
         parent.stdout.close()
 
 
-def test_it_starts_without_the_numeric_libraries() -> None:
-    code = (
-        "import sys, station.simulation.controller.__main__;"
-        "print([m for m in ('numpy', 'scipy', 'cv2', 'textual', 'rtde_control') if m in sys.modules])"
-    )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.strip() == "[]"
-
-
 @pytest.mark.parametrize("host", ["192.0.2.1", "0.0.0.0", "::", "robot.example"])
 def test_no_other_computer_may_send_programs(host: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert __main__.main(["--host", host]) == 2

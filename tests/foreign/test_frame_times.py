@@ -43,19 +43,12 @@ def emulator(**options: Any) -> EmulatedCamera:
     return EmulatedCamera(serial="EMU7", size=(320, 240), **options)
 
 
-async def test_its_stamp_places_a_frame(lonely_network: None) -> None:
-    emulated = emulator()
-    async with opened(emulated) as camera:
-        for _ in range(5):
-            image = await camera.capture()
-            assert image.time is not None and image.time.source == "latched"
-            assert abs(error_s(emulated, image)) <= image.time.bound_s + 0.001
-
-
 @pytest.mark.parametrize("stamp_error_ms", [-2000, 2000])
 async def test_a_stamp_that_cannot_be_is_not_believed(lonely_network: None, stamp_error_ms: int) -> None:
     emulated = emulator()
     async with opened(emulated) as camera:
+        believed = (await camera.capture()).time
+        assert believed is not None and believed.source == "latched"  # how well: test_camera_drivers
         emulated.stamp_error_ns = stamp_error_ms * 1_000_000
         image = await camera.capture()
         assert image.time is not None and image.time.source == "arrival"

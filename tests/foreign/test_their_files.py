@@ -38,6 +38,12 @@ from tests.foreign.bags import (
 from tests.recordings.small_recording import refused
 
 DESCRIPTION = "mount: eye-in-hand\nboard: {kind: chessboard, columns: 7, rows: 6, square_m: 0.025}\n"
+
+
+def ros(folder: Path) -> Path:
+    return write_ros_mcap(folder / "a.mcap")
+
+
 SOURCES = {
     "rosbag1": lambda folder: write_rosbag1(folder / "a.bag"),
     "rosbag2 sqlite3": lambda folder: write_rosbag2(folder / "bag", "sqlite3"),
@@ -48,7 +54,7 @@ SOURCES = {
     ),
     "rosbag2 mcap": lambda folder: write_rosbag2(folder / "bag", "mcap"),
     "rosbag2 mcap, packed": lambda folder: write_rosbag2(folder / "bag", "mcap", "storage"),
-    "mcap, Python's defaults": lambda folder: write_ros_mcap(folder / "a.mcap"),
+    "mcap, Python's defaults": ros,
     "mcap, lz4": lambda folder: write_ros_mcap(folder / "a.mcap", compression=CompressionType.LZ4),
     "mcap, no chunks": lambda folder: write_ros_mcap(folder / "a.mcap", use_chunking=False),
     "mcap, no checksums": lambda folder: write_ros_mcap(folder / "a.mcap", enable_crcs=False),
@@ -154,21 +160,14 @@ def cut(path: Path) -> Path:
 
 REFUSED = {
     "no description": (lambda folder: write_rosbag2(folder / "bag", "mcap"), Wanted(), "no-dataset"),
-    "frames that are not there": (
-        lambda folder: write_ros_mcap(folder / "a.mcap"),
-        Wanted(flange="gripper"),
-        "no-frames",
-    ),
-    "a topic that is not there": (
-        lambda folder: write_ros_mcap(folder / "a.mcap"),
-        Wanted(image_topic="/left"),
-        "no-topic",
-    ),
+    "frames that are not there": (ros, Wanted(flange="gripper"), "no-frames"),
+    "a topic that is not there": (ros, Wanted(image_topic="/left"), "no-topic"),
     "a ROS 1 bag that is cut": (
         lambda folder: cut(write_rosbag1(folder / "a.bag")),
         Wanted(),
         "unreadable-bag",
     ),
+    "an MCAP file that is cut": (lambda folder: cut(ros(folder)), Wanted(), "unfinished-recording"),
     "nothing": (lambda folder: folder / "none", Wanted(), "no-file"),
     "no bag at all": (lambda folder: Path(__file__), Wanted(), "damaged-recording"),
 }
@@ -185,12 +184,6 @@ def test_what_cannot_be_imported_is_named(tmp_path: Path, name: str) -> None:
         given = tmp_path / "dataset.yaml" if name == "no bag at all" else None
         import_bag(source, tmp_path / "out.mcap", given, wanted)
     assert sorted(tmp_path.iterdir()) == before
-
-
-def test_a_cut_bag_is_named_as_such(tmp_path: Path, description: Path) -> None:
-    path = cut(write_ros_mcap(tmp_path / "a.mcap"))
-    with refused("unfinished-recording"):
-        import_bag(path, tmp_path / "out.mcap", description)
 
 
 def test_without_rosbags_the_way_out_is_named(tmp_path: Path, description: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]

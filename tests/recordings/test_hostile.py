@@ -79,13 +79,6 @@ def test_a_file_with_too_many_messages_is_not_called_damaged(
         open_recording(small)
 
 
-def test_foreign_topics_are_ignored_but_listed(tmp_path: Path) -> None:
-    records = DECLARED + schema(2, Topic.LOG) + channel(2, 2, "/theirs") + STATE + message(2, b"x") * 3
-    recording = open_recording(write(tmp_path, sealed(SESSION + chunk(records), DECLARED)))
-    assert list(recording.robot_states()) == [make_state(0)]
-    assert len(recording.segments[0].topics["/theirs"]) == 3
-
-
 def without_checksums(content: bytes) -> bytes:
     """Data section and summary with 0 instead of a checksum, as other writers leave them."""
     changed = bytearray(content)

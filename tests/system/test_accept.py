@@ -21,6 +21,7 @@ from station.protocol.client import Client
 from station.protocol.verbs import Stop
 from station.simulation.launch import AdminClient, SimulatedController
 from station.simulation.truth import write_truth
+from tests.codes import raises
 from tests.system.conftest import AT_REST_RAD_S, TRUTH, SystemRig, both_paths, status_when
 
 pytestmark = pytest.mark.process
@@ -99,21 +100,19 @@ async def test_a_stop_that_is_ignored_ends_the_test_and_the_arm_is_stopped_all_t
 
 async def test_nothing_moves_without_emergency_stop_full_slider_and_acknowledged_stop(rig: SystemRig) -> None:
     client, hands, test = await begun(rig, StopWay.CONTROL, holds=False)
-    with pytest.raises(RefusedError) as refused:
+    with raises("no-emergency-stop", RefusedError):
         await test.run()
-    assert refused.value.code == "no-emergency-stop"
     hands.holds = True
     rig.admin.ask("slider", fraction=0.5)
     await status_when(client, lambda s: s.robot.state and s.robot.state.target_speed_fraction < 0.6)
-    with pytest.raises(RefusedError) as refused:
+    with raises("slider-low", RefusedError):
         await test.run()
-    assert refused.value.code == "slider-low"
     rig.admin.ask("slider", fraction=1.0)
     await status_when(client, lambda s: s.robot.state and s.robot.state.target_speed_fraction > 0.99)
     await client.call(Stop())
-    with pytest.raises(RefusedError) as refused:
+    with raises("wrong-state", RefusedError):
         await test.run()
-    assert refused.value.code == "wrong-state" and not hands.approved
+    assert not hands.approved
     await client.close()
 
 

@@ -20,6 +20,7 @@ from calibrate.geometry import Array, pose
 from recordings.schema.messages import RobotIdentity
 from tests.calibrate.files.test_exports import calibration as calibration
 from tests.codes import raises
+from tests.foreign.bags import RosMessages
 
 OPTICAL = (-np.pi / 2, 0, -np.pi / 2)
 Frames = dict[str, tuple[str, tuple[float, ...], tuple[float, ...]]]
@@ -72,19 +73,13 @@ def as_echo(frames: Frames) -> str:
 
 def as_bag(frames: Frames, folder: Path) -> None:
     from rosbags.rosbag2 import Writer
-    from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    of = store.types
+    ros, kind = RosMessages(), "tf2_msgs/msg/TFMessage"
     with Writer(folder, version=9) as writer:
-        topic = writer.add_connection("/tf_static", "tf2_msgs/msg/TFMessage", typestore=store)
+        topic = writer.add_connection("/tf_static", kind, typestore=ros.store)
         for child, (parent, xyz, rpy) in frames.items():
-            turn = of["geometry_msgs/msg/Quaternion"](*Rotation.from_euler("xyz", rpy).as_quat().tolist())
-            moved = of["geometry_msgs/msg/Transform"](of["geometry_msgs/msg/Vector3"](*xyz), turn)
-            header = of["std_msgs/msg/Header"](of["builtin_interfaces/msg/Time"](1, 0), parent)
-            stamped = of["geometry_msgs/msg/TransformStamped"](header, child, moved)
-            message = of["tf2_msgs/msg/TFMessage"]([stamped])
-            writer.write(topic, 1, store.serialize_cdr(message, "tf2_msgs/msg/TFMessage"))
+            stamped = ros.transform(10**9, parent, child, xyz, Rotation.from_euler("xyz", rpy).as_quat())
+            writer.write(topic, 1, ros.store.serialize_cdr(ros.make(kind, [stamped]), kind))
 
 
 def written(frames: Frames, kind: str, folder: Path) -> Path:

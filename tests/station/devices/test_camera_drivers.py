@@ -19,6 +19,7 @@ from recordings.schema.messages import Image
 from station.cell.errors import CameraError
 from station.devices.base import Camera
 from station.simulation.launch import SimulatedController, start_controller
+from tests.codes import raises
 from tests.station.devices.camera_drivers import DRIVERS, Driver
 
 pytestmark = [pytest.mark.gige, pytest.mark.process]
@@ -140,7 +141,7 @@ async def test_a_picture_that_does_not_come_is_an_error_in_time_and_the_next_one
 
         beating = asyncio.create_task(beat())
         async with driver.silence():
-            with pytest.raises(CameraError):
+            with raises("no-image", CameraError):
                 await camera.capture(timeout_s=LATE_S)
         beating.cancel()
         assert beats >= 5, "the daemon's loop goes on meanwhile"

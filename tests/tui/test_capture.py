@@ -91,7 +91,7 @@ def test_the_error_falls_towards_its_goal() -> None:
         )
         for i in range(25)
     )
-    estimate = EstimateStatus(6, (1.0, 2.0, 3.0), 0.83, 0.5)
+    estimate = EstimateStatus(6, predicted_error_mm=0.83, working_distance_m=0.5)
     status = msgspec.structs.replace(in_session(idle(), poses=poses), estimate=estimate)
     lines = error_lines(Known(status, configuration=CELL), 60, 14).plain.split("\n")
     assert (

@@ -52,8 +52,8 @@ def read_folder(
 ) -> Pictures:
     """Read a folder of images and robot poses as `recordings import` does; nothing is written.
 
-    What is not given is found: board and mount by dataset.yaml or by names, the convention of the numbers and
-    the square by the board's motion. poses: the file or folder that holds them, where others may be meant.
+    What is not given is found: board and mount by dataset.yaml, images or names, the convention of the
+    numbers and the square by the board's motion. poses: their file or folder, where others may be meant.
     Raises RecordingError, which names what decides.
     """
     folder = Path(folder)

@@ -11,54 +11,29 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from station.cell.arm_acceptance import Acceptance, StopResult, StopWay, read_acceptance
+from station.cell.arm_acceptance import Acceptance, StopWay, read_acceptance
 from station.cell.errors import RefusedError
-from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
 from station.devices.ur_state import TraceRecorder
 from station.operate.stop_test import AcceptanceTest
 from station.protocol.client import Client
 from station.protocol.verbs import Stop
-from station.simulation.launch import AdminClient, SimulatedController
+from station.simulation.launch import SimulatedController
 from station.simulation.truth import write_truth
 from tests.codes import raises
+from tests.station.operate.test_stop_test import Hands
 from tests.system.conftest import AT_REST_RAD_S, TRUTH, SystemRig, both_paths, status_when
 
 pytestmark = pytest.mark.process
 SLOW_M_S = 0.05
 
 
-class SimulatedHands:
-    """A person whose hands are the simulation's own port."""
-
-    def __init__(self, admin: AdminClient, holds: bool = True) -> None:
-        self._admin, self.holds = admin, holds
-        self.approved: list[MotionPreview] = []
-        self.told: list[StopResult] = []
-
-    async def holds_emergency_stop(self) -> bool:
-        return self.holds
-
-    async def approves(self, preview: MotionPreview) -> bool:
-        self.approved.append(preview)
-        return True
-
-    def judged(self, result: StopResult) -> None:
-        self.told.append(result)
-
-
-async def begun(
-    rig: SystemRig, *ways: StopWay, holds: bool = True
-) -> tuple[Client, SimulatedHands, AcceptanceTest]:
+async def begun(rig: SystemRig, *ways: StopWay, holds: bool = True) -> tuple[Client, Hands, AcceptanceTest]:
     daemon = await rig.daemon()
     client = await daemon.client()
     await status_when(client, lambda s: s.state is S.IDLE)
-    tester = SimulatedHands(rig.admin, holds)
-    return (
-        client,
-        tester,
-        AcceptanceTest(client, tester, TraceRecorder(rig.controller.host), SLOW_M_S, 0, ways),
-    )
+    hands, recorder = Hands(holds), TraceRecorder(rig.controller.host)
+    return client, hands, AcceptanceTest(client, hands, recorder, SLOW_M_S, 0, ways)
 
 
 async def test_a_sound_arm_passes_and_every_move_was_approved_by_itself(rig: SystemRig) -> None:

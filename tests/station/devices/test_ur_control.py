@@ -259,19 +259,13 @@ async def test_a_stop_into_its_end_leaves_no_process_behind(parent: Parent) -> N
     assert parent.process.kills and parent.child.gone.is_set()
 
 
-async def test_a_move_that_was_not_taken_raises(parent: Parent) -> None:
+@pytest.mark.parametrize(("late", "code"), [({}, "move-refused"), ({"late_ms": 140.0}, "computer-late")])
+async def test_a_move_that_was_not_taken_raises(parent: Parent, late: dict[str, float], code: str) -> None:
+    """For which the heartbeat is missing: it was refused by a late computer."""
     moving = asyncio.create_task(parent.child.move([0.0] * 6, 0.5, 0.5))
     assert (await parent.asked())["do"] == "move"
-    parent.answer({"moved": "a stop was asked for"})
-    with raises("move-refused"):
-        await moving
-
-
-async def test_a_move_for_which_a_heartbeat_is_missing_was_refused_by_a_late_computer(parent: Parent) -> None:
-    moving = asyncio.create_task(parent.child.move([0.0] * 6, 0.5, 0.5))
-    assert (await parent.asked())["do"] == "move"
-    parent.answer({"moved": "the session's heartbeat is missing", "late_ms": 140.0})
-    with raises("computer-late", late_ms=140.0):
+    parent.answer({"moved": "in the child's words", **late})
+    with raises(code, **late):
         await moving
 
 

@@ -47,17 +47,20 @@ class Daemon:
 
 
 class Hands:
-    def __init__(self) -> None:
-        self.approvals: list[str] = []
+    """A person who approves, and is told."""
+
+    def __init__(self, holds: bool = True) -> None:
+        self.holds = holds
+        self.approved: list[MotionPreview] = []
         self.told: list[StopResult] = []
         self.says_no_after = 1000
 
     async def holds_emergency_stop(self) -> bool:
-        return True
+        return self.holds
 
     async def approves(self, preview: MotionPreview) -> bool:
-        self.approvals.append(preview.token)
-        return len(self.approvals) <= self.says_no_after
+        self.approved.append(preview)
+        return len(self.approved) <= self.says_no_after
 
     def judged(self, result: StopResult) -> None:
         self.told.append(result)
@@ -98,7 +101,7 @@ async def test_every_way_has_its_own_approval_and_it_is_accepted_up_to_the_chose
     found = await test.run()
     assert found.accepted and found.speed_m_s == 0.1
     assert [(verb.way, verb.speed_m_s) for verb in daemon.asked] == [(way, 0.1) for way in StopWay]
-    assert len(set(hands.approvals)) == daemon.went == len(StopWay)
+    assert len({preview.token for preview in hands.approved}) == daemon.went == len(StopWay)
 
 
 async def test_part_of_the_ways_accepts_nothing() -> None:

@@ -11,6 +11,7 @@ from station.cell.status import MotionPreview
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, StopTest
 from station.session.checklist import checklist
+from tests.codes import raises
 from tests.patience import until
 from tests.station.session_rig import NewRig, Rig
 
@@ -34,9 +35,8 @@ async def test_a_move_needs_its_own_approval_and_records_nothing(rig: Rig) -> No
         offer = await offered(rig)
         await rig.session.go(1, offer.token)
         await rig.until(S.IDLE)
-        with pytest.raises(RefusedError) as refused:
+        with raises("approval-used", RefusedError):
             await rig.session.go(1, offer.token)
-        assert refused.value.code == "approval-used"
     assert rig.arm.log.count("move") == 2 and rig.camera.taken == 0
     assert rig.session.context.recording is None and rig.cause == "stop-tested"
 

@@ -14,12 +14,13 @@ import numpy as np
 
 from benchmarks.scene import MID, CellNoise, grid
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
-from calibrate.kinematics import MODELS, forward, inverse_nearest
+from calibrate.kinematics import MODELS, forward
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
+from tests.calibrate.cells import inverse_nearest
 
 BOARD = BoardSpec(BoardKind.CHESSBOARD, 9, 7, 0.025)
 

@@ -163,7 +163,7 @@ def x_error(cell: RandomCell, flange: Array, rng: np.random.Generator) -> Array:
         np.zeros((n, 6, 0)),
         extent_of(POINTS),
     )
-    board = bent_points(observed, rng.normal(size=len(SHAPE)) * _PRIORS.board_sigma)
+    board = bent_points(observed, rng.normal(size=len(SHAPE)) * _PRIORS.board.sigma)
     points = np.einsum("nij,nkj->nki", C[:, :3, :3], board) + C[:, None, :3, 3]
     pixels = project(CAMERA, points).pixels + rng.normal(0, NOISE.pixel_px, (n, k, 2))
     # From where the boards truly were: starting where the arm says would set its noise to zero at first.

@@ -47,7 +47,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     coverage: float | None = 0.25
     """Share of the image in which corners were seen, when the intrinsics were estimated from these images."""
     lens_pull: float | None = 1.0
-    """Shift of X caused by the given intrinsics, beyond their tolerance, over the predicted error."""
+    """Shift of X caused by the given intrinsics, beyond their tolerance, over its error without an arm's."""
     board_pull: float | None = 1.0
     """The same for the stated board: size, print and flatness."""
     clock_bound_s: float | None = 0.02
@@ -121,13 +121,13 @@ _RULES = {
     "coverage": _Rule("Image coverage", "≥", "share", "Bring the board into the corners of the image."),
     "clock_bound_s": _Rule("Time sync", "≤", "s", "Check the camera's clock, or use a hardware trigger."),
     "lens_pull": _Rule(
-        "Unexplained shift by the fixed intrinsics over the predicted error",
+        "Unexplained shift by the fixed intrinsics over the error of X",
         "≤",
         "",
         "Solve with --estimate-intrinsics, or calibrate the camera again.",
     ),
     "board_pull": _Rule(
-        "Unexplained shift by the stated board over the predicted error",
+        "Unexplained shift by the stated board over the error of X",
         "≤",
         "",
         "Measure the squares both ways and the flatness, correct square_m and solve again.",
@@ -161,9 +161,9 @@ def _measured(solution: Solution, inputs: GateInputs) -> Iterator[tuple[str, flo
     yield "coverage", inputs.coverage, "", ""
     yield "clock_bound_s", inputs.clock_bound_s, "", ""
     for name, finding in (("lens_pull", solution.lens_finding), ("board_pull", solution.board_finding)):
-        if finding is not None and predicted_m:
+        if finding is not None:
             figures = f"({finding.unexplained_m * 1e3:.2f} of {finding.pull_m * 1e3:.2f} mm)"
-            yield name, finding.unexplained_m / predicted_m, figures, ""
+            yield name, finding.unexplained_m / finding.error_m, figures, ""
     if noise is not None:
         yield "robot_error_m", noise.robot_m, "", ""
         yield "robot_error_deg", float(np.degrees(noise.robot_rad)), "", ""

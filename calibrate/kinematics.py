@@ -258,16 +258,6 @@ def _in_arm_plane(
     return np.asarray(x), np.asarray(y), np.asarray(tilt)
 
 
-def inverse_nearest(model: RobotModel, base_from_flange: Array, near_rad: ArrayLike) -> Array | None:
-    """Find the solution (6,) nearest to `near_rad`, turns of 2π within the joint limits; None if none."""
-    near = np.asarray(near_rad, dtype=float)
-    candidates = inverse_all(model, base_from_flange)
-    if len(candidates) == 0:
-        return None
-    turned = turned_near(model, candidates, near)
-    return np.asarray(turned[np.argmin(np.abs(turned - near).max(axis=1))])
-
-
 def turned_near(model: RobotModel, joints_rad: Array, near_rad: Array) -> Array:
     """Choose whole turns of joints (..., 6) so that they are within the limits and near `near_rad` (6,)."""
     turned = joints_rad + 2 * np.pi * np.round((near_rad - joints_rad) / (2 * np.pi))

@@ -1,7 +1,8 @@
 """Systematic errors of the arm and of a bracket that bends, to be estimated.
 
 The arm is a chain of axes: learned from the recorded joints (`calibrate.chain`), or a Universal Robots table
-that the recorded flanges follow. Each link but the last has a shift and a turn as its error.
+that the recorded flanges follow. Each link but the last has a shift and a turn as its error. Without a chain,
+the flange itself has a shift and a turn that vary smoothly with its position.
 """
 
 from __future__ import annotations
@@ -90,6 +91,19 @@ def flex_motion(flange: Array, held: Array, level: Array | None = None) -> Array
     gravity = gravity - (gravity.mean(axis=0) if level is None else level)
     turn = np.einsum("rk,nc->nkrc", np.eye(3), gravity).reshape(len(R), 3, 9)
     return np.concatenate([-R @ skew(held[:3, 3]) @ turn, -R @ turn], axis=1)
+
+
+def smooth_motion(flange: Array) -> Array:
+    """Compute the motion (n, 6, 54) of the flange, in base, by the errors of an arm of unknown kinematics.
+
+    Shift and turn are polynomials of second degree of the flange's position, whose rms distance from its mean
+    is the unit: three shifts, then three turns, for each of the nine terms.
+    """
+    place = flange[:, :3, 3] - flange[:, :3, 3].mean(axis=0)
+    place = place / max(float(np.sqrt((place**2).sum(axis=1).mean())), 1e-9)
+    i, j = np.triu_indices(3)
+    terms = np.concatenate([place, place[:, i] * place[:, j]], axis=1)
+    return np.asarray(np.einsum("nk,ab->nakb", terms, np.eye(6)).reshape(len(flange), 6, -1))
 
 
 def recorded_joints(views: ViewSet) -> Array | None:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import special
 
 from calibrate.geometry import Array
+from calibrate.handeye.arm import smooth_motion
 from calibrate.handeye.cell_state import CellState
 from calibrate.handeye.estimate import Estimate, MeanParts, corner_weights, is_settled
 from calibrate.handeye.linear import MAX_STEPS, Linear, LinearSolution
@@ -128,6 +129,26 @@ def estimate_with_arm_errors(
         mean_of=MeanParts(chances, _against(spread[:, :6, :6], covariance[:6, :6])),
     )
     return with_errors, log_bayes
+
+
+def unknown_arm_covariance(observed: Observations, found: Estimate, priors: Priors) -> Array:
+    """Compute what errors of an arm of unknown kinematics add to the covariance (6, 6) of X.
+
+    X stays where it fits the flanges as they are told. With a flange that errs smoothly (`smooth_motion`) its
+    mean is elsewhere: that distance counts as error. LinAlgError where the views leave it open.
+    """
+    motion, bends = smooth_motion(observed.flange), observed.by_arm_errors
+    sizes = _Sizes(motion.shape[2], bends.shape[2])
+    state = replace(found.state, arm_errors=np.append(np.zeros(motion.shape[2]), found.state.arm_errors))
+    both = replace(observed, by_arm_errors=np.concatenate([motion, bends], axis=2))
+    linear = Linear.at(both, state, found.corner_weights)
+    kept = _explore(sizes, partial(_solve, linear, priors, state), found.scales)
+    chances = special.softmax([sizes.log_chance(one) + each.log_evidence for one, each in kept.items()])
+    added = -found.covariance[:6, :6]
+    for chance, each in zip(chances, kept.values(), strict=True):
+        added = added + chance * (linear.covariance(each)[:6, :6] + np.outer(each.step[:6], each.step[:6]))
+    values, vectors = np.linalg.eigh((added + added.T) / 2)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _solve(

@@ -12,6 +12,7 @@ from calibrate.geometry import Array, difference, skew
 from calibrate.handeye.cell_state import Layout
 from calibrate.handeye.estimate import FULL, CellFit, estimate
 from calibrate.handeye.linear import Linear
+from calibrate.handeye.metrics import point_error_m
 from calibrate.handeye.solution import Finding
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.projection import intrinsics_vector
@@ -25,23 +26,23 @@ _LOOSER = 0.01
 def judge_lens(fit: CellFit, distance_m: float) -> Finding:
     """Compare the given lens with what the images and the robot's motion tell."""
     state, prior = fit.estimate.state, fit.priors.lens
-    places = np.arange(Layout.of(state).lens.start, Layout.of(state).lens.stop)
-    return _judge(fit, places, intrinsics_vector(state.camera) - prior.mean, prior.sigma, distance_m)
+    return _judge(
+        fit, Layout.of(state).lens, intrinsics_vector(state.camera) - prior.mean, prior.sigma, distance_m
+    )
 
 
 def judge_board(fit: CellFit, distance_m: float) -> Finding:
     """Compare the stated board (size, equal scale in x and y, flatness) with what the views tell."""
     state = fit.estimate.state
-    places = np.arange(Layout.of(state).shape.start, Layout.of(state).shape.stop)
-    return _judge(fit, places, state.shape, fit.priors.board_sigma, distance_m)
+    return _judge(fit, Layout.of(state).shape, state.shape, fit.priors.board.sigma, distance_m)
 
 
-def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: float) -> Finding:
+def _judge(fit: CellFit, places: slice, miss: Array, sigma: Array, distance_m: float) -> Finding:
     covariance = fit.estimate.covariance
     # If statement and views agree, the covariance of the difference of the estimates with and without the
     # statement is the difference of their covariances.
     root = 1.0 / sigma
-    left = np.eye(len(places)) - covariance[np.ix_(places, places)] * root * root[:, None]
+    left = np.eye(len(sigma)) - covariance[places, places] * root * root[:, None]
     values, vectors = np.linalg.eigh((left + left.T) / 2)
     told = values > 1e-3
     square = float(((vectors.T @ (miss * root))[told] ** 2 / values[told]).sum())
@@ -59,9 +60,9 @@ def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: f
         moved = inverse_of(inverse_of(covariance) - np.diag(precision)) @ step
     except np.linalg.LinAlgError:
         moved = np.zeros(len(covariance))
-    lever = fit.estimate.state.X[:3, :3] @ np.array([0.0, 0.0, distance_m])
-    J = np.concatenate([np.eye(3), -skew(lever)], axis=1)
-    return Finding(sigmas if told.any() else 0.0, float(np.linalg.norm(J @ moved[:6])))
+    pull_m = point_error_m(fit.estimate.state.X, np.outer(moved[:6], moved[:6]), distance_m)
+    error_m = point_error_m(fit.estimate.state.X, covariance[:6, :6], distance_m)
+    return Finding(sigmas if told.any() else 0.0, pull_m, error_m)
 
 
 def error_shares(fit: CellFit, common: Array) -> dict[str, float]:
@@ -112,9 +113,7 @@ def _explain(fit: CellFit, implied: Array, place: int, places: Places) -> Reject
             inner = covariance[np.ix_(rest, rest)]
             if _chance(residual[rest], inner) > _CHANCE:
                 gain = covariance[number, rest] @ np.linalg.solve(inner, residual[rest])
-                slip = float(
-                    gain - residual[number]
-                )  # recorded minus true; `robot` is implied minus recorded
+                slip = float(gain - residual[number])  # recorded minus true: `robot` is implied - recorded
                 size = f"{slip * 1e3:.2f} mm" if number < 3 else f"{np.degrees(slip):.2f}°"
                 text = f"Only {_COMPONENTS[number]} of the robot pose in base is off, by {size}."
                 return RejectedView(

@@ -178,6 +178,8 @@ class CellFit:
     """Pairs of the views that count."""
     certified: GlobalResult
     """Optimum of the quadratic objective over these pairs."""
+    unknown_arm: Array
+    """(6, 6) what errors of an arm of unknown kinematics add to the covariance of X."""
     arm_failure: str = ""
     """Why systematic errors could not be fitted, where that failed."""
     joints_note: str = ""

@@ -10,7 +10,7 @@ import numpy as np
 from calibrate.errors import PosesDisagreeError
 from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.arm import arm_postures, flex_motion
-from calibrate.handeye.arm_fit import estimate_with_arm_errors
+from calibrate.handeye.arm_fit import estimate_with_arm_errors, unknown_arm_covariance
 from calibrate.handeye.axxb.global_start import GlobalResult, solve_global
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.cell_state import CellState
@@ -53,7 +53,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
     STAGES.info("2 of 4: camera, board and lens together")
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
-    log_bayes, plain, failure = None, found, ""
+    log_bayes, plain, failure, unknown = None, found, "", np.zeros((6, 6))
     arm, joints_note = arm_postures(views) if model_arm else (None, "")
     if model_arm and len(views) >= FEWEST_FOR_ARM_ERRORS:
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y  # camera or board
@@ -64,13 +64,16 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
         try:
             found, log_bayes = estimate_with_arm_errors(modelled, found, priors, links.shape[2])
             observed = modelled
+            if arm is None:
+                unknown = unknown_arm_covariance(observed, found, priors)
         except np.linalg.LinAlgError as problem:
             failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used))
     arm = None if log_bayes is None else arm
     return CellFit(
-        views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified, failure, joints_note
-    )
+        views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified, unknown, failure,
+        joints_note,
+    )  # fmt: skip
 
 
 def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Estimate:
@@ -87,8 +90,7 @@ def _certify(views: ViewSet, found: Estimate, places: Places) -> tuple[Pairs, Gl
     """Solve A X = X B over the used views again, with the board poses of the final lens and board."""
     H = mount_poses(views.base_from_flange, views.mount)[places]
     pairs = all_pairs(H, found.board_poses[places])
-    problem = f"the quadratic objective over the pairs of the {len(places)} used views"
-    return pairs, solve_global(pairs, problem)
+    return pairs, solve_global(pairs, f"the quadratic objective over the pairs of {len(places)} used views")
 
 
 def require_plausible_noise(found: Estimate) -> None:

@@ -15,8 +15,8 @@ import numpy as np
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.cell_state import CellState, Layout, Quadratic, flange_derivatives, flange_residuals
 from calibrate.handeye.corner_modes import INFORMATION, CornerModes
-from calibrate.handeye.mixture import class_chances, expected
-from calibrate.handeye.noise_scales import WIDE, Scales, first_scales, update_corners, update_robot
+from calibrate.handeye.mixture import SHARE_COUNTS, class_chances, expected
+from calibrate.handeye.noise_scales import WIDE, Scales, update_corners, update_robot
 from calibrate.handeye.reprojection import linearise_corners
 from calibrate.handeye.uncertainty import information_lost, inverse_of
 from calibrate.views import Observations
@@ -93,8 +93,14 @@ class Linear:
         return cls(H, A, m + (A @ modes.free.to_optimum[..., None])[..., 0], J, modes)
 
     def first_scales(self, wide: float = WIDE) -> Scales:
-        """Take initial noise scales from the residuals, the robot's times `wide`."""
-        return first_scales(self.m, 1.0 if self.modes is None else self.modes.typical_px, wide)
+        """Take initial noise scales from the medians of the residuals, the robot's times `wide`.
+
+        Above 1, `wide` starts with a wide noise, so that no view begins as an outlier.
+        """
+        parts = self.m.reshape(-1, 2, 3).swapaxes(0, 1).reshape(2, -1)
+        robot = np.maximum(wide * 1.48 * np.median(np.abs(parts), axis=1), 1e-5)
+        corner_px = 1.0 if self.modes is None else self.modes.typical_px
+        return Scales(robot, corner_px, corner_px, corner_px, SHARE_COUNTS / SHARE_COUNTS.sum())
 
     def solve(
         self, prior: Quadratic, scales: Scales, fit: Fit = "all", rounds: int = ROUNDS

@@ -204,21 +204,17 @@ class HeldOut:
     pairs: Pairs
 
 
-def held_out_views(views: ViewSet) -> HeldOut | None:
-    """Hold out all pairs inside the last 6 views; None for too few views."""
+def held_out(views: ViewSet, paper: bool) -> HeldOut | None:
+    """Hold out all pairs inside the last 6 views, or the paper's samples, the last 6 consecutive pairs.
+
+    None for too few views.
+    """
     fitted = len(views) - HELD_OUT
     if fitted < FEWEST_FITTED:
         return None
-    last = views.select(list(range(fitted, len(views))))
-    H = mount_poses(last.base_from_flange, views.mount)
-    return HeldOut(views.select(list(range(fitted))), all_pairs(H, last.camera_from_board))
-
-
-def held_out_pairs(views: ViewSet) -> HeldOut | None:
-    """Hold out the paper's own samples, the last 6 consecutive pairs; fit the views of those before."""
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
-    pairs = consecutive_pairs(H, C)
-    count = len(pairs) - HELD_OUT
-    if count + 1 < FEWEST_FITTED:
-        return None
-    return HeldOut(views.select(list(range(count + 1))), pairs.select(slice(count, None)))
+    if paper:
+        pairs = consecutive_pairs(H, C).select(slice(fitted - 1, None))
+    else:
+        pairs = all_pairs(H[fitted:], C[fitted:])
+    return HeldOut(views.select(list(range(fitted))), pairs)

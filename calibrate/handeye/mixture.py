@@ -17,12 +17,6 @@ SHARE_COUNTS = np.array([5.0, 0.5 / 3, 0.5 / 3, 0.5 / 3])
 """Dirichlet prior of the classes' shares, in counts of views."""
 
 
-def class_variances(robot: Array) -> Array:
-    """Compute the variances (K, 6) of each class from the ordinary 1σ (2,), metres and radians."""
-    garbage = np.repeat([GARBAGE_M**2, GARBAGE_RAD**2], 3)
-    return np.concatenate([GAIN[:, None] ** 2 * np.repeat(robot, 3) ** 2, garbage[None]])
-
-
 def class_chances(residual: Array, S: Array, S_inverse: Array, shares: Array) -> tuple[Array, Array]:
     """Compute the probabilities (n, K) of the classes and the log density (n,) of residuals (n, 6).
 

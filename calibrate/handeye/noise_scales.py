@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calibrate.geometry import Array
-from calibrate.handeye.mixture import GAIN, SHARE_COUNTS, class_variances
+from calibrate.handeye.mixture import GAIN, GARBAGE_M, GARBAGE_RAD, SHARE_COUNTS
 
 WIDE = 3.0
 _USUAL_ROBOT = np.array([1e-4, np.radians(0.02)])
@@ -40,17 +40,8 @@ class Scales:
     @property
     def classes(self) -> Array:
         """Variances (K, 6) of the robot's noise in each class."""
-        return class_variances(self.robot)
-
-
-def first_scales(residual: Array, corner_px: float, wide: float = WIDE) -> Scales:
-    """Take initial noise scales from the medians of the robot residuals (n, 6), times `wide`.
-
-    Above 1, `wide` starts with a wide noise, so that no view begins as an outlier.
-    """
-    parts = residual.reshape(-1, 2, 3).swapaxes(0, 1).reshape(2, -1)
-    robot = np.maximum(wide * 1.48 * np.median(np.abs(parts), axis=1), 1e-5)
-    return Scales(robot, corner_px, corner_px, corner_px, SHARE_COUNTS / SHARE_COUNTS.sum())
+        garbage = np.repeat([GARBAGE_M**2, GARBAGE_RAD**2], 3)
+        return np.concatenate([GAIN[:, None] ** 2 * np.repeat(self.robot, 3) ** 2, garbage[None]])
 
 
 def update_robot(scales: Scales, chances: Array, z: Array, P: Array) -> Scales:

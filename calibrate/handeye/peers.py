@@ -32,8 +32,7 @@ from calibrate.handeye.metrics import (
     HeldOut,
     board_spread,
     distance_in_sigmas,
-    held_out_pairs,
-    held_out_views,
+    held_out,
     mean_pose,
     motion_errors,
     placed_boards,
@@ -69,7 +68,7 @@ def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[Pee
     ours = solve_robust_profile(views, options)
     ours_ms = 1e3 * (time.perf_counter() - start)
     kept = views if paper else replace(views, views=ours.kept)
-    held = held_out_pairs(kept) if paper else held_out_views(kept)
+    held = held_out(kept, paper)
     rows = [_row(name, method, kept, held, ours) for name, method in _methods(options).items()]
     final = _scored("ours", ours.matrix, kept, ours)
     if paper and held is not None:

@@ -37,27 +37,24 @@ def posterior_of(fit: CellFit, stated_arm_error: Array) -> Posterior | None:
     by_arm = 0 if fit.arm is None else len(fit.arm.chain.link_errors)
     errors = np.arange(0 if chain is not None else by_arm, len(state.arm_errors))
     kept = np.concatenate([at.all_but_board[: -len(state.arm_errors) or None], at.arm_errors.start + errors])
-    lower = found.covariance[np.ix_(kept, kept)][np.tril_indices(len(kept))]
+    covariance = found.covariance[np.ix_(kept, kept)]
+    covariance[:6, :6] += fit.unknown_arm
     scales = found.scales
-    learned, gravity = None, None
-    if chain is not None:
-        learned = chain.plain
-    if len(state.arm_errors):
-        gravity = tuple(gravity_in_flange(fit.views.base_from_flange).mean(axis=0).tolist())
+    level = gravity_in_flange(fit.views.base_from_flange).mean(axis=0)
     return Posterior(
         X=_rows(state.X),
         lens=intrinsics_vector(state.camera).tolist(),
         shape=state.shape.tolist(),
         errors=state.arm_errors[errors].tolist(),
-        covariance_lower=lower.tolist(),
+        covariance_lower=covariance[np.tril_indices(len(kept))].tolist(),
         robot_noise=tuple(scales.robot.tolist()),
         corner_noise_px=(scales.tau_px, scales.lambda_px, scales.sigma_px),
         class_shares=scales.shares.tolist(),
         freedom=found.freedom,
         board_extent_m=_rows(fit.observed.extent),
-        arm=learned,
+        arm=None if chain is None else chain.plain,
         stated_arm_error=_rows(stated_arm_error) if stated_arm_error.any() else None,
-        gravity=gravity,
+        gravity=tuple(level.tolist()) if len(state.arm_errors) else None,
     )
 
 

@@ -97,7 +97,7 @@ class Priors:
         vector = intrinsics_vector(state.camera)
         errors = state.arm_errors
         errors_sigma = np.broadcast_to(ARM_ERROR_UNIT * np.asarray(arm_error_sigma), errors.shape)
-        sigma = np.concatenate([self.lens.sigma, self.board_sigma, errors_sigma])
+        sigma = np.concatenate([self.lens.sigma, self.board.sigma, errors_sigma])
         value = np.concatenate([vector - self.lens.mean, state.shape, errors])
         places = np.arange(at.lens.start, at.arm_errors.stop)
         N[places, places] = sigma**-2.0
@@ -110,11 +110,6 @@ class Priors:
         # Constants are left out, except what differs between sizes of the arm's errors.
         log = -0.5 * float(((errors / errors_sigma) ** 2).sum()) - float(np.log(errors_sigma).sum())
         return Quadratic(N, right, log)
-
-    @property
-    def board_sigma(self) -> Array:
-        """1σ (5,) of the board's shape, in the order of `SHAPE`."""
-        return self.board.sigma
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,6 +83,8 @@ class Finding:
     """Significance of the contradiction, as sigmas of one normal variable."""
     pull_m: float
     """Shift of X at the working distance caused by using the stated value, metres."""
+    error_m: float
+    """1σ of X at the working distance, without errors of an unknown arm: wrong statements look like them."""
 
     @property
     def unexplained_m(self) -> float:

@@ -127,21 +127,20 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
     H, C = mount_poses(views.base_from_flange, views.mount), found.board_poses
     parent, child = camera_frames(views.mount)
     distance = options.working_distance_m or median_distance_m(C[used])
-    common = _common_error(views, state.X, options) if fit.arm is None else np.zeros((6, 6))
-    covariance = found.covariance[:6, :6] + common
+    stated = _common_error(views, state.X, options) if fit.arm is None else np.zeros((6, 6))
+    by_unknown_arm = stated + fit.unknown_arm
+    covariance = found.covariance[:6, :6] + by_unknown_arm
     arm = _arm(fit, found.covariance[at.arm_errors, at.arm_errors], options, distance)
     installed = None if arm is None else arm.installed
     pairs, certified = fit.pairs, fit.certified
     apart = distance_in_sigmas(certified.X, state.X, pair_covariance(certified.objective, pairs, certified.X))
     spread_m, spread_rad = board_spread(H[used], C[used], state.X)
-    given = not options.intrinsics_from_same_pictures
     seen = fit.observed.has_pixels
-    lens_finding = judge_lens(fit, distance) if given and seen else None
+    lens_finding = judge_lens(fit, distance) if seen and not options.intrinsics_from_same_pictures else None
     board_finding = judge_board(fit, distance) if seen else None
     STAGES.info("4 of 4: proof on views left out")
     folds = cross_validate(fit, options.seed) if options.folds else None
     holdout = _holdout(fit) if options.holdout else None
-    weight = found.weight
     rms_px, view_rms_px = _corner_rms(fit)
     return Solution(
         mount=views.mount,
@@ -159,7 +158,7 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
         holdout=holdout,
         kept=tuple(replace(views.views[i], camera_from_board=C[i]) for i in used),
         turned=tuple(indices[i] for i in fit.turned),
-        weights={index: float(w) for index, w in zip(indices, weight, strict=True)},
+        weights={index: float(w) for index, w in zip(indices, found.weight, strict=True)},
         suspects={indices[i]: float(1 - found.chances[i, 0]) for i in used if found.chances[i, 0] <= FULL},
         cross_validation=folds,
         lens_finding=lens_finding,
@@ -167,9 +166,9 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
         board=_board(fit, found.covariance[at.shape, at.shape]) if seen else None,
         board_finding=board_finding,
         noise=NoiseScales(found.scales.tau_px, *(float(s) for s in found.scales.robot)),
-        error_shares=error_shares(fit, common),
+        error_shares=error_shares(fit, by_unknown_arm),
         arm=arm,
-        without_arm=fit.arm is None and not common.any(),
+        without_arm=fit.arm is None and not stated.any(),
         predicted_error_m=point_error_m(state.X, covariance, distance)
         if installed is None
         else installed.error_m,
@@ -181,7 +180,7 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
             indices[i]: (float(np.linalg.norm(found.robot[i, :3])), float(np.linalg.norm(found.robot[i, 3:])))
             for i in used
         },
-        posterior=posterior_of(fit, common),
+        posterior=posterior_of(fit, stated),
         seed=options.seed,
     )
 
@@ -252,9 +251,8 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
     except BadViewsError:
         return None
     H = mount_poses(fit.views.base_from_flange, fit.views.mount)[last]
-    state = partial.state
     seen, C = fit.observed.part(last), whole.board_poses[last]
-    C = fit_corners(seen, state.camera, C, shape=state.shape, robust=True).C
+    C = fit_corners(seen, partial.state.camera, C, shape=partial.state.shape, robust=True).C
     pairs = all_pairs(H, C)
     indices = [fit.views.views[i].index for i in last]
     note = f"fit on {len(first)} views, all {len(pairs)} pairs inside the other {HELD_OUT} scored"

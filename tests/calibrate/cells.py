@@ -7,6 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from benchmarks.scene import HIGH as HIGH
 from benchmarks.scene import LOW as LOW
@@ -14,6 +15,7 @@ from benchmarks.scene import MID, PAPER_CAMERA, CellNoise, SceneCell, make_cell
 from calibrate.geometry import Array, difference, perturb, pose, random_rotation
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
 from calibrate.handeye.solution import Solution, SolveOptions
+from calibrate.kinematics import RobotModel, inverse_all, turned_near
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
 from calibrate.views import BoardView, ViewSet, implied_flange
@@ -148,3 +150,13 @@ def sigmas_of(solution: Solution, truth: Array) -> float:
 def inside(solution: Solution, truth: Array) -> bool:
     """Does the stated 95 % region hold the truth?"""
     return sigmas_of(solution, truth) < solution.confidence_threshold
+
+
+def inverse_nearest(model: RobotModel, base_from_flange: Array, near_rad: ArrayLike) -> Array | None:
+    """Find the solution (6,) nearest to `near_rad`, turns of 2π within the joint limits; None if none."""
+    near = np.asarray(near_rad, dtype=float)
+    candidates = inverse_all(model, base_from_flange)
+    if len(candidates) == 0:
+        return None
+    turned = turned_near(model, candidates, near)
+    return np.asarray(turned[np.argmin(np.abs(turned - near).max(axis=1))])

@@ -35,8 +35,8 @@ def solution(solved_real: SolvedRecording) -> Solution:
         weights=dict.fromkeys(found.used, 1.0),
         session=Explanation(Reading.AS_RECORDED, 0.0),
         cross_validation=CrossValidation(0.5, 0.06, 0.4, 5, 1.5),
-        lens_finding=Finding(2.0, 0.0001),
-        board_finding=Finding(2.0, 0.0001),
+        lens_finding=Finding(2.0, 0.0001, 0.0005),
+        board_finding=Finding(2.0, 0.0001, 0.0005),
         predicted_error_m=0.0005,
         working_distance_m=0.5,
         residual_px=dict.fromkeys(found.used, 0.2),
@@ -67,8 +67,8 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
         "session": replace(solution, session=other, warnings=(Remark(other.reading.value, "Move them."),)),
         "weight": replace(solution, weights=dict.fromkeys(solution.used, 0.79)),
         "cross_validation": replace(solution, cross_validation=replace(folds, rms_mm=0.61)),
-        "lens_pull": replace(solution, lens_finding=Finding(8.0, 0.0011)),
-        "board_pull": replace(solution, board_finding=Finding(8.0, 0.0011)),
+        "lens_pull": replace(solution, lens_finding=Finding(8.0, 0.0011, 0.0005)),
+        "board_pull": replace(solution, board_finding=Finding(8.0, 0.0011, 0.0005)),
         "view_rms_px": replace(solution, residual_px={3: 9.0}),
         "holdout_share": replace(solution, holdout=msgspec.structs.replace(solution.holdout, e_t_m=0.02)),
         "predicted_error_m": replace(solution, predicted_error_m=0.003),
@@ -113,7 +113,7 @@ def test_a_statement_closes_its_gate_by_what_its_tolerance_leaves_unexplained(
     solution: Solution, sigmas: float, pull_m: float, closed: bool
 ) -> None:
     for name in ("lens", "board"):
-        told = replace(solution, **{f"{name}_finding": Finding(sigmas, pull_m)})
+        told = replace(solution, **{f"{name}_finding": Finding(sigmas, pull_m, 0.0005)})
         assert failed(judge(told, GOOD)) == [f"{name}_pull"] * closed
 
 

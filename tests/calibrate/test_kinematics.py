@@ -16,10 +16,10 @@ from calibrate.kinematics import (
     RobotModel,
     forward,
     inverse_all,
-    inverse_nearest,
     jacobian,
     singularity_measure,
 )
+from tests.calibrate.cells import inverse_nearest
 
 UR10 = MODELS["UR10"]
 NAMES = sorted(MODELS)

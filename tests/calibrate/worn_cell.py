@@ -10,9 +10,10 @@ from benchmarks.imperfect_cells import table_errors
 from benchmarks.scene import LOW, PAPER_X, CellNoise, grid, make_cell, view_set
 from benchmarks.trials import rms
 from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp
-from calibrate.kinematics import MODELS, forward, inverse_nearest
+from calibrate.kinematics import MODELS, forward
 from calibrate.projection import project
 from calibrate.views import ViewSet
+from tests.calibrate.cells import inverse_nearest
 
 _MODEL = MODELS["UR10"]
 _HOME = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)

@@ -57,7 +57,7 @@ def test_a_lens_that_is_stated_too_surely_closes_its_gate():
     views = seen_through(cell.views, with_focal(cell.camera, 1.005))
     sure = solve_views(views, replace(QUICK, lens_sigma=(0.15, 0.15, 0.5, 0.5, 1e-3, 1e-3, 1e-5, 1e-5, 1e-3)))
     assert sure.lens_finding.sigmas > 8
-    assert sure.lens_finding.unexplained_m > sure.predicted_error_m
+    assert sure.lens_finding.unexplained_m > sure.lens_finding.error_m
     assert "lens_pull" in closed(sure)
     assert closed(solve_views(views, QUICK)) == set()
 

@@ -6,12 +6,13 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
-from calibrate.kinematics import MODELS, forward, inverse_nearest
+from calibrate.kinematics import MODELS, forward
 from calibrate.projection import project
 from recordings.schema.messages import RobotIdentity
 from station.analysis.worker import CapturedView
 from station.operate.draft import CameraChoice, Draft
 from station.simulation.truth import CellTruth
+from tests.calibrate.cells import inverse_nearest
 
 NEARER_M = (0.0, 0.02, -0.05, 0.06, 0.0)
 TILTS = ((0.0, 0.0, 0.0), (0.45, 0.0, 0.1), (-0.2, 0.45, 0.0), (-0.3, -0.35, 0.3), (0.2, -0.4, -0.6))

@@ -13,6 +13,7 @@ import msgspec
 import typer
 from rich.text import Text
 
+from station.cell.errors import RefusedError
 from station.cell.pose_plan import Plan
 from station.cell.status import CHECK_VIEWS, StationState, StationStatus
 from station.cli.attended import attended
@@ -76,6 +77,9 @@ def drift_check_command(
     async def captured() -> tuple[StationStatus, str]:
         async with attended(socket, headless, approve, quiet=headless) as shell:
             standing = await shell.status()
+            if standing.robot.by_hand:  # a person who moves it needs the picture
+                identity = standing.robot.identity
+                raise RefusedError("moved-by-hand", robot=identity.model if identity else "The arm")
             started = await start_drift_check(shell.client, standing, shell.approves, poses)
             return await shell.watch(started, standing), shell.client.camera
 

@@ -46,6 +46,8 @@ READ_BYTES, PAUSE_S, LINES_READ = 8192, 0.005, 50
 LINE_BYTES = 2048
 STATES_KEPT = 20_000
 """Of `HISTORY_S` at most, whatever times are posted."""
+LINKS = 8
+"""Programs connected at once, of which one has the arm; more are refused at once."""
 DECLARED_S = 3.0
 """Longest wait for a program's first line, in which it keeps others away."""
 WRONG_S = 1.0
@@ -188,6 +190,8 @@ class PostedArm:
         if (serving := asyncio.current_task()) is not None:
             self._links[writer] = serving
         try:
+            if len(self._links) > LINKS:
+                raise RobotError("post-refused", poster=poster, reason=f"{LINKS} programs are connected")
             if token and not await _gives(token, reader):
                 raise RobotError("post-token", file=self.token_file)
             if self._poster:

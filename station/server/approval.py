@@ -24,6 +24,8 @@ class Process:
     """Start since boot, in clock ticks: tells apart processes that have the same number one after another."""
     terminal: str
     """Terminal in whose foreground it is, such as 'pts/3'; empty: none."""
+    parent: int = 0
+    """Process that started it; a screen's hears F12 for it (`tui.stop_key`)."""
 
 
 def process(pid: int) -> Process | None:
@@ -37,7 +39,7 @@ def process(pid: int) -> Process | None:
         return None
     group, terminal, foreground = int(fields[2]), int(fields[4]), int(fields[5])
     shown = terminal != 0 and group == foreground
-    return Process(user, int(fields[19]), _terminal_name(terminal) if shown else "")
+    return Process(user, int(fields[19]), _terminal_name(terminal) if shown else "", int(fields[1]))
 
 
 def _terminal_name(number: int) -> str:
@@ -63,6 +65,8 @@ class Peer:
     """Name of the user; empty until it is looked up."""
     began_ticks: int | None = None
     """Start of the process that made the connection; None: not known."""
+    parent: int = 0
+    """The process that started it; 0: not known."""
 
     @property
     def who(self) -> str:
@@ -105,7 +109,9 @@ class ApprovalRule:
         seen = self._see(asks.pid)
         if seen is None or seen.user != asks.uid or seen.began_ticks != asks.began_ticks:
             return ""
-        return seen.terminal
+        # A screen runs in a terminal of its own; the process that hears F12 for it is in the person's.
+        outer = self._see(seen.parent) if seen.terminal else None
+        return outer.terminal if outer and outer.user == asks.uid and outer.terminal else seen.terminal
 
     def _require_permitted(self, asks: Peer) -> None:
         if self._config.persons and asks.user not in self._config.persons:

@@ -36,8 +36,9 @@ class SessionDispatcher:
         return self._to_the_end(self._session.stop(peer.who))
 
     def stop_by_datagram(self, sender: Peer) -> None:
-        """Begin STOP for a sender without a connection, named by the connection of its process if any."""
-        known = (c for c in self._callers.values() if (c.pid, c.uid) == (sender.pid, sender.uid))
+        """Begin STOP for a sender without a connection, named by that of its process or of a child of it."""
+        callers = (caller for caller in self._callers.values() if caller.uid == sender.uid)
+        known = (caller for caller in callers if sender.pid in (caller.pid, caller.parent))
         caller = next(known, None)
         user = self._names.get(sender.uid, f"uid {sender.uid}")
         who = caller.who if caller else f"{user} (pid {sender.pid})"
@@ -79,7 +80,8 @@ class SessionDispatcher:
         if peer.client_id not in self._callers:
             self._callers[peer.client_id] = peer
             seen = self._see(peer.pid)
-            peer.began_ticks = seen.began_ticks if seen else None
+            if seen is not None:
+                peer.began_ticks, peer.parent = seen.began_ticks, seen.parent
         return peer
 
     async def _carry_out(self, caller: Peer, verb: Verb[object]) -> object:

@@ -96,7 +96,10 @@ class PlanScreen(StationScreen):
 
     def on_data_table_row_selected(self) -> None:
         """Tell all of a pose, of which the table may show the beginning."""
-        pose = self.known.shown.session.poses[self.table.cursor_row]
+        row, poses = self.table.cursor_row, self.known.shown.session.poses
+        if row >= len(poses):
+            return  # a shorter plan came
+        pose = poses[row]
         told = ". ".join(words for words in (pose.name, pose.why, pose.reason) if words)
         self.notify(told, timeout=10, markup=False)
 

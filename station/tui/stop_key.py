@@ -23,8 +23,12 @@ from pathlib import Path
 from station.cell.process import die_with_parent
 from station.protocol.stop_client import send_stop
 
-_F12 = re.compile(rb"\x1b\[24[;~]")
+_F12 = re.compile(rb"\x1b\[24(?:;[\d:;]*)?~")
+"""With any modifier keys. A terminal that says its cursor is in row 24 writes `ESC[24;1R`."""
+_KEY_BYTES = 16
 _CHUNK_BYTES = 65536
+_LAST_PICTURE_S = 1.0
+"""Longest wait, once the screen ended, for a terminal that does not take its last picture."""
 
 
 def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
@@ -35,9 +39,11 @@ def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
     if not _in_foreground():
         show()
         return
+    size = fcntl.ioctl(0, termios.TIOCGWINSZ, bytes(8))
     child, glass = pty.fork()
     if child == 0:
         try:
+            fcntl.ioctl(0, termios.TIOCSWINSZ, size)
             show()
         except BaseException:
             traceback.print_exc()
@@ -49,19 +55,22 @@ def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
     if picture == 0:
         die_with_parent(parent)  # it holds the child's terminal open
         os._exit(_pass_picture(glass))
-    before = termios.tcgetattr(0)
+    before, drawn = termios.tcgetattr(0), os.pidfd_open(picture)
     signal.signal(signal.SIGWINCH, lambda *_: _resize(glass))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         tty.setraw(0)
         _resize(glass)
-        _pass_keys(glass, control, os.pidfd_open(picture))
+        _pass_keys(glass, control, [drawn, os.pidfd_open(child)])
+        select.select([drawn], [], [], _LAST_PICTURE_S)
     finally:
-        termios.tcsetattr(0, termios.TCSADRAIN, before)
-        os.kill(child, signal.SIGHUP)  # unless it ended: its terminal goes
+        os.kill(picture, signal.SIGKILL)  # where the terminal takes nothing it would wait for ever
+        os.close(glass)  # the child's terminal goes, and with it the child
+        termios.tcsetattr(0, termios.TCSANOW, before)
+        termios.tcflush(0, termios.TCIFLUSH)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if code:
-        sys.exit(code)
+        sys.exit(code if code > 0 else 128 - code)
 
 
 def _in_foreground() -> bool:
@@ -75,13 +84,15 @@ def _resize(glass: int) -> None:
     fcntl.ioctl(glass, termios.TIOCSWINSZ, fcntl.ioctl(0, termios.TIOCGWINSZ, bytes(8)))
 
 
-def _pass_keys(glass: int, control: Path, end: int) -> None:
+def _pass_keys(glass: int, control: Path, ends: list[int]) -> None:
     """Pass keys on; what a screen that reads none cannot take is dropped, so that STOP is heard."""
-    before = b""
-    while end not in select.select([0, end], [], [])[0] and (data := os.read(0, _CHUNK_BYTES)):
-        if _F12.search(before + data):
+    seen = b""
+    while not set(ends) & set(select.select([0, *ends], [], [])[0]) and (data := os.read(0, _CHUNK_BYTES)):
+        seen += data
+        if keys := list(_F12.finditer(seen)):
             send_stop(control)
-        before = (before + data)[-4:]  # a key may come in parts
+            seen = seen[keys[-1].end() :]
+        seen = seen[-_KEY_BYTES:]  # a key may come in parts
         with contextlib.suppress(BlockingIOError):
             os.write(glass, data)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 from pathlib import Path
 
+import pytest
+
 from station.cell.socket_folder import stop_socket
 from tests.patience import PATIENCE_S
 from tests.tui.terminal import ScreenProcess
@@ -33,6 +35,26 @@ def test_a_screen_that_reads_no_key_ever_does_not_hold_up_stop(tmp_path: Path) -
             assert daemon.recv(16) == b"STOP"
         finally:
             screen.end()
+
+
+def test_a_cursor_in_row_24_is_no_stop_and_modifier_keys_are_part_of_the_key(tmp_path: Path) -> None:
+    control = tmp_path / "c.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as daemon:
+        daemon.bind(str(stop_socket(control)))
+        daemon.setblocking(False)
+        screen = behind(control, ECHO)
+        try:
+            screen.wait_for("size")
+            screen.press_now("\x1b[24;1R\x1b[24;80R")
+            screen.wait_for("24;80R")  # in a read of its own
+            screen.press_now("\x1b[24;5~")
+            screen.press_now("\n")
+            assert screen.process.wait(PATIENCE_S) == 0
+        finally:
+            screen.end()
+        assert daemon.recv(16) == b"STOP"
+        with pytest.raises(BlockingIOError):
+            daemon.recv(16)
 
 
 def test_keys_size_and_picture_pass_and_its_end_is_the_screen_s(tmp_path: Path) -> None:

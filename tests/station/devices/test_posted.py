@@ -23,9 +23,10 @@ from station.cell.config import RobotConfig, StillnessConfig
 from station.cell.errors import RobotError
 from station.cell.layout import flange_pose
 from station.cell.stillness import StillnessMonitor
+from station.devices import posted
 from station.devices.posted import PAUSE_S, PostedArm
 from tests.codes import raises
-from tests.patience import until
+from tests.patience import PATIENCE_S, until
 from tests.station.session_rig import memory_config
 
 LIVE = {"source": "live"}
@@ -263,6 +264,15 @@ async def test_a_program_by_tcp_gives_the_token_first_and_is_one_as_any_other(
     assert await (await by_tcp(arm.token_file.read_bytes())).refused() == "post-refused"
     await arm.close()
     assert not arm.token_file.exists()
+
+
+async def test_programs_that_give_no_token_do_not_pile_up(
+    arm: PostedArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(posted, "DECLARED_S", PATIENCE_S)
+    door = ("127.0.0.1", arm._tcp_port)
+    *_, last = [Poster(*await asyncio.open_connection(*door)) for _ in range(posted.LINKS + 1)]
+    assert await last.refused() == "post-refused"
 
 
 async def test_a_port_that_another_program_has_is_named_at_every_attempt(tmp_path: Path) -> None:

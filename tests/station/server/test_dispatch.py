@@ -26,7 +26,7 @@ from station.cell.socket_folder import user_name
 from station.cell.status import StationState
 from station.protocol.client import Client
 from station.server import dispatch
-from station.server.approval import Peer, Process, process
+from station.server.approval import ApprovalRule, Peer, Process, process
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
 from station.session import checklist
@@ -40,7 +40,8 @@ See = Callable[[int], Process | None]
 class Served:
     def __init__(self, rig: Rig, path: Path, see: See = process) -> None:
         self.rig, self.path = rig, path
-        self.control = ControlServer(path, SessionDispatcher(rig.session, see))
+        self.dispatcher = SessionDispatcher(rig.session, see)
+        self.control = ControlServer(path, self.dispatcher)
 
     async def client(self) -> Client:
         return await Client(self.path, "tty1").open()
@@ -314,3 +315,17 @@ async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
         await bert.request("skip", index=0)
         with raises("approval-used"):
             await bert.request("go", token=summary["token"])
+
+
+async def test_stop_by_the_process_that_hears_a_screens_key_is_named_by_the_screen(served: Served) -> None:
+    async with await served.client():
+        served.dispatcher.stop_by_datagram(Peer(0, os.getppid(), os.getuid()))
+        await until(lambda: served.rig.session.store.state is StationState.STOPPED)
+    assert f"(pid {os.getpid()})" in served.rig.session.store.status.reason
+
+
+def test_an_approval_in_a_screen_is_told_by_the_persons_own_terminal() -> None:
+    user = os.getuid()
+    see = {5: Process(user, 77, "pts/9", parent=4), 4: Process(user, 70, "pts/3")}.get
+    rule = ApprovalRule(ApprovalConfig(), False, see)
+    assert rule.by_person(Peer(1, 5, user, began_ticks=77), "A move") == "at pts/3"

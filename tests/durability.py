@@ -1,4 +1,4 @@
-"""What a power loss may take away: the order in which a program asks for things to be on the disk."""
+"""A disk that is full; what a power loss may take away: in which order things are asked to be on the disk."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+
+def full(*_: object) -> int:
+    """In place of a call that writes."""
+    raise OSError(28, "No space left on device")
 
 
 @contextmanager

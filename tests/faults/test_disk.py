@@ -11,6 +11,7 @@ from recordings import manifest
 from recordings.manifest import enter_part, read_manifest
 from recordings.recover import recover_recording
 from station.cell.session_folder import list_sessions, new_session_folder
+from tests.durability import full
 from tests.recordings.small_recording import refused, write_small
 
 
@@ -39,9 +40,6 @@ def test_29_a_list_of_parts_that_cannot_be_written_keeps_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     enter_part(tmp_path, "cell", 1, "session.mcap")
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(manifest, "write_atomically", full)
     with refused("disk", errno=28):

@@ -17,6 +17,7 @@ from recordings.reader import open_recording
 from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
 from tests.command_line import call
+from tests.durability import full
 from tests.recordings.small_recording import (
     START_NS,
     make_info,
@@ -93,9 +94,6 @@ def test_info_of_an_empty_recording(tmp_path: Path) -> None:
 def test_a_full_disk_behind_the_output_is_one_sentence_and_1(
     small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(_: object) -> None:
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr("recordings.cli.commands._print_info", full)
     result = run("info", small)
     assert result.returncode == 1 and len(result.stderr.splitlines()) == 1

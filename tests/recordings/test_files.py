@@ -25,7 +25,7 @@ from recordings.files import (
 )
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
-from tests.durability import disk_order
+from tests.durability import disk_order, full
 from tests.recordings.small_recording import make_info, make_picture, refused, write_small
 
 EVIL = ["../../etc/x", "/etc/passwd", "a\0b", "x" * 300, "", "..", ".", "a/b", "Ä", "a..b", "A", "a\n"]
@@ -134,9 +134,6 @@ def test_a_small_file_that_cannot_be_written_stays_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "a.json").write_bytes(b"old")
-
-    def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError):

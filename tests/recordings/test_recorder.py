@@ -19,6 +19,7 @@ from recordings.recorder import Recorder
 from recordings.schema.definitions import encode
 from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
+from tests.durability import full
 from tests.patience import PATIENCE_S, wait_until
 from tests.recordings.small_recording import (
     make_image,
@@ -219,13 +220,6 @@ def test_the_callers_never_wait_for_the_disk(gate: Gate, tmp_path: Path) -> None
     recorder.close()
 
 
-def break_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    def write(file: OutputFile, data: bytes) -> int:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(OutputFile, "write", write)
-
-
 def test_the_first_write_error_is_final_and_said_to_everyone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -234,7 +228,7 @@ def test_the_first_write_error_is_final_and_said_to_everyone(
     recorder.view(make_view(0))
     recorder.sync().result(PATIENCE_S)
     safe = recorder.part_path.read_bytes()
-    break_disk(monkeypatch)
+    monkeypatch.setattr(OutputFile, "write", full)
     recorder.image(make_picture(1))
     with refused("disk", errno=errno.ENOSPC):
         recorder.sync().result(PATIENCE_S)
@@ -260,7 +254,7 @@ def test_waiting_syncs_fail_with_the_error_and_nobody_hangs(
     recorder.image(make_picture(0))
     waiting = [recorder.sync() for _ in range(3)]
     finishing = recorder.finish()
-    break_disk(monkeypatch)
+    monkeypatch.setattr(OutputFile, "write", full)
     gate.opened.set()
     for future in (*waiting, finishing):
         with refused("disk", errno=errno.ENOSPC):

@@ -21,7 +21,7 @@ from recordings.recover import recover_recording
 from recordings.schema.messages import CameraModel
 from recordings.schema.topics import Topic
 from recordings.writer import RecordingWriter
-from tests.durability import disk_order
+from tests.durability import disk_order, full
 from tests.recordings.small_recording import make_info, make_picture, make_view, refused, write_small
 
 
@@ -218,9 +218,6 @@ def test_a_disk_that_fails_during_recovery_leaves_everything_as_it_was(
 ) -> None:
     part = write_unfinished(tmp_path / "a.mcap")
     before = part.read_bytes()
-
-    def full(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
     with refused("disk", errno=errno.ENOSPC):

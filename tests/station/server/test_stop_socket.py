@@ -40,6 +40,7 @@ from station.protocol.stop_client import (
 from station.server import stop_server
 from station.server.control import ControlServer
 from station.server.stop_server import Peer, StopServer
+from tests.durability import full
 from tests.patience import PATIENCE_S, until
 from tests.station.server.test_control import RecordingHandler, raw
 
@@ -339,9 +340,6 @@ async def test_socket_and_page_are_the_groups(station: Station) -> None:
 async def test_a_disk_that_is_full_costs_the_confirmation_never_the_stop(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(stop_server, "write_page", full)
     assert await stopped(station.control) is Outcome.SILENT
     assert station.heard

@@ -20,6 +20,7 @@ from station.analysis.worker import BoardDetection, sight
 from station.cell.pose_plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
+from tests.durability import full
 from tests.patience import until
 from tests.station.quick_plan import quick_plan
 from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, crash, memory_config, sealed
@@ -115,9 +116,6 @@ async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate(
 async def test_nothing_moves_by_poses_that_the_disk_did_not_take(
     half_way: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
     moves = half_way.arm.log.count("move")
     summary = await half_way.session.prepare(1, Purpose.RESUME)
     monkeypatch.setattr("station.session.recording.write_state", full)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import errno
-import os
-
 import pytest
 
 from recordings.errors import RecordingError
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Retake, Skip
 from tests.codes import raises
+from tests.durability import full
 from tests.patience import until
 from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
 
@@ -40,9 +38,6 @@ async def test_a_change_that_the_disk_does_not_take_is_told_to_who_asked(
 ) -> None:
     await rig.go_until_it_moves()
     await rig.pause_after_this_pose("anna")
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("station.session.recording.write_state", full)
     with raises("change-not-saved", RecordingError):

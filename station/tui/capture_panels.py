@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
+
 from textual.content import Content
 
 from station.cell.status import DetectionStatus, GuidanceStatus
 from station.tui.task import Known
-from station.tui.widgets.canvas import Series, curve
-from station.tui.words import degrees, dim, error_facts, facts, limit_bar, lines, mark, mm
+from station.tui.words import ERROR_SHOWN_MM, dim, error_facts, facts, limit_bar, lines, mark
 
 BURNT = 0.01
 """Share of saturated pixels above which the image counts as too bright."""
+LABEL_CELLS, HALVES = 7, " ▄█"
+"""Cells of the axis of the errors; signs of an empty, a half and a full cell, which a console has too."""
 
 
 def quality_line(seen: DetectionStatus) -> Content:
@@ -28,9 +32,9 @@ def quality_line(seen: DetectionStatus) -> Content:
         mark("done" if good else "look") + " " + facts((name, value, "")) for name, value, good in judged
     ]
     if seen.tilt_rad is not None:
-        parts.append(facts(("tilt", degrees(seen.tilt_rad, 0), "")))
+        parts.append(facts(("tilt", f"{math.degrees(seen.tilt_rad):.0f}°", "")))
     if seen.distance_m is not None:
-        parts.append(facts(("at", mm(seen.distance_m, 0), "")))
+        parts.append(facts(("at", f"{1000 * seen.distance_m:.0f} mm", "")))
     parts.append(facts(("fills", f"{100 * seen.coverage:.0f} %", "")))
     line = Content("  ").join(parts)
     return line + Content.styled(f"   {seen.advice}", "$warn") if seen.advice else line
@@ -63,34 +67,50 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
 
 
 def error_lines(known: Known, width: int, height: int) -> Content:
-    """Draw the predicted error after each pose: by images solid, planned dotted, the goal dashed."""
-    estimate, session, goal = known.shown.estimate, known.shown.session, known.goal_mm
-    poses = session.poses
+    """Write the predicted error, the goal, and what the plan promises; draw the error after each pose."""
+    estimate, poses, goal = known.shown.estimate, known.shown.session.poses, known.goal_mm
     head = error_facts("", estimate.predicted_error_mm, estimate.working_distance_m)
     if goal:
         head += Content.assemble(("  goal ", "$dim"), (f"{goal:g} mm", "$warn"))
     if estimate.enough:
         head += Content("  ") + mark("done", "reached")
-    measured = [(i + 1.0, p.estimated_sigma_mm) for i, p in enumerate(poses) if p.estimated_sigma_mm]
-    planned = [
-        (i + 1.0, p.predicted_sigma_mm)
-        for i, p in enumerate(poses)
-        if p.predicted_sigma_mm and p.predicted_sigma_mm < 100 * (goal or 0.5)
-    ]
     rows = [head]
     if poses and poses[-1].predicted_sigma_mm is not None and height > 6:
         end = error_facts("by the plan", poses[-1].predicted_sigma_mm, None)
         rows.append(end + dim(f" after {len(poses)} poses"))
-    rows.append(
-        curve(
-            [Series(planned, "$faint", dash=2), Series(measured, "$accent")],
-            goal,
-            width,
-            height - len(rows),
-            ends=f"pose 1|{len(poses)}" if height > 6 else "",
-        )
-    )
-    return lines(*rows)
+    columns = [
+        (p.estimated_sigma_mm or p.predicted_sigma_mm, "$accent" if p.estimated_sigma_mm else "$line")
+        for p in poses
+    ]
+    return lines(*rows, *error_columns(columns, goal, width, height - len(rows)))
+
+
+def error_columns(
+    columns: Sequence[tuple[float | None, str]], goal: float | None, width: int, height: int
+) -> Iterator[Content]:
+    """Draw (error, style) … as columns over a logarithmic axis; the goal is an amber line through them."""
+    room = max(1, width - LABEL_CELLS)
+    columns = columns[:: math.ceil(len(columns) / room) or 1]
+    known = [error for error, _ in columns if error and error <= ERROR_SHOWN_MM]
+    if not known or height < 3:
+        return
+    levels = [*known, goal] if goal else known
+    low, high = min(levels) / 1.15, max(levels) * 1.15
+
+    def halves(error: float) -> int:
+        """Height of a column in half rows."""
+        return round(2 * height * math.log(min(error, high) / low) / math.log(high / low))
+
+    at_goal = halves(goal) // 2 if goal else -1
+    labels = {height - 1: high, 0: low, at_goal: goal or low}
+    wide = room // len(columns)
+    for row in reversed(range(height)):
+        label = f"{labels[row]:>5.2f}" if row in labels else ""
+        parts = [(f"{label:>5} ", "$warn" if row == at_goal else "$dim"), ("│", "$line")]
+        for error, style in columns:
+            filled = min(2, max(0, halves(error) - 2 * row)) if error else 0
+            parts.append(("─" * wide, "$warn") if row == at_goal else (HALVES[filled] * wide, style))
+        yield Content.assemble(*parts).simplify()
 
 
 _HEAT = ("$foreground on $h1", "$strong on $h2", "$onaccent on $h3", "$onaccent on $h4")

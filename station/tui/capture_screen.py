@@ -43,9 +43,8 @@ class CaptureScreen(StationScreen):
                 yield PreviewPane(id="preview")
                 yield Line(lambda known, _: quality_line(known.shown.detection), id="quality")
             with Vertical(id="live-right"):
-                with Box("Poses", id="progress", below=LEGEND):
-                    yield Panel("", _progress, id="poses")
-                yield Panel("Predicted error", error_lines, id="error")
+                yield Panel("Poses", _progress, id="progress", below=LEGEND)
+                yield Panel("Predicted error", error_lines, id="error", below="after each pose")
                 yield Panel("Where the board was seen", coverage_lines, id="coverage", below="images")
         yield Stopped(id="stopped")
 
@@ -59,19 +58,19 @@ class CaptureScreen(StationScreen):
 
     def show(self, known: Known) -> None:
         super().show(known)
-        self.draw_panels(known)
         self.query_one(Stopped).show(known)
         status = known.status
         if status is None:
             return
         session = status.session
         by_hand = bool(status.guidance.outline)
-        self.query_one("#progress").border_subtitle = BACK if by_hand else LEGEND
+        progress = self.query_one("#progress", Panel)
+        progress.border_subtitle = BACK if by_hand else LEGEND
         self.query_one(PreviewPane).wanted = status.guidance.outline
-        title = "By hand" if by_hand else "Poses"
+        progress.heading = "By hand" if by_hand else "Poses"
         if not by_hand and session.current is not None and status.state in RUNNING:
-            title = f"Pose {session.current + 1} of {len(session.poses)}"
-        self.query_one("#progress").border_title = f"{title}: OLD" if known.old else title
+            progress.heading = f"Pose {session.current + 1} of {len(session.poses)}"
+        self.draw_panels(known)
         self.query_one("#picture").border_title = (
             f"Camera  {status.camera.model}"
             if status.camera.connected or status.playback

@@ -125,16 +125,15 @@ class Reason(Question[str]):
         Binding("escape", "dismiss('')", "Cancel", tooltip="Change nothing")
     ]
 
-    def __init__(self, title: str, body: str, keys: str) -> None:
-        """`keys`: what becomes of the reason, and what Enter does."""
+    def __init__(self, title: str, body: str) -> None:
+        """`body` also says what becomes of the reason, and what Enter does."""
         super().__init__()
-        self.title, self._body, self._keys = title, body, keys
+        self.title, self._body = title, body
 
     def body(self) -> ComposeResult:
         yield Static(self._body, markup=False)
         yield Input(id="reason", placeholder="your reason, in words", compact=True)
         yield Label("", id="dialog-problem", markup=False)
-        yield Label(self._keys, id="dialog-keys")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         if problem := reason_problem(event.value):

@@ -24,7 +24,6 @@ from station.tui.installed import Result, local, state_root
 OVERRIDABLE = ("gate-failed", "objection")
 """Codes of refusals that a person may override with a reason."""
 OVERRIDES = "Your name and the reason go into the file. Enter installs, Escape does not."
-WITHDRAWS = "Your name and the reason are kept. Enter takes it out of use, Escape does not."
 NO_VERDICT = "Another session began: the drift check has no verdict. Its views, if any, are on 5 (k)."
 
 
@@ -79,7 +78,7 @@ async def install_result(desk: Desk, result: Result, calibration: Calibration) -
         except CalibrationError as refusal:
             if refusal.code not in OVERRIDABLE:
                 raise
-            if not (reason := await desk.question(Reason("Not installed", refusal.text, OVERRIDES))):
+            if not (reason := await desk.question(Reason("Not installed", f"{refusal.text}\n\n{OVERRIDES}"))):
                 desk.app.notify("Nothing was installed.")
                 return
             await asyncio.to_thread(put, override=reason)
@@ -117,9 +116,10 @@ async def _withdraw(desk: Desk, root: Path, camera: str, current: InstalledVersi
         return
     body = (
         f"{_named(current)}\nThere is none before it to go back to. Programs of this cell are refused it "
-        "from then on, until a calibration is installed."
+        "from then on, until a calibration is installed.\n\nYour name and the reason are kept. "
+        "Enter takes it out of use, Escape does not."
     )
-    if not (reason := await desk.question(Reason("Take it out of use?", body, WITHDRAWS))):
+    if not (reason := await desk.question(Reason("Take it out of use?", body))):
         return
     if await desk.attempt(asyncio.to_thread(withdraw, root, reason, camera=camera)) is not None:
         desk.app.notify("Out of use: programs are refused it. i installs a calibration.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import datetime
+
 from textual.app import ComposeResult
 from textual.content import Content
 from textual.widgets import RichLog
@@ -9,16 +11,17 @@ from textual.widgets import RichLog
 from station.cell.status import Event
 from station.tui.screen import StationScreen
 from station.tui.task import Known
-from station.tui.words import clock, rich_text
+from station.tui.words import rich_text
 
 _LEVELS = {"debug": "$dim", "info": "", "warning": "$warn", "error": "bold $bad"}
 _SIGNS = {"debug": "", "info": "", "warning": "▲ ", "error": "✗ "}
 
 
 def event_text(event: Event) -> Content:
+    clock = datetime.fromtimestamp(event.wall_ns / 1e9)
     pose = "" if event.pose_index is None else f"pose {event.pose_index + 1} "
     said = _SIGNS[event.level] + pose + event.text
-    return Content.assemble((clock(event.wall_ns), "$faint"), "  ", (said, _LEVELS[event.level]))
+    return Content.assemble((f"{clock:%H:%M:%S}", "$faint"), "  ", (said, _LEVELS[event.level]))
 
 
 class LogScreen(StationScreen):

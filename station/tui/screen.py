@@ -10,7 +10,6 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Container, Vertical
 from textual.content import Content
-from textual.reactive import reactive
 from textual.widgets import DataTable, Footer
 
 from station.protocol.client import ANSWER_S
@@ -25,22 +24,19 @@ from station.tui.words import rich_text
 class Panel(Line):
     """A titled box of text."""
 
-    old: reactive[bool] = reactive(False)
-    """The text is out of date; the title says so."""
-
     def __init__(
         self, title: str, body: Callable[[Known, int, int], Content], *, id: str, below: str = ""
     ) -> None:
         """`body`: text from what is known, width and height. `below`: unit or keys, in the lower border."""
         super().__init__(lambda known, _: body(known, *self.content_size), id=id, classes="panel")
         self.border_title, self.border_subtitle = title, below
-        self._title = title
-
-    def watch_old(self, old: bool) -> None:
-        self.border_title = f"{self._title}: OLD" if old else self._title
+        self.heading = title
+        """The title without `OLD`."""
 
     def show(self, known: Known) -> None:
-        self.old = known.old
+        title = f"{self.heading}: OLD" if known.old else self.heading
+        if self.border_title != title:
+            self.border_title = title
         if known.status is not None and self.display:
             super().show(known)
 

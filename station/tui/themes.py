@@ -92,8 +92,7 @@ def chosen_theme(no_colour: bool = False) -> str:
     """Return the theme that TEXTUAL_THEME names; on a terminal of 16 colours or none, the terminal's own."""
     if (asked := os.environ.get("TEXTUAL_THEME", "")) in THEMES:
         return asked
-    few = no_colour or os.environ.get("TERM", "") in FEW_COLOURS
-    return TERMINAL if few else "station-dark"
+    return TERMINAL if no_colour or few_signs() else "station-dark"
 
 
 def few_signs() -> bool:

@@ -24,9 +24,8 @@ from station.tui.installed import Result, state_root
 ABOUT = (
     "Bring the tip of the tool or pointer onto a corner of the board, with freedrive or the pendant, hold it "
     "there and press Enter on that corner. The station moves nothing. The board must stay where it is until "
-    "the end."
+    "the end: Escape ends, and writes what was found."
 )
-END = "end"
 
 
 class TouchCorners(Question[list[Touch]]):
@@ -45,9 +44,8 @@ class TouchCorners(Question[list[Touch]]):
         yield Static(ABOUT, markup=False)
         corners = outer_corners(self._board.calibration.board)
         lines = [Option(self._line(corner), str(corner)) for corner in corners]
-        yield OptionList(*lines, Option("end, and write what was found", END), id="corners", compact=True)
+        yield OptionList(*lines, id="corners", compact=True)
         yield Label("", id="dialog-problem", markup=False)
-        yield Label("Enter: read that corner. Escape: end.", id="dialog-keys")
 
     def _line(self, corner: int) -> Text:
         if (touch := self._found.get(corner)) is not None:
@@ -56,9 +54,6 @@ class TouchCorners(Question[list[Touch]]):
         return Text(f"corner {corner}, at {x_mm:.0f}, {y_mm:.0f} mm on the board: not touched yet")
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        if event.option_id == END:
-            self.action_end()
-            return
         corner, problem = int(str(event.option_id)), ""
         now = None if self.known.old else self.known.status
         try:

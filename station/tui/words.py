@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from typing import Literal
 
 from rich.text import Text
@@ -114,18 +113,6 @@ def state_of(status: StationStatus) -> tuple[str, str]:
 
 def duration(seconds: float | None) -> str:
     return "-:--" if seconds is None else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
-
-
-def clock(wall_ns: int) -> str:
-    return time.strftime("%H:%M:%S", time.localtime(wall_ns / 1e9))
-
-
-def mm(metres: float, digits: int = 1) -> str:
-    return f"{metres * 1000:.{digits}f} mm"
-
-
-def degrees(radians: float, digits: int = 1) -> str:
-    return f"{math.degrees(radians):.{digits}f}°"
 
 
 def many(count: int, what: str) -> str:

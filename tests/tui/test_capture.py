@@ -10,11 +10,10 @@ from calibrate.geometry import pose as pose_of
 from station.cell.config import matrix4
 from station.cell.layout import layout_of
 from station.cell.status import ArmCondition, EstimateStatus, PoseStatus, StationState
-from station.tui.capture_panels import coverage_lines, error_lines
+from station.tui.capture_panels import coverage_lines, error_columns, error_lines
 from station.tui.progress import chips, pose_line
 from station.tui.stopped import stopped_text
 from station.tui.task import Known
-from station.tui.widgets.canvas import Series, curve
 from station.tui.widgets.cell_drawing import draw
 from tests.recordings.small_recording import make_state
 from tests.tui.conftest import CELL, FakeLink, idle, in_session, opened, until
@@ -106,11 +105,11 @@ def test_the_error_falls_towards_its_goal() -> None:
     assert "✓ reached" in error_lines(Known(enough, configuration=CELL), 60, 14).plain
 
 
-def test_a_curve_stays_in_its_room_whatever_it_is_given() -> None:
-    for values in ([], [(1.0, 0.0)], [(1.0, float("inf"))], [(1.0, 1e-9), (2.0, 1e9)]):
+def test_columns_stay_in_their_room_whatever_they_are_given() -> None:
+    for errors in ([], [None], [0.0], [float("inf")], [1e-9, 1e9], [1.0] * 200):
         for goal in (None, 0.5):
-            drawn = curve([Series(values, "$accent")], goal, 40, 8).plain
-            assert all(len(line) <= 40 for line in drawn.split("\n"))
+            drawn = list(error_columns([(error, "$accent") for error in errors], goal, 40, 8))
+            assert len(drawn) in (0, 8) and all(len(line.plain) <= 40 for line in drawn)
 
 
 def seeing(x_m: float, y_m: float) -> PoseStatus:

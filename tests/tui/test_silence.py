@@ -78,7 +78,7 @@ async def test_without_a_daemon_what_it_said_last_stays_and_is_marked_old(link: 
         assert "The daemon ended" in text_of(pilot.app, "#next")
         assert table.row_count == 25
         await pilot.press("3")
-        await until(pilot, lambda: "p08" in text_of(pilot.app, "#poses"))
+        await until(pilot, lambda: "p08" in text_of(pilot.app, "#progress"))
         assert "NO DAEMON" in text_of(pilot.app, "#bar")
         assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose 8 of 25: OLD"
 

@@ -1,10 +1,9 @@
-"""Drawings made of braille dots: lines and areas, and curves with an axis."""
+"""A drawing made of braille dots: lines, areas and words."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,61 +104,3 @@ def _row(letters: list[str], ranks: list[int], styles: Sequence[str]) -> Content
             runs.append(("".join(letters[begun:i]), style))
             begun = i
     return Content.assemble(*runs)
-
-
-@dataclass(frozen=True)
-class Series:
-    """A curve through (x, y) points."""
-
-    values: Sequence[tuple[float, float]]
-    style: str
-    dash: int = 0
-
-
-def curve(
-    series: Sequence[Series], goal: float | None, width: int, height: int, *, ends: str = ""
-) -> Content:
-    """Draw curves over a logarithmic axis with labels at the left; the goal is a dashed amber line.
-
-    `ends`: words below the axis, its two ends parted by '|'.
-    """
-    points = [[(x, y) for x, y in line.values if math.isfinite(y) and y > 0] for line in series]
-    places = [x for line in series for x, _ in line.values]
-    levels = [y for line in points for _, y in line]
-    if not levels or width < 20 or height < 3:
-        return Content()
-    levels += [goal] if goal else []
-    low, high = min(levels) / 1.15, max(levels) * 1.15
-    label, rows = 7, height - bool(ends)
-    canvas = Canvas(width - label, rows)
-    left, right = min(places), max(max(places), min(places) + 1e-9)
-
-    def dots(line: Sequence[tuple[float, float]]) -> Points:
-        xy = np.array(line, dtype=float).reshape(-1, 2)
-        share = np.log(xy[:, 1] / low) / math.log(high / low)
-        across = (xy[:, 0] - left) / (right - left)
-        return np.stack([across * (canvas.width - 1), (1 - share) * (canvas.height - 1)], axis=1)
-
-    marks = {0: (_label(high), "$dim"), rows - 1: (_label(low), "$dim")}
-    if goal:
-        at = dots([(left, goal), (right, goal)])
-        canvas.lines(at[:1], at[1:], 1, dash=3)
-        marks[min(rows - 1, max(0, int(at[0, 1]) * rows // canvas.height))] = (_label(goal), "$warn")
-    for rank, (line, drawn) in enumerate(zip(points, series, strict=True), start=2):
-        at = dots(line)
-        canvas.lines(at[:-1], at[1:], rank, dash=drawn.dash)
-        canvas.points(at, rank)
-    lines = []
-    for row, text in enumerate(canvas.content(["$warn", *(line.style for line in series)]).split("\n")):
-        words, style = marks.get(row, ("", "$dim"))
-        lines.append(Content.assemble((f"{words:>5} ", style), ("│", "$line"), text))
-    if ends:
-        first, _, last = ends.partition("|")
-        gap = " " * max(1, width - label - len(first) - len(last))
-        lines.append(Content.styled(" " * label + first + gap + last, "$dim"))
-    return Content("\n").join(lines)
-
-
-def _label(value: float) -> str:
-    """Write a number in at most 5 letters."""
-    return f"{value:.2f}" if value < 99 else f"{value:.0f}" if value < 1e5 else f"{value:.0e}"

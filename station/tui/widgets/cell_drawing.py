@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 
 import msgspec
 import numpy as np
@@ -47,8 +48,7 @@ def cell_scene(config: StationConfig | None, status: StationStatus) -> CellLayou
 
 
 def _board_corners(scene: CellLayout) -> Array:
-    low, high = board_extent(scene.board)
-    return np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    return np.array([*product(*zip(*board_extent(scene.board), strict=True), (0.0,))])
 
 
 def draw(
@@ -131,20 +131,15 @@ def _surroundings(
         level = abs(normal[2]) > 0.9
         axis = int(np.argmax(np.abs(normal)))
         across = [k for k in range(3) if k != axis]
-        corners = []
-        for a in (low[across[0]], high[across[0]]):
-            for b in (low[across[1]], high[across[1]]):
-                corner = np.zeros(3)
-                corner[across] = a, b
-                corner[axis] = (normal @ point - normal[across] @ corner[across]) / normal[axis]
-                corners.append(corner)
+        corners = np.zeros((4, 3))
+        corners[:, across] = [*product(*zip(low[across], high[across], strict=True))]
+        corners[:, axis] = (normal @ point - corners @ normal) / normal[axis]
         rank = FLOOR if level else KEEP_OUT
-        edges(np.array(corners), _QUAD, rank, 0 if level else 3)
+        edges(corners, _QUAD, rank, 0 if level else 3)
         text(corners[0] * 0.9 + corners[3] * 0.1, plane.name, rank)
     if limits.workspace_min_m is not None and limits.workspace_max_m is not None:
         sides = zip(limits.workspace_min_m, limits.workspace_max_m, strict=True)
-        ends = list(sides)
-        box = np.array([[x, y, z] for x in ends[0] for y in ends[1] for z in ends[2]])
+        box = np.array([*product(*sides)])
         edges(box, _BOX, KEEP_OUT, 3)
         text(box[0], "workspace", KEEP_OUT)
 

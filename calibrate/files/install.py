@@ -43,6 +43,7 @@ from calibrate.files.versions import (
     who,
 )
 from calibrate.geometry import difference
+from calibrate.handeye.metrics import point_error_m
 from calibrate.results import Gate
 from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import Source
@@ -340,16 +341,14 @@ def _regression(calibration: Calibration, before: Calibration | None) -> list[Ga
     """
     if before is None or before.quality.failed:
         return []
-    new, old = calibration.quality, before.quality
-    same_place = new.working_distance_m == old.working_distance_m
-    if same_place and new.predicted_error_mm is not None and old.predicted_error_mm is not None:
-        ours, theirs = new.predicted_error_mm, old.predicted_error_mm
-        title = f"Regression: predicted error at {1e3 * (new.working_distance_m or 0):.0f} mm"
-    else:
-        ours, theirs = calibration.sigma.translation_mm, before.sigma.translation_mm
-        title = "Regression: standard uncertainty of the position"
+    distance_m = calibration.quality.working_distance_m or 0.0
+    ours, theirs = (
+        point_error_m(one.transform.matrix, np.array(one.covariance), distance_m)
+        for one in (calibration, before)
+    )
+    title = f"Regression: predicted error at {1e3 * distance_m:.0f} mm"
     remedy = "Capture more or better poses, or keep the installed one."
-    gate = Gate.measured("no_worse", title, ours / 1e3, "≤", WORSE_TIMES * theirs / 1e3, "m", remedy)
+    gate = Gate.measured("no_worse", title, ours, "≤", WORSE_TIMES * theirs, "m", remedy)
     return [] if gate.passed else [gate]
 
 

@@ -165,11 +165,10 @@ async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready
     link: FakeLink, calibration: Path
 ) -> None:
     """`install` would ask for a reason: who looks at the result knows it before."""
-    assert GOOD.quality.predicted_error_mm is None
     write_calibration(GOOD, calibration.with_name("a.yaml"))
     install(calibration.with_name("a.yaml"), calibration.parents[2], cell="simulated")
-    vague = msgspec.structs.replace(GOOD.sigma, translation_mm=9 * GOOD.sigma.translation_mm)
-    write_calibration(msgspec.structs.replace(LATER, sigma=vague), calibration)
+    vague = tuple(tuple(81 * value for value in row) for row in GOOD.covariance)
+    write_calibration(msgspec.structs.replace(LATER, covariance=vague), calibration)
     async with opened(link) as pilot:
         pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
         await pilot.press("4")

@@ -53,10 +53,13 @@ def test_what_speaks_against_it_beside_its_gates_is_known_before(make_file: Make
     now = installed_calibration(tmp_path)
     assert objections_beside(now, tmp_path) == []
     assert objections_beside(now, tmp_path / "empty") == []
-    error_mm = now.quality.predicted_error_mm
-    assert error_mm is not None
-    quality = msgspec.structs.replace(now.quality, predicted_error_mm=3 * error_mm)
-    (worse,) = objections_beside(msgspec.structs.replace(now, quality=quality), tmp_path)
+    quality = msgspec.structs.replace(
+        now.quality, working_distance_m=0.9 * (now.quality.working_distance_m or 1)
+    )
+    elsewhere = msgspec.structs.replace(now, quality=quality)
+    assert objections_beside(elsewhere, tmp_path) == [], "as right as the installed one, for nearer points"
+    vague = tuple(tuple(9 * value for value in row) for row in now.covariance)
+    (worse,) = objections_beside(msgspec.structs.replace(elsewhere, covariance=vague), tmp_path)
     assert "Regression" in worse
     robot = msgspec.structs.replace(now.robot, serial="2099999999")
     (other,) = objections_beside(msgspec.structs.replace(now, robot=robot), tmp_path)

@@ -11,7 +11,7 @@ from recordings.schema.messages import Matrix4, Mount, ToldJoints
 
 Criterion = Literal["A", "D", "arm", "all"]
 """Criterion of a plan. A: smallest error of X; arm: smallest error over the workspace with the arm's
-corrected table; all: smallest ellipsoid of X, board, lens and table together; D: of earlier releases."""
+corrected table; all and D: of earlier releases."""
 
 
 class ExpectedView(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):

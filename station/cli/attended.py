@@ -11,9 +11,9 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
+from recordings.cli.console import progress_bar
 from station.cell.errors import RefusedError, StationError
 from station.cell.socket_folder import default_socket
 from station.cell.status import MotionPreview, StationStatus
@@ -21,15 +21,14 @@ from station.cli.console import err
 from station.operate.motion import (
     HASH_DIGITS,
     Watcher,
-    carry_out,
     motion_facts,
-    not_approved,
+    prepared_motion,
     status_now,
     wait_until_idle,
     watched,
 )
 from station.protocol.client import Client
-from station.protocol.verbs import Purpose, Stop
+from station.protocol.verbs import Prepare, Purpose, Stop
 
 STOP_ANSWER_S = 3.0
 
@@ -74,20 +73,15 @@ class Attended:
 
     async def carry_out(self, purpose: Purpose) -> StationStatus:
         """One session, until it rests."""
-        with session_progress(err, self._quiet, await self.status()) as show:
-            return await carry_out(
-                self.client,
-                purpose,
-                self.approves,
-                show,
-                finish_with_loss=self._headless,
-                plans_here=self.plans_here if self.interactive else None,
-            )
+        before, plans_here = await self.status(), self.plans_here if self.interactive else None
+        wanted = Prepare(purpose)
+        started = await prepared_motion(self.client, wanted, self.approves, plans_here=plans_here)
+        return await self.watch(started, before)
 
     async def watch(self, started: object, before: StationStatus) -> StationStatus:
         """A session that was just started, until it rests. RefusedError when it was not `started`."""
         if not started:
-            raise not_approved()
+            raise RefusedError("not-approved")
         with session_progress(err, self._quiet, before) as show:
             return await watched(self.client, show, finish_with_loss=self._headless)
 
@@ -160,36 +154,23 @@ def ctrl_c_at_once() -> Iterator[None]:
 
 @contextlib.contextmanager
 def session_progress(console: Console, quiet: bool, before: StationStatus) -> Iterator[Watcher]:
-    """Give what shows a session by each status; events of `before` are not told again.
-
-    The bar appears with the first status, so that a question before it has the terminal to itself.
-    """
-    bar = Progress(
-        TextColumn("{task.description:<34}"),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        disable=quiet,
-    )
-    task = bar.add_task("", total=None)
+    """Give what shows a session by each status; events of `before` are not told again."""
+    if quiet:
+        yield lambda status: None
+        return
     told = before.events[-1:]
+    with progress_bar("", console) as bar:
 
-    def show(status: StationStatus) -> None:
-        nonlocal told
-        session, events = status.session, status.events
-        where = f"pose {session.current + 1} " if session.current is not None else ""
-        words = f"{where}{status.state.value}"
-        bar.start()
-        bar.update(task, description=words, total=len(session.poses), completed=session.captured)
-        new = events[events.index(told[0]) + 1 :] if told and told[0] in events else events
-        told = events[-1:] or told
-        for event in new:
-            number = f"pose {event.pose_index + 1:>2}  " if event.pose_index is not None else ""
-            style = {"warning": "yellow", "error": "red"}.get(event.level, "dim")
-            bar.console.print(Text(f"{number}{event.text}", style))
+        def show(status: StationStatus) -> None:
+            nonlocal told
+            session, events = status.session, status.events
+            where = f"pose {session.current + 1} " if session.current is not None else ""
+            bar(session.captured, len(session.poses), f"{where}{status.state.value}")
+            new = events[events.index(told[0]) + 1 :] if told and told[0] in events else events
+            told = events[-1:] or told
+            for event in new:
+                number = f"pose {event.pose_index + 1:>2}  " if event.pose_index is not None else ""
+                style = {"warning": "yellow", "error": "red"}.get(event.level, "dim")
+                console.print(Text(f"{number}{event.text}", style))
 
-    try:
-        yield (lambda status: None) if quiet else show
-    finally:
-        bar.stop()
+        yield show

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import numpy as np
 import typer
-from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
 from calibrate.files.formatting import predicted_error
+from recordings.cli.console import progress_bar
 from recordings.schema.messages import Mount
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config
@@ -58,17 +58,14 @@ def plan_command(
     else:
         if output is not None:
             _require_replaceable(output)
-        with Progress(
-            TextColumn("{task.description}"), BarColumn(), console=err, transient=True, disable=as_json
-        ) as bar:
-            task = bar.add_task("planning", total=1.0)
+        with nullcontext() if as_json else progress_bar("planning", err) as bar:
             plan = make_plan(
                 cell,
                 start_joints_rad=standing,
                 seed=seed,
                 count=poses,
                 criterion=CRITERIA[purpose],
-                progress=lambda text, done: bar.update(task, description=text, completed=done),
+                progress=lambda text, done: bar and bar(round(100 * done), 100, text),
             )
         if output is not None:
             save_plan(plan, output)
@@ -107,7 +104,7 @@ def _configured(config: Path, socket: Path) -> tuple[StationConfig, list[float] 
     cell, _ = load_config(config)
     if cell.robot.driver == "posted":
         raise RefusedError("moved-by-hand", robot=cell.robot.model)
-    with contextlib.suppress(StationError, OSError, TimeoutError):
+    with suppress(StationError, OSError, TimeoutError):
         status = asyncio.run(asyncio.wait_for(status_now(socket), _ASK_S))
         ours = (status.cell, status.mount) == (cell.name, cell.mount)
         if ours and status.robot.model == cell.robot.model and status.robot.joints_rad is not None:

@@ -14,7 +14,7 @@ from station.cell.errors import RefusedError, StationError
 from station.cell.pose_plan import Criterion
 from station.cell.status import MotionPreview, StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
-from station.protocol.verbs import PLANNED_ELSEWHERE, Finish, GetPlan, Go, MakePlan, Prepare, Purpose
+from station.protocol.verbs import PLANNED_ELSEWHERE, Finish, GetPlan, Go, MakePlan, Prepare
 
 Watcher = Callable[[StationStatus], None]
 Approve = Callable[[MotionPreview], Awaitable[bool]]
@@ -95,25 +95,6 @@ def motion_facts(preview: MotionPreview) -> list[tuple[str, str]]:
         ("Plan", preview.plan_sha256[:HASH_DIGITS]),
         *(("WARNING", warning) for warning in preview.warnings),
     ]
-
-
-async def carry_out(
-    link: Client,
-    purpose: Purpose,
-    approve: Approve,
-    watch: Watcher,
-    *,
-    finish_with_loss: bool = False,
-    plans_here: PlansHere | None = None,
-) -> StationStatus:
-    """Run a session from its approval until it is finished or paused. RefusedError when refused."""
-    if not await prepared_motion(link, Prepare(purpose), approve, plans_here=plans_here):
-        raise not_approved()
-    return await watched(link, watch, finish_with_loss)
-
-
-def not_approved() -> RefusedError:
-    return RefusedError("not-approved")
 
 
 async def watched(link: Client, watch: Watcher, finish_with_loss: bool = False) -> StationStatus:

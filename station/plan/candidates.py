@@ -39,12 +39,8 @@ class CandidateSet:
     """(n, 6)"""
     base_from_flange: Array
     """(n, 4, 4)"""
-    camera_from_board: Array
-    """(n, 4, 4) by the initial camera and board pose"""
     branch: NDArray[np.intp]
     """(n,) arm branch, as numbered by `inverse_many`"""
-    margin_m: Array
-    """(n,) smallest distance to any limit, metres"""
     lost: Counter[str] = field(default_factory=Counter)
     """Limit → number of rejected poses that violate it (a pose may violate several)."""
     alone: Counter[str] = field(default_factory=Counter)
@@ -58,9 +54,7 @@ class CandidateSet:
             self,
             joints_rad=self.joints_rad[places],
             base_from_flange=self.base_from_flange[places],
-            camera_from_board=self.camera_from_board[places],
             branch=self.branch[places],
-            margin_m=self.margin_m[places],
         )
 
 
@@ -102,22 +96,22 @@ def find_candidates(
     flange = layout.base_from_flange(views)
     seen = seen_for_certain(layout, flange, view)
     lost = Counter({NOT_IN_PICTURE: int((~seen).sum())})
-    views, flange = views[seen][:count], flange[seen][:count]
+    flange = flange[seen][:count]
     rows, joints, branches = _all_branches(layout, flange, near_joints_rad)
-    lost[OUT_OF_REACH] = len(views) - len(np.unique(rows))
-    checks, worst = _checks(layout, view, joints, flange[rows])
+    lost[OUT_OF_REACH] = len(flange) - len(np.unique(rows))
+    checks = _checks(layout, view, joints, flange[rows])
     keep = np.logical_and.reduce(list(checks.values()))
     failing = np.sum([~good for good in checks.values()], axis=0)
     alone = Counter({name: int((~good & (failing == 1)).sum()) for name, good in checks.items()})
     lost += Counter({name: int((~good).sum()) for name, good in checks.items()})
-    kept = CandidateSet(joints, flange[rows], views[rows], branches, worst, lost, alone)
+    kept = CandidateSet(joints, flange[rows], branches, lost, alone)
     return kept.take(np.flatnonzero(keep))
 
 
 def _checks(
     layout: CellLayout, view: ViewRange, joints: Array, base_from_flange: Array
-) -> tuple[dict[str, NDArray[np.bool_]], Array]:
-    """Check joints (n, 6): return results (n,) by name of the limit, and the smallest margins (n,)."""
+) -> dict[str, NDArray[np.bool_]]:
+    """Check joints (n, 6): return results (n,) by name of the limit."""
     low, high = joint_bounds(layout.geometry)
     checks: dict[str, NDArray[np.bool_]] = {
         "the joint range": np.asarray(((joints >= low) & (joints <= high)).all(axis=1)),
@@ -131,7 +125,7 @@ def _checks(
         name = _limit_of(contact)
         good = np.asarray(gap >= _PATH_RESERVE_M)
         checks[name] = checks[name] & good if name in checks else good
-    return checks, gaps.min(axis=1)
+    return checks
 
 
 def _limit_of(contact: Contact) -> str:

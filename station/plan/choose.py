@@ -24,9 +24,8 @@ from calibrate.projection import intrinsics_names
 from station.cell.layout import CellLayout
 from station.cell.pose_plan import Criterion
 
-WITH_LINKS = ("arm", "all")
-Aim = Literal["camera", "arm", "both"]
-CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm", "both": "all"}
+Aim = Literal["camera", "arm"]
+CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm"}
 """Aim of a plan, as users name it → criterion."""
 _LENS_SHARE = 0.02
 """Weight of the lens in criterion A, so that the views cover the image."""
@@ -52,8 +51,6 @@ class Objective:
     """(p, p) K: the mean squared error of a point over the arm's workspace is trace(K C)."""
 
     def __call__(self, information: Array) -> Array:
-        if self.criterion == "all":
-            return -np.asarray(np.linalg.slogdet(information + self.prior)[1])
         if self.criterion == "arm":
             assert self.workspace is not None
             C = covariance_of(information, self.prior)
@@ -66,8 +63,6 @@ class Objective:
     def slope(self, information: Array) -> Array:
         """Compute G (p, p): adding dM to the information changes the value by -trace(G dM), first order."""
         C = covariance_of(information, self.prior)
-        if self.criterion == "all":
-            return C
         if self.criterion == "arm":
             assert self.workspace is not None
             return np.asarray(C @ self.workspace @ C / np.trace(self.workspace @ C))
@@ -104,9 +99,9 @@ def objective_for(
 ) -> Objective:
     """Make the objective of a criterion.
 
-    `joints_rad`: (n, 6) postures that stand for the workspace, needed by the criteria with the arm's links.
+    `joints_rad`: (n, 6) postures that stand for the workspace, needed by the criterion with the arm's links.
     """
-    link_mm = LINK_ERROR_MM if criterion in WITH_LINKS else 0.0
+    link_mm = LINK_ERROR_MM if criterion == "arm" else 0.0
     prior = prior_information(layout.camera, not free_intrinsics, BoardTolerance.of(layout.board), link_mm)
     lens = slice(12, 12 + len(intrinsics_names(layout.camera))) if free_intrinsics else None
     K = None

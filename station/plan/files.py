@@ -16,18 +16,10 @@ from station.cell.pose_plan import Plan
 _POSE_LIMIT = 200
 
 
-class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # yaml has no types
-    """YAML writer without anchors, which the strict reader does not accept."""
-
-    def ignore_aliases(self, data: object) -> bool:
-        return True
-
-
 def save_plan(plan: Plan, path: Path) -> None:
     """Write a plan file atomically. ConfigError with the remedy when it cannot be written."""
-    text = yaml.dump(
-        msgspec.to_builtins(plan),
-        Dumper=_Dumper,
+    text = yaml.safe_dump(
+        msgspec.to_builtins(plan),  # lists of their own, so that no anchors are written
         sort_keys=False,
         default_flow_style=None,
         width=110,

@@ -26,7 +26,7 @@ from station.plan.candidates import (
     best_group,
     find_candidates,
 )
-from station.plan.choose import WITH_LINKS, Objective, choose, informations, objective_for
+from station.plan.choose import Objective, choose, informations, objective_for
 from station.plan.order import ordered
 from station.plan.visibility import ViewRange, expected_view, planned_pose, view_range, visible
 
@@ -195,7 +195,7 @@ def _choose_and_order(
     progress: Progress,
 ) -> Plan:
     """Choose and order poses, and check the plan; repeat without poses that no free path leads to."""
-    joints = pool.joints_rad if options.criterion in WITH_LINKS else None
+    joints = pool.joints_rad if options.criterion == "arm" else None
     objective = objective_for(layout, options.criterion, options.free_intrinsics, joints)
     information = informations(layout, pool.base_from_flange, joints, options.noise)
     left = np.arange(len(pool))

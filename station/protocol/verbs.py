@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 import msgspec
 
-from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, ToldJoints, Vector6
+from recordings.schema.messages import BoardSpec, Matrix4, Mount, Source, Vector6
 from station.cell.arm_acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
@@ -100,15 +100,6 @@ class LoadedPlan(msgspec.Struct, frozen=True, omit_defaults=True):
     sha256: str = ""
 
 
-class PlanFacts(msgspec.Struct, frozen=True):
-    poses: int
-    sha256: str
-
-
-class PoseNumber(msgspec.Struct, frozen=True):
-    index: int
-
-
 class PreviewImage(msgspec.Struct, frozen=True, omit_defaults=True):
     jpeg_base64: str = ""
     """JPEG in base64; empty: there is no image."""
@@ -126,13 +117,7 @@ class Observation(msgspec.Struct, frozen=True, omit_defaults=True):
     source: Source
     robot_serial: str
     camera_serial: str
-    wall_ns: int
-    rested_s: float
-    """Time for which the arm had rested by then."""
     base_from_flange: Matrix4
-    joints_rad: ToldJoints
-    width: int
-    height: int
     tcp_offset: Vector6 = (0.0,) * 6
     """The pendant's tool centre point, in the flange."""
     corners: tuple[int, ...] = ()
@@ -203,7 +188,7 @@ class GetPlan(Verb[LoadedPlan], frozen=True):
     control = False
 
 
-class LoadPlan(Verb[PlanFacts], frozen=True):
+class LoadPlan(Verb[Done], frozen=True):
     """Load a plan, checked; refused with all its problems."""
 
     states = _LOADING
@@ -212,7 +197,7 @@ class LoadPlan(Verb[PlanFacts], frozen=True):
     plan: Plan
 
 
-class MakePlan(Verb[PlanFacts], frozen=True):
+class MakePlan(Verb[Done], frozen=True):
     """Make a plan in a worker process and load it."""
 
     states = _LOADING
@@ -221,8 +206,8 @@ class MakePlan(Verb[PlanFacts], frozen=True):
     poses: Annotated[int, msgspec.Meta(ge=4, le=200)] = 25
     seed: int = 0
     lens_known: bool = False
-    aim: Literal["camera", "arm", "both"] = "camera"
-    """What the poses should determine: the camera pose, the arm's table, or both and the lens."""
+    aim: Literal["camera", "arm"] = "camera"
+    """What the poses should determine: the camera pose, or the arm's table, too."""
 
 
 class StopTest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -294,7 +279,7 @@ class Freedrive(Verb[Done], frozen=True):
     """A session that begins is a drift check."""
 
 
-class Record(Verb[PoseNumber], frozen=True):
+class Record(Verb[Done], frozen=True):
     """Capture here and now (freedrive)."""
 
     states = frozenset({S.FREE_DRIVE})

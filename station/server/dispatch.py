@@ -99,10 +99,8 @@ class SessionDispatcher:
                 return verbs.LoadedPlan(queue.plan, queue.sha256) if queue else verbs.LoadedPlan()
             case verbs.LoadPlan():
                 session.load_plan(client, verb.plan)
-                return self._plan_facts()
             case verbs.MakePlan():
                 await session.make_plan(client, verb.poses, verb.seed, verb.lens_known, verb.aim)
-                return self._plan_facts()
             case verbs.Prepare():
                 if verb.stop_test is not None:
                     self._rule.by_person(await self._named(caller), "A stop test")
@@ -119,7 +117,7 @@ class SessionDispatcher:
             case verbs.Freedrive():
                 await self._to_the_end(session.switch_free_drive(client, verb.on, verb.check))
             case verbs.Record():
-                return verbs.PoseNumber(await session.record(client))
+                await session.record(client)
             case verbs.Preview():
                 return await session.previews.preview(verb.width, verb.height)
             case verbs.Observe():
@@ -134,10 +132,6 @@ class SessionDispatcher:
         caller.told = said if said.split(" ")[0] == user else f"{user} ({said})"
         context = self._session.context
         return verbs.Welcome(caller.client_id, str(context.root), context.cell.config)
-
-    def _plan_facts(self) -> verbs.PlanFacts:
-        queue = self._session.context.require_queue()
-        return verbs.PlanFacts(len(queue.statuses), queue.sha256)
 
     async def _approval(self, caller: Peer, plan_sha256: str) -> str:
         """Check that this client may approve what is offered; return who did, and how."""

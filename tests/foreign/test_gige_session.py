@@ -20,10 +20,10 @@ from recordings.reader import open_recording
 from station.cell.config import ApprovalConfig, StationConfig
 from station.cell.pose_plan import Plan
 from station.cell.status import MotionPreview, StationState, StationStatus
-from station.operate.motion import carry_out, prepared_motion, wait_until_idle
+from station.operate.motion import prepared_motion, wait_until_idle, watched
 from station.plan.planner import make_plan
 from station.protocol.client import Client
-from station.protocol.verbs import Check, Doctor, LoadPlan, Prepare, Purpose, Stop
+from station.protocol.verbs import Check, Doctor, LoadPlan, Prepare, Stop
 from station.simulation.camera_process import CameraProcess
 from station.simulation.cells import cell_config, make_cell
 from station.simulation.launch import SimulatedController, start_controller
@@ -95,7 +95,8 @@ async def yes(preview: MotionPreview) -> bool:
 
 async def captured(client: Client, plan: Plan) -> StationStatus:
     await client.call(LoadPlan(plan))
-    return await carry_out(client, Purpose.RUN, yes, lambda status: None)
+    assert await prepared_motion(client, Prepare(), yes)
+    return await watched(client, lambda status: None)
 
 
 async def stopped_in_mid_move(client: Client, plan: Plan, arm: SimulatedController) -> StationStatus:

@@ -44,7 +44,7 @@ def install_on(link: FakeLink, folder: Path) -> None:
 def installed(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The daemon's root, with something installed; the check itself is a job that notes what it was asked."""
     install_on(link, tmp_path)
-    link.answers["make_plan"] = verbs.PlanFacts(6, CHECK_PLAN)
+    link.answers["make_plan"] = verbs.Done()
     link.answers["plan"] = verbs.LoadedPlan(LOADED)
     (tmp_path / "some_job.py").write_text(JOB)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
@@ -99,7 +99,7 @@ async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, in
 async def test_planning_it_is_said_on_every_screen(tmp_path: Path) -> None:
     link = SlowPlanner()
     install_on(link, tmp_path)
-    link.answers |= {"plan": verbs.LoadedPlan(LOADED), "make_plan": verbs.PlanFacts(6, CHECK_PLAN)}
+    link.answers |= {"plan": verbs.LoadedPlan(LOADED), "make_plan": verbs.Done()}
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
         await ask_for_it(pilot)

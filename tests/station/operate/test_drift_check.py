@@ -36,7 +36,7 @@ class FakeLink:
             raise RefusedError()
         answers = {
             verbs.GetPlan: verbs.LoadedPlan(LOADED),
-            verbs.MakePlan: verbs.PlanFacts(8, PREVIEW.plan_sha256),
+            verbs.MakePlan: verbs.Done(),
             verbs.Prepare: PREVIEW,
         }
         return answers.get(type(verb), verbs.Done())

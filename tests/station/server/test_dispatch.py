@@ -59,8 +59,8 @@ async def served(new_rig: NewRig, tmp_path: Path) -> AsyncIterator[Served]:
 
 async def test_a_capture_over_the_socket(served: Served, small_plan: Plan) -> None:
     async with await served.client() as anna:
-        answer = await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
-        assert answer["sha256"] == plan_sha256(small_plan)
+        await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
+        assert (await anna.request("plan"))["sha256"] == plan_sha256(small_plan)
         lease = served.rig.session.store.status.lease
         assert lease.client_id == anna.own_id and "tty1" in lease.holder and "pid" in lease.holder
         summary = await anna.request("prepare", purpose="run")

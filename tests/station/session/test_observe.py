@@ -19,7 +19,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
 from station.session import previews
 from tests.codes import raises
-from tests.station.session_rig import TRUTH, NewRig, Rig
+from tests.station.session_rig import NewRig, Rig
 
 TAG = BoardSpec(BoardKind.APRIL_TAG, square_m=0.05)
 
@@ -37,12 +37,10 @@ async def test_corners_and_the_arms_pose_of_mid_exposure_without_control_or_sess
     rig.arm.at = lambda ns: told.append(ns) or at(ns)  # type: ignore[method-assign, func-returns-value]
     found = await rig.session.previews.observe(TAG)
     state = rig.arm.latest()
-    assert (found.corners, found.joints_rad) == ((0, 1, 2, 3), state.joints_rad)
+    assert found.corners == (0, 1, 2, 3)
     assert np.allclose(found.base_from_flange, flange_pose(state, rig.arm.identity.tcp_offset))
-    assert (found.width, found.height) == (TRUTH.camera.width, TRUTH.camera.height)
     assert (found.robot_serial, found.camera_serial, found.source) == ("DOUBLE", "1", "simulated")
     assert len(told) == 1 and rig.camera.taken == 1
-    assert 0 < found.rested_s < 10
     assert rig.arm.log == [] and rig.state is S.IDLE
     assert not list(rig.session.context.root.rglob("*.mcap*"))
 

@@ -35,7 +35,7 @@ from station.tui.desk import SILENT_S, Desk, KnowingApp, StatusChanged
 from station.tui.dialogs import Confirm, ConfirmMotion
 from station.tui.installed import Marks, marks, read_result, read_sessions, state_root
 from station.tui.jobs import check_drift, solve_session
-from station.tui.live_page import SIDE_PX, LivePage, news_of
+from station.tui.live_page import SIDE_PX, LivePageApp, news_of
 from station.tui.log_screen import LogScreen
 from station.tui.plan_screen import PlanScreen
 from station.tui.result import ResultScreen
@@ -63,7 +63,7 @@ SCREENS: tuple[type[StationScreen], ...] = (
 )
 
 
-class StationApp(KnowingApp):
+class StationApp(LivePageApp[None], KnowingApp):
     """One app, several screens; the same keys everywhere.
 
     Screens are drawn from `known` alone. What they ask for goes to the daemon by `desk`.
@@ -100,7 +100,6 @@ class StationApp(KnowingApp):
         self._marks: tuple[str, Marks] | None = None
         """The shown file, and marks of all below the root, when they were read."""
         self._greeted = False
-        self._live_page: LivePage | None = None
 
     def on_mount(self) -> None:
         self.run_worker(self.desk.follow(), group="follow", exit_on_error=False)
@@ -125,12 +124,8 @@ class StationApp(KnowingApp):
     @work(exclusive=True, group="live page", exit_on_error=False)
     async def action_open_live(self) -> None:
         """Open the live page, and feed it for as long as a browser asks."""
-        try:
-            page = self._live_page = self._live_page or LivePage()
-        except OSError as problem:
-            self.notify(f"No live picture in a browser: {problem}.", severity="error", markup=False)
+        if (page := self.open_live_page()) is None:
             return
-        self.notify(page.open(), timeout=60, markup=False)
         picture = PreviewImage()
         while True:
             await asyncio.sleep(PREVIEW_PERIOD_S if self.known.works else LIVE_PERIOD_S)
@@ -138,10 +133,6 @@ class StationApp(KnowingApp):
                 with contextlib.suppress(OSError, StationError):
                     picture = await self.desk.client.call(verbs.Preview(SIDE_PX, SIDE_PX), timeout_s=SILENT_S)
                 page.publish(news_of(self.known, picture))
-
-    async def on_unmount(self) -> None:
-        if self._live_page is not None:
-            await asyncio.to_thread(self._live_page.close)
 
     def on_status_changed(self, message: StatusChanged) -> None:
         before, status = self.known.live, message.status

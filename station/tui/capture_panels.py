@@ -13,8 +13,8 @@ from station.tui.words import ERROR_SHOWN_MM, dim, error_facts, facts, limit_bar
 
 BURNT = 0.01
 """Share of saturated pixels above which the image counts as too bright."""
-LABEL_CELLS, HALVES = 7, " ▄█"
-"""Cells of the axis of the errors; signs of an empty, a half and a full cell, which a console has too."""
+LABEL_CELLS, HALVES = 7, (" .:", " ▄█")
+"""Cells of the axis of the errors; signs of an empty, a half and a full cell, planned and by images."""
 
 
 def quality_line(seen: DetectionStatus) -> Content:
@@ -78,17 +78,14 @@ def error_lines(known: Known, width: int, height: int) -> Content:
     if poses and poses[-1].predicted_sigma_mm is not None and height > 6:
         end = error_facts("by the plan", poses[-1].predicted_sigma_mm, None)
         rows.append(end + dim(f" after {len(poses)} poses"))
-    columns = [
-        (p.estimated_sigma_mm or p.predicted_sigma_mm, "$accent" if p.estimated_sigma_mm else "$line")
-        for p in poses
-    ]
+    columns = [(p.estimated_sigma_mm or p.predicted_sigma_mm, bool(p.estimated_sigma_mm)) for p in poses]
     return lines(*rows, *error_columns(columns, goal, width, height - len(rows)))
 
 
 def error_columns(
-    columns: Sequence[tuple[float | None, str]], goal: float | None, width: int, height: int
+    columns: Sequence[tuple[float | None, bool]], goal: float | None, width: int, height: int
 ) -> Iterator[Content]:
-    """Draw (error, style) … as columns over a logarithmic axis; the goal is an amber line through them."""
+    """Draw (error, by images) … as columns over a logarithmic axis, planned ones dotted, and the goal."""
     room = max(1, width - LABEL_CELLS)
     columns = columns[:: math.ceil(len(columns) / room) or 1]
     known = [error for error, _ in columns if error and error <= ERROR_SHOWN_MM]
@@ -107,9 +104,10 @@ def error_columns(
     for row in reversed(range(height)):
         label = f"{labels[row]:>5.2f}" if row in labels else ""
         parts = [(f"{label:>5} ", "$warn" if row == at_goal else "$dim"), ("│", "$line")]
-        for error, style in columns:
+        for error, measured in columns:
             filled = min(2, max(0, halves(error) - 2 * row)) if error else 0
-            parts.append(("─" * wide, "$warn") if row == at_goal else (HALVES[filled] * wide, style))
+            sign, style = HALVES[measured][filled], "$accent" if measured else "$dim"
+            parts.append(("─" * wide, "$warn") if row == at_goal else (sign * wide, style))
         yield Content.assemble(*parts).simplify()
 
 

@@ -59,9 +59,9 @@ class KnowingApp(ThemedApp[None]):
     desk: Desk
 
     async def show_result(self, calibration: str) -> None:
-        """Open a calibration file; empty: there is none any more."""
+        """Open a calibration file."""
         self.result_path = calibration
-        await self.switch_mode("result" if calibration else "sessions")
+        await self.switch_mode("result")
 
 
 class Desk:

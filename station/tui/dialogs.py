@@ -39,11 +39,11 @@ class Confirm(Question[bool]):
     ]
 
     def __init__(self, title: str, body: str, yes: str, no: str = "Cancel") -> None:
-        super().__init__()
-        self.title, self._body, self._yes, self._no = title, body, yes, no
+        super().__init__(title, body)
+        self._yes, self._no = yes, no
 
     def body(self) -> ComposeResult:
-        yield Static(self._body, id="confirm-body", markup=False)
+        yield Static(self.words, id="confirm-body", markup=False)
         yield from self.buttons()
 
     def buttons(self) -> ComposeResult:
@@ -119,19 +119,17 @@ def motion_text(preview: MotionPreview) -> Content:
 
 
 class Reason(Question[str]):
-    """Ask for a reason to override a refusal; empty: not done."""
+    """Ask for a reason to override a refusal; empty: not done.
+
+    Its words also say what becomes of the reason, and what Enter does.
+    """
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "dismiss('')", "Cancel", tooltip="Change nothing")
     ]
 
-    def __init__(self, title: str, body: str) -> None:
-        """`body` also says what becomes of the reason, and what Enter does."""
-        super().__init__()
-        self.title, self._body = title, body
-
     def body(self) -> ComposeResult:
-        yield Static(self._body, markup=False)
+        yield Static(self.words, markup=False)
         yield Input(id="reason", placeholder="your reason, in words", compact=True)
         yield Label("", id="dialog-problem", markup=False)
 

@@ -261,6 +261,10 @@ class Question(ModalScreen[R], Framed[R]):
     NEXT: ClassVar[Action | None] = ANSWER
     BOX: ClassVar[str] = "dialog"
 
+    def __init__(self, title: str = "", words: str = "") -> None:
+        super().__init__()
+        self.title, self.words = title or self.TITLE, words
+
     def compose(self) -> ComposeResult:
         yield Frame(self.NAME, "", self.NEXT)
         with Container(id="question"), Vertical(id=self.BOX):

@@ -6,6 +6,7 @@ screen published last. There is no verb, no form and no other method than GET.
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import os
 import secrets
@@ -16,16 +17,19 @@ import threading
 import time
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
 from recordings.cli.console import open_in_browser
-from station.cell.status import StationState
+from station.cell.status import DetectionStatus, GuidanceStatus, StationState
 from station.protocol.verbs import PreviewImage
 from station.tui.capture_panels import quality_line
 from station.tui.frame import bar_line
-from station.tui.task import Known, next_action
+from station.tui.task import Action, Known, next_action
+from station.tui.themes import ThemedApp
 
+R = TypeVar("R")
 LOOPBACK = "127.0.0.1"
 SIDE_PX = 1024
 """Pixels to ask for on either side: the most that the daemon sends."""
@@ -46,19 +50,33 @@ OWN_SCRIPT = (
 
 
 def news_of(known: Known, picture: PreviewImage) -> dict[str, object]:
-    """Say what the screens say, in the same words, as the page's script reads it."""
-    status, action = known.shown, next_action(known)
-    by_hand = status.state is StationState.FREE_DRIVE
+    """Say what the screens say, in the same words."""
+    status, guidance = known.shown, known.shown.guidance
+    if status.state is not StationState.FREE_DRIVE:
+        guidance = msgspec.structs.replace(guidance, still=float(status.robot.still))
+    bar, saved = bar_line(known, "Live", 1000).plain.strip(), status.session.captured
+    return news(bar, next_action(known), status.detection, guidance, saved, picture) | {"old": known.old}
+
+
+def news(
+    bar: str,
+    action: Action,
+    seen: DetectionStatus,
+    guidance: GuidanceStatus,
+    saved: int,
+    picture: PreviewImage,
+) -> dict[str, object]:
+    """Put it as the page's script reads it. `saved`: number of views; `picture`: the newest."""
     return {
-        "bar": bar_line(known, "Live", 1000).plain.strip(),
+        "bar": bar,
         "next": f"{action.key}  {action.label}".strip(),
         "why": action.why,
         "look": action.look,
-        "seen": quality_line(status.detection).plain,
-        "still": status.guidance.still if by_hand else float(status.robot.still),
-        "outline": status.guidance.outline,
-        "saved": status.session.captured,
-        "old": known.old,
+        "seen": quality_line(seen).plain,
+        "still": guidance.still,
+        "outline": guidance.outline,
+        "saved": saved,
+        "old": False,
         "picture": picture,
     }
 
@@ -143,6 +161,26 @@ class LivePage(socketserver.ThreadingTCPServer):
 
     def handle_error(self, request: object, address: object) -> None:
         """A browser that went away is no error."""
+
+
+class LivePageApp(ThemedApp[R]):
+    """An app that has a live page from the first time a person asks for it."""
+
+    live_page: LivePage | None = None
+
+    def open_live_page(self) -> LivePage | None:
+        """Open it in a browser; None after a notice that says why not."""
+        try:
+            page = self.live_page = self.live_page or LivePage()
+        except OSError as problem:
+            self.notify(f"No live picture in a browser: {problem}.", severity="error", markup=False)
+            return None
+        self.notify(page.open(), timeout=60, markup=False)
+        return page
+
+    async def on_unmount(self) -> None:
+        if self.live_page is not None:
+            await asyncio.to_thread(self.live_page.close)
 
 
 class _Reader(BaseHTTPRequestHandler):

@@ -23,13 +23,15 @@ from textual.widgets.option_list import Option
 from recordings.errors import CodedError
 from station.analysis.worker import preview_image
 from station.cell.errors import StationError
+from station.cell.status import DetectionStatus
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import STEPS, CameraChoice, CellStep, Hardware
+from station.protocol.verbs import PreviewImage
 from station.tui.frame import BREAKPOINTS, StopBlock, fitting, next_line, rail_line
+from station.tui.live_page import LivePage, LivePageApp, news
 from station.tui.new_cell_steps import DRAWINGS, PAGES, about, accept, file_text, live_lines, next_of, typed
 from station.tui.task import Step
-from station.tui.themes import ThemedApp
 from station.tui.widgets.preview import PreviewPane
 from station.tui.words import dim
 
@@ -37,17 +39,17 @@ Ending = Literal["", "serve", "rehearse"]
 """What to open after the wizard: nothing, the cell, or its rehearsal."""
 ARM_PERIOD_S, CAMERA_PERIOD_S, LOOK_S = 0.1, 0.15, 1.0
 SHOWN_WIDTH_PX = 640
-NO_CAMERA = "No camera answers. Check its power, cable and network; this list refreshes every few seconds."
 ONLY_IN = {
     "other_mount": CellStep.MOUNTING,
     "drop": CellStep.VIEWS,
+    "open_live": CellStep.VIEWS,
     "table_here": CellStep.SAVE,
     "rehearse": CellStep.SAVE,
 }
 """Actions that have a key in one step only."""
 
 
-class NewCell(ThemedApp[Ending]):
+class NewCell(LivePageApp[Ending]):
     """Asks step by step; one may leave at any step and go on later."""
 
     TITLE = "New cell"
@@ -60,6 +62,7 @@ class NewCell(ThemedApp[Ending]):
         Binding("pagedown", "go(1)", "On", tooltip="The next step", priority=True, show=False),
         Binding("left,right", "other_mount", "Other drawing"),
         Binding("backspace", "drop", "Take back", tooltip="Take the last view back"),
+        Binding("o", "open_live", "Live picture", tooltip="The live picture, large, in a browser"),
         Binding("f7", "table_here", "Table here", tooltip="The table is as high as the tool now"),
         Binding("f9", "rehearse", "Rehearse", tooltip="Run the whole job with this cell in simulation"),
         Binding("escape", "leave", "Leave", tooltip="Leave; what was found is kept"),
@@ -70,6 +73,8 @@ class NewCell(ThemedApp[Ending]):
         super().__init__()
         self.setup = CellSetup(hardware, root, output)
         self._pictures = 0
+        self._news = dict[str, object]()
+        """What the live page shows."""
 
     def compose(self) -> ComposeResult:
         with Horizontal(classes="frame"):
@@ -128,11 +133,13 @@ class NewCell(ThemedApp[Ending]):
                     await self._look_for_cameras()
             except StationError as problem:
                 self._say("#problem", str(problem))
+                if self.live_page is not None:
+                    self.live_page.publish(self._news | {"old": True})
                 await asyncio.sleep(LOOK_S)
 
     async def _look_for_cameras(self) -> None:
         changed = await self.setup.look_for_cameras()
-        self._say("#problem", "" if self.setup.cameras else NO_CAMERA)
+        self._say("#problem", "")
         if changed:
             choice = self.query_one("#choice", OptionList)
             choice.set_options([Option(camera.name) for camera in self.setup.cameras])
@@ -151,14 +158,24 @@ class NewCell(ThemedApp[Ending]):
             line.value = typed(setup, step)
             line.cursor_position = len(line.value)
         pane = self.query_one(PreviewPane)
-        if pane.display:
+        if pane.display or self.live_page is not None:
             self._pictures += 1
             corners = np.zeros((0, 2)) if setup.seen is None else setup.seen.pixels
+            picture = preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures)
             pane.wanted = setup.guidance.outline if self.step is CellStep.VIEWS else ()
-            pane.show(preview_image(image, corners, SHOWN_WIDTH_PX, SHOWN_WIDTH_PX, self._pictures))
+            pane.show(picture)
+            if self.live_page is not None:
+                self._publish(self.live_page, picture)
         if taken:
             self._view_taken()
         self._show()
+
+    def _publish(self, page: LivePage, picture: PreviewImage) -> None:
+        setup, typed_now = self.setup, self.query_one("#typed", Input).value.strip()
+        seen = DetectionStatus() if setup.seen is None else setup.seen.status
+        action, views = next_of(setup, self.step, typed_now), len(setup.draft.views)
+        self._news = news("New cell", action, seen, setup.guidance, views, picture)
+        page.publish(self._news)
 
     def _view_taken(self) -> None:
         self.bell()
@@ -232,6 +249,9 @@ class NewCell(ThemedApp[Ending]):
     def action_rehearse(self) -> None:
         if self.setup.draft.written and not self.setup.draft.posted:
             self.exit("rehearse")
+
+    def action_open_live(self) -> None:
+        self.open_live_page()
 
     def action_drop(self) -> None:
         self.setup.drop_view()

@@ -122,7 +122,7 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
             why = "You move the arm." if draft.posted else "The arm is read."
             return Action("Enter", "On to the camera", why)
         case CellStep.CAMERA if setup.camera is None:
-            return Action("", "Connect a camera", "This list refreshes every few seconds.")
+            return Action("", "Connect a camera", "Check its power, cable and network.")
         case CellStep.CAMERA:
             return Action("Enter", "This camera", "")
         case CellStep.MOUNTING:

@@ -93,12 +93,7 @@ def test_the_error_falls_towards_its_goal() -> None:
     estimate = EstimateStatus(6, predicted_error_mm=0.83, working_distance_m=0.5)
     status = msgspec.structs.replace(in_session(idle(), poses=poses), estimate=estimate)
     lines = error_lines(Known(status, configuration=CELL), 60, 14).plain.split("\n")
-    assert (
-        "0.83 mm" in lines[0]
-        and "500 mm" in lines[0]
-        and "goal 1 mm" in lines[0]
-        and "reached" not in lines[0]
-    )
+    assert all(said in lines[0] for said in ("0.83 mm", "500 mm", "goal 1 mm")) and "reached" not in lines[0]
     assert len(lines) == 14
     assert any(line.startswith(" 1.00 ") for line in lines)
     enough = msgspec.structs.replace(status, estimate=msgspec.structs.replace(estimate, enough=True))
@@ -108,7 +103,7 @@ def test_the_error_falls_towards_its_goal() -> None:
 def test_columns_stay_in_their_room_whatever_they_are_given() -> None:
     for errors in ([], [None], [0.0], [float("inf")], [1e-9, 1e9], [1.0] * 200):
         for goal in (None, 0.5):
-            drawn = list(error_columns([(error, "$accent") for error in errors], goal, 40, 8))
+            drawn = list(error_columns([(error, True) for error in errors], goal, 40, 8))
             assert len(drawn) in (0, 8) and all(len(line.plain) <= 40 for line in drawn)
 
 

@@ -39,8 +39,8 @@ def desktop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def page_of(app: StationApp) -> LivePage:
-    assert isinstance(app, StationApp) and app._live_page is not None
-    return app._live_page
+    assert isinstance(app, StationApp) and app.live_page is not None
+    return app.live_page
 
 
 def answer(page: LivePage, path: str = "/news", method: str = "GET", **headers: str) -> tuple[int, bytes]:
@@ -106,7 +106,7 @@ async def test_slow_readers_and_a_thousand_requests_reach_neither_the_daemon_nor
     link.answers["preview"] = link.answers["preview"].__class__("x" * 5_000_000)  # more than a link's buffers
     async with opened(link) as pilot:
         await pilot.press("o")
-        await until(pilot, lambda: pilot.app._live_page)  # type: ignore[attr-defined]
+        await until(pilot, lambda: pilot.app.live_page)  # type: ignore[attr-defined]
         page = page_of(pilot.app)  # type: ignore[arg-type]
         host, token = page.address[len("http://") :].split("/#")
         asked = f"GET /news HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n\r\n".encode()

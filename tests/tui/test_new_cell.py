@@ -68,7 +68,8 @@ class Operator:
         await asyncio.to_thread(lead)
 
 
-async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
+async def test_from_an_address_to_a_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.1 1 10.0.0.2 22")  # no browser is opened here
     truth = other_cell()
     write_truth(truth, tmp_path / "truth.json")
     with start_controller(truth.robot_model, truth=tmp_path / "truth.json") as controller:
@@ -89,6 +90,8 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
             await person.press("enter")
             await person.until_step(CellStep.VIEWS)
             await until(pilot, lambda: len(app.setup.draft.views) == 1)
+            await pilot.press("o")
+            await until(pilot, lambda: app.live_page and b'"outline":[[' in app.live_page._body)
             for joints in guided_joints(truth)[1:]:  # it stands at the first one
                 if app.step is not CellStep.VIEWS:
                     break

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 
 from textual.app import ComposeResult
@@ -14,7 +13,7 @@ from station.tui.frame import Line
 from station.tui.screen import Box, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.preview import PreviewPane
-from station.tui.words import Mark, dim, lines, mark
+from station.tui.words import Mark, dim, hanging, lines, mark
 
 AGAIN_S = 5.0
 STATES: dict[str, tuple[Mark, str]] = {
@@ -30,9 +29,6 @@ def checklist_text(checks: Sequence[Check], width: int) -> Content:
     if not checks:
         return Content("checking …")
 
-    def hanging(text: str, indent: int) -> str:
-        return f"\n{' ' * indent}".join(textwrap.wrap(text, max(20, width - indent)))
-
     rows = []
     for check in sorted(checks, key=lambda check: ("failed", "warning", "ok", "skipped").index(check.state)):
         kind, word = STATES[check.state]
@@ -40,10 +36,10 @@ def checklist_text(checks: Sequence[Check], width: int) -> Content:
         rows.append(
             mark(kind, f"{word:<9}")
             + Content.styled(f"{check.name:<15}", style)
-            + dim(hanging(check.text, 26))
+            + dim(hanging(check.text, width, 26))
         )
         if check.remedy and check.state != "ok":
-            rows.append(Content.styled(f"{'':11}→ {hanging(check.remedy, 13)}", "$foreground"))
+            rows.append(Content.styled(f"{'':11}→ {hanging(check.remedy, width, 13)}", "$foreground"))
     missing = any(check.state == "failed" for check in checks)
     end = (
         mark("look", "This list refreshes every few seconds.")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-import textwrap
 import time
 from typing import ClassVar
 
@@ -22,11 +21,11 @@ from station.operate.motion import motion_facts
 from station.tui.frame import Frame, Question
 from station.tui.task import Action
 from station.tui.widgets.cell_drawing import cell_scene, draw
-from station.tui.words import duration, limit_bar, lines
+from station.tui.words import duration, hanging, limit_bar, lines
 
 TERMINATE_S = 5.0
-WIDTH, INDENT = 54, 10
-"""Width of a fact in letters, and of its name before it."""
+WIDTH, INDENT = 64, 10
+"""Width of a fact with its name before it, and of the name, in letters."""
 
 
 class Confirm(Question[bool]):
@@ -108,14 +107,10 @@ def motion_text(preview: MotionPreview) -> Content:
     rows = []
     for name, text in motion_facts(preview):
         style = "bold $warn" if name == "WARNING" else "$foreground"
-        first, *more = textwrap.wrap(text, WIDTH) or [""]
-        rows.append(Content.assemble((f"{name:<{INDENT}}", "$dim"), (first, style)))
-        rows += [Content.styled(" " * INDENT + line, style) for line in more]
-    rows += [
-        Content(""),
-        Content("The emergency stop on the pendant is the safety device. F12 stops too."),
-    ]
-    return lines(*rows)
+        told = hanging(text, WIDTH, INDENT)
+        rows.append(Content.assemble((f"{name:<{INDENT}}", "$dim"), (told, style)))
+    device = "The emergency stop on the pendant is the safety device. F12 stops too."
+    return lines(*rows, Content(""), Content(device))
 
 
 class Reason(Question[str]):

@@ -13,15 +13,15 @@ from station.tui.screen import StationScreen
 from station.tui.task import Known
 from station.tui.words import rich_text
 
-_LEVELS = {"debug": "$dim", "info": "", "warning": "$warn", "error": "bold $bad"}
-_SIGNS = {"debug": "", "info": "", "warning": "▲ ", "error": "✗ "}
+_LEVELS = {"debug": ("", "$dim"), "info": ("", ""), "warning": ("▲ ", "$warn"), "error": ("✗ ", "bold $bad")}
+"""Sign and style of an event."""
 
 
 def event_text(event: Event) -> Content:
     clock = datetime.fromtimestamp(event.wall_ns / 1e9)
     pose = "" if event.pose_index is None else f"pose {event.pose_index + 1} "
-    said = _SIGNS[event.level] + pose + event.text
-    return Content.assemble((f"{clock:%H:%M:%S}", "$faint"), "  ", (said, _LEVELS[event.level]))
+    sign, style = _LEVELS[event.level]
+    return Content.assemble((f"{clock:%H:%M:%S}", "$faint"), "  ", (sign + pose + event.text, style))
 
 
 class LogScreen(StationScreen):
@@ -43,7 +43,7 @@ class LogScreen(StationScreen):
         start = events.index(self._last) + 1 if self._last in events else 0
         log = self.query_one("#log", RichLog)
         for event in events[start:]:
-            line = rich_text(event_text(event), self.app.theme_variables)
+            line = rich_text(event_text(event))
             line.no_wrap = False
             log.write(line)
             self._last = event

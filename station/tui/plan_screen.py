@@ -13,10 +13,11 @@ from station.cell.status import PoseStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import MakePlan, Retake, Skip
 from station.tui.frame import Line
+from station.tui.progress import pose_mark
 from station.tui.screen import Box, Panel, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
-from station.tui.words import ERROR_SHOWN_MM, MARKS, UNKNOWN, Mark, dim, error_facts, facts, mark
+from station.tui.words import ERROR_SHOWN_MM, MARKS, UNKNOWN, dim, error_facts, facts, mark
 
 COLUMNS = ("#", "error after", "state", "reason")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves)."
@@ -24,21 +25,16 @@ RETAKE = "Capture this pose again at the next run; the view it has counts until 
 SKIP = "Skip this pose; of a captured one only its retake"
 NEW = "Plan 25 poses from the configured initial poses (seconds)"
 POSE_VERBS = {"retake": Retake, "skip": Skip}
-_STATES: dict[str, tuple[Mark, str]] = {
-    "planned": ("todo", "planned"),
-    "done": ("done", "saved"),
-    "failed": ("failed", "failed"),
-    "skipped": ("todo", "skipped"),
-}
 
 
 def row_of(pose: PoseStatus) -> tuple[Content, ...]:
     """Make a row of the table."""
     error_mm = pose.estimated_sigma_mm or pose.predicted_sigma_mm
     shown = f"{error_mm:6.2f}" if error_mm and error_mm <= ERROR_SHOWN_MM else f"{UNKNOWN:>6}"
-    kind, word = _STATES.get(pose.state, ("now", pose.state))
+    kind = pose_mark(pose)
+    word: str = "saved" if pose.state == "done" else pose.state
     if pose.kept:
-        kind, word = "look", "to be captured again"
+        word = "to be captured again"
     elif pose.state == "failed" and pose.reason:
         word = f"failed: {pose.reason}"
     return (

@@ -9,14 +9,16 @@ from textual.content import Content
 from station.cell.status import PoseStatus, SessionStatus, StationState, StationStatus
 from station.protocol.states import RUNNING
 from station.tui.task import Known
-from station.tui.words import dim, duration, facts, lines, mark
+from station.tui.words import Mark, dim, duration, facts, lines, mark
 
 _STEPS = {"moving": "move", "settling": "settle", "capturing": "capture", "writing": "save"}
-CHIPS: dict[str, tuple[str, str]] = {
+_MARKS: dict[str, Mark] = {"planned": "todo", "skipped": "todo", "done": "done", "failed": "failed"}
+CHIPS: dict[Mark, tuple[str, str]] = {
     "done": ("✓", "$ok on $okbg"),
-    "planned": ("·", "$dim"),
-    "skipped": ("-", "$dim"),
+    "todo": ("·", "$dim"),
+    "look": ("!", "$warn on $warnbg"),
     "failed": ("✗", "bold $bad on $badbg"),
+    "now": ("▶", "bold $strong on $accentbg"),
 }
 LEGEND = "✓ saved  ! look  ▶ now  · to come  ✗ failed"
 
@@ -82,9 +84,15 @@ def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:
 
 def _chip(pose: PoseStatus, current: bool, cells: int) -> Content:
     number = f"{pose.index + 1:>{cells - 2}}"
+    kind = pose_mark(pose)
     if current and pose.state in _STEPS:
-        return Content.styled(f"{number}▶ ", "bold $strong on $accentbg")
-    if pose.kept or (pose.state == "done" and pose.attempt > 1):
-        return Content.styled(f"{number}! ", "$warn on $warnbg")
-    sign, style = CHIPS.get(pose.state, ("▶", "bold $strong on $accentbg"))
-    return Content.styled(f"{number}{sign} ", style)
+        kind = "now"
+    elif kind == "done" and pose.attempt > 1:
+        kind = "look"
+    sign, style = CHIPS[kind]
+    return Content.styled(f"{number}{'-' if pose.state == 'skipped' else sign} ", style)
+
+
+def pose_mark(pose: PoseStatus) -> Mark:
+    """Choose the mark of a pose."""
+    return "look" if pose.kept else _MARKS.get(pose.state, "now")

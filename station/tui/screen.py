@@ -64,7 +64,7 @@ class Rows(DataTable[object]):
 
     def show(self, cells: Sequence[tuple[Content, ...]]) -> None:
         """Draw these rows, unless they stand there. The cursor stays on its line."""
-        texts = [[rich_text(cell, self.app.theme_variables) for cell in row] for row in cells]
+        texts = [[rich_text(cell) for cell in row] for row in cells]
         if texts == self._texts:
             return
         at, self._texts = self.cursor_row, texts

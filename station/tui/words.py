@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
+import textwrap
 from typing import Literal
 
 from rich.text import Text
@@ -88,13 +88,15 @@ def limit_bar(value: float, limit: float, cells: int, colour: str, at: float = 0
     return Content.assemble(*zip(signs, styles, strict=True)).simplify()
 
 
-def rich_text(content: Content, variables: dict[str, str]) -> Text:
-    """Convert content for a table's cell, which does not know the theme's names."""
-    text = Text(content.plain, no_wrap=True)
-    for start, end, style in content.spans:
-        named = re.sub(r"\$([\w-]+)", lambda found: variables.get(found[1], "default"), str(style))
-        text.stylize(named.replace("ansi_", ""), start, end)
-    return text
+def rich_text(content: Content) -> Text:
+    """Convert content for a table's cell or a log's line, which do not know the theme's names."""
+    parts = content.render_segments()
+    return Text.assemble(*((part.text, part.style or "") for part in parts), no_wrap=True)
+
+
+def hanging(text: str, width: int, indent: int) -> str:
+    """Break lines to fit into the width behind this indent."""
+    return f"\n{' ' * indent}".join(textwrap.wrap(text, max(20, width - indent)))
 
 
 def state_of(status: StationStatus) -> tuple[str, str]:
@@ -111,8 +113,8 @@ def state_of(status: StationStatus) -> tuple[str, str]:
     return f"▶ {STATE_WORDS[state]}", "bold $onaccent on $accent"
 
 
-def duration(seconds: float | None) -> str:
-    return "-:--" if seconds is None else f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+def duration(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
 def many(count: int, what: str) -> str:

@@ -142,7 +142,7 @@ def test_what_a_person_should_look_at_is_never_cut(why: str, look: bool, width: 
 WINDOWS = [
     lambda: Confirm("Finish?", "words", "Finish"),
     lambda: ConfirmMotion(SUMMARY),
-    lambda: Reason("Not installed", "a gate failed", "Enter installs it."),
+    lambda: Reason("Not installed", "a gate failed"),
 ]
 
 

@@ -39,9 +39,10 @@ def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
     if not _in_foreground():
         show()
         return
-    size = fcntl.ioctl(0, termios.TIOCGWINSZ, bytes(8))
+    size, parent = fcntl.ioctl(0, termios.TIOCGWINSZ, bytes(8)), os.getpid()
     child, glass = pty.fork()
     if child == 0:
+        die_with_parent(parent)  # a screen that is gone has no control
         try:
             fcntl.ioctl(0, termios.TIOCSWINSZ, size)
             show()
@@ -50,7 +51,6 @@ def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
             os._exit(1)
         os._exit(0)
     os.set_blocking(glass, False)
-    parent = os.getpid()
     picture = os.fork()  # no thread: the key would wait for it
     if picture == 0:
         die_with_parent(parent)  # it holds the child's terminal open

@@ -195,13 +195,16 @@ async def test_an_arm_that_goes_another_way_than_the_checked_one_is_stopped(
 ) -> None:
     c = await cell()
     ask, before = ControlChild.move, await c.joints_rad()
+    late = True
 
     async def elsewhere(self: ControlChild, joints_rad: list[float], *speeds: float) -> None:
         await ask(self, [joints_rad[0], joints_rad[1] - 0.6, *joints_rad[2:]], *speeds)
 
     monkeypatch.setattr(ControlChild, "move", elsewhere)
     with raises("off-path", joint=2):
-        await c.far_move()
+        while late:  # a computer that is too busy ends the move before
+            before = await c.joints_rad()
+            late = await c.go_on(c.far_move())
     await c.stops()
     assert max(abs(a - b) for a, b in zip(await c.joints_rad(), before, strict=True)) < 0.5
     await c.stays_at_rest()

@@ -38,7 +38,7 @@ PROGRAM = (sys.executable, "-m", "tests.system.cell_daemon")
 def short_plan() -> Plan:
     """Three poses, driven slowly enough to be caught in mid-move."""
     plan = quick_plan(cell_config(TRUTH), TRUTH, seed=5, count=3)
-    return msgspec.structs.replace(plan, joint_speed_rad_s=0.4)
+    return msgspec.structs.replace(plan, joint_speed_rad_s=0.25)
 
 
 class Notified:

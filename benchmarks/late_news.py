@@ -86,7 +86,8 @@ class Rig:
             await asyncio.to_thread(self.cable.ask, "black_hole", on=False)
 
     async def control_late(self, late_s: float) -> None:
-        await self.halt(self.robot.control_pid, late_s)
+        assert self.robot._child is not None
+        await self.halt(self.robot._child.pid, late_s)
 
     def speed_rad_s(self) -> float:
         return float(max(map(abs, self.admin.ask("state")["joint_speeds_rad_s"])))

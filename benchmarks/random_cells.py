@@ -17,7 +17,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, pose, rotation_exp
-from calibrate.kinematics import MODELS, inverse_all, inverse_many, link_frames
+from calibrate.kinematics import MODELS, inverse_many, link_frames
 from recordings.schema.messages import CameraModel
 from station.cell.config import (
     PAPER_BOARD,
@@ -114,7 +114,7 @@ def _taught(X: Array, Y: Array, rng: np.random.Generator) -> Array | None:
     for C in _views(rng, 20, (0.42, 0.58), np.deg2rad(20)):
         if not shows_board(C):
             continue
-        solutions = inverse_all(ARM, Y @ inverse(X @ C))
+        solutions = inverse_many(ARM, (Y @ inverse(X @ C))[None])[1]
         free = [q for q in solutions if is_free(q[None], X, Y, 0.03)[0] and abs(np.sin(q[4])) > 0.1]
         if free:
             return np.asarray(free[rng.integers(len(free))])

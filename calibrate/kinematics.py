@@ -194,21 +194,14 @@ def singularity_measure(model: RobotModel, joints_rad: ArrayLike) -> Array:
     return np.asarray(np.linalg.svd(J, compute_uv=False)[..., -1])
 
 
-def inverse_all(model: RobotModel, base_from_flange: Array) -> Array:
-    """List all analytic solutions of the nominal table, (n, 6) with n ≤ 8, each joint in (-π, π].
-
-    At a wrist singularity (sin q5 = 0) there are infinitely many; only those with wrist 3 = 0 are given, and
-    there may be none near the limit of the reach. Unreachable poses give (0, 6).
-    """
-    return inverse_many(model, np.asarray(base_from_flange, dtype=float)[None])[1]
-
-
 def inverse_many(
     model: RobotModel, base_from_flange: Array
 ) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
     """Solve many poses (n, 4, 4): the pose of each solution (m,), joints (m, 6), branch (m,).
 
-    Branches 0 … 7 are those of shoulder, wrist and elbow.
+    Branches 0 … 7 are those of shoulder, wrist and elbow, each joint in (-π, π]. At a wrist singularity
+    (sin q5 = 0) there are infinitely many solutions: only those with wrist 3 = 0 are given, and there may be
+    none near the limit of the reach.
 
     Source: K. Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
     """
@@ -256,11 +249,3 @@ def _in_arm_plane(
     y = p[2] - d1
     tilt = np.arctan2(in_base[1][2], c1 * in_base[1][0] + n1 * in_base[1][1])
     return np.asarray(x), np.asarray(y), np.asarray(tilt)
-
-
-def turned_near(model: RobotModel, joints_rad: Array, near_rad: Array) -> Array:
-    """Choose whole turns of joints (..., 6) so that they are within the limits and near `near_rad` (6,)."""
-    turned = joints_rad + 2 * np.pi * np.round((near_rad - joints_rad) / (2 * np.pi))
-    limit = model.joint_limit_rad
-    turned = np.where(turned > limit, turned - 2 * np.pi, turned)
-    return np.where(turned < -limit, turned + 2 * np.pi, turned)

@@ -181,7 +181,7 @@ class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     present: bool = False
     identity: str = ""
     pulses: int = 0
-    frames: int = 0
+    """Pulses so far; the frames that belong to them: `CameraCounts.paired`"""
 
 
 class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):

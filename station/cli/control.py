@@ -56,7 +56,7 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     if camera.connected:
         words = [camera.model, f"{camera.counts.missing} frames dropped"]
     if trigger.present:
-        words.append(f"trigger {trigger.pulses} pulses, {trigger.frames} frames")
+        words.append(f"trigger {trigger.pulses} pulses, {camera.counts.paired} frames")
     out.print(", ".join(words))
     if session.recording:
         out.print(f"recording {session.recording}")
@@ -153,11 +153,7 @@ def doctor_command(
     if example:
         print((Path(__file__).parents[1] / "example.yaml").read_text(), end="")
         return
-    if config is not None:
-        if _incomplete(config):
-            raise typer.Exit(1)
-        return
-    checks = ask(socket or default_socket(), Doctor())
+    checks = _checks_of(config) if config is not None else ask(socket or default_socket(), Doctor())
     good = all(check.state != "failed" for check in checks)
     if as_json:
         print_json(DoctorJson(good, checks))
@@ -169,24 +165,22 @@ def doctor_command(
             remedy = f"\n→ {check.remedy}" if check.remedy and check.state != "ok" else ""
             table.add_row(_MARKS[check.state], check.name, f"{check.text}{remedy}")
         out.print(table)
+        if config is not None:
+            words = f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it"
+            out.print(words)
     if not good:
         raise typer.Exit(1)
 
 
-def _incomplete(config: Path) -> bool:
-    """Check a file, say what it is of, and list what a planned capture lacks; False: nothing."""
+def _checks_of(config: Path) -> list[Check]:
+    """Check a file: what it is of, and what a planned capture lacks."""
     from station.cell.config_file import load_config, missing_for_capture
     from station.devices.ur import control_path, control_trouble
 
     found, _ = load_config(config)
-    missing, path = list(missing_for_capture(found)), control_path(found.robot)
-    by_hand = found.robot.driver == "posted"
+    path, by_hand = control_path(found.robot), found.robot.driver == "posted"
     driven = "moved by a person" if by_hand else f"at {found.robot.host}, control by {path}"
-    what = f"{found.robot.model} {driven}, {found.mount}"
-    out.print(f"{config}: {'incomplete' if missing else 'good'}; {what}")
-    for problem in missing:
-        out.print(Text.assemble(("MISSING", "red"), f" {problem}"))
-    if not by_hand and (words := ": ".join(filter(None, control_trouble(path)))):
-        out.print(words)
-    out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
-    return bool(missing)
+    checks = [Check("configuration", "ok", f"{found.robot.model} {driven}, {found.mount}")]
+    checks += [Check(lack.where, "failed", lack.text, lack.remedy) for lack in missing_for_capture(found)]
+    trouble, remedy = ("", "") if by_hand else control_trouble(path)
+    return [*checks, Check("control", "warning", trouble, remedy)] if trouble else checks

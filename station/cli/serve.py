@@ -53,16 +53,11 @@ def serve_command(
     With --rehearse the configuration's limits, guesses, board and plan are used with a simulated arm and a
     rendered camera, marked SIMULATED. What it makes lies in `rehearsal` below the state folder.
     """
-    if [simulate, config is not None, replay is not None].count(True) != 1:
-        raise ConfigError(
-            "usage",
-            problem="Missing the cell to serve",
-            advice="Give one of --config FILE (a real cell), --simulate, --replay RECORDING.",
+    if [simulate, config is not None, replay is not None].count(True) != 1 or (rehearse and config is None):
+        advice = (
+            "Give one of --config FILE (a real cell; --rehearse: simulated), --simulate, --replay RECORDING."
         )
-    if rehearse and config is None:
-        raise ConfigError(
-            "usage", problem="--rehearse needs the cell to rehearse", advice="Give --config FILE too."
-        )
+        raise ConfigError("usage", problem="Missing the cell to serve", advice=advice)
     log_to_stderr()
     go_before_others(DAEMON_NICENESS)
     real_time = RealTimeThreads()  # before a simulated controller is started, which is given the same

@@ -94,10 +94,6 @@ class UrRobot(UrLink):
         return control_path(self.config)
 
     @property
-    def control_pid(self) -> int | None:
-        return self._child.pid if self._child is not None else None
-
-    @property
     def in_motion(self) -> bool:
         return self._sent or super().in_motion
 

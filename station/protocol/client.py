@@ -19,7 +19,7 @@ from recordings.plain_text import plain_data
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus
-from station.protocol.messages import LINE_LIMIT_BYTES, Request
+from station.protocol.messages import LINE_LIMIT_BYTES, Answer, Request
 from station.protocol.stop_client import send_stop
 from station.protocol.verbs import Hello, Verb
 
@@ -61,18 +61,6 @@ def who_am_i() -> str:
         return f"uid {os.getuid()}{terminal}"
 
 
-class _Incoming(msgspec.Struct):
-    """A line from the daemon: a `Reply`, or a `Notice`."""
-
-    id: int | None = None
-    ok: bool = False
-    result: object = None
-    error: str = ""
-    problem: ErrorData | None = None
-    status: dict[str, object] | None = None
-    changes: dict[str, object] | None = None
-
-
 class Client:
     """Connection to the daemon: of a command while its block runs, of a screen opened again after a loss.
 
@@ -83,7 +71,7 @@ class Client:
         """`who`: name that others see, by default user and terminal."""
         self._path, self._who = path, who
         self._next_id = 1
-        self._waiting: dict[int, asyncio.Future[_Incoming]] = {}
+        self._waiting: dict[int, asyncio.Future[Answer]] = {}
         self._plain_status: dict[str, object] | None = None
         self._news = asyncio.Event()
         """Set, and replaced, with every new status and at the connection's end."""
@@ -156,7 +144,7 @@ class Client:
             raise RefusedError(
                 "request-too-long", verb=verb, size_bytes=len(line), limit_bytes=LINE_LIMIT_BYTES
             )
-        answer: asyncio.Future[_Incoming] = asyncio.get_running_loop().create_future()
+        answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._waiting[request.id] = answer
         try:
             writer.write(line)
@@ -204,12 +192,12 @@ class Client:
         await self.close()
 
     async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        decoder = msgspec.json.Decoder(_Incoming)
+        decoder = msgspec.json.Decoder(Answer)
         try:
             while line := await reader.readline():
                 message = decoder.decode(line)
                 if _SUSPECT.search(line):
-                    message = msgspec.convert(plain_data(msgspec.to_builtins(message)), _Incoming)
+                    message = msgspec.convert(plain_data(msgspec.to_builtins(message)), Answer)
                 self._take(message)
         except (OSError, ValueError, msgspec.DecodeError):
             pass  # treat invalid messages as a lost connection
@@ -221,7 +209,7 @@ class Client:
                     answer.set_exception(self._gone_error())
             self._tell()
 
-    def _take(self, message: _Incoming) -> None:
+    def _take(self, message: Answer) -> None:
         if message.id is not None:
             answer = self._waiting.get(message.id)
             if answer is not None and not answer.done():

@@ -11,10 +11,11 @@ it also has a socket of its own: `station.server.stop_server`.
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 
 from recordings.errors import CodedError, ErrorData
-from station.cell.status import StationStatus
 
 LINE_LIMIT_BYTES = 1024 * 1024
 """Longest request, enough for a plan of a thousand poses; bounds memory per connection."""
@@ -30,21 +31,19 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Kept as it came until the verb tells its type: nothing large is made of nonsense."""
 
 
-class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
-    id: int
-    ok: bool
+class Answer(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Line from the daemon: the reply to a request, or, to a watcher and without `id`, news of the status."""
+
+    id: int | None = None
+    ok: bool | None = None
     result: object = None
     error: str = ""
     """Error as a sentence for people; for programs see `problem`."""
     problem: ErrorData | None = None
+    status: Any = None
+    """The whole status."""
+    changes: dict[str, Any] | None = None
 
     @classmethod
-    def refused(cls, request_id: int, error: CodedError) -> Reply:
+    def refused(cls, request_id: int, error: CodedError) -> Answer:
         return cls(request_id, False, error=str(error), problem=error.data)
-
-
-class Notice(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Message to a watcher without a request; exactly one field is set."""
-
-    status: StationStatus | None = None
-    changes: dict[str, object] | None = None

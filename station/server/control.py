@@ -24,8 +24,7 @@ from station.protocol.messages import (
     CLIENT_LIMIT,
     LINE_LIMIT_BYTES,
     USER_CLIENT_LIMIT,
-    Notice,
-    Reply,
+    Answer,
     Request,
 )
 from station.protocol.verbs import VERBS
@@ -80,7 +79,7 @@ class ControlServer:
         changes = changed_sections(self._status, status)
         self._status = status
         if changes:
-            line = msgspec.json.encode(Notice(changes=changes)) + b"\n"
+            line = msgspec.json.encode(Answer(changes=changes)) + b"\n"
             for connection in list(self._connections):
                 if connection.watching:
                     connection.send(line)
@@ -115,7 +114,7 @@ class ControlServer:
             peer = Peer(self._next_client_id, pid, uid)
             if (full := self._full_for(peer.uid)) is not None:
                 with link, contextlib.suppress(OSError):
-                    link.send(msgspec.json.encode(Reply.refused(0, full)) + b"\n")
+                    link.send(msgspec.json.encode(Answer.refused(0, full)) + b"\n")
                 continue
             self._next_client_id += 1
             self._opened[peer.uid].append(loop.time())
@@ -213,15 +212,15 @@ class _Connection:
     async def _answer_stop(self, request_id: int, stopping: Awaitable[object]) -> None:
         await stopping
         self._publish()
-        self.reply(Reply(request_id, True, {}))
+        self.reply(Answer(request_id, True, {}))
 
     async def _answer(self, request: Request) -> None:
         try:
             result = await self._handler.handle(self.peer, request.verb, request.args)
             status = self._publish()  # before the reply, so that the client never sees an older status
-            self.reply(Reply(request.id, True, result))
+            self.reply(Answer(request.id, True, result))
             if request.verb == "watch" and not self.watching:
-                self.send(msgspec.json.encode(Notice(status=status)) + b"\n")
+                self.send(msgspec.json.encode(Answer(status=status)) + b"\n")
                 self.watching = True
         except CodedError as error:
             self.refuse(request.id, error)
@@ -230,9 +229,9 @@ class _Connection:
             self.refuse(request.id, StationError("internal", error=f"{request.verb}: {error!r}"))
 
     def refuse(self, request_id: int, error: CodedError) -> None:
-        self.reply(Reply.refused(request_id, error))
+        self.reply(Answer.refused(request_id, error))
 
-    def reply(self, reply: Reply) -> None:
+    def reply(self, reply: Answer) -> None:
         self.send(msgspec.json.encode(reply) + b"\n")
 
     def send(self, line: bytes) -> None:
@@ -246,7 +245,7 @@ class _Connection:
     def drop(self, why: str) -> None:
         log.warning("client %d (pid %d) is dropped: %s", self.peer.client_id, self.peer.pid, why)
         with contextlib.suppress(OSError):
-            dropped = Reply.refused(0, RefusedError("dropped", why=why))
+            dropped = Answer.refused(0, RefusedError("dropped", why=why))
             self._writer.write(msgspec.json.encode(dropped) + b"\n")
         self.hang_up()
 

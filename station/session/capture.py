@@ -56,7 +56,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
     )
     view = View(
         index=index,
-        name=context.require_queue().pose(index).name,
+        name=context.loaded().pose(index).name,
         picture_sequence=image.sequence,
         base_from_flange=matrix4(flange_pose(state, context.cell.robot.identity.tcp_offset)),
         joints_rad=state.joints_rad or None,
@@ -70,7 +70,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
 
 
 def _phase(context: SessionContext, index: int, state: StationState, pose_state: PoseState) -> None:
-    context.require_queue().mark(index, pose_state)
+    context.loaded().mark(index, pose_state)
     context.store.enter(state)
     context.show_poses(index)
 
@@ -122,7 +122,7 @@ async def at_exposure(context: SessionContext, image: Image) -> tuple[RobotState
 
 async def _write(context: SessionContext, index: int, image: Image, view: View) -> None:
     """Write the image while the board is detected; write the view, and count the pose, only with a board."""
-    recording, queue = context.require_recording(), context.require_queue()
+    recording, queue = context.require_recording(), context.loaded()
     recording.image(image)
     sighting = await _sighting(context, image, index)
     unusable = _unusable(sighting) if sighting is not None else None
@@ -179,7 +179,7 @@ class ImageWatch:
         self._again = asyncio.Event()
         model = context.cell.config.camera.model
         self._width = model.width if model is not None else 0
-        view = context.require_queue().pose(index).view
+        view = context.loaded().pose(index).view
         # A fixed camera may see mostly background at rest, so look at the board, which may swing.
         fixed = context.cell.config.mount == "eye-to-hand" and model is not None
         self._box = board_box(view, model.width, model.height) if fixed and model is not None else None

@@ -74,11 +74,6 @@ class SessionContext:
             raise RefusedError("no-plan")
         return self.queue
 
-    def require_queue(self) -> PoseQueue:
-        """Return the loaded plan's poses; inside a run there always are."""
-        assert self.queue is not None
-        return self.queue
-
     def require_recording(self) -> SessionRecording:
         assert self.recording is not None
         return self.recording

@@ -41,7 +41,7 @@ async def seal(context: SessionContext) -> None:
 
 async def _seal(context: SessionContext) -> None:
     """Finish the recording; a STOP meanwhile stays latched, or if acknowledged the state becomes idle."""
-    recording, queue = context.require_recording(), context.require_queue()
+    recording, queue = context.require_recording(), context.loaded()
     if recording.recorder is None:  # nothing was added since the crash
         await context.recover_segments(recording)
         await recording.save_state(queue, path := await DISK.run(recording.whole))

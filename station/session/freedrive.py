@@ -141,7 +141,7 @@ class FreedriveCapture:
         """Let an image count no more, in the recording too. RefusedError, RecordingError."""
         if self.taking:
             raise RefusedError("still-ending", what="the last image")
-        context, queue, recording = self._context, self._context.require_queue(), self._context.recording
+        context, queue, recording = self._context, self._context.loaded(), self._context.recording
         async with self._taking:
             queue.take_back(index)
             view = context.seen.pop(index, None)
@@ -167,7 +167,7 @@ class FreedriveCapture:
 
     async def _record(self, asked: bool) -> int:
         context = self._context
-        queue, store = context.require_queue(), context.store
+        queue, store = context.loaded(), context.store
         joints = (await fresh(context.cell.robot)).joints_rad
         if (refusal := Record.refusal(store.state)) is not None:
             raise refusal  # STOP, or the end of freedrive, came in between

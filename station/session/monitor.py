@@ -91,8 +91,7 @@ class Monitor:
         shown, box = self._context.store.status.trigger, self._context.cell.trigger
         if box is None or not shown.present:
             return shown
-        paired = self._context.cell.camera.counts().paired
-        return msgspec.structs.replace(shown, pulses=box.pulses, frames=paired)
+        return msgspec.structs.replace(shown, pulses=box.pulses)
 
     def _watch_files(self) -> None:
         """Read files in a thread, as a hanging disk must not delay the heartbeat."""

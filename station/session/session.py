@@ -98,7 +98,7 @@ class Session:
             await self._run_ended(END_RUN_AT_CLOSE_S)
         if context.recording is not None and context.recorder is not None:
             with contextlib.suppress(RecordingError):
-                path = await context.recording.seal(context.require_queue())
+                path = await context.recording.seal(context.loaded())
                 self.store.event("finished", f"finished before the end: {path}", path=str(path))
         for task in self._tasks:
             task.cancel()

@@ -15,7 +15,7 @@ from benchmarks.scene import MID, PAPER_CAMERA, CellNoise, SceneCell, make_cell
 from calibrate.geometry import Array, difference, perturb, pose, random_rotation
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
 from calibrate.handeye.solution import Solution, SolveOptions
-from calibrate.kinematics import RobotModel, inverse_all, turned_near
+from calibrate.kinematics import RobotModel, inverse_many
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
 from calibrate.views import BoardView, ViewSet, implied_flange
@@ -155,8 +155,11 @@ def inside(solution: Solution, truth: Array) -> bool:
 def inverse_nearest(model: RobotModel, base_from_flange: Array, near_rad: ArrayLike) -> Array | None:
     """Find the solution (6,) nearest to `near_rad`, turns of 2π within the joint limits; None if none."""
     near = np.asarray(near_rad, dtype=float)
-    candidates = inverse_all(model, base_from_flange)
+    candidates = inverse_many(model, base_from_flange[None])[1]
     if len(candidates) == 0:
         return None
-    turned = turned_near(model, candidates, near)
+    turned = candidates + 2 * np.pi * np.round((near - candidates) / (2 * np.pi))
+    limit = model.joint_limit_rad
+    turned = np.where(turned > limit, turned - 2 * np.pi, turned)
+    turned = np.where(turned < -limit, turned + 2 * np.pi, turned)
     return np.asarray(turned[np.argmin(np.abs(turned - near).max(axis=1))])

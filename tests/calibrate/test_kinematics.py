@@ -15,7 +15,7 @@ from calibrate.kinematics import (
     MODELS,
     RobotModel,
     forward,
-    inverse_all,
+    inverse_many,
     jacobian,
     singularity_measure,
 )
@@ -74,7 +74,7 @@ def test_forward_agrees_with_the_product_of_exponentials(name: str) -> None:
 def test_every_inverse_solution_reaches_the_pose_and_the_joints_are_among_them(q: Array, name: str) -> None:
     model = MODELS[name]
     T = forward(model, q)
-    solutions = inverse_all(model, T)
+    solutions = inverse_many(model, T[None])[1]
     assert len(solutions) >= 1 or abs(np.sin(q[4])) < 1e-8
     reached = forward(model, solutions)
     assert np.abs(reached - T).max(initial=0.0) < 1e-6
@@ -85,7 +85,7 @@ def test_every_inverse_solution_reaches_the_pose_and_the_joints_are_among_them(q
 
 
 def test_a_pose_well_inside_the_reach_has_eight_different_inverses() -> None:
-    solutions = inverse_all(UR10, forward(UR10, [0.3, -1.2, 1.6, -1.0, -1.3, 0.4]))
+    solutions = inverse_many(UR10, forward(UR10, [[0.3, -1.2, 1.6, -1.0, -1.3, 0.4]]))[1]
     assert solutions.shape == (8, 6)
     apart = np.abs((solutions[:, None] - solutions[None] + pi) % (2 * pi) - pi).max(axis=2)
     assert apart[~np.eye(8, dtype=bool)].min() > 0.05
@@ -95,7 +95,7 @@ def test_a_pose_well_inside_the_reach_has_eight_different_inverses() -> None:
 def test_a_pose_out_of_reach_has_no_inverse(offset_m: list[float]) -> None:
     T = forward(UR10, [0.3, -1.2, 1.6, -1.0, -1.3, 0.4])
     T[:3, 3] += offset_m
-    assert inverse_all(UR10, T).shape == (0, 6)
+    assert inverse_many(UR10, T[None])[1].shape == (0, 6)
     assert inverse_nearest(UR10, T, np.zeros(6)) is None
 
 
@@ -103,14 +103,14 @@ def test_a_wrist_on_the_shoulder_axis_has_no_inverse() -> None:
     T = np.eye(4)
     T[:3, 3] = [0.05, 0.0, 0.6]
     T[:3, :3] = np.diag([1.0, -1.0, -1.0])
-    assert inverse_all(UR10, T).shape == (0, 6)
+    assert inverse_many(UR10, T[None])[1].shape == (0, 6)
 
 
 @pytest.mark.parametrize("q5", [0.0, 1e-12, 1e-9, 1e-8, 1e-6, pi - 1e-9, pi])
 @pytest.mark.parametrize("q3", [0.0, 1e-7, 1.6])
 def test_near_singular_poses_are_reached_with_full_precision(q3: float, q5: float) -> None:
     T = forward(UR10, [0.3, -1.2, q3, -1.0, q5, 0.4])
-    solutions = inverse_all(UR10, T)
+    solutions = inverse_many(UR10, T[None])[1]
     assert len(solutions) >= 2
     assert np.abs(forward(UR10, solutions) - T).max() < 1e-7
 

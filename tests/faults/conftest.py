@@ -36,6 +36,10 @@ class Cell:
         self._admin, self._asking = controller.admin(), asyncio.Lock()
         self._heart = asyncio.create_task(self._beat())
 
+    @property
+    def control_pid(self) -> int | None:
+        return self.robot._child.pid if self.robot._child is not None else None
+
     async def _beat(self) -> None:
         while True:
             if self.beating:

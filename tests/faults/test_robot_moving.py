@@ -45,7 +45,7 @@ def heart_stands_still(c: Cell) -> None:
 
 
 def child_gets(number: signal.Signals) -> Any:
-    return lambda c: os.kill(c.robot.control_pid, number)
+    return lambda c: os.kill(c.control_pid, number)
 
 
 def cut(how: str, ports: list[str] | None) -> dict[str, Any]:
@@ -75,7 +75,7 @@ FAULTS: dict[str, tuple[Any, str]] = {
 async def test_fault(cell: MakeCell, name: str) -> None:
     fault, code = FAULTS[name]
     c = await cell("UR10e" if code == "local-control" else "UR10")
-    child_pid = c.robot.control_pid
+    child_pid = c.control_pid
     assert child_pid is not None
     error = await c.strike(fault)
     late_too = (
@@ -161,7 +161,7 @@ async def test_a_lost_link_is_named_although_it_may_be_back_already(
 
 async def test_a_control_process_held_up_between_two_moves_is_named_by_the_next(cell: MakeCell) -> None:
     c = await cell()
-    control_pid, here = c.robot.control_pid, await c.joints_rad()
+    control_pid, here = c.control_pid, await c.joints_rad()
     assert control_pid is not None
     os.kill(control_pid, signal.SIGSTOP)
     await asyncio.sleep(0.4)
@@ -179,7 +179,7 @@ async def test_control_that_ended_between_two_moves_is_no_trouble_once_it_was_to
     """One approval continues at once, also before the next look at the robot."""
     monkeypatch.setattr("station.devices.ur_link.RETRY_S", 600.0)
     c = await cell()
-    control_pid = c.robot.control_pid
+    control_pid = c.control_pid
     assert control_pid is not None
     os.kill(control_pid, signal.SIGSTOP)
     await until(lambda: c.robot._ended_by is not None)

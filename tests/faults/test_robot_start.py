@@ -34,7 +34,7 @@ async def unheard(cell: MakeCell, model: str = "UR10") -> tuple[Cell, asyncio.Ta
 async def gone(c: Cell) -> None:
     """Nothing of control is left, and nothing moved."""
     await c.robot.idle()
-    assert not c.robot.control and c.robot.control_pid is None
+    assert not c.robot.control and c.control_pid is None
     await c.stays_at_rest()
     assert await c.asked("move") == 0
 
@@ -104,7 +104,7 @@ async def test_a_heart_that_beats_late_is_in_time(cell: MakeCell) -> None:
 
 
 def child_gets(number: signal.Signals) -> Any:
-    return lambda c: os.kill(c.robot.control_pid, number)
+    return lambda c: os.kill(c.control_pid, number)
 
 
 BEFORE_THE_FIRST: dict[str, tuple[Any, bool, str]] = {

@@ -45,8 +45,8 @@ async def test_with_a_hung_child_the_dashboard_stops_the_arm(
         monkeypatch.setattr(c.robot.dashboard, "send", lambda command: loop.create_future())
     else:
         monkeypatch.setattr(c.robot, "_dashboard_stop_anew", no_other)
-    assert c.robot.control_pid is not None
-    os.kill(c.robot.control_pid, signal.SIGSTOP)
+    assert c.control_pid is not None
+    os.kill(c.control_pid, signal.SIGSTOP)
     await c.robot.stop("operator")
     await c.stops()
     assert await c.asked("stop") == 0 and await c.asked("dashboard: stop") >= 1
@@ -82,13 +82,13 @@ async def test_stop_is_welcome_in_any_state(cell: MakeCell, tmp_path: Path) -> N
 async def test_stop_while_control_starts(cell: MakeCell) -> None:
     c = await cell(control=False)
     start = asyncio.create_task(c.robot.start_control())
-    await until(lambda: c.robot.control_pid is not None)
+    await until(lambda: c.control_pid is not None)
     await c.robot.stop("changed my mind")
     with raises("stopped"):
         await start
     await asyncio.sleep(0.4)
     await c.until(lambda state: state["program"] is None)
-    assert not c.robot.control and c.robot.control_pid is None
+    assert not c.robot.control and c.control_pid is None
 
 
 async def test_stop_before_the_control_process_exists(
@@ -104,7 +104,7 @@ async def test_stop_before_the_control_process_exists(
     monkeypatch.setattr(c.robot, "_may_start", stop_comes_now)
     with raises("stopped"):
         await c.robot.start_control()
-    assert c.robot.control_pid is None and await c.asked("upload") == 0
+    assert c.control_pid is None and await c.asked("upload") == 0
 
 
 async def test_a_new_approval_right_after_a_stop(cell: MakeCell) -> None:

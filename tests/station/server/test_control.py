@@ -19,7 +19,7 @@ import pytest
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
-from station.protocol.messages import LINE_LIMIT_BYTES, Reply
+from station.protocol.messages import LINE_LIMIT_BYTES, Answer
 from station.protocol.verbs import Go
 from station.server.approval import Peer
 from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer
@@ -186,7 +186,7 @@ async def test_a_flood_of_lines_holds_up_neither_stop_nor_the_heartbeat(
     server: Served, handler: RecordingHandler, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Lines that lie there already are read without a pause: a quarter of a megabyte took a second."""
-    answered: list[Reply] = []
+    answered: list[Answer] = []
     monkeypatch.setattr("station.server.control._Connection.reply", lambda _, reply: answered.append(reply))
     _, path = server
     with socket.socket(socket.AF_UNIX) as flood, socket.socket(socket.AF_UNIX) as other:

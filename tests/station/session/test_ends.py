@@ -118,7 +118,7 @@ async def test_of_two_states_of_a_session_the_newer_one_stays_on_the_disk(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await rig.go_until_it_moves()
-    recording, queue = rig.session.context.require_recording(), rig.session.context.require_queue()
+    recording, queue = rig.session.context.require_recording(), rig.session.context.loaded()
     disk, begun, written = threading.Event(), [], []
 
     def slow(self: SessionRecording, state: SessionState) -> None:

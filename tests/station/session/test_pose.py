@@ -77,7 +77,7 @@ async def test_an_arm_that_is_moved_between_rest_and_exposure_gives_no_view(
     monkeypatch.setattr(rig.arm, "at", pushed)
     await rig.session.switch_free_drive(1, True)
     index = await rig.session.record(1)
-    status = rig.session.context.require_queue().status(index)
+    status = rig.session.context.loaded().status(index)
     assert status.state == "failed"
     assert status.cause == "moved-in-exposure" and "elbow" in status.reason
     monkeypatch.setattr(rig.arm, "at", at)

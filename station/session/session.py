@@ -340,9 +340,9 @@ class Session:
         else:
             self.freedrive.end()
 
-    async def record(self, client_id: int) -> None:
+    async def record(self, client_id: int) -> int:
         self.permit(verbs.Record, client_id)
-        await self.freedrive.record()
+        return await self.freedrive.record()
 
     def admit(self, verb: type[Verb[object]], client_id: int, who: str) -> None:
         """Permit a request that arrives. If it needs control and nobody has it, its client gets control.

@@ -42,7 +42,7 @@ STATION = LazyGroup(
         ),
         "post": LazyCommand(
             "station.cli.post:post_command",
-            ("python tell_pose.py | station post",),
+            ("python tell_pose.py | station post", "station post --typed kuka-abc"),
             rare=True,
         ),
         "stop": LazyCommand("station.cli.control:stop_command", ("station stop",)),

@@ -329,6 +329,22 @@ async def test_a_thousand_poses_a_second_are_kept(arm: PostedArm) -> None:
     assert len(states) > 250 and trouble(arm) == ""
 
 
+async def test_typed_numbers_count_for_a_while_only_as_the_arm_then_moves_on(arm: PostedArm) -> None:
+    states: list[RobotState] = []
+    arm.subscribe(states.append)
+    words = ["post", "--typed", "kuka-abc", "--socket", str(arm.path.with_suffix(".sock"))]
+    typing = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "station.cli", *words, stdin=asyncio.subprocess.PIPE
+    )
+    assert typing.stdin is not None
+    typing.stdin.write(b"1 2 3\nX 400.0, Y -200.0, Z 300.0, A 0, B 0, C 0\n")
+    await until(lambda: states)
+    assert states[0].tcp_pose == pytest.approx((0.4, -0.2, 0.3, 0.0, 0.0, 0.0))
+    await until(lambda: trouble(arm) == "post-silent")
+    typing.stdin.close()
+    assert await typing.wait() == 0
+
+
 async def test_a_refused_program_is_told_so_although_it_has_nothing_more_to_say(arm: PostedArm) -> None:
     words = ["post", "--socket", str(arm.path.with_suffix(".sock"))]
     posting = await asyncio.create_subprocess_exec(

@@ -31,7 +31,8 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     session: bool | None = True
     """No other reading of the recording (inverted poses, other square size, …) explains it better."""
     arm: Literal["warn", "fail"] | None = "warn"
-    """What becomes of a stated error that is without the arm's own: no joints, model or accuracy known."""
+    """What becomes of a stated error that holds of the arm's own only what varies smoothly with its place: no
+    joints, model or accuracy are known."""
     rotation_deg: float | None = 30.0
     """Smallest allowed value of the largest rotation between two views."""
     axis_spread: float | None = 0.1
@@ -173,7 +174,7 @@ def _arm_gate(without: bool, limit: Literal["warn", "fail"]) -> Gate:
     if not without:
         return Gate("arm", True, None, None, "Arm's own error: in the stated error PASS")
     remedy = "Record joints, or state --robot-accuracy-mm."
-    text = f"Arm's own error: not in the stated error {limit.upper()}. {remedy}"
+    text = f"Arm's own error: only its smooth part is in the stated error {limit.upper()}. {remedy}"
     return Gate("arm", limit == "warn", None, None, text, remedy=remedy)
 
 

@@ -126,6 +126,8 @@ def _as_before(lies: Lies, told: Dataset, poses: PosesTold) -> Believed:
         raise ImportSourceError("no-pairs", source=lies.root, images=poses.images, tables=poses.table)
     seen = None if board is None else (board, convention(poses.board_convention))
     joints = tables.get(poses.joints)
+    if poses.joints and (joints is None or len(joints.numbers) != len(table.numbers)):
+        raise ImportSourceError("joints-rows", source=lies.root, joints=poses.joints, poses=poses.table)
     return Believed(told, _rows(lies, table, convention(poses.convention), pairs, seen, joints))
 
 

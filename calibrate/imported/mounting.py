@@ -2,8 +2,9 @@
 
 Three things are asked: the mounting, and whether the robot's and the board's poses are inverted. A camera in
 hand fits exactly as well as a fixed one with inverted poses, so the motion gives one of the three once the
-other two are known. Measured are recorded joints and what the images show around the board; else names count.
-Distances of camera and board from flange and base count with either, and no two may contradict each other.
+other two are known. A convention that the user tells and recorded joints decide. Else no two may contradict
+each other: the mounting that the user tells, names, what the images show around the board, and the distances
+of camera and board from flange and base. Of the last two alone both are needed.
 """
 
 from __future__ import annotations
@@ -62,18 +63,20 @@ def mounting(
     turned_board = named_so if all(seen.in_front) else seen.in_front[1]
     fits = _OTHER[best.mount] if turned_board else best.mount
     by_turn: dict[bool | None, set[Mount]] = {None: set(), False: {fits}, True: {_OTHER[fits]}}
-    measured = {"joints": by_turn[by_joints], "the scene around the board": _by_scenery(best)}
-    by_distances, far_apart = _inverted_by_distances(best)
-    straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
-    turned = inverted if straight != inverted and not as_told else None
-    facts = " ".join(f"{key} {str(value).lower()}" for key, value in lies.facts.items())
-    named = _named(f"{name} {best.family}") or _named(f"{lies.words} {facts}")
-    supposed = {far_apart: by_turn[by_distances], "names": by_turn[turned] | (set() if given else named)}
     told = ({given} if given else set()) | by_turn[False if as_told else None]
-    if any(measured.values()):
-        del supposed["names"]
-    evidence = measured if given and as_told else measured | supposed
-    possible = told.union(*evidence.values())
+    evidence = {"joints": by_turn[by_joints]}
+    possible = told | by_turn[by_joints]
+    if not as_told and by_joints is None:
+        by_distances, far_apart = _inverted_by_distances(best)
+        straight, inverted = (bool(way.search(name)) for way in (_TOOL_IN_BASE, _BASE_IN_TOOL))
+        turned = inverted if straight != inverted else None
+        facts = " ".join(f"{key} {str(value).lower()}" for key, value in lies.facts.items())
+        named = _named(f"{name} {best.family}") or _named(f"{lies.words} {facts}")
+        names, scene, distances = by_turn[turned] | named, _by_scenery(best), by_turn[by_distances]
+        evidence = {"names": names, "the scene around the board": scene, far_apart: distances}
+        # A bare wall, a gripper in the picture, or a frame at the table deceives one of the two alone.
+        if given or names or (scene and distances):
+            possible = told | names | scene | distances
     why = [(what, says) for what, says in evidence.items() if says]
     if len(possible) != 1:
         said = "; ".join(f"{' or '.join(sorted(says))} by {what}" for what, says in why)

@@ -56,6 +56,10 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     working_distance_m: float | None = None
     """Median distance of camera and board, for which the poses state a predicted error."""
 
+    def predicted_error_m(self, index: int) -> float | None:
+        """Predicted error with the poses up to this one; None: not known, or another figure (older plans)."""
+        return None if self.working_distance_m is None else self.poses[index].predicted_sigma_m
+
 
 def plan_sha256(plan: Plan) -> str:
     """Compute the hash, to which an approval is bound, of everything that decides the motion."""

@@ -128,13 +128,13 @@ class PlanJson(msgspec.Struct, frozen=True):
     path_m: float
     largest_step_rad: float
     top_speed_m_s: float
-    expected_sigma_mm: float | None
+    predicted_error_mm: float | None
     note: str
     problems: list[Problem]
 
 
 def _summary(plan: Plan, outcome: PlanCheck) -> PlanJson:
-    last = plan.poses[-1].predicted_sigma_m
+    last = plan.predicted_error_m(-1)
     return PlanJson(
         plan_sha256=plan_sha256(plan),
         poses=len(plan.poses),
@@ -144,7 +144,7 @@ def _summary(plan: Plan, outcome: PlanCheck) -> PlanJson:
         path_m=round(outcome.path_m, 4),
         largest_step_rad=round(outcome.largest_step_rad, 4),
         top_speed_m_s=round(outcome.top_speed_m_s, 4),
-        expected_sigma_mm=None if last is None else round(1000 * last, 4),
+        predicted_error_mm=None if last is None else round(1000 * last, 4),
         note=plan.note,
         problems=list(outcome.problems),
     )
@@ -155,13 +155,14 @@ def _show(plan: Plan, outcome: PlanCheck, goal_m: float) -> None:
     for heading in ("pose", "move s", "turn °", "margin mm", "error mm"):
         table.add_column(heading, justify="left" if heading == "pose" else "right", no_wrap=True)
     table.add_column("why")
-    for pose, move in zip(plan.poses, outcome.moves, strict=True):
+    for index, (pose, move) in enumerate(zip(plan.poses, outcome.moves, strict=True)):
+        error_m = plan.predicted_error_m(index)
         table.add_row(
             pose.name,
             f"{move.duration_s:.1f}",
             f"{np.rad2deg(move.step_rad):.0f}",
             f"{1000 * move.margin_m:.0f}",
-            "–" if pose.predicted_sigma_m is None else f"{1000 * pose.predicted_sigma_m:.2f}",
+            "–" if error_m is None else f"{1000 * error_m:.2f}",
             pose.why,
         )
     out.print(table)
@@ -169,7 +170,7 @@ def _show(plan: Plan, outcome: PlanCheck, goal_m: float) -> None:
         f"{len(plan.poses)} poses, {outcome.duration_s:.0f} s of motion over {outcome.path_m:.1f} m, "
         f"at most {outcome.top_speed_m_s:.2f} m/s and {np.rad2deg(outcome.largest_step_rad):.0f}° in one move"
     )
-    if (last_m := plan.poses[-1].predicted_sigma_m) is not None:
+    if (last_m := plan.predicted_error_m(-1)) is not None:
         error = predicted_error(1000 * last_m, plan.working_distance_m)
         out.print(
             f"{error.label} {error.about}: {error.value}, goal {1000 * goal_m:g} mm (capture.goal_m), "

@@ -27,7 +27,7 @@ class PoseQueue:
         """`restored`: states after a restart: poses that ended stay so, all others are planned again."""
         self.plan = plan
         """Plan with the poses added since it was loaded."""
-        self._statuses = [_planned(index, pose) for index, pose in enumerate(plan.poses)]
+        self._statuses = [_planned(plan, index) for index in range(len(plan.poses))]
         if [status.index for status in restored] == list(range(len(plan.poses))):
             self._statuses = list(restored)
             for status in restored:
@@ -129,7 +129,7 @@ class PoseQueue:
             raise RefusedError("too-many-poses", limit=POSE_LIMIT)
         # Without the planner's criterion, so that the plan is not replaced without asking.
         self.plan = msgspec.structs.replace(self.plan, poses=(*self.plan.poses, pose), criterion=None)
-        self._statuses.append(_planned(index, pose))
+        self._statuses.append(_planned(self.plan, index))
         return index
 
 
@@ -137,8 +137,9 @@ def _refused(code: str, index: int) -> RefusedError:
     return RefusedError(code, pose=index, number=index + 1)
 
 
-def _planned(index: int, pose: PlannedPose) -> PoseStatus:
-    sigma_m, view = pose.predicted_sigma_m, pose.view
+def _planned(plan: Plan, index: int) -> PoseStatus:
+    pose, sigma_m = plan.poses[index], plan.predicted_error_m(index)
+    view = pose.view
     return PoseStatus(
         index,
         pose.name,

@@ -43,6 +43,7 @@ def run_behind_stop_key(show: Callable[[], None], control: Path) -> None:
     child, glass = pty.fork()
     if child == 0:
         die_with_parent(parent)  # a screen that is gone has no control
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup has it ignored
         try:
             fcntl.ioctl(0, termios.TIOCSWINSZ, size)
             show()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 from pathlib import Path
 
@@ -15,8 +16,8 @@ BUSY = "import tty; tty.setraw(0); print('drawing', flush=True)\nwhile True: pas
 ECHO = "print('size', *os.get_terminal_size()); print('read', sys.stdin.readline())"
 
 
-def behind(control: Path, show: str) -> ScreenProcess:
-    program = f"import os, sys\ndef show(): exec({show!r})\n"
+def behind(control: Path, show: str, first: str = "") -> ScreenProcess:
+    program = first + f"import os, sys\ndef show(): exec({show!r})\n"
     program += "from pathlib import Path\nfrom station.tui.stop_key import run_behind_stop_key\n"
     program += f"run_behind_stop_key(show, Path({str(control)!r}))"
     return ScreenProcess(control, program)
@@ -64,5 +65,17 @@ def test_keys_size_and_picture_pass_and_its_end_is_the_screen_s(tmp_path: Path) 
         screen.press_now("hello\n")
         screen.wait_for("read hello", ended=True)
         assert screen.process.wait(PATIENCE_S) == 0
+    finally:
+        screen.end()
+
+
+def test_a_screen_that_was_started_by_nohup_ends_with_its_terminal_too(tmp_path: Path) -> None:
+    waits = "import signal\nprint('drawing'); sys.stdout.flush(); signal.pause()"
+    ignore = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+    screen = behind(tmp_path / "c.sock", waits, ignore)
+    try:
+        screen.wait_for("drawing")
+        screen.process.terminate()
+        assert screen.process.wait(PATIENCE_S) == 128 + signal.SIGTERM
     finally:
         screen.end()

@@ -111,9 +111,14 @@ def import_command(
 
 
 def _told(source: Path, output: Path | None) -> Path | None:
-    """The description of a folder: in it, or as an earlier import wrote it beside its recording."""
-    beside = [] if output is None else [output.with_suffix("." + DATASET_FILE)]
-    return next((path for path in (source / DATASET_FILE, *beside) if os.path.lexists(path)), None)
+    """The description of a folder: in it, or as an earlier import of it wrote it beside its recording."""
+    if os.path.lexists(source / DATASET_FILE):
+        return source / DATASET_FILE
+    beside = None if output is None else output.with_suffix("." + DATASET_FILE)
+    if beside is None or not os.path.lexists(beside):
+        return None
+    poses = read_dataset(beside)[0].poses
+    return beside if poses is not None and poses.source == str(source.resolve()) else None
 
 
 @single_threaded_opencv()

@@ -181,7 +181,7 @@ def _believed(lies: Lies, given: Given, best: Reading) -> Believed:
         del facts["images"], facts["camera"]
         facts["board"] = f"{len(pairs)} rows of {best.family}", f"{how_board.name}; {seen.told}"
     seen_how, moved_by = saw[1].name if saw else "", joints.name if joints else ""
-    told = PosesTold(best.table.name, best.family, how.name, seen_how, moved_by)
+    told = PosesTold(best.table.name, best.family, how.name, seen_how, moved_by, str(lies.root.resolve()))
     dataset = Dataset(mount, board, camera, lies.root.resolve().name, poses=told)
     return Believed(dataset, _rows(lies, best.table, how, pairs, saw, joints), facts)
 

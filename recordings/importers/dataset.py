@@ -57,6 +57,8 @@ class PosesTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How poses of the board are read, where they are told instead of images."""
     joints: str = ""
     """Table of the arm's joints, of as many rows as that of the poses."""
+    source: str = ""
+    """The folder of which this is believed: beside a recording it holds of no other."""
 
 
 class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -258,6 +259,8 @@ def test_what_was_believed_needs_no_flags_again(put: Callable[..., Path], tmp_pa
     assert first.info.mount == "eye-in-hand"
     assert first.info.robot.model not in MODELS
     out.unlink()
+    other = shutil.copytree(folder, tmp_path / "other")
+    assert call(main, "import", other, "-o", out).returncode == 1, "what is believed of one holds of no other"
     assert call(main, "import", folder, "-o", out, "--mount", "eye-to-hand").returncode == 0
     assert open_recording(out).info.mount == "eye-to-hand"  # what is said now counts, and from now on
     out.unlink()

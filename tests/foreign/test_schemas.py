@@ -77,7 +77,8 @@ def test_what_the_commands_of_recordings_and_plans_print(findings: Findings, tmp
     sample.write_bytes(SAMPLE.read_bytes()[:-2000])
     recovered = printed("recordings", "recover", sample)
     assert findings("recover", recovered) == [] and recovered[0]["kept_original"]
-    printed("recordings", "export", SAMPLE, "--to", "folder", "-o", "folder")
+    export = [sys.executable, "-m", "recordings.cli", "export", SAMPLE, "--to", "folder", "-o", "folder"]
+    subprocess.run(export, cwd=tmp_path, check=True)
     assert findings("import", printed("recordings", "import", "folder", "-o", "again.mcap")) == []
     made = printed("station", "plan", "--poses", "4", "-o", "plan.yaml")
     assert findings("plan-report", made) == [] and "workspace_mm" not in made

@@ -218,7 +218,7 @@ def raw_array(data: bytes, encoding: str, width: int, height: int, step: int = 0
         raise ImageError(f"is encoded as '{encoding}' (known: {', '.join(_LAYOUTS)}, PNG, JPEG)")
     channels, kind, conversion = _LAYOUTS[encoding]
     row = width * channels * np.dtype(kind).itemsize
-    step = step or row
+    step, data = (step, data[: step * height]) if step else (row, data)  # drivers may leave more in a buffer
     if step < row or len(data) != step * height or not height:
         raise ImageError(f"holds {len(data)} bytes where {width}×{height} {encoding} needs {step * height}")
     pixels = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(height, step)[:, :row]).view(kind)

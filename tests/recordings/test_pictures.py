@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.images import ImageError, ImageHeader, decode_image, encode_png, read_header
+from recordings.images import ImageError, ImageHeader, decode_image, encode_png, raw_array, read_header
 from tests.recordings.small_recording import HEIGHT, WIDTH, make_image
 
 COLOUR = np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
@@ -96,3 +96,11 @@ def test_any_edit_decodes_to_the_right_size_or_is_refused(name: str, draw: st.Da
 def test_any_bytes_have_a_header_or_none(data: bytes, start: bytes) -> None:
     with suppress(ImageError):
         assert read_header(start + data).width > 0
+
+
+def test_bytes_after_the_last_row_of_an_image_of_a_bag_are_left_out() -> None:
+    rows = bytes(range(64)) * 48
+    found = raw_array(rows + b"left", "mono8", 60, 48, 64)
+    np.testing.assert_array_equal(found, raw_array(rows, "mono8", 60, 48, 64))
+    with pytest.raises(ImageError):
+        raw_array(rows + b"left", "mono8", 64, 48)

@@ -301,7 +301,7 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def without_arm(self) -> bool:
-        """Whether the stated error is without the arm's own, by the gate `arm`."""
+        """Whether the stated error holds only the smooth part of the arm's own, by the gate `arm`."""
         return any(gate.name == "arm" and gate.remedy for gate in self.gates)
 
     @property

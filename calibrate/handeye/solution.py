@@ -257,7 +257,7 @@ class Solution:
     error_shares: dict[str, float] = field(default_factory=dict)
     arm: ArmErrors | None = None
     without_arm: bool = False
-    """The stated error is without the arm's own: it is neither modelled nor stated."""
+    """Of the arm's own error only the smooth part is stated: no model, joints or accuracy are known."""
     predicted_error_m: float | None = None
     """1σ (root of the mean squared length) of a point at the working distance on the camera's axis; where
     errors of the arm are detected, that of `ArmErrors.installed`."""

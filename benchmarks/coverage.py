@@ -14,11 +14,11 @@ import numpy as np
 from benchmarks.imperfect_cells import Imperfection, Known, imperfect_cell
 from benchmarks.trials import Miss, rms, rows_of, table, trials
 from calibrate.errors import CalibrationError
-from calibrate.gates import GateInputs, judge
+from calibrate.gates import judge
 from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import LensModel
-from calibrate.pipeline import picture_coverage, single_threaded_opencv
+from calibrate.pipeline import single_threaded_opencv
 from recordings.schema.messages import Mount
 
 TRIALS = 200
@@ -99,9 +99,7 @@ def measure(task: tuple[int, Mount, int]) -> CoverageTrial:
             solution = solve_views(cell.views, SolveOptions(intrinsics_from_same_pictures=not row.known.lens))
     except CalibrationError as problem:
         return CoverageTrial((str(problem.values.get("hypothesis", type(problem).__name__)),))
-    used = set(solution.used)
-    seen = picture_coverage(cell.views.select([k for k, v in enumerate(cell.views) if v.index in used]))
-    gates = judge(solution, GateInputs(None if row.known.lens else seen))
+    gates = judge(solution)
     miss = Miss.of(solution, cell.X)
     beyond = (
         miss.shift_m > _BEYOND * solution.sigma_translation_m

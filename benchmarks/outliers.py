@@ -11,7 +11,7 @@ from benchmarks.imperfect_cells import BOARD, ImperfectCell, Known, imperfect_ce
 from benchmarks.scene import MID
 from benchmarks.trials import Miss, rows_of, table, trials
 from calibrate.errors import CalibrationError
-from calibrate.gates import GateInputs, judge
+from calibrate.gates import judge
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.handeye.solution import Reading, Solution, SolveOptions
 from calibrate.handeye.solve import solve_views
@@ -100,7 +100,7 @@ def measure(task: tuple[str, float, Mount, int]) -> OutlierTrial:
             falsely = "hypothesis" in problem.values and not truly
             return OutlierTrial(False, named, oracle, truly, falsely)
         reading = solution.session.reading
-    passed = all(gate.passed for gate in judge(solution, GateInputs()))
+    passed = all(gate.passed for gate in judge(solution))
     truly, falsely = _named(solution, spoilt, set(bad.tolist()))
     return OutlierTrial(passed, reading.value, oracle, truly, falsely, Miss.of(solution, spoilt.X))
 

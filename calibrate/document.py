@@ -114,7 +114,6 @@ def _arm_table(solution: Solution, arm: ArmResult) -> CorrectedArm:
         without_table_mm=1e3 * solution.arm.uncorrected.error_m,
         joints_rad=[(low, high) for low, high in arm.joints_rad.T.tolist()],
         held_out=None if arm.held_out_m is None else _held_out(arm.held_out_m),
-        verified=None if arm.verified_m is None else _held_out(arm.verified_m, arm.verified_by),
         refused=arm.refused or "",
         nominal=None if table is None else DhTable.of(table),
         learned=arm.nominal.plain if table is None else None,
@@ -124,10 +123,10 @@ def _arm_table(solution: Solution, arm: ArmResult) -> CorrectedArm:
     )
 
 
-def _held_out(missed_m: Array, recording: str = "") -> HeldOutViews:
+def _held_out(missed_m: Array) -> HeldOutViews:
     """Sum up errors (2, n), NaN: none, of the arm as it is and of the corrected one."""
     as_it_is, corrected = (1e3 * np.sqrt(np.nanmean(missed_m**2, axis=1))).tolist()
-    return HeldOutViews(as_it_is, corrected, int(np.isfinite(missed_m[0]).sum()), recording)
+    return HeldOutViews(as_it_is, corrected, int(np.isfinite(missed_m[0]).sum()))
 
 
 @cache

@@ -1,14 +1,14 @@
 """Gates: named conditions that a calibration must meet before it may be installed.
 
-A gate is, under one name, a limit in `GateLimits`, a rule in `_RULES`, and a value that `_measured` yields.
-The value is the solution's, or a field of `GateInputs`, filled by who solves (`pipeline`, `pictures`). A gate
-without a value has a function of its own that `judge` calls, such as `_session_gate`.
+A gate is, under one name, a limit in `GateLimits`, a rule in `_RULES`, and a value that `_measured` yields of
+the solution; None: it is not judged. A new figure is a field of `handeye.solution.Solution`, filled by
+`_describe` in `handeye.solve`. A gate without a value has a function of its own that `judge` calls, such as
+`_session_gate`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -58,16 +58,6 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robot_error_deg: float | None = 0.3
 
 
-@dataclass(frozen=True)
-class GateInputs:
-    """Figures that the gates need besides the solution."""
-
-    coverage: float | None = None
-    """Share of the image in which corners were seen; None: intrinsics are not from these images."""
-    clock_bound_s: float | None = None
-    """Largest bound of the time offset over the used views; None where no clocks were recorded."""
-
-
 def read_limits(path: Path) -> GateLimits:
     """Read YAML with some of GateLimits' fields. Raises UsageError naming file and field."""
     try:
@@ -78,13 +68,18 @@ def read_limits(path: Path) -> GateLimits:
         raise UsageError("gate-limits", path=path, problem=str(said), names=names) from None
 
 
-def judge(solution: Solution, inputs: GateInputs, limits: GateLimits | None = None) -> tuple[Gate, ...]:
-    """Judge every gate that is switched on and can be judged, in order of reading."""
+def judge(
+    solution: Solution, limits: GateLimits | None = None, clock_bound_s: float | None = None
+) -> tuple[Gate, ...]:
+    """Judge every gate that is switched on and can be judged, in order of reading.
+
+    clock_bound_s: largest bound of the time offset over the used views; None where no clocks were recorded.
+    """
     limits = limits or GateLimits()
     found = [_session_gate(solution)] if limits.session and solution.profile == "robust" else []
     if limits.arm and solution.profile == "robust":
         found.append(_arm_gate(solution.without_arm, limits.arm))
-    for name, value, title, remedy in _measured(solution, inputs):
+    for name, value, title, remedy in _measured(solution, clock_bound_s):
         limit = getattr(limits, name)
         if value is None or limit is None:
             continue
@@ -138,7 +133,9 @@ _RULES = {
 }
 
 
-def _measured(solution: Solution, inputs: GateInputs) -> Iterator[tuple[str, float | None, str, str]]:
+def _measured(
+    solution: Solution, clock_bound_s: float | None
+) -> Iterator[tuple[str, float | None, str, str]]:
     """Yield each gate's id, value in its unit (None: not judged), end of its title, and own remedy or ""."""
     seen, folds, noise = solution.observability, solution.cross_validation, solution.noise
     predicted_m, distance_m = solution.predicted_error_m, solution.working_distance_m
@@ -159,8 +156,8 @@ def _measured(solution: Solution, inputs: GateInputs) -> Iterator[tuple[str, flo
         yield "cross_validation", folds.rms_mm / folds.claimed_mm / folds.limit, figures, ""
     remedy = f"Least known: {seen.weakest_text}. Add rotations about that direction."
     yield "predicted_error_m", predicted_m, f"at {(distance_m or 0.0) * 1e3:.0f} mm", remedy
-    yield "coverage", inputs.coverage, "", ""
-    yield "clock_bound_s", inputs.clock_bound_s, "", ""
+    yield "coverage", solution.coverage if solution.lens_estimated else None, "", ""
+    yield "clock_bound_s", clock_bound_s, "", ""
     for name, finding in (("lens_pull", solution.lens_finding), ("board_pull", solution.board_finding)):
         if finding is not None:
             figures = f"({finding.unexplained_m * 1e3:.2f} of {finding.pull_m * 1e3:.2f} mm)"

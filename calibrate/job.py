@@ -173,7 +173,6 @@ class Solved:
 
 @dataclass(frozen=True, eq=False)
 class SolvedRecording(PreparedViews, Solved):
-    coverage: float
     calibration: Calibration
     solve_ms: float
     """Of everything, opening and detection included."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points, check_board, typed_board
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.gates import GateInputs, judge
+from calibrate.gates import judge
 from calibrate.geometry import Array
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
@@ -23,7 +23,7 @@ from calibrate.handeye.solution import SolveOptions
 from calibrate.handeye.solve import solve_views
 from calibrate.imported import Given, believe, is_described
 from calibrate.job import Solved
-from calibrate.pipeline import picture_coverage, single_threaded_opencv, with_board_poses
+from calibrate.pipeline import single_threaded_opencv, with_board_poses
 from calibrate.views import BoardView, ViewSet, array_of
 from recordings.errors import ImportSourceError
 from recordings.files import usable_cores
@@ -168,6 +168,4 @@ def solve(
         board=BoardTolerance.of(board),
     )
     solution = solve_views(found, options)
-    used = found.select([k for k, view in enumerate(found) if view.index in set(solution.used)])
-    inputs = GateInputs(picture_coverage(used) if intrinsics is not None else None)
-    return SolvedPictures(found, solution, judge(solution, inputs), without)
+    return SolvedPictures(found, solution, judge(solution), without)

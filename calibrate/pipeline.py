@@ -15,8 +15,7 @@ import numpy as np
 from calibrate.boards.model import check_board
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
-from calibrate.gates import GateInputs, judge
-from calibrate.handeye.arm_result import verify_elsewhere
+from calibrate.gates import judge
 from calibrate.handeye.metrics import FEWEST_TO_SOLVE
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Solution, SolveOptions
@@ -107,35 +106,20 @@ def solve_recording(
     path: Path,
     options: JobOptions | None = None,
     progress: Progress | None = None,
-    verify: Path | None = None,
 ) -> SolvedRecording:
-    """Solve and judge a recording. Raises RecordingError or CalibrationError; each says what to do next.
-
-    `verify`: a recording of the same camera and board at other poses, which judges the corrected arm.
-    """
+    """Solve and judge a recording. Raises RecordingError or CalibrationError; each says what to do next."""
     options = options or JobOptions()
     begun_s = time.perf_counter()
     prepared = prepare_views(path, options, progress)
     recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
     solution = solve_views(views, solver_options(options, prepared))
-    if verify is not None:
-        same = replace(options, board=loaded.board, square_m=None, camera=solution.camera, without=())
-        same = replace(same, find_intrinsics=False)
-        elsewhere = prepare_views(verify, same, progress, 1)
-        solution = verify_elsewhere(solution, elsewhere.views, verify.name)
-    used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
-    coverage = picture_coverage(used)
-    inputs = GateInputs(
-        coverage if prepared.intrinsics is not None else None, _clock_bound_s(recording, solution)
-    )
-    gates = judge(solution, inputs, options.limits)
+    gates = judge(solution, options.limits, _clock_bound_s(recording, solution))
     calibration = make_calibration(
         recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen
     )
     return SolvedRecording(
         **vars(prepared),
         solution=solution,
-        coverage=coverage,
         gates=gates,
         calibration=calibration,
         solve_ms=1e3 * (time.perf_counter() - begun_s),
@@ -160,16 +144,6 @@ def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:
         board = msgspec.structs.replace(board, square_m=options.square_m, marker_m=marker_m)
         check_board(board)
     return board
-
-
-def picture_coverage(views: ViewSet) -> float:
-    """Share of the picture inside the outlines of the boards seen, all views together; 0 without corners."""
-    scale = 64 / max(views.camera.width, views.camera.height)
-    seen = np.zeros((round(views.camera.height * scale), round(views.camera.width * scale)), np.uint8)
-    for view in (view for view in views if len(view.pixels)):
-        outline = cv2.convexHull((view.pixels * scale).astype(np.float32)).round().astype(np.int32)
-        cv2.fillConvexPoly(seen, outline, 1)
-    return float(seen.mean())
 
 
 def _clock_bound_s(recording: Recording, solution: Solution) -> float | None:

@@ -83,10 +83,6 @@ def solve(
     robot_accuracy_deg: Annotated[
         float | None, typer.Option(min=0.0, help="The same of its orientation (1 mrad a mm)")
     ] = None,
-    verify: Annotated[
-        Path | None,
-        typer.Option(help="A recording at other poses, same board: judges the corrected arm"),
-    ] = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
@@ -120,7 +116,7 @@ def solve(
         if os.path.realpath(report) == os.path.realpath(target):
             raise UsageError("target-exists", path=target, by="both calibration and report")
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
-        job = solve_recording(recording, options, progress, verify)
+        job = solve_recording(recording, options, progress)
     write_calibration(job.calibration, target)
     if report is not None:
         from calibrate.report.page import report_page  # like matplotlib, slow to load

@@ -176,8 +176,6 @@ class HeldOutViews(msgspec.Struct, frozen=True):
     without_table_mm: float
     with_table_mm: float
     views: int
-    recording: str = ""
-    """File name of a recording whose views took no part; empty: left-out views of the calibration's own."""
 
 
 class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -205,8 +203,6 @@ class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
     joints_rad: list[tuple[float, float]] = []
     """Least and greatest of each joint in the recording; a learned chain is not asked beyond."""
     held_out: HeldOutViews | None = None
-    verified: HeldOutViews | None = None
-    """Verification by another recording: distance of the board's middle from its mean position."""
     refused: str = ""
     """Reason why it is not offered: no-evidence, no-joints, not-nominal, not-better; empty: offered."""
     corrected: DhTable | None = None

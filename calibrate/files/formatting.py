@@ -216,15 +216,11 @@ def arm_sentences(calibration: Calibration) -> Iterator[str]:
         f"Over the {'range of the joints' if learned else 'workspace'} {point} is placed to "
         f"{arm.with_table_mm:.2f} mm (1σ) by the corrected arm, to {arm.without_table_mm:.2f} mm as it is."
     )
-    for seen, poses in (
-        (arm.held_out, "Views predicted from poses elsewhere"),
-        (arm.verified, f"Verified by {arm.verified.recording}" if arm.verified else ""),
-    ):
-        if seen is not None:
-            yield (
-                f"{poses}: {seen.with_table_mm:.2f} mm by the corrected arm, {seen.without_table_mm:.2f} mm "
-                f"as it is ({seen.views} views)."
-            )
+    if (seen := arm.held_out) is not None:
+        yield (
+            f"Views predicted from poses elsewhere: {seen.with_table_mm:.2f} mm by the corrected arm, "
+            f"{seen.without_table_mm:.2f} mm as it is ({seen.views} views)."
+        )
     if arm.offered:
         how = "--to urdf --arm ROBOT.urdf" if learned else "--to ur-kinematics"
         yield (

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsError
@@ -13,6 +15,7 @@ from calibrate.projection import camera_matrix, distortion
 from calibrate.results import HoldoutScore
 from calibrate.views import BoardView, ViewSet, require_no_copies
 from recordings.errors import Value
+from recordings.schema.messages import CameraModel
 
 _MIN_SECOND_AXIS_RAD = np.radians(0.3)
 """Rms rotation about the second axis below which X is not determined."""
@@ -191,6 +194,19 @@ def distance_in_sigmas(X: Array, reference: Array, covariance: Array) -> float:
     """
     delta = difference(X, reference)
     return float(np.sqrt(max(0.0, float(delta @ np.linalg.pinv(covariance, 1e-14, hermitian=True) @ delta))))
+
+
+def picture_coverage(views: Sequence[BoardView], camera: CameraModel) -> float:
+    """Compute the share of the picture inside the outlines of the boards seen; 0 without corners."""
+    corners = [view.pixels for view in views if len(view.pixels)]
+    if not corners:
+        return 0.0
+    scale = 64 / max(camera.width, camera.height)
+    seen = np.zeros((round(camera.height * scale), round(camera.width * scale)), np.uint8)
+    for pixels in corners:
+        outline = cv2.convexHull((pixels * scale).astype(np.float32)).round().astype(np.int32)
+        cv2.fillConvexPoly(seen, outline, 1)
+    return float(seen.mean())
 
 
 HELD_OUT = 6

@@ -123,10 +123,6 @@ class ArmResult:
     """(2, n) error of views predicted from those taken elsewhere: by the arm as it is, by the corrected."""
     refused: ArmRefusal | None
     """Reason why the corrected arm is not offered; None where it is."""
-    verified_by: str = ""
-    """File name of a second recording."""
-    verified_m: Array | None = None
-    """(2, n) distance of the board's middle from its mean place at poses of that recording, likewise."""
 
     @property
     def offered(self) -> bool:
@@ -247,6 +243,10 @@ class Solution:
     session: Explanation = field(default_factory=lambda: Explanation(Reading.AS_RECORDED, 0.0))
     """Reading of the recording as a whole."""
     cross_validation: CrossValidation | None = None
+    coverage: float = 0.0
+    """Share of the image inside the outlines of the boards in the used views; 0 without corners."""
+    lens_estimated: bool = False
+    """The lens was found from these same images."""
     lens_finding: Finding | None = None
     """None where no lens was given."""
     lens_covariance: Array | None = None

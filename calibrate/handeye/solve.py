@@ -35,6 +35,7 @@ from calibrate.handeye.metrics import (
     mean_pose,
     median_distance_m,
     observe,
+    picture_coverage,
     placed_boards,
     point_error_m,
     require_motion,
@@ -142,6 +143,7 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
     folds = cross_validate(fit, options.seed) if options.folds else None
     holdout = _holdout(fit) if options.holdout else None
     rms_px, view_rms_px = _corner_rms(fit)
+    kept = tuple(replace(views.views[i], camera_from_board=C[i]) for i in used)
     return Solution(
         mount=views.mount,
         profile="robust",
@@ -156,11 +158,13 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
         certificate=replace(certified.certificate, distance_sigma=apart),
         observability=observe(pairs, covariance, distance, parent),
         holdout=holdout,
-        kept=tuple(replace(views.views[i], camera_from_board=C[i]) for i in used),
+        kept=kept,
         turned=tuple(indices[i] for i in fit.turned),
         weights={index: float(w) for index, w in zip(indices, found.weight, strict=True)},
         suspects={indices[i]: float(1 - found.chances[i, 0]) for i in used if found.chances[i, 0] <= FULL},
         cross_validation=folds,
+        coverage=picture_coverage(kept, state.camera),
+        lens_estimated=options.intrinsics_from_same_pictures,
         lens_finding=lens_finding,
         lens_covariance=found.covariance[at.lens, at.lens] if seen else None,
         board=_board(fit, found.covariance[at.shape, at.shape]) if seen else None,
@@ -321,6 +325,8 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
         if held
         else None,
         kept=views.views,
+        coverage=picture_coverage(views.views, views.camera),
+        lens_estimated=options.intrinsics_from_same_pictures,
         predicted_error_m=point_error_m(X, covariance, distance),
         working_distance_m=distance,
         board_spread_m=spread_m,

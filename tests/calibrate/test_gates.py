@@ -12,13 +12,13 @@ import pytest
 
 from calibrate.errors import UsageError
 from calibrate.files.formatting import figures
-from calibrate.gates import GateInputs, GateLimits, judge, read_limits
+from calibrate.gates import GateLimits, judge, read_limits
 from calibrate.handeye.solution import Explanation, Finding, NoiseScales, Reading, Solution
 from calibrate.job import SolvedRecording
 from calibrate.results import CrossValidation, Gate, HoldoutScore, Remark
 from tests.codes import raises
 
-GOOD = GateInputs(0.6, 0.001)
+CLOCK_S = 0.001
 DEFAULTS = {name: limit for name, limit in msgspec.structs.asdict(GateLimits()).items() if limit is not None}
 
 
@@ -32,6 +32,8 @@ def solution(solved_real: SolvedRecording) -> Solution:
         found,
         holdout=holdout,
         noise=noise,
+        coverage=0.6,
+        lens_estimated=True,
         weights=dict.fromkeys(found.used, 1.0),
         session=Explanation(Reading.AS_RECORDED, 0.0),
         cross_validation=CrossValidation(0.5, 0.06, 0.4, 5, 1.5),
@@ -49,13 +51,13 @@ def failed(gates: tuple[Gate, ...]) -> list[str]:
 
 
 def test_a_good_solution_passes_every_gate(solution: Solution) -> None:
-    gates = judge(solution, GOOD)
+    gates = judge(solution, None, CLOCK_S)
     assert failed(gates) == []
     assert sorted(gate.name for gate in gates) == sorted(DEFAULTS), "a gate's id is the name of its limit"
 
 
-def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
-    """Solution and figures that close this gate alone."""
+def spoiled(solution: Solution, name: str) -> tuple[Solution, float]:
+    """Solution and bound of the clocks that close this gate alone."""
     seen, folds = solution.observability, solution.cross_validation
     assert solution.holdout is not None and folds is not None
     other = Explanation(Reading.SHIFTED, 90.0, 1)
@@ -74,15 +76,15 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
         "predicted_error_m": replace(solution, predicted_error_m=0.003),
         "robot_error_m": replace(solution, noise=NoiseScales(0.1, 0.01, 0.0)),
         "robot_error_deg": replace(solution, noise=NoiseScales(0.1, 0.0, 0.02)),
+        "coverage": replace(solution, coverage=0.05),
     }
-    evidence = {"coverage": replace(GOOD, coverage=0.05), "clock_bound_s": replace(GOOD, clock_bound_s=0.05)}
-    return changed.get(name, solution), evidence.get(name, GOOD)
+    return changed.get(name, solution), 0.05 if name == "clock_bound_s" else CLOCK_S
 
 
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_each_gate_closes_alone_and_says_why(solution: Solution, name: str) -> None:
-    bad, evidence = spoiled(solution, name)
-    gates = judge(bad, evidence, GateLimits(arm="fail"))
+    bad, clock_s = spoiled(solution, name)
+    gates = judge(bad, GateLimits(arm="fail"), clock_s)
     assert failed(gates) == [name]
     gate = next(gate for gate in gates if gate.name == name)
     assert gate.remedy and gate.text.endswith(f"FAIL. {gate.remedy}")
@@ -90,7 +92,7 @@ def test_each_gate_closes_alone_and_says_why(solution: Solution, name: str) -> N
 
 
 def test_values_and_limits_are_in_the_units_of_the_file_of_limits(solution: Solution) -> None:
-    gates = {gate.name: (gate.value, gate.limit) for gate in judge(solution, GOOD)}
+    gates = {gate.name: (gate.value, gate.limit) for gate in judge(solution, None, CLOCK_S)}
     assert gates["rotation_deg"] == pytest.approx((np.degrees(1.2), 30))
     assert gates["holdout_share"] == pytest.approx((0.0005 / 0.5, 0.01))
     assert gates["cross_validation"] == pytest.approx((0.0005 / 0.0004 / 1.5, 1.0))
@@ -114,17 +116,17 @@ def test_a_statement_closes_its_gate_by_what_its_tolerance_leaves_unexplained(
 ) -> None:
     for name in ("lens", "board"):
         told = replace(solution, **{f"{name}_finding": Finding(sigmas, pull_m, 0.0005)})
-        assert failed(judge(told, GOOD)) == [f"{name}_pull"] * closed
+        assert failed(judge(told, None, CLOCK_S)) == [f"{name}_pull"] * closed
 
 
 def test_the_certificate_informs_and_closes_nothing(solution: Solution) -> None:
     bad = replace(solution.certificate, certified=False, distance_sigma=40.0)
-    assert failed(judge(replace(solution, certificate=bad), GOOD)) == []
+    assert failed(judge(replace(solution, certificate=bad), None, CLOCK_S)) == []
 
 
 def test_what_cannot_be_judged_is_left_out(solution: Solution) -> None:
-    bare = replace(solution, noise=None, holdout=None, predicted_error_m=None, cross_validation=None)
-    judged = {gate.name for gate in judge(bare, GateInputs())}
+    bare = replace(solution, noise=None, holdout=None, lens_estimated=False, cross_validation=None)
+    judged = {gate.name for gate in judge(bare)}
     assert judged & {"views", "holdout_share", "cross_validation", "coverage", "robot_error_m"} == {"views"}
 
 
@@ -133,7 +135,7 @@ def test_limits_come_from_a_file_and_null_switches_a_gate_off(solution: Solution
     path.write_text("views: 3\nview_rms_px: null\n")
     limits = read_limits(path)
     bad, _ = spoiled(solution, "view_rms_px")
-    assert failed(judge(bad, GOOD, limits)) == []
+    assert failed(judge(bad, limits, CLOCK_S)) == []
     assert limits.views == 3
     assert limits.rotation_deg == GateLimits().rotation_deg
 
@@ -162,7 +164,7 @@ def test_the_documented_defaults_are_those_in_force() -> None:
 def test_an_error_without_the_arm_s_own_is_a_warning_unless_the_integrator_says_more(
     solution: Solution,
 ) -> None:
-    gates = judge(replace(solution, without_arm=True), GOOD)
+    gates = judge(replace(solution, without_arm=True), None, CLOCK_S)
     assert failed(gates) == []
     assert [gate.name for gate in gates if gate.remedy] == ["arm"]
     assert all(gate.narrow for gate in gates if gate.remedy)
@@ -183,7 +185,7 @@ def test_the_pose_to_retake_is_numbered_as_on_the_screen(solution: Solution) -> 
     """From 1, as `station retake` takes it."""
     bad = solution.used[3]
     residual_px = {**solution.residual_px, bad: 9.0}
-    gates = judge(replace(solution, residual_px=residual_px), GOOD)
+    gates = judge(replace(solution, residual_px=residual_px), None, CLOCK_S)
     (gate,) = (gate for gate in gates if not gate.passed)
     assert (gate.name, gate.value, gate.unit) == ("view_rms_px", 9.0, "px")
     assert f"pose {bad + 1}" in gate.remedy

@@ -13,30 +13,22 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.imperfect_cells import table_errors
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import difference, inverse, pose, rotation_exp
+from calibrate.geometry import difference
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.readings import explain_recording
 from calibrate.handeye.solution import Reading
 from calibrate.job import JobOptions, SolvedRecording
-from calibrate.kinematics import MODELS, forward
 from calibrate.pipeline import solve_recording, with_board_poses
 from calibrate.views import ViewSet
 from recordings.importers.folder import import_folder
-from recordings.reader import open_recording
-from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Image, Stamps, View
-from recordings.writer import RecordingWriter
-from station.simulation.renderer import render
-from tests.calibrate.cells import error_mm_deg, inside, inverse_nearest
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
+from tests.calibrate.cells import error_mm_deg, inside
 from tests.calibrate.sessions import (
     CAMERA,
-    LIGHT,
-    PAPER_BOARD,
     SYMMETRIC_BOARD,
     X_TRUE,
     Scene,
-    looking,
     write_session,
 )
 from tests.codes import raises
@@ -195,32 +187,3 @@ def test_options_leave_a_trace_and_threads_do_not(small_session_file: Path) -> N
     job = solve_recording(small_session_file, replace(options, seed=4))
     assert job.calibration.provenance.options == {"working_distance_m": 0.3}
     assert job.calibration.provenance.seed == 4
-
-
-def worn_session(path: Path, seed: int, views: int, errors: float, at_m: list[float]) -> Path:
-    """A UR10 whose table is off by `errors` mm and mrad looks at a board at `at_m`; joints are recorded."""
-    stated, rng = MODELS["UR10"], np.random.default_rng(seed)
-    true = stated.calibrated(*table_errors(np.random.default_rng(5), errors))
-    X, Y = pose(rotation_exp([0.1, -0.1, 0.2]), [0.02, -0.05, 0.11]), pose(rotation_exp([np.pi, 0, 0]), at_m)
-    info = open_recording(write_session(path.with_name(f"of-{path.name}"), Scene(views=4), True)).info
-    with RecordingWriter(path, info) as writer:
-        for k in range(views):
-            joints = None
-            while joints is None:
-                flange = Y @ inverse(looking(PAPER_BOARD, rng)) @ inverse(X)
-                joints = inverse_nearest(stated, flange, (-1.7, -1.7, 2.0, -1.9, -1.57, 0.0))
-            image = render(CAMERA, PAPER_BOARD, inverse(forward(true, joints) @ X) @ Y, LIGHT, rng)
-            stamps = Stamps(k * 10**9, 1_700_000_000_000_000_000 + k * 10**9)
-            writer.image(Image(image, stamps, frame_id=k, sequence=k))
-            said = tuple(map(tuple, forward(stated, joints).tolist()))
-            writer.view(View(k, f"pose-{k}", k, said, stamps=stamps, joints_rad=tuple(joints.tolist())))
-        return writer.finish()
-
-
-def test_a_second_recording_elsewhere_decides_whether_the_table_is_offered(tmp_path: Path) -> None:
-    first = worn_session(tmp_path / "a.mcap", 1, 13, 1.0, [0.1, -0.7, 0.1])
-    same = worn_session(tmp_path / "b.mcap", 2, 7, 1.0, [0.6, -0.5, 0.3])
-    good = solve_recording(first, verify=same).calibration.arm_table
-    assert good is not None and good.verified is not None and good.offered
-    assert good.verified.recording == "b.mcap"
-    assert good.verified.with_table_mm < 0.5 * good.verified.without_table_mm

@@ -142,26 +142,14 @@ def same(found: Array, calibration: Calibration, tolerance: float = 1e-12) -> No
     assert np.abs(found - calibration.transform.matrix).max() < tolerance
 
 
-@pytest.mark.parametrize("name", ["urdf", "halcon", "zivid"])
+@pytest.mark.parametrize("name", READERS)
 def test_beside_a_table_it_is_said_for_which_arm_the_pose_is(calibration: Calibration, name: str) -> None:
     bare = msgspec.structs.replace(calibration, arm_table=None)
     note = "not for the corrected arm"
     assert note in export(calibration, name) and note not in export(bare, name)
 
 
-@pytest.mark.parametrize("name", ["ros-launch", "halcon", "zivid"])
-def test_points_are_where_the_readers_rule_puts_them(
-    calibration: Calibration, tmp_path: Path, name: str
-) -> None:
-    path = tmp_path / "exported"
-    path.write_text(export(calibration, name))
-    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
-    parent_points = points @ calibration.transform.matrix[:3, :3].T + calibration.transform.translation_m
-    found = READERS[name](path, parent_points, parent_of(calibration))
-    np.testing.assert_allclose(found["camera"], points, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["opencv", "halcon", "zivid"])
+@pytest.mark.parametrize("name", [name for name, form in FORMATS.items() if not form.names_robot])
 def test_names_of_robot_frames_are_refused_where_none_is_written(calibration: Calibration, name: str) -> None:
     with raises("frames-of", ExportError):
         export(calibration, name, FrameNames(base="base_link"))

@@ -10,18 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate.chain import chain_of
-from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb, pose, random_rotation
-from calibrate.handeye.arm_result import verify_elsewhere
 from calibrate.handeye.solution import ArmResult, Solution, UncorrectedArm
 from calibrate.handeye.solve import solve_views
 from calibrate.handeye.uncertainty import inverse_of
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.kinematics import MODELS, forward, with_near_axes
-from calibrate.views import BoardView, ViewSet
 from tests.calibrate.cells import MOUNTS, QUICK
 from tests.calibrate.worn_cell import Worn, worn_cell
-from tests.codes import raises
 
 UR10 = MODELS["UR10"]
 CHAIN = chain_of(UR10)
@@ -76,36 +72,6 @@ def test_held_out_poses_elsewhere_say_the_same(solved: Solution) -> None:
     assert missed is not None and missed.shape == (2, 25)
     without, with_table = np.sqrt(np.nanmean(missed**2, axis=1))
     assert with_table < 0.8 * without
-
-
-def elsewhere(worn: Worn) -> ViewSet:
-    """Poses that took no part, seen without noise; the board lies where it lay."""
-    nothing = np.zeros((0, 3)), np.zeros((0, 2))
-    views = (
-        BoardView(i, "", flange, *nothing, q, C)
-        for i, (flange, q, C) in enumerate(
-            zip(forward(UR10, worn.new_joints), worn.new_joints, worn.new_board_poses, strict=True)
-        )
-    )
-    return replace(worn.views, views=tuple(views))
-
-
-def test_a_recording_elsewhere_judges_the_table(worn: Worn, solved: Solution) -> None:
-    verified = table_of(verify_elsewhere(solved, elsewhere(worn), "second.mcap"))
-    as_it_is, corrected = np.sqrt(np.mean(verified.verified_m**2, axis=1))
-    assert verified.offered and corrected < 0.6 * as_it_is
-    assert solved.arm is not None
-    twice = CHAIN.with_errors(-np.array([value for value, _ in solved.arm.errors.values()][:30]))
-    arm = replace(solved.arm, result=replace(table_of(solved), corrected=twice))
-    assert table_of(verify_elsewhere(replace(solved, arm=arm), elsewhere(worn))).refused == "not-better"
-
-
-def test_the_fit_s_own_poses_verify_nothing(worn: Worn, solved: Solution) -> None:
-    with raises("not-elsewhere", BadViewsError):
-        verify_elsewhere(solved, worn.views)
-    bare = replace(elsewhere(worn), views=tuple(replace(v, joints_rad=None) for v in elsewhere(worn)))
-    with raises("not-elsewhere", BadViewsError):
-        verify_elsewhere(solved, bare)
 
 
 def test_a_table_that_fails_elsewhere_is_not_offered(worn: Worn, monkeypatch: pytest.MonkeyPatch) -> None:

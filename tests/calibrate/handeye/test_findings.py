@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.gates import GateInputs, judge
+from calibrate.gates import judge
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import solve_views
@@ -28,7 +28,7 @@ MEASURED = replace(QUICK, board=BoardTolerance(5e-4, 1e-4))
 
 
 def closed(solution):
-    return {gate.name for gate in judge(solution, GateInputs()) if not gate.passed}
+    return {gate.name for gate in judge(solution) if not gate.passed}
 
 
 @MOUNTS
@@ -93,7 +93,7 @@ def test_a_lens_found_from_the_same_pictures_was_never_stated():
     cell = make_cell(np.random.default_rng(2), 15, LOW, refit_camera=True)
     solution = solve_views(cell.views, replace(QUICK, intrinsics_from_same_pictures=True))
     assert solution.lens_finding is None
-    assert "lens_pull" not in {gate.name for gate in judge(solution, GateInputs())}
+    assert "lens_pull" not in {gate.name for gate in judge(solution)}
 
 
 def test_a_principal_point_that_is_off_is_found():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibrate.gates import GateInputs, judge
+from calibrate.gates import judge
 from calibrate.geometry import pose, rotation_exp, transform_points
 from calibrate.handeye.solution import Reading
 from calibrate.handeye.solve import solve_views
@@ -33,7 +33,7 @@ def test_a_move_half_way_is_named_with_its_place_and_does_not_pass(mount, what, 
     solution = solve_views(views, QUICK)
     assert solution.session.reading is (Reading.CAMERA_MOVED if what == "camera" else Reading.BOARD_MOVED)
     assert abs(solution.session.at - 12) <= 1
-    assert "session" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
+    assert "session" in [g.name for g in judge(solution) if not g.passed]
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_a_camera_that_moved_near_the_end_never_passes(at):
     """X of before the move is of no use to anybody now."""
     views, X, _ = moved_cell(1, "eye-in-hand", "camera", at)
     solution = solve_views(views, QUICK)
-    assert inside(solution, X) or [g.name for g in judge(solution, GateInputs()) if not g.passed]
+    assert inside(solution, X) or [g.name for g in judge(solution) if not g.passed]
 
 
 def half_turn(view):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.gates import GateInputs, judge
+from calibrate.gates import judge
 from calibrate.geometry import perturb
 from calibrate.handeye import diagnosis
 from calibrate.handeye import solve as profile_robust
@@ -78,7 +78,7 @@ def test_sound_claims_are_confirmed(mount):
         cv = solution.cross_validation
         assert cv.folds == 5
         assert 0.5 < cv.rms_mm / cv.claimed_mm < cv.limit
-        assert all(g.passed for g in judge(solution, GateInputs()) if g.name == "cross_validation")
+        assert all(g.passed for g in judge(solution) if g.name == "cross_validation")
 
 
 def test_a_claim_that_is_too_small_closes_the_gate(fit, monkeypatch):
@@ -96,7 +96,7 @@ def test_a_claim_that_is_too_small_closes_the_gate(fit, monkeypatch):
     assert honest.rms_mm < honest.limit * honest.claimed_mm
     assert boasted.rms_mm > boasted.limit * boasted.claimed_mm
     solution = replace(solve_views(fit.views, replace(CV, folds=False)), cross_validation=boasted)
-    assert "cross_validation" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
+    assert "cross_validation" in [g.name for g in judge(solution) if not g.passed]
 
 
 def test_five_views_are_too_few_to_leave_some_out():

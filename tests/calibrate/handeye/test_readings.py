@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibrate.errors import PosesDisagreeError
-from calibrate.gates import GateInputs, judge
+from calibrate.gates import judge
 from calibrate.geometry import (
     inverse,
     matrix_from_quaternion,
@@ -171,7 +171,7 @@ def test_a_misread_recording_is_refused_or_closes_the_session_gate(reading, moun
         return
     assert solution.session.reading is reading
     assert reading.value in {remark.code for remark in solution.warnings}
-    assert "session" in [gate.name for gate in judge(solution, GateInputs()) if not gate.passed]
+    assert "session" in [gate.name for gate in judge(solution) if not gate.passed]
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from calibrate.gates import GateInputs, judge
+from calibrate.gates import judge
 from calibrate.handeye.metrics import distance_in_sigmas
 from calibrate.handeye.solve import solve_views
 from tests.calibrate.cells import (
@@ -114,7 +114,7 @@ def test_shuffled_poses_cost_hardly_more_than_their_views(share):
         good = [i for i in range(25) if i not in set(bad)]
         ours.append(error_mm_deg(solution.matrix, c.X)[0])
         oracle.append(error_mm_deg(solve_views(c.views.select(good), QUICK).matrix, c.X)[0])
-        gates = {gate.name: gate.passed for gate in judge(solution, GateInputs())}
+        gates = {gate.name: gate.passed for gate in judge(solution)}
         assert gates["weight"] == (share < 0.2)
     assert np.mean(ours) < 1.15 * np.mean(oracle)
 

@@ -16,15 +16,20 @@ import numpy as np
 from calibrate.geometry import (
     Array,
     inverse,
+    matrix_from_quaternion,
     perturb,
     pose,
     project_to_rotation,
-    random_rotation,
     rotation_exp,
 )
 from calibrate.projection import camera_matrix, project
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
+
+
+def random_rotation(rng: np.random.Generator) -> Array:
+    """Draw a rotation (3, 3), uniform on SO(3)."""
+    return matrix_from_quaternion(rng.normal(size=4))
 
 
 @dataclass(frozen=True)

@@ -232,11 +232,6 @@ def interpolate(first: Array, second: Array, fraction: float) -> Array:
     return pose(R, (1 - fraction) * first[:3, 3] + fraction * second[:3, 3])
 
 
-def random_rotation(rng: np.random.Generator) -> Array:
-    """Draw a rotation (3, 3), uniform on SO(3)."""
-    return matrix_from_quaternion(rng.normal(size=4))
-
-
 def left_jacobian(v: Array) -> Any:
     """Compute the (..., 3, 3) of Exp(v + δ) ≈ Exp(J δ) Exp(v) for rotation vectors (..., 3)."""
     angle = np.linalg.norm(v, axis=-1)[..., None, None]

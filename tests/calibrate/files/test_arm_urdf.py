@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.scene import random_rotation
 from calibrate.chain import Chain, learn_chain
 from calibrate.errors import BadViewsError, CalibrationFileError
 from calibrate.files import exports
@@ -21,7 +22,7 @@ from calibrate.files.calibration import (
     encode_calibration,
 )
 from calibrate.files.exports import ExportError, FrameNames
-from calibrate.geometry import Array, Transform, inverse, pose, random_rotation, rotation_exp
+from calibrate.geometry import Array, Transform, inverse, pose, rotation_exp
 from calibrate.job import SolvedRecording
 from tests.calibrate.chains import ROWS, DhArm
 from tests.calibrate.files.test_exports import calibration as calibration

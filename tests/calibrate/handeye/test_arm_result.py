@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.scene import random_rotation
 from calibrate.chain import chain_of
-from calibrate.geometry import Array, difference, inverse, perturb, pose, random_rotation
+from calibrate.geometry import Array, difference, inverse, perturb, pose
 from calibrate.handeye.solution import ArmResult, Solution, UncorrectedArm
 from calibrate.handeye.solve import solve_views
 from calibrate.handeye.uncertainty import inverse_of

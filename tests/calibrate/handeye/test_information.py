@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks.scene import random_rotation
 from calibrate.boards.model import board_points
-from calibrate.geometry import inverse, perturb, pose, random_rotation, rotation_exp, transform_points
+from calibrate.geometry import inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.handeye.information import (
     MeasurementNoise,
     covariance_of,

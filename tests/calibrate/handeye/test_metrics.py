@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from benchmarks.scene import random_rotation
 from calibrate.errors import DegenerateMotionError
-from calibrate.geometry import perturb, pose, random_rotation, rotation_exp
+from calibrate.geometry import perturb, pose, rotation_exp
 from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.objective import pair_covariance
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs

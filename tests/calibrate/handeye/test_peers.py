@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from calibrate.geometry import inverse, is_rigid, pose, random_rotation, rotation_exp
+from benchmarks.scene import random_rotation
+from calibrate.geometry import inverse, is_rigid, pose, rotation_exp
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs
 from calibrate.handeye.axxb.peer_methods import linear_system, orthonormalised, zhao_minimax

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.scene import random_rotation
 from calibrate.errors import BadViewsError, CalibrationError, DegenerateMotionError, TooFewViewsError
 from calibrate.geometry import (
     Array,
@@ -15,7 +16,6 @@ from calibrate.geometry import (
     perturb,
     pose,
     pose_from_quaternion,
-    random_rotation,
     rotation_exp,
 )
 from calibrate.handeye.solve import SolveOptions, solve_views

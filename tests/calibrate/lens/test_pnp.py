@@ -6,13 +6,13 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.scene import random_rotation
 from calibrate.boards.model import board_from_turned, board_points
 from calibrate.geometry import (
     Array,
     inverse,
     perturb,
     pose,
-    random_rotation,
     rotation_angle,
     transform_points,
 )

@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibrate.geometry import perturb, pose, random_rotation, rotation_exp
+from benchmarks.scene import random_rotation
+from calibrate.geometry import perturb, pose, rotation_exp
 from calibrate.handeye.axxb.certificate import TOLERANCE, _constraints, certify
 from calibrate.handeye.axxb.global_start import solve_global
 from calibrate.handeye.axxb.objective import build_objective

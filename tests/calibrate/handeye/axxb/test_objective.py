@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calibrate.geometry import perturb, pose, random_rotation
+from benchmarks.scene import random_rotation
+from calibrate.geometry import perturb, pose
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
 from tests.calibrate.cells import exact_motions, noisy_pairs

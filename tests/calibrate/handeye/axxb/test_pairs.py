@@ -1,6 +1,7 @@
 import numpy as np
 
-from calibrate.geometry import inverse, pose, random_rotation
+from benchmarks.scene import random_rotation
+from calibrate.geometry import inverse, pose
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses, screw_invariants
 from tests.calibrate.cells import MOUNTS, exact_motions, make_cell
 

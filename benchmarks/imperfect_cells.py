@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from benchmarks.scene import MID, CellNoise, grid
+from benchmarks.scene import MID, grid
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.kinematics import MODELS, forward
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
@@ -92,7 +93,7 @@ def imperfect_cell(
     known: Known | None = None,
     model: LensModel = "plumb_bob",
     views: int = 25,
-    noise: CellNoise = MID,
+    noise: MeasurementNoise = MID,
 ) -> ImperfectCell:
     """One cell. CalibrationError where its lens cannot be found."""
     wrong, known = wrong or Imperfection(), known or Known()

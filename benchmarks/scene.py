@@ -22,6 +22,7 @@ from calibrate.geometry import (
     project_to_rotation,
     rotation_exp,
 )
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.projection import camera_matrix, project
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
@@ -32,16 +33,9 @@ def random_rotation(rng: np.random.Generator) -> Array:
     return matrix_from_quaternion(rng.normal(size=4))
 
 
-@dataclass(frozen=True)
-class CellNoise:
-    corner_px: float
-    robot_m: float
-    robot_rad: float
-
-
-LOW = CellNoise(0.1, 0.05e-3, np.radians(0.005))
-MID = CellNoise(0.2, 0.3e-3, np.radians(0.03))
-HIGH = CellNoise(0.5, 1e-3, np.radians(0.1))
+LOW = MeasurementNoise(0.1, 0.05e-3, np.radians(0.005))
+MID = MeasurementNoise(0.2, 0.3e-3, np.radians(0.03))
+HIGH = MeasurementNoise(0.5, 1e-3, np.radians(0.1))
 
 PAPER_CAMERA = CameraModel(
     1280, 1024, ((8e-3 / 4.8e-6, 0.0, 639.5), (0.0, 8e-3 / 4.8e-6, 511.5), (0.0, 0.0, 1.0)), (0.0,) * 5
@@ -74,7 +68,7 @@ class SceneCell:
 def make_cell(
     rng: np.random.Generator,
     views: int = 25,
-    noise: CellNoise = LOW,
+    noise: MeasurementNoise = LOW,
     *,
     scene: str = "paper",
     mount: Mount = "eye-in-hand",

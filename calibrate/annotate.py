@@ -1,4 +1,4 @@
-"""A calibration drawn into its recording: camera, board, residuals of each view, rejected views in red.
+"""A calibration drawn into its recording: frames, residuals of each view, rejected views in red.
 
 For Foxglove, Lichtblick or rerun. It holds all that the recording holds, so it can be solved
 and exported like it.
@@ -22,14 +22,13 @@ from calibrate.projection import project_pixels
 from calibrate.recorded_views import Progress, load_views
 from calibrate.views import board_in_camera
 from recordings.reader import Recording
-from recordings.schema.messages import CameraModel, Image, Matrix4, View
-from recordings.schema.viewing import DETECTED, Entity, Marks, Polyline
+from recordings.schema.messages import CameraModel, Image, Matrix4
+from recordings.schema.viewing import DETECTED, Marks
 from recordings.writer import RecordingWriter, derived_recording
 
 USED, REJECTED, PREDICTED = DETECTED, (0.95, 0.1, 0.1), (1.0, 0.8, 0.1)
 MAGNIFIED = 50.0
 """Residuals are drawn so many times longer."""
-_CAMERA_DEPTH_M = 0.05
 _FEWEST_VIEWS = 1
 
 
@@ -82,9 +81,6 @@ def annotate(
         copies = _copied(recording, writer)
         for image, of_view, residual in zip(copies, marks, found, strict=True):
             writer.marks(image.sequence, of_view, _text(residual))
-        pairs = zip(recording.views(), found, strict=True)
-        cameras = [_camera_entity(calibration, camera, view, residual) for view, residual in pairs]
-        writer.scene(0, [_board_entity(calibration), *cameras])
         writer.finish()
     return found
 
@@ -137,29 +133,3 @@ def _text(view: ViewResidual) -> str:
         else f"{view.rms_px:.2f} px RMS, lines {MAGNIFIED:.0f} times as long"
     )
     return f"pose {view.index + 1}: {said}" + (f", REJECTED: {view.rejected}" if view.rejected else "")
-
-
-def _board_entity(calibration: Calibration) -> Entity:
-    points = board_points(calibration.board)
-    low, high = points.min(axis=0), points.max(axis=0)
-    outline = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]], low[:2]])
-    line = Polyline(np.column_stack([outline, np.zeros(5)]), (0.2, 0.5, 1.0, 1.0))
-    return Entity("board", calibration.board_place.child_frame, (line,), "board")
-
-
-def _camera_entity(
-    calibration: Calibration, camera: CameraModel, view: View, residual: ViewResidual
-) -> Entity:
-    """A small pyramid: eye-in-hand where the camera was, eye-to-hand where the flange was."""
-    assert camera.matrix is not None
-    K = np.array(camera.matrix)
-    corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height], [0, 0]])
-    rays = np.column_stack([(corners - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(5)]) * _CAMERA_DEPTH_M
-    spokes = np.stack([np.zeros((4, 3)), rays[:4]], axis=1).reshape(-1, 3)
-    T = np.array(view.base_from_flange)
-    if calibration.mount == "eye-in-hand":
-        T = T @ calibration.transform.matrix
-    colour = (*(REJECTED if residual.rejected else USED), 1.0)
-    lines = tuple(Polyline(points @ T[:3, :3].T + T[:3, 3], colour, 0.0015) for points in (rays, spokes))
-    at = T[:3, 3]
-    return Entity(f"pose {view.index + 1}", "base", lines, str(view.index + 1), (at[0], at[1], at[2]))

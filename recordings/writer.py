@@ -161,11 +161,6 @@ class RecordingWriter:
         if (time_ns := self._images.get(sequence)) is not None:
             self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
 
-    def scene(self, sequence: int, entities: Sequence[viewing.Entity]) -> None:
-        """Shapes in space as they are at a recorded image's time, for viewers."""
-        time_ns = self._images[sequence]
-        self._show(Topic.SCENE, viewing.scene_update(entities, time_ns), time_ns)
-
     def frame(
         self, parent: str, child: str, parent_from_child: Matrix4, stamps: Stamps | None = None
     ) -> None:

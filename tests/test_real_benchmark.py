@@ -9,8 +9,9 @@ from benchmarks.mistakes import MISTAKES, Mistake, Said, named_truly
 from benchmarks.real import charge, left_out_error_m, paired_bootstrap
 from benchmarks.real_methods import calibration_rs, opencv, ours
 from benchmarks.real_sets import RealSet
-from benchmarks.scene import CellNoise, make_cell
+from benchmarks.scene import make_cell
 from calibrate.geometry import difference
+from calibrate.handeye.noise_scales import MeasurementNoise
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
 
 
@@ -31,7 +32,7 @@ def test_equal_errors_give_a_ratio_of_one_and_better_ones_stay_below() -> None:
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_every_method_answers_in_our_frames_and_predicts_the_board(mount: Mount) -> None:
-    cell = make_cell(np.random.default_rng(3), 14, CellNoise(0.02, 1e-5, 1e-5), mount=mount)
+    cell = make_cell(np.random.default_rng(3), 14, MeasurementNoise(0.02, 1e-5, 1e-5), mount=mount)
     board, views = BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025), cell.views
     answers = {"ours": ours(views, board)} | opencv(views, board) | calibration_rs(views)
     assert len(answers) == 1 + 2 * 7 + 1, "the lens is given: OpenCV's seven twice"

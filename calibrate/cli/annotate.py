@@ -20,8 +20,8 @@ def annotate(
 ) -> None:
     """Draw a calibration into a recording, for Foxglove, Lichtblick or rerun.
 
-    Camera, board and every view in space; over each image its corners, and lines to where the calibration
-    predicts them. Rejected views are red.
+    Frames of camera and board; over each image its corners, and lines to where the calibration predicts
+    them. Rejected views are red.
     """
     source = open_recording(recording)
     with detection_progress() as progress:

@@ -21,10 +21,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from calibrate.handeye.information import MeasurementNoise as MeasurementNoise
     from calibrate.handeye.information import covariance_of as covariance_of
     from calibrate.handeye.information import prior_information as prior_information
     from calibrate.handeye.information import view_information as view_information
+    from calibrate.handeye.noise_scales import MeasurementNoise as MeasurementNoise
     from calibrate.handeye.peers import compare_all as compare_all
     from calibrate.handeye.priors import BoardTolerance as BoardTolerance
     from calibrate.handeye.solution import Solution as Solution
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from calibrate.views import ViewSet as ViewSet
 
 _MODULES = {
-    "calibrate.handeye.information": "MeasurementNoise covariance_of prior_information view_information",
+    "calibrate.handeye.information": "covariance_of prior_information view_information",
+    "calibrate.handeye.noise_scales": "MeasurementNoise",
     "calibrate.handeye.peers": "compare_all",
     "calibrate.handeye.priors": "BoardTolerance",
     "calibrate.handeye.solution": "Solution SolveOptions",

@@ -10,8 +10,6 @@ X = flange_from_camera, Y = base_from_board (eye-in-hand), or X = base_from_came
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -19,6 +17,7 @@ from calibrate.geometry import Array
 from calibrate.handeye.cell_state import CellState, Layout
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.metrics import point_error_m
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.projection import camera_matrix
 from calibrate.results import SHAPE
@@ -31,15 +30,6 @@ _LINK_ERRORS = 30
 """Errors of the links of an arm with six joints, as in `Chain.by_links`."""
 _POSE_PRECISION = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 """Prior of a pose, 1 m and about 3 rad: practically none, but the first few views get a finite sigma."""
-
-
-@dataclass(frozen=True)
-class MeasurementNoise:
-    """Standard deviations of corner and robot noise, per axis."""
-
-    pixel_px: float = 0.15
-    robot_m: float = 0.0001
-    robot_rad: float = 0.00017
 
 
 USUAL_NOISE = MeasurementNoise()
@@ -79,12 +69,12 @@ def view_information(
     state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), np.zeros(errors.shape[2]))
     linear = Linear.at(observed, state, observed.present, information=1.0)
     robot = np.repeat([noise.robot_m, noise.robot_rad], 3) ** 2
-    W = np.linalg.inv(noise.pixel_px**2 * linear.B + np.diag(robot))
+    W = np.linalg.inv(noise.corner_px**2 * linear.B + np.diag(robot))
     J_t = np.swapaxes(linear.J, 1, 2)
     information = J_t @ W @ linear.J
     if linear.modes is not None:
         shared = linear.modes.shared
-        information[:, shared, shared] += linear.modes.free.information / noise.pixel_px**2
+        information[:, shared, shared] += linear.modes.free.information / noise.corner_px**2
     return np.asarray(information)
 
 

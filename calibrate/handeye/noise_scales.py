@@ -23,6 +23,15 @@ MODE_COUNT = 4.0
 """Weight, in residuals, of the prior that τ is about λ or larger."""
 
 
+@dataclass(frozen=True)
+class MeasurementNoise:
+    """Noise of corners and robot, 1σ per axis."""
+
+    corner_px: float = 0.15
+    robot_m: float = 0.0001
+    robot_rad: float = 0.00017
+
+
 @dataclass(frozen=True, eq=False)
 class Scales:
     """Scales (1σ) of the noise of robot and corners, and the shares of the noise classes."""

@@ -16,6 +16,7 @@ from calibrate.chain import Chain
 from calibrate.errors import require_choice
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.metrics import Observability
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.kinematics import RobotModel
 from calibrate.results import (
@@ -90,16 +91,6 @@ class Finding:
     def unexplained_m(self) -> float:
         """The part of `pull_m` that the stated value's tolerance does not explain."""
         return float(self.pull_m * np.maximum(0.0, 1.0 - _EXPLAINED / np.maximum(self.sigmas, 1e-9)))
-
-
-@dataclass(frozen=True)
-class NoiseScales:
-    """Noise estimated from the residuals (restricted maximum likelihood), 1σ."""
-
-    corner_px: float
-    """Of a corner per axis: only the smooth part of the corner errors, which moves the board's pose."""
-    robot_m: float
-    robot_rad: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +244,8 @@ class Solution:
     """(p, p) of `projection.intrinsics_names`."""
     board: BoardShape | None = None
     board_finding: Finding | None = None
-    noise: NoiseScales | None = None
+    noise: MeasurementNoise | None = None
+    """By restricted maximum likelihood; of corners only the smooth part, which moves the board's pose."""
     error_shares: dict[str, float] = field(default_factory=dict)
     arm: ArmErrors | None = None
     without_arm: bool = False

@@ -42,6 +42,7 @@ from calibrate.handeye.metrics import (
     require_solvable,
     score_holdout,
 )
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.pose_fit import pose_views
 from calibrate.handeye.posterior import posterior_of
 from calibrate.handeye.priors import LensPrior, Priors
@@ -50,7 +51,6 @@ from calibrate.handeye.reprojection import corner_distance, corner_residuals
 from calibrate.handeye.solution import (
     ArmErrors,
     Explanation,
-    NoiseScales,
     Reading,
     Solution,
     SolveOptions,
@@ -169,7 +169,7 @@ def _describe(fit: CellFit, options: SolveOptions) -> Solution:
         lens_covariance=found.covariance[at.lens, at.lens] if seen else None,
         board=_board(fit, found.covariance[at.shape, at.shape]) if seen else None,
         board_finding=board_finding,
-        noise=NoiseScales(found.scales.tau_px, *(float(s) for s in found.scales.robot)),
+        noise=MeasurementNoise(found.scales.tau_px, *(float(s) for s in found.scales.robot)),
         error_shares=error_shares(fit, by_unknown_arm),
         arm=arm,
         without_arm=fit.arm is None and not stated.any(),

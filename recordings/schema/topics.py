@@ -12,7 +12,6 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap_protobuf.schema import build_file_descriptor_set
 
@@ -35,7 +34,6 @@ class Topic(StrEnum):
     BOARD_TRANSFORM = "/tf_static/board"
     JOINTS = "/joint_states"
     ANNOTATIONS = "/camera/annotations"
-    SCENE = "/scene"
     LOG = "/log"
 
 
@@ -53,7 +51,6 @@ _MESSAGES: dict[Topic, Any] = {
     Topic.BOARD_TRANSFORM: FrameTransform,
     Topic.JOINTS: JointStates,
     Topic.ANNOTATIONS: ImageAnnotations,
-    Topic.SCENE: SceneUpdate,
     Topic.LOG: Log,
 }
 

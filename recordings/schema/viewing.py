@@ -14,11 +14,9 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
-from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -183,46 +181,3 @@ def quaternion_xyzw(transform: Matrix4) -> tuple[float, float, float, float]:
     """Quaternion of a rigid transform, w ≥ 0."""
     x, y, z, w = Rotation.from_matrix(np.array(transform)[:3, :3]).as_quat(canonical=True).tolist()
     return x, y, z, w
-
-
-Colour = tuple[float, float, float, float]
-"""Red, green, blue, opacity, each 0…1."""
-
-
-@dataclass(frozen=True, eq=False)
-class Polyline:
-    """Points (n, 3) joined by a line, in the entity's frame, metres."""
-
-    points: NDArray[np.float64]
-    colour: Colour
-    width_m: float = 0.003
-
-
-@dataclass(frozen=True)
-class Entity:
-    """Things that appear together; one of the same name later replaces it."""
-
-    name: str
-    frame: str
-    lines: tuple[Polyline, ...] = ()
-    text: str = ""
-    text_at_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-def scene_update(entities: Sequence[Entity], time_ns: int) -> Any:
-    """Shapes in space, for a 3D panel."""
-    update = SceneUpdate()
-    for entity in entities:
-        made = update.entities.add(id=entity.name, frame_id=entity.frame)
-        _stamp(made, time_ns)
-        for line in entity.lines:
-            shape = made.lines.add(type=LinePrimitive.LINE_STRIP, thickness=line.width_m)
-            shape.pose.orientation.w = 1.0
-            shape.color.r, shape.color.g, shape.color.b, shape.color.a = line.colour
-            for x, y, z in line.points:
-                shape.points.add(x=x, y=y, z=z)
-        if entity.text:
-            label = made.texts.add(text=entity.text, font_size=0.02, billboard=True)
-            label.pose.position.x, label.pose.position.y, label.pose.position.z = entity.text_at_m
-            label.pose.orientation.w = label.color.a = 1.0
-    return update

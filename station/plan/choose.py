@@ -13,11 +13,11 @@ from calibrate.chain import chain_of
 from calibrate.geometry import Array
 from calibrate.handeye.information import (
     USUAL_NOISE,
-    MeasurementNoise,
     covariance_of,
     prior_information,
     view_information,
 )
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.workspace import Workspace, sample_workspace
 from calibrate.projection import intrinsics_names

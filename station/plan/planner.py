@@ -10,8 +10,9 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.handeye.information import USUAL_NOISE, MeasurementNoise, predicted_error_m
+from calibrate.handeye.information import USUAL_NOISE, predicted_error_m
 from calibrate.handeye.metrics import median_distance_m
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.kinematics import forward
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError

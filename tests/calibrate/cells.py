@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike
 
 from benchmarks.scene import HIGH as HIGH
 from benchmarks.scene import LOW as LOW
-from benchmarks.scene import MID, PAPER_CAMERA, CellNoise, SceneCell, make_cell, random_rotation
+from benchmarks.scene import MID, PAPER_CAMERA, SceneCell, make_cell, random_rotation
 from calibrate.geometry import Array, difference, perturb, pose
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.kinematics import RobotModel, inverse_many
 from calibrate.lens.pnp import solve_pnp
@@ -21,7 +22,7 @@ from calibrate.projection import project_pixels
 from calibrate.views import BoardView, ViewSet, implied_flange
 from recordings.schema.messages import CameraModel, Mount
 
-NONE = CellNoise(0.0, 0.0, 0.0)
+NONE = MeasurementNoise(0.0, 0.0, 0.0)
 QUICK = SolveOptions(holdout=False, folds=False)
 MOUNTS = pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 LENSES = {
@@ -65,7 +66,7 @@ def printed(points: Array, shape: tuple[float, ...]) -> Array:
 def real_cell(
     rng: np.random.Generator,
     views: int = 20,
-    noise: CellNoise = MID,
+    noise: MeasurementNoise = MID,
     *,
     mount: Mount = "eye-in-hand",
     camera: CameraModel = PAPER_CAMERA,
@@ -126,7 +127,7 @@ def changed(views: ViewSet, places: list[int], **fields) -> ViewSet:  # type: ig
 
 
 def slipped(
-    cell: SceneCell, what: str, at: int, slip: Array, noise: CellNoise, rng: np.random.Generator
+    cell: SceneCell, what: str, at: int, slip: Array, noise: MeasurementNoise, rng: np.random.Generator
 ) -> tuple[ViewSet, Array, Array]:
     """Views, X and the board's pose after camera or board slipped before view `at`: other robot poses."""
     X, Y = (perturb(cell.X, slip), cell.Y) if what == "camera" else (cell.X, perturb(cell.Y, slip))

@@ -46,8 +46,6 @@ def test_the_command_writes_the_result_beside_the_pictures(tmp_path: Path, solve
     assert len(marks) == 25
     assert len(marks[0].points[0].points) == 42, "every corner"
     assert len(marks[0].points[1].points) == 84, "and a line from each"
-    ((_, scene),) = shown(path, "/scene")
-    assert len(scene.entities) == 26, "the board, and where the camera was in each view"
     again, original = open_recording(path), open_recording(SAMPLE)
     assert list(again.robot_states()) == list(original.robot_states())
     for (_, ours), (_, theirs) in zip(again.images(), original.images(), strict=True):

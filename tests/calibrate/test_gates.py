@@ -13,7 +13,8 @@ import pytest
 from calibrate.errors import UsageError
 from calibrate.files.formatting import figures
 from calibrate.gates import GateLimits, judge, read_limits
-from calibrate.handeye.solution import Explanation, Finding, NoiseScales, Reading, Solution
+from calibrate.handeye.noise_scales import MeasurementNoise
+from calibrate.handeye.solution import Explanation, Finding, Reading, Solution
 from calibrate.job import SolvedRecording
 from calibrate.results import CrossValidation, Gate, HoldoutScore, Remark
 from tests.codes import raises
@@ -27,7 +28,7 @@ def solution(solved_real: SolvedRecording) -> Solution:
     """One that every gate lets through."""
     found = solved_real.solution
     holdout = HoldoutScore(0.0005, 0.001, [0.0005], [0.001], [(0, 1)], 12)
-    noise = NoiseScales(0.1, 0.0001, 0.0002)
+    noise = MeasurementNoise(0.1, 0.0001, 0.0002)
     return replace(
         found,
         holdout=holdout,
@@ -74,8 +75,8 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, float]:
         "view_rms_px": replace(solution, residual_px={3: 9.0}),
         "holdout_share": replace(solution, holdout=msgspec.structs.replace(solution.holdout, e_t_m=0.02)),
         "predicted_error_m": replace(solution, predicted_error_m=0.003),
-        "robot_error_m": replace(solution, noise=NoiseScales(0.1, 0.01, 0.0)),
-        "robot_error_deg": replace(solution, noise=NoiseScales(0.1, 0.0, 0.02)),
+        "robot_error_m": replace(solution, noise=MeasurementNoise(0.1, 0.01, 0.0)),
+        "robot_error_deg": replace(solution, noise=MeasurementNoise(0.1, 0.0, 0.02)),
         "coverage": replace(solution, coverage=0.05),
     }
     return changed.get(name, solution), 0.05 if name == "clock_bound_s" else CLOCK_S

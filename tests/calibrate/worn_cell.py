@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.imperfect_cells import table_errors
-from benchmarks.scene import LOW, PAPER_X, CellNoise, grid, make_cell, view_set
+from benchmarks.scene import LOW, PAPER_X, grid, make_cell, view_set
 from benchmarks.trials import rms
 from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.kinematics import MODELS, forward
 from calibrate.projection import project
 from calibrate.views import ViewSet
@@ -37,7 +38,7 @@ def worn_cell(rng: np.random.Generator, size_mm: float) -> Worn:
     true = forward(_MODEL.calibrated(*table_errors(rng, size_mm)), joints)
     C = inverse(PAPER_X) @ inverse(true) @ Y
     error = difference(true, forward(_MODEL, joints))[:, :3]
-    camera, board = make_cell(rng, 1, CellNoise(0, 0, 0)).camera, grid(7, 6, 0.025)
+    camera, board = make_cell(rng, 1, MeasurementNoise(0, 0, 0)).camera, grid(7, 6, 0.025)
     seen = project(camera, board @ np.swapaxes(C[:25, :3, :3], 1, 2) + C[:25, None, :3, 3]).pixels
     pixels = seen + LOW.corner_px * rng.normal(size=seen.shape)
     repeatability = rng.normal(size=(25, 6)) * np.repeat([LOW.robot_m, LOW.robot_rad], 3)
@@ -52,7 +53,7 @@ def worn_cell(rng: np.random.Generator, size_mm: float) -> Worn:
 def _reachable(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
     """Joints (count, 6) that look at a board lying in front of the arm, and base_from_board."""
     while True:
-        C = make_cell(rng, 2 * count, CellNoise(0, 0, 0), with_pnp=False).C
+        C = make_cell(rng, 2 * count, MeasurementNoise(0, 0, 0), with_pnp=False).C
         turn = rotation_exp([np.pi, 0, 0]) @ rotation_exp([0, 0, rng.uniform(-np.pi, np.pi)])
         Y = pose(turn, [rng.uniform(0.5, 0.8), rng.uniform(-0.3, 0.3), rng.uniform(-0.1, 0.1)])
         found = [inverse_nearest(_MODEL, flange, _HOME) for flange in Y @ inverse(C) @ inverse(PAPER_X)]

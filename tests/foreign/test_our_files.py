@@ -9,7 +9,7 @@ import pytest
 
 from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, Stamps
-from recordings.schema.viewing import DETECTED, Entity, Marks, Polyline
+from recordings.schema.viewing import DETECTED, Marks
 from recordings.writer import RecordingWriter
 from tests.foreign.judges import JUDGES, rerun
 from tests.recordings.small_recording import START_NS, TURNED, make_info, make_picture, make_state, make_view
@@ -33,8 +33,6 @@ def fresh(folder: Path) -> Path:
             writer.marks(index, [Marks(np.zeros((2, 2)), DETECTED, np.ones((2, 2)))], "0.1 px")
             writer.view(_at(make_view(index), Stamps(now_ns, START_NS + now_ns - 5_000_000)))
             writer.event(CaptureEvent(stamps, "captured", pose_index=index))
-        line = Polyline(np.zeros((2, 3)), (1.0, 0.0, 0.0, 1.0))
-        writer.scene(0, [Entity("board", "base", (line,), "board")])
         writer.frame("flange", "camera", TURNED)
         return writer.finish()
 

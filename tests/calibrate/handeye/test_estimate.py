@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import difference
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solve import solve_views
 from calibrate.projection import intrinsics_vector
@@ -17,7 +18,6 @@ from tests.calibrate.cells import (
     MOUNTS,
     NONE,
     QUICK,
-    CellNoise,
     changed,
     error_mm_deg,
     inside,
@@ -139,9 +139,9 @@ def test_wrong_corners_hardly_move_it():
 @pytest.mark.parametrize(
     ("noise", "expected"),
     [
-        (CellNoise(0.6, 1e-5, 1e-5), "corners"),
-        (CellNoise(0.02, 1e-3, 1e-5), "robot_translation"),
-        (CellNoise(0.02, 1e-5, 2e-3), "robot_rotation"),
+        (MeasurementNoise(0.6, 1e-5, 1e-5), "corners"),
+        (MeasurementNoise(0.02, 1e-3, 1e-5), "robot_translation"),
+        (MeasurementNoise(0.02, 1e-5, 2e-3), "robot_rotation"),
     ],
 )
 def test_the_dominant_source_of_noise_is_named(noise, expected):

@@ -8,12 +8,12 @@ from benchmarks.scene import random_rotation
 from calibrate.boards.model import board_points
 from calibrate.geometry import inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.handeye.information import (
-    MeasurementNoise,
     covariance_of,
     predicted_error_m,
     prior_information,
     view_information,
 )
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.projection import intrinsics_vector, project, with_intrinsics_vector
@@ -46,7 +46,7 @@ def test_the_predicted_sigma_is_the_one_that_the_solver_states(mount):
     """25 views of a simulated cell: their geometry alone says what the estimate will claim."""
     cell = make_cell(np.random.default_rng(4), 25, MID, mount=mount)
     solution = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
-    noise = MeasurementNoise(MID.corner_px, MID.robot_m, MID.robot_rad)
+    noise = MID
     points = cell.views.views[0].board_points
     each = view_information(mount, cell.camera, cell.flange, cell.X, cell.Y, points, noise)
     prior = prior_information(cell.camera, True, BoardTolerance())

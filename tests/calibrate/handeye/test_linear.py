@@ -8,11 +8,11 @@ import pytest
 from calibrate.geometry import perturb
 from calibrate.handeye.cell_state import CellState, Layout, flange_residuals
 from calibrate.handeye.linear import Linear
-from calibrate.handeye.noise_scales import Scales
+from calibrate.handeye.noise_scales import MeasurementNoise, Scales
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.reprojection import corner_residuals
 from calibrate.views import observe_views
-from tests.calibrate.cells import LENSES, MID, MOUNTS, CellNoise, changed, make_cell, real_cell
+from tests.calibrate.cells import LENSES, MID, MOUNTS, changed, make_cell, real_cell
 
 ONE_CLASS = np.array([1.0, 1e-300, 1e-300, 1e-300])
 VIEWS = 5
@@ -124,7 +124,7 @@ def test_noise_scales_come_out_as_they_went_in():
 
 
 def test_an_unclear_view_costs_information_but_never_more_than_it_tells():
-    cell = make_cell(np.random.default_rng(0), 12, CellNoise(0.1, 1e-4, 1e-4))
+    cell = make_cell(np.random.default_rng(0), 12, MeasurementNoise(0.1, 1e-4, 1e-4))
     observed = observe_views(cell.views)
     for size in (0.0, 4.0, 100.0):
         flange = observed.flange.copy()

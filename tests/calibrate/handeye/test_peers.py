@@ -8,9 +8,10 @@ from calibrate.geometry import inverse, is_rigid, pose, rotation_exp
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs
 from calibrate.handeye.axxb.peer_methods import linear_system, orthonormalised, zhao_minimax
+from calibrate.handeye.noise_scales import MeasurementNoise
 from calibrate.handeye.peers import compare_all, reprojection_px
 from calibrate.handeye.solve import SolveOptions, solve_views
-from tests.calibrate.cells import LOW, MID, MOUNTS, CellNoise, error_mm_deg, make_cell
+from tests.calibrate.cells import LOW, MID, MOUNTS, error_mm_deg, make_cell
 
 NAMES = [
     "Tsai-Lenz", "Park-Martin", "Horaud", "Andreff", "Daniilidis", "Shah", "Li", "Zhao CO", "Zhao CO + SVD",
@@ -20,7 +21,7 @@ NAMES = [
 
 @MOUNTS
 def test_all_methods_agree_on_nearly_clean_views(mount):
-    cell = make_cell(np.random.default_rng(0), 14, CellNoise(1e-3, 1e-7, 1e-7), mount=mount)
+    cell = make_cell(np.random.default_rng(0), 14, MeasurementNoise(1e-3, 1e-7, 1e-7), mount=mount)
     rows = compare_all(cell.views)
     assert [row.name for row in rows] == NAMES
     for row in rows:
@@ -97,7 +98,7 @@ def test_the_minimax_solution_has_the_smallest_largest_residual():
 
 
 def test_reprojection_at_the_truth_is_the_corner_noise():
-    cell = make_cell(np.random.default_rng(4), 20, CellNoise(0.3, 0.0, 0.0))
+    cell = make_cell(np.random.default_rng(4), 20, MeasurementNoise(0.3, 0.0, 0.0))
     assert reprojection_px(cell.views, cell.X) == pytest.approx(0.3 * np.sqrt(2), rel=0.05)
     wrong = pose(random_rotation(np.random.default_rng(0)), [0, 0, 0])
     assert reprojection_px(cell.views, wrong) > 50

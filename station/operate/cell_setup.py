@@ -102,7 +102,7 @@ class CellSetup:
     def _found(self, same: bool, **values: object) -> None:
         """Keep what a device tells; views of another device count no more."""
         if not same:
-            values = {"views": (), "written": "", **values}
+            values = {"views": (), **values}
         self.keep(msgspec.structs.replace(self.draft, **values))
         self.guide = None
 
@@ -138,12 +138,12 @@ class CellSetup:
             return False
         flange = np.array(flange_pose(arm.latest(), arm.identity.tcp_offset))
         view = CapturedView(len(draft.views), flange, seen.indices, seen.pixels)
-        self.change(views=(*draft.views, view), written="")
+        self.change(views=(*draft.views, view))
         guide.taken(True)
         return True
 
     def drop_view(self) -> None:
-        self.change(views=self.draft.views[:-1], written="")
+        self.change(views=self.draft.views[:-1])
 
     def correct_mount(self) -> bool:
         """Take the other mounting where the views fit it far better; tell whether they did."""
@@ -157,15 +157,14 @@ class CellSetup:
     def set_mount(self) -> None:
         """Save the selected mounting."""
         if self.draft.mount != self.mount:
-            self.change(mount=self.mount, written="")
+            self.change(mount=self.mount)
 
     def set_board(self, board: BoardSpec) -> None:
         """Save the board; views stay when only its sizes are others."""
         self.seen, before = None, self.draft.board
         sizes = {"square_m": board.square_m, "marker_m": board.marker_m}
-        self._found(
-            before is not None and msgspec.structs.replace(before, **sizes) == board, board=board, written=""
-        )
+        same = before is not None and msgspec.structs.replace(before, **sizes) == board
+        self._found(same, board=board)
 
     async def stop(self) -> None:
         if self.arm is not None:

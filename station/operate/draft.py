@@ -115,8 +115,6 @@ class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
     views: tuple[CapturedView, ...] = ()
     table_m: float | None = None
     """Height of the table in `base`; None: derived from the board."""
-    written: str = ""
-    """Path of the written configuration; empty: not written yet."""
 
     @property
     def posted(self) -> str:

@@ -86,8 +86,6 @@ def summary(draft: Draft, step: CellStep) -> str:
             return board_words(draft.board)
         case CellStep.VIEWS if draft.views:
             return f"{len(draft.views)} of {max(FEWEST_GUIDED, len(draft.views))}"
-        case CellStep.SAVE if draft.written:
-            return Path(draft.written).name
     return ""
 
 

@@ -23,7 +23,7 @@ from textual.screen import Screen
 
 from station.cell.errors import StationError
 from station.cell.status import MotionPreview, StationState
-from station.operate.motion import prepared_motion
+from station.operate.motion import PREPARE_S, prepared_motion
 from station.protocol import verbs
 from station.protocol.client import Client, who_am_i
 from station.protocol.states import RUNNING
@@ -37,7 +37,7 @@ from station.tui.installed import Marks, marks, read_result, read_sessions, stat
 from station.tui.jobs import check_drift, solve_session
 from station.tui.live_page import SIDE_PX, LivePageApp, news_of
 from station.tui.log_screen import LogScreen
-from station.tui.plan_screen import PlanScreen
+from station.tui.plan_screen import NEW_PLAN, PlanScreen
 from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
@@ -75,7 +75,7 @@ class StationApp(LivePageApp[None], KnowingApp):
     DEFAULT_MODE = "capture"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", show=False, priority=True, tooltip="Stop the arm now"),
-        Binding("f5", "run", "Run", tooltip="Check the path, show the motion, and ask"),
+        Binding("f5", "run", "Run", tooltip="Plan if there is no plan, show the motion, and ask"),
         Binding("f6", "ask('pause')", "Pause", tooltip="Stop after this pose"),
         Binding("f7", "finish", "Finish", tooltip="Finish with the poses so far"),
         Binding("f8", "acknowledge", "Acknowledge", show=False, priority=True, tooltip=ACKNOWLEDGE),
@@ -218,8 +218,12 @@ class StationApp(LivePageApp[None], KnowingApp):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_run(self) -> None:
-        """Start the plan, or go on with a session that is paused."""
-        paused = self.known.live is not None and self.known.live.state is StationState.PAUSED
+        """Start the plan, made now where there is none, or go on with a session that is paused."""
+        status = self.known.live
+        paused = status is not None and status.state is StationState.PAUSED
+        if status is not None and not status.session.poses and not status.robot.by_hand:
+            if await self.desk.ask(NEW_PLAN, timeout_s=PREPARE_S) is None:
+                return
         wanted = Purpose.RESUME if paused else Purpose.RUN
         begun = prepared_motion(
             self.desk.client, verbs.Prepare(wanted), self.approves, plans_here=self.plans_here

@@ -95,7 +95,7 @@ class NewCell(LivePageApp[Ending]):
             yield PreviewPane(id="picture")
             with VerticalScroll(id="text"):
                 yield Static(id="written", markup=False)
-        yield Footer()
+        yield Footer(compact=True, show_command_palette=False)
 
     def on_mount(self) -> None:
         self.watch_step()
@@ -192,7 +192,8 @@ class NewCell(LivePageApp[Ending]):
     # --- keys ---
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        return ONLY_IN.get(action, self.step) is self.step
+        rehearsed = action == "rehearse" and self.setup.draft.posted
+        return ONLY_IN.get(action, self.step) is self.step and not rehearsed
 
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
@@ -231,7 +232,7 @@ class NewCell(LivePageApp[Ending]):
         self.action_accept(self.setup.cameras[event.option_index])
 
     @work(group="accept", exclusive=True, exit_on_error=False)
-    async def action_accept(self, chosen: CameraChoice | None = None) -> None:
+    async def action_accept(self, chosen: CameraChoice | None = None, ending: Ending = "serve") -> None:
         step = self.step
         if step is CellStep.ROBOT:
             self._say("#live-lines", "Asking the controller …")
@@ -241,14 +242,13 @@ class NewCell(LivePageApp[Ending]):
             if not await accept(self.setup, step, self.query_one("#typed", Input).value.strip()):
                 self.watch_step()
             elif step is CellStep.SAVE:
-                self.exit("serve")
+                self.exit(ending)
             else:
                 after = STEPS[STEPS.index(step) + 1]
                 self.step = CellStep.SAVE if after is CellStep.VIEWS and self.setup.draft.posted else after
 
     def action_rehearse(self) -> None:
-        if self.setup.draft.written and not self.setup.draft.posted:
-            self.exit("rehearse")
+        self.action_accept(ending="rehearse")
 
     def action_open_live(self) -> None:
         self.open_live_page()
@@ -259,7 +259,7 @@ class NewCell(LivePageApp[Ending]):
 
     def action_table_here(self) -> None:
         if self.setup.state is not None:
-            self.setup.change(table_m=float(self.setup.state.tcp_pose[2]), written="")
+            self.setup.change(table_m=float(self.setup.state.tcp_pose[2]))
             self.watch_step()
 
     # --- what is shown ---
@@ -313,7 +313,7 @@ class NewCell(LivePageApp[Ending]):
 
     def _rail(self) -> tuple[Step, ...]:
         draft = self.setup.draft
-        reached = STEPS.index(flow.next_step(draft)) + bool(draft.written)
+        reached = STEPS.index(flow.next_step(draft))
         return tuple(
             Step(
                 step,

@@ -64,7 +64,8 @@ PAGES = {
     CellStep.SAVE: Page(
         "Where may the arm move? Write the configuration",
         "The workspace lies around the guided views. Type the table's height if it is another (F7: as the "
-        "tool is now). Enter writes the file below. Nothing moves.",
+        "tool is now). Enter writes the file below and opens the cell, F9 rehearses the whole job in "
+        "simulation first. Nothing moves.",
         ("#typed", "#text"),
         "table's height over the arm's base, mm; empty: as shown",
     ),
@@ -81,10 +82,9 @@ STILL_CELLS = 30
 _TINY_M = 0.005
 """Squares below this size are rare: the number may be one of centimetres."""
 POSTED_SAVE = (
-    "You move this arm: no views and no limits are asked for. Enter writes the file below. Then open the "
-    "cell, start the program that posts its pose (docs: Any arm), and press F3."
+    "You move this arm: no views and no limits are asked for. Enter writes the file below and opens the "
+    "cell. Then start the program that posts the arm's pose (docs: Any arm), and press F3."
 )
-WRITTEN = "Written. F9 rehearses the whole job in simulation, Enter opens the cell."
 
 
 def about(setup: CellSetup, step: CellStep) -> str:
@@ -94,8 +94,8 @@ def about(setup: CellSetup, step: CellStep) -> str:
         return REMOTE_ON
     if step is CellStep.SAVE and setup.draft.posted:
         return POSTED_SAVE
-    if step is CellStep.SAVE and setup.draft.written:
-        return WRITTEN if remote is not False else f"{WRITTEN} {REMOTE_OFF}"
+    if step is CellStep.SAVE and remote is False:
+        return f"{PAGES[step].words} {REMOTE_OFF}"
     return PAGES[step].words
 
 
@@ -135,11 +135,9 @@ def next_of(setup: CellSetup, step: CellStep, text: str) -> Action:
             if draft.enough:
                 return Action("Enter", "On to the file", "The views are enough.")
             return to_wanted(setup.guidance, DetectionStatus() if setup.seen is None else setup.seen.status)
-        case _ if not draft.written:
-            return Action("Enter", "Write the file", "")
     if draft.posted:
-        return Action("Enter", "Open this cell", "Then start the program that posts.")
-    return Action("Enter", "Open this cell", "Or F9: rehearse it first; nothing real moves.")
+        return Action("Enter", "Write it, open the cell", "Then start the program that posts.")
+    return Action("Enter", "Write it, open the cell", "Or F9: write and rehearse.")
 
 
 def _board_typed(setup: CellSetup, text: str) -> Action:
@@ -216,13 +214,10 @@ async def accept(setup: CellSetup, step: CellStep, text: str) -> bool:
             height_m = float(text.replace("mm", "").replace(",", ".")) / 1000
         except ValueError:
             raise StationError("no-height-typed", typed=text) from None
-        setup.change(table_m=height_m, written="")
+        setup.change(table_m=height_m)
         return False
-    if draft.written:
-        return True
     await asyncio.to_thread(flow.write_config, draft, setup.output)
-    setup.change(written=str(setup.output))
-    return False
+    return True
 
 
 def file_text(setup: CellSetup) -> str:

@@ -20,10 +20,11 @@ from station.tui.widgets.cell_drawing import LEGEND, cell_scene, draw
 from station.tui.words import ERROR_SHOWN_MM, MARKS, UNKNOWN, dim, error_facts, facts, mark
 
 COLUMNS = ("#", "error after", "state", "reason")
-NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves)."
+NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); F5 makes it and asks."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Skip this pose; of a captured one only its retake"
 NEW = "Plan 25 poses from the configured initial poses (seconds)"
+NEW_PLAN = MakePlan(25, seed=1)
 POSE_VERBS = {"retake": Retake, "skip": Skip}
 
 
@@ -107,4 +108,4 @@ class PlanScreen(StationScreen):
             self.ask(POSE_VERBS[verb](status.session.poses[self.table.cursor_row].index))
 
     def action_make(self) -> None:
-        self.ask(MakePlan(25, seed=1), PREPARE_S)
+        self.ask(NEW_PLAN, PREPARE_S)

@@ -17,7 +17,7 @@ from station.tui.screen import Box, Rows, StationScreen
 from station.tui.task import Known
 from station.tui.words import facts, mark
 
-NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
+NO_SESSION = "No session is recorded yet: F5 plans one, shows its path and asks."
 COLUMNS = ("session", "what became of it", "verdict", "views", "predicted error")
 
 

@@ -266,7 +266,7 @@ def _at_rest(known: Known, status: StationStatus) -> Action:
     if result is not None:
         return _with_result(result, status)
     if not session.poses:
-        return Action("n", "Plan 25 poses", "Some seconds; nothing moves.", at="plan")
+        return Action("F5", "Plan and start", "Plans 25 poses, shows the motion and asks before it begins.")
     if session.check:
         return Action("k", "Judge the drift check", "Its recording is finished.", at="sessions")
     return Action("F9", "Solve", f"{many(session.captured, 'pose')} saved; solving takes some seconds.")

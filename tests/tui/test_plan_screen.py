@@ -41,6 +41,14 @@ async def test_it_says_that_it_plans_for_as_long_as_it_does() -> None:
         await until(pilot, lambda: "Wait" not in text_of(pilot.app, "#next"))
 
 
+async def test_run_makes_the_plan_that_is_not_there_and_asks(link: FakeLink) -> None:
+    link.show(in_session(idle(), poses=()))
+    async with opened(link) as pilot:
+        await pilot.press("f5")
+        await until(pilot, lambda: pilot.app.screen.query("#motion"))
+        assert link.verbs == ["make_plan", "prepare"]
+
+
 async def test_the_end_of_two_hundred_poses_is_told_as_the_start_is(link: FakeLink) -> None:
     poses = tuple(PoseStatus(index=i, name=f"p{i + 1:03d}", why=f"place {i + 1}") for i in range(200))
     link.show(in_session(idle(), poses=poses))

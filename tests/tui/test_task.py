@@ -63,7 +63,7 @@ CASES = [
     (Known(held(StationState.IDLE)), ""),
     (Known(held(StationState.PAUSED)), ""),
     (Known(idle(), (Check("camera", "failed", "none", "plug it in"),)), "1"),
-    (Known(resting(poses=())), "n"),
+    (Known(resting(poses=())), "F5"),
     (Known(resting(name="")), "F5"),
     (Known(resting(recording="/r")), "F9"),
     (Known(resting(recording="/r", check=True)), "k"),
@@ -76,8 +76,8 @@ def test_every_state_has_one_next_action(known: Known, key: str) -> None:
 
 
 def test_a_key_of_another_screen_becomes_the_way_there() -> None:
-    action = next_action(Known(resting(poses=())))
-    assert (action.on("plan").key, action.on("capture").key) == ("n", DIGITS["plan"])
+    action = next_action(Known(resting(recording="/r", check=True)))
+    assert (action.on("sessions").key, action.on("capture").key) == ("k", DIGITS["sessions"])
 
 
 @pytest.mark.parametrize("known", [known for known, _ in CASES])

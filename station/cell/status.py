@@ -153,6 +153,9 @@ class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
         return "" if self.identity is None else self.identity.model
 
 
+NO_IMAGE = "no-image"
+
+
 class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Board detection in the newest preview or captured image."""
 
@@ -167,7 +170,7 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     tilt_rad: float | None = None
     distance_m: float | None = None
     cause: str = ""
-    """Why no board was found, or over-exposed, under-exposed, blurred; empty: nothing is wrong."""
+    """Why no board was found, or over-exposed, under-exposed, blurred, or `NO_IMAGE`; empty: all is well."""
     advice: str = ""
     """What is wrong with light or focus, and what to set; empty: nothing."""
 

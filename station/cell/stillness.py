@@ -156,7 +156,7 @@ class StillnessMonitor:
                 resting_since_ns = resting_since_ns or newest_ns - round(found.window_s * 1e9)
                 seen = look(resting_since_ns)
                 if seen is None:
-                    unrest, code = "no images", "no-images"
+                    code = "no-images"
                 else:
                     motion_px = None if math.isnan(seen) else seen
                     found = msgspec.structs.replace(found, image_motion_px=motion_px)

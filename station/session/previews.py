@@ -16,7 +16,7 @@ from station.analysis.worker import BoardDetection, preview_image, sight
 from station.cell.config import matrix4
 from station.cell.errors import RefusedError, StationError
 from station.cell.layout import flange_pose
-from station.cell.status import StationState
+from station.cell.status import NO_IMAGE, DetectionStatus, StationState
 from station.cell.stillness import NotStillError
 from station.protocol.verbs import Observation, Observe, PreviewImage
 from station.session.capture import at_exposure
@@ -24,6 +24,8 @@ from station.session.context import SessionContext
 
 PREVIEW_PERIOD_S = 0.1
 SIDES = (16, 1024)
+OLD_S = 2.0
+"""Age of the newest image from which screens are told that none comes; one lost frame is no news."""
 _OBSERVE_S = 5.0
 _TAKING = (StationState.SETTLING, StationState.CAPTURING, StationState.WRITING)
 
@@ -36,7 +38,7 @@ class Previewer:
         self._taking = asyncio.Lock()
         self._picture: Image | None = None
         self._sighting: BoardDetection | None = None
-        self._taken_s = 0.0
+        self._taken_s = self._seen_s = 0.0
         self._count = 0
 
     async def look(self) -> tuple[Image, BoardDetection] | None:
@@ -95,8 +97,11 @@ class Previewer:
             return  # camera or worker are needed by the capture
         try:
             image = await context.cell.camera.glimpse()
-        except StationError:
+        except StationError as error:
+            if self._taken_s - self._seen_s > OLD_S:
+                context.store.update(detection=DetectionStatus(reason=f"no image: {error}", cause=NO_IMAGE))
             return
+        self._seen_s = self._taken_s
         config = context.cell.config
         try:
             exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None

@@ -252,8 +252,8 @@ class Run:
         if pausing:
             return "paused", f"Paused by {pausing}. Approve again to continue."
         if self._failures >= FAILURES_IN_A_ROW:
-            remedy = "Fix the cause, then resume or finish."
-            return "failures", f"{self._failures} consecutive failures: {self._why.rstrip('.')}. {remedy}"
+            remedy = "Mend the cause, then continue or finish."
+            return "failures", f"{self._failures} poses in a row failed: {self._why.rstrip('.')}. {remedy}"
         if queue.open:
             count = len(queue.open)
             left = "1 pose is" if count == 1 else f"{count} poses are"

@@ -221,9 +221,9 @@ class StationApp(LivePageApp[None], KnowingApp):
         """Start the plan, made now where there is none, or go on with a session that is paused."""
         status = self.known.live
         paused = status is not None and status.state is StationState.PAUSED
-        if status is not None and not status.session.poses and not status.robot.by_hand:
-            if await self.desk.ask(NEW_PLAN, timeout_s=PREPARE_S) is None:
-                return
+        unplanned = status is not None and not status.session.poses and not status.robot.by_hand
+        if unplanned and await self.desk.ask(NEW_PLAN, timeout_s=PREPARE_S) is None:
+            return
         wanted = Purpose.RESUME if paused else Purpose.RUN
         begun = prepared_motion(
             self.desk.client, verbs.Prepare(wanted), self.approves, plans_here=self.plans_here

@@ -55,7 +55,7 @@ def news_of(known: Known, picture: PreviewImage) -> dict[str, object]:
     if status.state is not StationState.FREE_DRIVE:
         guidance = msgspec.structs.replace(guidance, still=float(status.robot.still))
     bar, saved = bar_line(known, "Live", 1000).plain.strip(), status.session.captured
-    return news(bar, next_action(known), status.detection, guidance, saved, picture) | {"old": known.old}
+    return news(bar, next_action(known), status.detection, guidance, saved, picture) | {"old": known.blind}
 
 
 def news(

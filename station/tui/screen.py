@@ -118,7 +118,7 @@ class StationScreen(Framed[None]):
     def show(self, known: Known) -> None:
         self.set_class(known.old, "-old")
         for preview in self.query(PreviewPane):
-            preview.old, preview.calm = known.old, not known.works
+            preview.old, preview.calm = known.blind, not known.works
         super().show(known)
 
     @property

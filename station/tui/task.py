@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from station.cell.config import StationConfig
-from station.cell.status import DetectionStatus, GuidanceStatus, StationState, StationStatus
+from station.cell.status import NO_IMAGE, DetectionStatus, GuidanceStatus, StationState, StationStatus
 from station.operate.ending import Way, after_solve
 from station.protocol.states import LATCHED, RUNNING
 from station.protocol.verbs import Check
@@ -87,6 +87,11 @@ class Known:
     def old(self) -> bool:
         """The status is out of date."""
         return bool(self.gone) or self.silent_s is not None
+
+    @property
+    def blind(self) -> bool:
+        """No picture is live: the status is old, or the camera gives no image."""
+        return self.old or self.shown.detection.cause == NO_IMAGE
 
     @property
     def works(self) -> bool:
@@ -224,7 +229,9 @@ def _by_state(known: Known, status: StationStatus) -> Action | None:
         return _by_hand(status)
     if state in RUNNING:
         good = " Good enough already: F7 finishes." if status.estimate.enough else ""
-        why = status.pending or status.reason or f"F12 stops it at once, F6 after this pose.{good}"
+        failed = [pose for pose in status.session.poses if pose.state == "failed"]
+        lost = f"{many(len(failed), 'pose')} failed: {failed[-1].reason}" if failed else ""
+        why = status.pending or status.reason or lost or f"F12 stops it at once, F6 after this pose.{good}"
         return Action("", "Watch the arm", why)
     if state is StationState.SEALING:
         return Action("", "Wait", "The recording is being finished.")
@@ -261,12 +268,12 @@ def _at_rest(known: Known, status: StationStatus) -> Action:
     if missing is not None:
         return Action("1", f"Mend: {missing.name}", missing.remedy or missing.text, look=True)
     if session.poses and not session.recording:
-        asks = f"{status.reason} It shows the motion and asks before the arm moves.".strip()
+        asks = f"{status.reason} Shows the motion and asks first.".strip()
         return Action("F5", "Start the capture", asks)
     if result is not None:
         return _with_result(result, status)
     if not session.poses:
-        return Action("F5", "Plan and start", "Plans 25 poses, shows the motion and asks before it begins.")
+        return Action("F5", "Plan and start", "Plans, shows the motion and asks first.")
     if session.check:
         return Action("k", "Judge the drift check", "Its recording is finished.", at="sessions")
     return Action("F9", "Solve", f"{many(session.captured, 'pose')} saved; solving takes some seconds.")

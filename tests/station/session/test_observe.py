@@ -13,8 +13,9 @@ from calibrate.boards.model import board_points
 from recordings.errors import CodedError
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.analysis.worker import BoardDetection
+from station.cell.errors import CameraError
 from station.cell.layout import flange_pose
-from station.cell.status import DetectionStatus
+from station.cell.status import NO_IMAGE, DetectionStatus
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
 from station.session import previews
@@ -91,3 +92,21 @@ async def test_what_cannot_be_looked_for_is_refused_before_a_picture(rig: Rig, n
     with raises("played"):
         await played.session.previews.observe(TAG)
     assert rig.camera.taken == played.camera.taken == 0
+
+
+async def test_a_silent_camera_is_told_and_one_lost_frame_is_not(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def silent() -> None:
+        raise CameraError("no-image", limit_s=1.0)
+
+    look, told = rig.session.previews.look, lambda: rig.session.store.status.detection.cause == NO_IMAGE
+    monkeypatch.setattr(previews, "PREVIEW_PERIOD_S", 0.0)
+    await look()
+    monkeypatch.setattr(rig.camera, "glimpse", silent)
+    monkeypatch.setattr(previews, "OLD_S", 60.0)
+    await look()
+    assert not told()
+    monkeypatch.setattr(previews, "OLD_S", 0.0)
+    await look()
+    assert told()

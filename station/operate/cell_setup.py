@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
-from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -13,11 +11,11 @@ import numpy as np
 from calibrate.boards.corners import to_grey
 from calibrate.boards.grids import seen_size
 from recordings.images import viewable
-from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotIdentity, RobotState
+from recordings.schema.messages import BoardSpec, CameraModel, Image, Mount, RobotIdentity
 from station.analysis.hand_guide import HandGuide
 from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.config import StillnessConfig
-from station.cell.errors import RobotError, StationError
+from station.cell.errors import StationError
 from station.cell.layout import flange_pose
 from station.cell.status import GuidanceStatus
 from station.cell.stillness import StillnessMonitor
@@ -42,8 +40,6 @@ class CellSetup:
         self.cameras: tuple[CameraChoice, ...] = ()
         self.mount: Mount = self.draft.mount or "eye-in-hand"
         """Mounting that is selected."""
-        self.state: RobotState | None = None
-        """Newest state of the arm; None: it does not answer."""
         self.seen: BoardDetection | None = None
         """The board in the newest image; None: it was not looked for."""
         self.counts: tuple[int, int] | None = None
@@ -105,12 +101,6 @@ class CellSetup:
             values = {"views": (), **values}
         self.keep(msgspec.structs.replace(self.draft, **values))
         self.guide = None
-
-    def read_arm(self) -> None:
-        """Take the newest state; none while the arm does not answer."""
-        self.state = None
-        with suppress(RobotError):
-            self.state = None if self.arm is None else self.arm.latest()
 
     async def look(self, begun_ns: int, image: Image, step: CellStep) -> bool:
         """Look for the board, and guide in the step of the views; tell whether a view was taken.
@@ -174,12 +164,6 @@ class CellSetup:
         for device in (self.camera, self.arm):
             if device is not None:
                 await device.close()
-
-    def arm_words(self) -> str:
-        """Describe the joints, or why they are not known."""
-        if self.state is not None:
-            return f"joints {', '.join(f'{math.degrees(q):.1f}' for q in self.state.joints_rad)}°"
-        return "" if self.arm is None else self.arm.trouble()
 
 
 async def _exposed(camera: CameraReader) -> Image:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import subprocess
-import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
@@ -42,14 +40,14 @@ from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.stop_key import run_behind_stop_key
-from station.tui.task import DIGITS
+from station.tui.task import DIGITS, STEPS
 from station.tui.widgets.preview import PreviewPane, sharp_widget
 
-GO_TO = Binding.Group("go to", compact=True)
 LOOK_S = 2.0
 PREVIEW_PERIOD_S = 0.25
 LIVE_PERIOD_S = 0.1
 """Between two pictures for a browser while the arm rests."""
+HELD = "The arm works, commanded from here. It decelerates at once, and the session pauses."
 ACKNOWLEDGE = "Leave STOPPED or FAULT after looking"
 
 
@@ -78,7 +76,7 @@ class StationApp(LivePageApp[None], KnowingApp):
         Binding("f5", "run", "Run", tooltip="Plan if there is no plan, show the motion, and ask"),
         Binding("f6", "ask('pause')", "Pause", tooltip="Stop after this pose"),
         Binding("f7", "finish", "Finish", tooltip="Finish with the poses so far"),
-        Binding("f8", "acknowledge", "Acknowledge", show=False, priority=True, tooltip=ACKNOWLEDGE),
+        Binding("f8", "acknowledge", "Acknowledge", priority=True, tooltip=ACKNOWLEDGE),
         Binding("f9", "solve_newest", "Solve", tooltip="Solve the session just recorded"),
         Binding("f3", "freedrive", "Freedrive", tooltip="Freedrive: move the arm by hand"),
         Binding("f2", "ask('record')", "Image", tooltip="Capture an image here (freedrive)"),
@@ -86,7 +84,13 @@ class StationApp(LivePageApp[None], KnowingApp):
             "o", "open_live", "Live picture", show=False, tooltip="The live picture, large, in a browser"
         ),
         *(
-            Binding(DIGITS[s.MODE], f"switch_mode('{s.MODE}')", s.MODE.title(), group=GO_TO, tooltip=s.TIP)
+            Binding(
+                DIGITS[s.MODE],
+                f"switch_mode('{s.MODE}')",
+                s.MODE.title(),
+                show=s.MODE not in STEPS,  # the rail names these
+                tooltip=s.TIP,
+            )
             for s in SCREENS
         ),
         Binding("ctrl+q", "leave", "Quit", show=False, tooltip="Close this screen; the daemon goes on"),
@@ -265,33 +269,18 @@ class StationApp(LivePageApp[None], KnowingApp):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_leave(self) -> None:
-        state = None if self.known.live is None else self.known.live.state
-        if state not in (None, StationState.IDLE, StationState.DISCONNECTED):
-            held = state in RUNNING and self.desk.has_control()
-            text = (
-                "The arm works, commanded from here. It decelerates at once, and the session pauses."
-                if held
-                else "The daemon and its session stay as they are; `station` opens this screen again."
-            )
-            if not await self.desk.question(Confirm("Close the screen?", text, yes="Close")):
-                return
-        self.exit()
+        held = self.known.works and self.desk.has_control()
+        if not held or await self.desk.question(Confirm("Close the screen?", HELD, yes="Close")):
+            self.exit()
 
     def get_key_display(self, binding: Binding) -> str:
         """Write F5 as it is printed on the key."""
         shown = super().get_key_display(binding)
         return shown.upper() if shown[0] == "f" and shown[1:].isdigit() else shown
 
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_new_cell(self) -> None:
-        """Run the wizard in this terminal; this screen comes back when the wizard ends."""
-        with self.suspend():
-            await asyncio.to_thread(subprocess.run, [sys.executable, "-m", "station.cli", "new"], check=False)
-
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
         """List every key's action by name; what moves the arm asks first from here too."""
         yield from super().get_system_commands(screen)
-        yield SystemCommand("New cell", "Set up a robot, a camera and a board", self.action_new_cell)
         own = screen.BINDINGS if isinstance(screen, StationScreen) else []
         for place, bindings in ((screen, own), (self, self.BINDINGS)):
             for binding in (b for b in bindings if isinstance(b, Binding) and b.tooltip):

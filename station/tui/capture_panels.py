@@ -11,8 +11,7 @@ from station.cell.status import DetectionStatus, GuidanceStatus
 from station.tui.task import Known
 from station.tui.words import ERROR_SHOWN_MM, dim, error_facts, facts, limit_bar, lines, mark
 
-BURNT = 0.01
-"""Share of saturated pixels above which the image counts as too bright."""
+STILL_CELLS = 12
 LABEL_CELLS, HALVES = 7, (" .:", " ▄█")
 """Cells of the axis of the errors; signs of an empty, a half and a full cell, planned and by images."""
 
@@ -22,15 +21,12 @@ def quality_line(seen: DetectionStatus) -> Content:
     if not seen.found:
         advice = f"  {seen.advice}" if seen.advice else ""
         return mark("look", seen.reason or "no board in view") + dim(advice)
-    burnt = seen.saturated > BURNT
     judged = (
-        ("corners", f"{seen.corners}/{seen.expected}", seen.corners == seen.expected),
-        ("sharp", f"{seen.sharpness:.2f}", burnt or not seen.advice),
-        ("saturated", f"{100 * seen.saturated:.1f} %", not burnt),
+        (f"corners {seen.corners}/{seen.expected}", seen.corners == seen.expected),
+        ("sharp", seen.cause != "blurred"),
+        ("light", not seen.cause.endswith("exposed")),
     )
-    parts = [
-        mark("done" if good else "look") + " " + facts((name, value, "")) for name, value, good in judged
-    ]
+    parts = [mark("done" if good else "look", name) for name, good in judged]
     if seen.tilt_rad is not None:
         parts.append(facts(("tilt", f"{math.degrees(seen.tilt_rad):.0f}°", "")))
     if seen.distance_m is not None:
@@ -40,14 +36,11 @@ def quality_line(seen: DetectionStatus) -> Content:
     return line + Content.styled(f"   {seen.advice}", "$warn") if seen.advice else line
 
 
-def still_lines(guidance: GuidanceStatus, cells: int) -> tuple[Content, Content]:
+def still_line(guidance: GuidanceStatus, cells: int) -> Content:
     """Draw how still everything is, and say what moves."""
     colour = "$ok" if guidance.still >= 1.0 else "$warn"
     bar = limit_bar(guidance.still, 1.0, cells, colour, at=1.0)
-    return (
-        dim("still ") + bar + dim(f" {100 * guidance.still:.0f} %"),
-        dim(guidance.moves or "nothing moves"),
-    )
+    return dim("still ") + bar + dim(f" {guidance.moves or 'nothing moves'}")
 
 
 def hand_lines(known: Known, width: int, height: int) -> Content:
@@ -55,7 +48,7 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
     status = known.shown
     guidance = status.guidance
     now_mm, after_mm = status.estimate.predicted_error_mm, guidance.after_mm
-    rows = [*still_lines(guidance, max(6, width - 14))]
+    rows = [still_line(guidance, STILL_CELLS)]
     rows.append(facts(("view", str(status.session.captured), f"of {status.session.least_by_hand} or more")))
     if after_mm is not None and (now_mm is None or after_mm < now_mm):
         rows.append(error_facts("with the next view", after_mm, None))

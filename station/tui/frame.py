@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import ClassVar, TypeVar
+from dataclasses import replace
+from typing import Any, ClassVar, TypeVar
 
 from rich.filesize import decimal
 from textual import events
 from textual.app import ComposeResult
+from textual.binding import ActiveBinding
 from textual.containers import Container, Horizontal, Vertical
 from textual.content import Content
 from textual.markup import escape
@@ -16,7 +18,9 @@ from textual.screen import ModalScreen, Screen
 from textual.widgets import Footer, Static
 
 from station.cell.status import StationStatus
-from station.protocol.states import LATCHED
+from station.protocol import verbs
+from station.protocol.states import LATCHED, RUNNING
+from station.protocol.verbs import Verb
 from station.tui.task import STEPS, Action, Known, Step, next_action, steps
 from station.tui.words import MARKS, dim, duration, shortened, state_of
 
@@ -25,9 +29,11 @@ STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
 STOP_NARROW = "STOP F12", "STOPPED"
 STOP_ELSEWHERE = "STOP on\nits own\npendant", "STOP is on the arm's\nown pendant"
 """In place of STOP where a person moves the arm, which the station cannot stop."""
+WHY_CELLS = 16
+"""Cells below which a reason would be cut to nothing that is understood."""
 RAIL_WIDE = 96
 """From this width on each step has a second line."""
-ANSWER = Action("", "Answer the question", "Tab, then Enter: yes. Enter alone or Escape: no.", look=True)
+ANSWER = Action("", "Answer the question", "Tab, Enter: yes. Enter, Escape: no.", look=True)
 
 
 class StopBlock(Static):
@@ -187,9 +193,10 @@ def rail_line(made: tuple[Step, ...], mode: str, width: int) -> Content:
     """Draw the steps in two lines where there is room, else in one; the open step is underlined."""
     if width < RAIL_WIDE:
         parts = []
-        for step in made:
+        for number, step in enumerate(made, start=1):
             brief = f" {step.brief}" if step.brief and step.mark in ("now", "stopped") else ""
-            parts.append(_step_name(step, mode, f"{MARKS[step.mark][0]}{step.mode.title()}{brief}"))
+            name = f"{MARKS[step.mark][0]}{number} {step.mode.title()}{brief}"
+            parts.append(_step_name(step, mode, name))
         return Content(" ").join(parts)
     cell = width // len(made)
     names, texts = [], []
@@ -218,10 +225,21 @@ def next_line(action: Action, width: int) -> Content:
     head = Content.assemble(
         (" NEXT " if width >= RAIL_WIDE else " ", "$dim"), (chip, f"bold $onaccent on {back}"), ("  ", "")
     )
-    room = max(8, width - head.cell_length - 1)
-    return head + Content.styled(action.why if action.look else shortened(action.why, room), "$foreground")
+    room = width - head.cell_length - 1
+    why = action.why if action.look else shortened(action.why, room) if room >= WHY_CELLS else ""
+    return head + Content.styled(why, "$foreground")
 
 
+ASKS: dict[str, type[Verb[Any]]] = {
+    "run": verbs.Prepare,
+    "ask('pause')": verbs.Pause,
+    "finish": verbs.Finish,
+    "acknowledge": verbs.Acknowledge,
+    "freedrive": verbs.Freedrive,
+    "ask('record')": verbs.Record,
+    "take_back": verbs.Record,
+}
+"""Verb by the action of a key that asks the daemon for it."""
 BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]
 """Style classes by the terminal's columns, and by its rows."""
 
@@ -234,6 +252,16 @@ class Framed(Screen[R]):
     """What the app knew when this was drawn last."""
     HORIZONTAL_BREAKPOINTS, VERTICAL_BREAKPOINTS = BREAKPOINTS
 
+    @property
+    def active_bindings(self) -> dict[str, ActiveBinding]:
+        """All keys; the footer shows those that the daemon takes now, the others say why not when pressed."""
+        state, keys = self.known.shown.state, super().active_bindings
+        for key, active in keys.items():
+            verb = ASKS.get(active.binding.action)
+            if verb is not None and state not in verb.states:
+                keys[key] = active._replace(binding=replace(active.binding, show=False))
+        return keys
+
     def show(self, known: Known) -> None:
         """Draw every part from what is known."""
         for frame in self.query(Frame):
@@ -244,7 +272,10 @@ class Framed(Screen[R]):
         self.show(self.known)
 
     def _hear(self, known: Known) -> None:
+        states = {self.known.shown.state, known.shown.state}
         self.known = known
+        if len(states) > 1 and not states <= RUNNING:
+            self.refresh_bindings()
         self.call_next(self._show_known)
 
     def _show_known(self) -> None:

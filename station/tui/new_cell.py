@@ -119,7 +119,6 @@ class NewCell(LivePageApp[Ending]):
 
     def look_at_arm(self) -> None:
         if self.setup.arm is not None:
-            self.setup.read_arm()
             self._show()
 
     @work(group="camera", exit_on_error=False)
@@ -258,9 +257,10 @@ class NewCell(LivePageApp[Ending]):
         self._tell_found()
 
     def action_table_here(self) -> None:
-        if self.setup.state is not None:
-            self.setup.change(table_m=float(self.setup.state.tcp_pose[2]))
-            self.watch_step()
+        with self._problems():
+            if self.setup.arm is not None:
+                self.setup.change(table_m=float(self.setup.arm.latest().tcp_pose[2]))
+                self.watch_step()
 
     # --- what is shown ---
 

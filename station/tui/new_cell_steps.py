@@ -17,7 +17,7 @@ from station.cell.status import DetectionStatus
 from station.operate import new_cell as flow
 from station.operate.cell_setup import CellSetup
 from station.operate.draft import FEWEST_GUIDED, CellStep
-from station.tui.capture_panels import quality_line, still_lines
+from station.tui.capture_panels import STILL_CELLS, quality_line, still_line
 from station.tui.task import Action, to_wanted
 from station.tui.words import dim, lines
 
@@ -78,7 +78,6 @@ REMOTE_OFF = (
     "The station can drive the arm only in Remote Control: ☰ → Settings → System → Remote Control → Enable, "
     "then the icon top right → Remote Control."
 )
-STILL_CELLS = 30
 _TINY_M = 0.005
 """Squares below this size are rare: the number may be one of centimetres."""
 POSTED_SAVE = (
@@ -155,20 +154,18 @@ def _board_typed(setup: CellSetup, text: str) -> Action:
 def live_lines(setup: CellSetup, step: CellStep) -> Content:
     """Return the lines that follow arm and camera, shown ten times a second."""
     draft, found = setup.draft, setup.draft.found
-    arm, board, seen = Content(setup.arm_words()), dim(""), setup.seen
+    board, seen = dim(""), setup.seen
     if draft.board is not None:
         board = (
             dim(f"{describe_board(draft.board)}: looking …") if seen is None else quality_line(seen.status)
         )
     match step:
-        case CellStep.ROBOT:
-            return arm
         case CellStep.BOARD:
             return board
         case CellStep.VIEWS:
             views = len(draft.views)
             taken = Content(f"views {'✓' * views}{'○' * max(0, FEWEST_GUIDED - views)}")
-            rows = [arm, board, *still_lines(setup.guidance, STILL_CELLS), taken]
+            rows = [board, still_line(setup.guidance, STILL_CELLS), taken]
             if found is not None:
                 x, y, z = 1000 * found.X[:3, 3]
                 sigma = f"± {1000 * found.sigma_m:.0f} mm, {math.degrees(found.sigma_rad):.1f}°"

@@ -34,7 +34,7 @@ from station.tui.words import MARKS, Mark, dim, limit_bar, lines, mark, sentence
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on 5, Enter shows older ones."
 SHOWN = {"PASS": ("✓", "-pass"), "PASS WITH A REASON": ("▲", "-reason"), "FAIL": ("✗", "-fail")}
-BAR_CELLS, NAME_CELLS = 14, 27
+BAR_CELLS, NAME_CELLS = 14, 34
 JOBS = {"install": install_result, "touch test": run_touch_test, "undo": undo_install}
 Row = tuple[tuple[Content, ...], str]
 """A row of the table of checks, and what Enter tells of it."""
@@ -92,7 +92,9 @@ def _to_do(result: Result, calibration: Calibration) -> Iterator[str]:
 
 def check_rows(result: Result, calibration: Calibration) -> list[Row]:
     """List everything that was checked: gates (failed and narrow ones first), touched corners, drift."""
-    gates = sorted(calibration.quality.gates, key=lambda gate: (gate.passed, not gate.narrow))
+    gates = sorted(
+        calibration.quality.gates, key=lambda gate: (gate.passed, not gate.narrow, gate.sense is None)
+    )
     rows = [_gate_row(gate) for gate in gates]
     for touch in calibration.verification:
         sigmas, name = touch_sigmas(touch), f"touch, corner {touch.corner}"

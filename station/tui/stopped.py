@@ -48,8 +48,9 @@ def stopped_text(status: StationStatus) -> Content:
     )
     held, told = robot.condition.held, robot.condition.safety
     pendant = mark("look", held) if held else mark("done", "nothing to clear there") if told else Content()
-    safety = Content.assemble(("safety ", "$dim"), (told or UNKNOWN, "bold $strong"))
-    rests = ""  # its news may be old
+    if not held:
+        pendant = Content.assemble(("safety ", "$dim"), (told or UNKNOWN, "bold $strong"), "  ", pendant)
+    rests = " If the arm moves, press the emergency stop."  # its news may be old
     if robot.connected and not robot.by_hand and status.cause in ("stop", *STOPPED_BY):
         rests = " The arm stands still." if robot.still else " The arm is told to stop."
     return lines(
@@ -60,12 +61,12 @@ def stopped_text(status: StationStatus) -> Content:
         Content.assemble(
             (" 1  ", "bold $strong"),
             ("Look at the cell. ", "bold"),
-            "Is anybody in reach? Did the arm touch anything?",
+            "Is anybody in reach? Was anything touched?",
         ),
-        Content.assemble((" 2  ", "bold $strong"), ("At the pendant: ", "bold"), safety, "  ", pendant),
+        Content.assemble((" 2  ", "bold $strong"), ("At the pendant: ", "bold"), pendant),
         Content.assemble(
             (" 3  ", "bold $strong"),
             (" F8  Acknowledge ", "bold $onaccent on $warn"),
-            ("  Nothing moves by it; F5 then asks again.", "$dim"),
+            ("  Nothing moves. F5 then asks again.", "$dim"),
         ),
     )

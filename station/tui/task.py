@@ -15,10 +15,7 @@ from station.tui.words import UNKNOWN, Mark, duration, many, sentence
 
 STEPS = ("connect", "plan", "capture", "result")
 DIGITS = {mode: str(place) for place, mode in enumerate((*STEPS, "sessions", "log"), start=1)}
-SILENT = (
-    "Daemon not responding: the data below are old. The arm's watchdog stops it; if it moves, press the "
-    "emergency stop."
-)
+SILENT = "What stands below is old. The arm's watchdog stops it."
 _STILL = {StationState.IDLE, StationState.PAUSED, StationState.FREE_DRIVE}
 
 
@@ -189,7 +186,7 @@ def next_action(known: Known) -> Action:
     """Choose the one next action; its reason names alternatives."""
     status = known.live
     if known.silent_s is not None:
-        why = f"No answer for {known.silent_s:.0f} s: the data below are old. {SILENT}"
+        why = f"No answer for {known.silent_s:.0f} s. {SILENT}"
         return Action("", "EMERGENCY STOP if it moves", why, look=True)
     if status is None:
         return _without_daemon(known)

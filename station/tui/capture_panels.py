@@ -60,19 +60,15 @@ def hand_lines(known: Known, width: int, height: int) -> Content:
 
 
 def error_lines(known: Known, width: int, height: int) -> Content:
-    """Write the predicted error, the goal, and what the plan promises; draw the error after each pose."""
+    """Write the predicted error and the goal; draw the error after each pose."""
     estimate, poses, goal = known.shown.estimate, known.shown.session.poses, known.goal_mm
     head = error_facts("", estimate.predicted_error_mm, estimate.working_distance_m)
     if goal:
         head += Content.assemble(("  goal ", "$dim"), (f"{goal:g} mm", "$warn"))
     if estimate.enough:
         head += Content("  ") + mark("done", "reached")
-    rows = [head]
-    if poses and poses[-1].predicted_sigma_mm is not None and height > 6:
-        end = error_facts("by the plan", poses[-1].predicted_sigma_mm, None)
-        rows.append(end + dim(f" after {len(poses)} poses"))
     columns = [(p.estimated_sigma_mm or p.predicted_sigma_mm, bool(p.estimated_sigma_mm)) for p in poses]
-    return lines(*rows, *error_columns(columns, goal, width, height - len(rows)))
+    return lines(head, *error_columns(columns, goal, width, height - 1))
 
 
 def error_columns(

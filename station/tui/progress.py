@@ -23,10 +23,7 @@ CHIPS: dict[Mark, tuple[str, str]] = {
 LEGEND = "✓ saved  ! look  ▶ now  · to come  ✗ failed"
 
 
-_WIDE = 46
-
-
-def pose_line(status: StationStatus, width: int = _WIDE) -> Content:
+def pose_line(status: StationStatus) -> Content:
     """Draw the steps of the pose under way; at rest say what comes next."""
     pose = pose_under_way(status)
     if pose is None:
@@ -41,7 +38,7 @@ def pose_line(status: StationStatus, width: int = _WIDE) -> Content:
             parts.append(Content.styled(f" ▶ {word} ", "bold $strong on $accentbg"))
         else:
             parts.append(mark("done" if i < at else "todo", word))
-    return Content.styled(" ─ " if width >= _WIDE else " ", "$line").join(parts)
+    return Content(" ").join(parts)
 
 
 def pose_under_way(status: StationStatus) -> PoseStatus | None:
@@ -68,7 +65,7 @@ def progress_lines(known: Known, width: int, height: int) -> Content:
     if status.playback:
         head += Content.styled("   played, no arm moves", "$sim")
     why = "" if pose is None else f"{pose.name}: {pose.why}" if pose.why else pose.name
-    return lines(head, pose_line(status, width), dim(why), *chips(session, width, max(1, height - 3)))
+    return lines(head, pose_line(status), dim(why), *chips(session, width, max(1, height - 3)))
 
 
 def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:

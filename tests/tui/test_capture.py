@@ -26,7 +26,7 @@ def test_steps_of_a_pose_are_marked_one_after_the_other() -> None:
         poses=(msgspec.structs.replace(first, state="settling"), *rest),
         current=0,
     )
-    assert pose_line(moving).plain == "✓ move ─  ▶ settle  ─ ○ capture ─ ○ save"
+    assert pose_line(moving).plain == "✓ move  ▶ settle  ○ capture ○ save"
     failed = msgspec.structs.replace(first, state="failed", reason="the board is cut")
     assert "the board is cut" in pose_line(in_session(idle(), poses=(failed, *rest), current=0)).plain
 

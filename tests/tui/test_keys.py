@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+import pytest
 
 from station.cell.errors import RefusedError
 from station.cell.status import StationState

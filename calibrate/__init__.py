@@ -24,8 +24,9 @@ remedy names an option of the commands, such as `--board`, it is the argument `b
 at their first use. The solver without files is `calibrate.handeye`. Everything else is private.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from recordings.door import open_door
 
 if TYPE_CHECKING:
     from calibrate.errors import CalibrationError as CalibrationError
@@ -55,26 +56,4 @@ if TYPE_CHECKING:
     from calibrate.pipeline import solve_recording as solve_recording
     from calibrate.results import Gate as Gate
 
-_MODULES = {
-    "errors": "CalibrationError",
-    "files.calibration": "Calibration read_calibration write_calibration",
-    "files.exports": "FrameNames export",
-    "files.install": "install rollback set_validity",
-    "files.loader": "InstallationChange InstalledCalibration load_installed watch",
-    "files.validity": "Validity ValidityReason ValidityState",
-    "geometry": "Transform",
-    "job": "JobOptions Solved SolvedRecording",
-    "pictures": "SolvedPictures read_folder solve",
-    "pipeline": "solve_recording",
-    "gates": "GateLimits",
-    "results": "Gate",
-}
-"""Module → names that it gives."""
-_HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
-__all__ = sorted(_HOME)
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+__getattr__, __all__ = open_door(__name__, __file__)

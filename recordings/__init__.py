@@ -21,8 +21,9 @@ Poses are `base_from_flange`, 4×4 in metres; angles are radians, stamps ns or s
 docs/integrator/recording-format.md. Everything else is private.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from recordings.door import open_door
 
 if TYPE_CHECKING:
     from recordings.errors import BadImageError as BadImageError
@@ -52,26 +53,4 @@ if TYPE_CHECKING:
     from recordings.schema.messages import View as View
     from recordings.writer import RecordingWriter as RecordingWriter
 
-_MODULES = {
-    "errors": "BadImageError CodedError CorruptRecordingError MissingSegmentError RecordingError "
-    "UnfinishedRecordingError",
-    "exporters.export": "export_recording",
-    "images": "viewable",
-    "importers.bag": "import_bag",
-    "importers.folder": "import_folder",
-    "info": "recording_info",
-    "reader": "Pictures Recording RobotSamples open_recording",
-    "recorder": "Recorder",
-    "recover": "recover_recording",
-    "schema.messages": "BoardKind BoardSpec CameraModel Image RobotState SessionInfo Stamps View",
-    "writer": "RecordingWriter",
-}
-"""Module → names that it gives."""
-_HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
-__all__ = sorted(_HOME)
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+__getattr__, __all__ = open_door(__name__, __file__)

@@ -17,8 +17,9 @@ they are recorded. Errors are `calibrate.errors.CalibrationError`s with `code`, 
 Everything else is private. Names are loaded at their first use.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from recordings.door import open_door
 
 if TYPE_CHECKING:
     from calibrate.handeye.information import covariance_of as covariance_of
@@ -34,22 +35,4 @@ if TYPE_CHECKING:
     from calibrate.views import BoardView as BoardView
     from calibrate.views import ViewSet as ViewSet
 
-_MODULES = {
-    "calibrate.handeye.information": "covariance_of prior_information view_information",
-    "calibrate.handeye.noise_scales": "MeasurementNoise",
-    "calibrate.handeye.peers": "compare_all",
-    "calibrate.handeye.priors": "BoardTolerance",
-    "calibrate.handeye.solution": "Solution SolveOptions",
-    "calibrate.handeye.solve": "solve_views",
-    "calibrate.results": "PeerResult",
-    "calibrate.views": "BoardView ViewSet",
-}
-"""Module → names that it gives."""
-_HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
-__all__ = sorted(_HOME)
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+__getattr__, __all__ = open_door(__name__, __file__)

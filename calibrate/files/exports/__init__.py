@@ -32,7 +32,7 @@ class Format(NamedTuple):
 
 
 FORMATS: dict[str, Format] = {
-    "ros-camera-info": Format(".yaml", "ROS camera_info YAML: the intrinsics", ros.ros_camera_info, True),
+    "ros-camera-info": Format(".yaml", "ROS camera_info YAML: the intrinsics", ros.ros_camera_info),
     "ros-launch": Format(
         ".launch.py", "ROS 2 launch file with the static transform", ros.ros_launch, True, True
     ),

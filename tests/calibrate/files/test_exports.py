@@ -149,10 +149,14 @@ def test_beside_a_table_it_is_said_for_which_arm_the_pose_is(calibration: Calibr
     assert note in export(calibration, name) and note not in export(bare, name)
 
 
-@pytest.mark.parametrize("name", [name for name, form in FORMATS.items() if not form.names_robot])
-def test_names_of_robot_frames_are_refused_where_none_is_written(calibration: Calibration, name: str) -> None:
-    with raises("frames-of", ExportError):
-        export(calibration, name, FrameNames(base="base_link"))
+@pytest.mark.parametrize("name", FORMATS)
+def test_names_of_robot_frames_are_written_or_refused(calibration: Calibration, name: str) -> None:
+    try:
+        text = export(calibration, name, FrameNames(base="its base", flange="its hand"))
+    except ExportError as refused:
+        assert refused.code == "frames-of" and not FORMATS[name].names_robot
+    else:
+        assert FORMATS[name].names_robot and "its " in text
 
 
 def test_frame_names_of_any_kind_stay_names(calibration: Calibration, tmp_path: Path) -> None:

@@ -23,7 +23,6 @@ from calibrate.cli.output import AsJson, detection_progress, out, print_json
 from calibrate.cli.solve_options import BoardFile
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration, Provenance
-from calibrate.files.folders import current_version, readable_folder
 from calibrate.files.formatting import VALIDITY_STYLES
 from calibrate.files.install import note_check
 from calibrate.files.validity import Validity, ValidityReason, validity_text
@@ -74,7 +73,7 @@ def drift_check(
     production = (source / DATASET_FILE).is_file()
     if not production and calibration_file is None:
         camera = open_recording(source).info.camera_identity.name or MAIN_CAMERA
-    calibration, _ = named_or_installed(calibration_file, root, camera)
+    calibration, held = named_or_installed(calibration_file, root, camera)
     options = JobOptions(
         board=None if board is None else read_board(board), camera=calibration.intrinsics.model
     )
@@ -86,21 +85,21 @@ def drift_check(
         prepared = prepare_views(
             recording, options, progress, fewest=1 if production else FEWEST_FOR_DRIFT_CHECK
         )
-    info, noted = prepared.recording.info, calibration_file is None
+    info = prepared.recording.info
     own, trend, validity, before = False, None, None, list[bool]()
     if production:
         result = _check_pictures(source, prepared, calibration)
         text = production_text(result, len(prepared.views))
-        if noted and not result.passed:  # no alarm is no proof
-            validity = _judge(result, source.name, datetime.now(UTC), root, camera)
+        if held is not None and not result.passed:  # no alarm is no proof
+            validity = _judge(result, source.name, datetime.now(UTC), root, camera, held.version)
     else:
-        _require_this_cell(source, info, calibration, root, camera, noted)
+        _require_this_cell(source, info, calibration, root, camera, held)
         result = check_drift(prepared.views, calibration, prepared.loaded.board)
         text = check_text(result, calibration)
         own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
-        if noted and not own:
-            before, trend = _log(result, calibration, info, root, camera)
-            validity = _judge(result, info.name, _taken(info), root, camera)
+        if held is not None and not own:
+            before, trend = _log(result, calibration, info, root, camera, held.version)
+            validity = _judge(result, info.name, _taken(info), root, camera, held.version)
     proves_nothing = own and result.passed
     if as_json:
         said = {"passed": result.passed and not own, "own_views": own, "validity": validity}
@@ -131,15 +130,19 @@ def _check_pictures(folder: Path, prepared: PreparedViews, calibration: Calibrat
 
 
 def _log(
-    result: DriftCheck, calibration: Calibration, info: SessionInfo, root: Path | None, camera: str
+    result: DriftCheck,
+    calibration: Calibration,
+    info: SessionInfo,
+    root: Path | None,
+    camera: str,
+    version: int,
 ) -> tuple[list[bool], Trend | None]:
     """Log the check: results of the earlier ones of the installed calibration, and the trend with it."""
-    number, _ = current_version(readable_folder(root, camera))
     before = read_checks(root, camera)
-    entry = entry_of(result, _taken(info).timestamp(), number, info.name)
-    trend = find_trend([*before, entry], number, known_cell(calibration))
+    entry = entry_of(result, _taken(info).timestamp(), version, info.name)
+    trend = find_trend([*before, entry], version, known_cell(calibration))
     append_check(msgspec.structs.replace(entry, trend=trend), root, camera)
-    return earlier_results(before, number), trend
+    return earlier_results(before, version), trend
 
 
 def _taken(info: SessionInfo) -> datetime:
@@ -147,7 +150,9 @@ def _taken(info: SessionInfo) -> datetime:
     return datetime.fromtimestamp(info.created_wall_ns / 1e9 or time.time(), UTC)
 
 
-def _judge(result: DriftCheck, recording: str, taken: datetime, root: Path | None, camera: str) -> Validity:
+def _judge(
+    result: DriftCheck, recording: str, taken: datetime, root: Path | None, camera: str, version: int
+) -> Validity:
     """Let the check put the installed calibration in doubt, or clear it."""
     verdict = "PASS" if result.passed else "FAIL"
     reason = ValidityReason(
@@ -170,6 +175,7 @@ def _judge(result: DriftCheck, recording: str, taken: datetime, root: Path | Non
         proves=result.power >= POWER if result.passed else result.arm_known,
         when=taken,
         camera=camera,
+        version=version,
     )
 
 
@@ -179,17 +185,26 @@ def _require_this_cell(
     calibration: Calibration,
     root: Path | None,
     camera: str,
-    noted: bool,
+    held: Validity | None,
 ) -> None:
     """Refuse views of another cell; a session of this cell with another device doubts what is installed."""
     try:
         require_same_cell(str(recording), calibration, CellIdentity.of(info))
     except OtherCellError as other:
         own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
-        if noted and own and other.device:
+        if held is not None and own and other.device:
             reason = ValidityReason(f"{other.device}-changed", other.text, dict(other.values))
             when = _taken(info)
-            note_check(root, "drift-check", reason, passed=False, proves=True, when=when, camera=camera)
+            note_check(
+                root,
+                "drift-check",
+                reason,
+                passed=False,
+                proves=True,
+                when=when,
+                camera=camera,
+                version=held.version,
+            )
         raise
 
 

@@ -60,13 +60,13 @@ def read_validity(folder: Path) -> dict[int, Validity]:
     return parse_validity(read_file(path, LOG_LIMIT_BYTES)) if path.exists() else {}
 
 
-def current_validity(folder: Path, now: datetime | None = None) -> Validity:
-    """Read the current version's validity at `now` (default: this moment). InstallError without one."""
-    return validity_of(folder, current_version(folder)[0], now)
+def current_validity(folder: Path) -> Validity:
+    """Read the current version's validity now. InstallError without one."""
+    return validity_of(folder, current_version(folder)[0])
 
 
-def validity_of(folder: Path, number: int, now: datetime | None = None) -> Validity:
-    """Read the validity of version `number`, which need not be the current one, at `now`."""
+def validity_of(folder: Path, number: int) -> Validity:
+    """Read the validity now of version `number`, which need not be the current one."""
     try:
         installed = datetime.fromtimestamp((folder / "current").lstat().st_mtime, UTC)
         found = read_validity(folder).get(number) or unrecorded(number, time_text(installed))
@@ -74,4 +74,4 @@ def validity_of(folder: Path, number: int, now: datetime | None = None) -> Valid
         raise InstallError(
             "state-folder", path=problem.filename or str(folder), why=problem.strerror
         ) from None
-    return found.at(now or datetime.now(UTC))
+    return found.at(datetime.now(UTC))

@@ -83,16 +83,14 @@ def prior_information(
     lens_known: bool,
     board: BoardTolerance,
     arm_error_mm: float = 0.0,
-    lens: LensPrior | None = None,
 ) -> Array:
     """Compute the prior information (p, p), before any view, of lens and board tolerance.
 
-    `arm_error_mm`: 1σ, mm and mrad, of errors of the arm's links; 0: none are modelled. `lens`: what is
-    known of the lens; None: the defaults for a known or an unknown one.
+    `arm_error_mm`: 1σ, mm and mrad, of errors of the arm's links; 0: none are modelled.
     """
     errors = np.zeros(_LINK_ERRORS if arm_error_mm else 0)
     state = CellState(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), errors)
-    lens = lens or (LensPrior.given(camera) if lens_known else LensPrior.unknown(camera))
+    lens = LensPrior.given(camera) if lens_known else LensPrior.unknown(camera)
     N = Priors(lens, board).linearise(state, arm_error_mm).N
     at = Layout.of(state)
     N[np.arange(12), np.arange(12)] += np.tile(_POSE_PRECISION, 2)

@@ -21,12 +21,12 @@ SPREAD = 0.25 * np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
 """Directions of points about the camera's axis, radians, itself first: there a roll of X has no effect."""
 
 
-def sample_workspace(model: RobotModel, like_rad: Array, count: int = 400, seed: int = 0) -> Array:
+def sample_workspace(model: RobotModel, like_rad: Array, count: int = 400) -> Array:
     """Draw joints (count, 6) over the arm's reach above its base, in the arm branch of `like_rad` (n, 6).
 
     Positions are uniform in a shell about the shoulder, orientations uniform. Deterministic.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     published = MODELS[model.name]
     reach, found = abs(published.a_m[1]) + abs(published.a_m[2]), np.zeros((0, 6))
     branch = _branch(published, like_rad)

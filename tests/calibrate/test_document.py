@@ -50,6 +50,7 @@ def test_a_given_lens_is_called_given_and_judged_by_these_pictures(solved_real: 
     lens, views = solved_real.calibration.intrinsics, solved_real.views
     found = solved_real.solution
     assert solved_real.intrinsics is None and lens.found == "given"
+    assert "coverage" not in {gate.name for gate in solved_real.gates}
     assert found.lens_covariance is not None
     assert list(lens.sigma.values()) == pytest.approx(np.sqrt(np.diag(found.lens_covariance)))
     # A given lens is what is known beforehand, no constant: 0.2 % of it, and the pictures say the rest.

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from calibrate import load_installed
+from calibrate.check.drift import DriftCheck, check_drift
 from calibrate.errors import InstallError
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install
@@ -113,6 +115,22 @@ def _everything_says_that_it_is_in_doubt(folder: Path) -> None:
     withdrawn = run("withdraw", "a pallet hit the camera", "--json", cwd=folder)
     assert json.loads(withdrawn.stdout)["state"] == "withdrawn"
     refused(run("withdraw", "xxx", cwd=folder), 1, "reason-too-short")
+
+
+def test_a_check_judges_the_calibration_that_it_was_made_on(
+    real_session_file: Path, real_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another one is installed while the board is looked for."""
+    install(real_file, root := tmp_path / "cell")
+
+    def meanwhile(*given: object) -> DriftCheck:
+        install(real_file, root)
+        return replace(check_drift(*given), passed=False)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("calibrate.cli.drift_check.check_drift", meanwhile)
+    monkeypatch.setattr("calibrate.cli.drift_check._is_origin", lambda *_: False)
+    refused(run("drift-check", real_session_file, "--root", root, cwd=tmp_path), 1, "other-version")
+    assert load_installed(root).validity.state is ValidityState.VALID
 
 
 @pytest.mark.parametrize(("device", "elsewhere"), [("robot", False), ("camera", False), ("robot", True)])

@@ -15,6 +15,7 @@ import msgspec
 
 from calibrate.batch.workers import BatchError, BatchWorkers, Lost, pool
 from calibrate.bounds import Limits, bounded
+from calibrate.document import software_versions
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import encode_calibration, write_output
 from calibrate.files.lines import append_line, read_lines
@@ -94,13 +95,14 @@ def run_batch(
 
 
 def batch_key(recording: Path, options: JobOptions) -> str:
-    """Key that changes with the recording's place, size and date, and with every option of the result."""
+    """Key that changes with the recording's place, size and date, options of the result, and the software."""
     found: list[str | int] = [os.path.realpath(recording), 0, 0]
     with suppress(OSError):
         stat = recording.stat()
         found[1:] = [stat.st_size, stat.st_mtime_ns]
     chosen = {name: msgspec.to_builtins(value) for name, value in vars(options).items() if name != "threads"}
-    return hashlib.sha256(msgspec.json.encode([found, chosen], order="deterministic")).hexdigest()[:24]
+    parts = [found, chosen, software_versions()]
+    return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()[:24]
 
 
 def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> tuple[BatchResult, bytes]:

@@ -348,6 +348,8 @@ def _regression(calibration: Calibration, before: Calibration | None) -> list[Ga
     )
     title = f"Regression: predicted error at {1e3 * distance_m:.0f} mm"
     remedy = "Capture more or better poses, or keep the installed one."
+    if len({one.provenance.software.get("calibration-station") for one in (calibration, before)}) > 1:
+        remedy += " Its error was stated by another version: solve its recording again to compare."
     gate = Gate.measured("no_worse", title, ours, "≤", WORSE_TIMES * theirs, "m", remedy)
     return [] if gate.passed else [gate]
 

@@ -84,17 +84,15 @@ def axis_spread(pairs: Pairs) -> tuple[Array, Array]:
 
 def require_motion(pairs: Pairs) -> None:
     """Raise DegenerateMotionError, naming what is missing, unless the arm turns about two axes."""
-    angle_A, _ = screw_invariants(pairs.A)
     singular, directions = axis_spread(pairs)
-    needed = _MIN_SECOND_AXIS_RAD
-    if singular[0] < needed:
-        raise DegenerateMotionError("rotation-range", largest_rad=float(angle_A.max()))
-    if singular[1] < needed:
+    if singular[0] < _MIN_SECOND_AXIS_RAD:
+        raise DegenerateMotionError("rotation-range", largest_rad=float(screw_invariants(pairs.A)[0].max()))
+    if singular[1] < _MIN_SECOND_AXIS_RAD:
         raise DegenerateMotionError(
             "one-axis",
             axis=", ".join(f"{v:+.2f}" for v in directions[0]),
             second_axis_rad=float(singular[1]),
-            limit_rad=float(needed),
+            limit_rad=float(_MIN_SECOND_AXIS_RAD),
         )
 
 

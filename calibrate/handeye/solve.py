@@ -271,9 +271,8 @@ def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Re
         f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm, "
         f"{arm.size_mrad if arm else 0.0:.2f} mrad in the arm's links, or a bracket that bends. "
     ) + ("Use the corrected arm." if offered else "Have the arm calibrated, and stiffen the bracket.")
-    as_recorded = session.reading is Reading.AS_RECORDED
     said = (
-        (not as_recorded, session.reading.value, explain_text(session, fit.views)),
+        (session.reading is not Reading.AS_RECORDED, session.reading.value, explain_text(session, fit.views)),
         (bool(suspects), "suspect-views", f"Suspect views, down-weighted: {suspects}. Retake them."),
         (not found.converged, "not-converged", f"Not converged after {found.steps} iterations."),
         (
@@ -306,7 +305,6 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     parent, _ = camera_frames(views.mount)
     certificate = _of_returned(build_objective(fit, "log", centre=X), X, len(fit))
     spread_m, spread_rad = board_spread(H, C, X)
-    fitted = len(fit) + 1
     note = f"pairs {len(fit)} and {len(fit) + 1} share a pose, as in the paper"
     return Solution(
         mount=views.mount,
@@ -321,7 +319,7 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
         rejected=(),
         certificate=certificate,
         observability=observe(fit, covariance, distance, parent),
-        holdout=score_holdout(X, pairs.select(slice(len(fit), None)), indices, fitted, note)
+        holdout=score_holdout(X, pairs.select(slice(len(fit), None)), indices, len(fit) + 1, note)
         if held
         else None,
         kept=views.views,

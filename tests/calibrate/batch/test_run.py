@@ -109,11 +109,16 @@ def test_it_goes_on_where_it_was_killed(recordings: list[Path], tmp_path: Path) 
     assert len(counted.asked) == 2
 
 
-def test_other_options_or_a_changed_recording_are_solved_again(recordings: list[Path]) -> None:
+def test_other_options_or_a_changed_recording_are_solved_again(
+    recordings: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     key = batch_key(recordings[0], JobOptions())
     assert key == batch_key(recordings[0], JobOptions(threads=7))
     assert key != batch_key(recordings[0], JobOptions(seed=1))
     assert key != batch_key(recordings[1], JobOptions())
+    with monkeypatch.context() as patch:
+        patch.setattr("calibrate.batch.run.software_versions", lambda: {"calibration-station": "0.0.1"})
+        assert key != batch_key(recordings[0], JobOptions())
     os.utime(recordings[0], (1, 1))
     assert key != batch_key(recordings[0], JobOptions())
 

@@ -59,8 +59,12 @@ def test_what_speaks_against_it_beside_its_gates_is_known_before(make_file: Make
     elsewhere = msgspec.structs.replace(now, quality=quality)
     assert objections_beside(elsewhere, tmp_path) == [], "as right as the installed one, for nearer points"
     vague = tuple(tuple(9 * value for value in row) for row in now.covariance)
-    (worse,) = objections_beside(msgspec.structs.replace(elsewhere, covariance=vague), tmp_path)
+    vaguer = msgspec.structs.replace(elsewhere, covariance=vague)
+    (worse,) = objections_beside(vaguer, tmp_path)
     assert "Regression" in worse
+    newer = msgspec.structs.replace(now.provenance, software={"calibration-station": "9.0"})
+    (stated_anew,) = objections_beside(msgspec.structs.replace(vaguer, provenance=newer), tmp_path)
+    assert stated_anew.startswith(worse) and stated_anew != worse, "another version's error is no measure"
     robot = msgspec.structs.replace(now.robot, serial="2099999999")
     (other,) = objections_beside(msgspec.structs.replace(now, robot=robot), tmp_path)
     assert "2099999999" in other

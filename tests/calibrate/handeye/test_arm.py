@@ -106,13 +106,15 @@ def test_noise_and_steps_are_those_of_the_fit_that_is_reported(monkeypatch):
     assert "not-converged" in {remark.code for remark in solve_views(views, QUICK).warnings}
 
 
-def test_an_arm_that_cannot_be_fitted_is_said(monkeypatch):
+@pytest.mark.parametrize("part", ["estimate_with_arm_errors", "unknown_arm_covariance"])
+def test_an_arm_that_cannot_be_fitted_is_said_and_left_out_whole(part, monkeypatch):
     def fails(*_):
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(fit_module, "estimate_with_arm_errors", fails)
-    found = solve_views(worn_views(0.4), QUICK)
-    assert found.arm is None
+    monkeypatch.setattr(fit_module, part, fails)
+    views = without_joints(worn_views(0.4))
+    found = solve_views(replace(views, robot_model="unknown", arm=None), QUICK)
+    assert found.arm is None and found.posterior.gravity is None
     assert "arm-not-fitted" in {remark.code for remark in found.warnings}
 
 

@@ -63,8 +63,8 @@ def disk_failed(context: SessionContext, error: RecordingError | StationError) -
     """Report a disk error; the `.part` file stays for recovery, and a STOP meanwhile stays latched."""
     if context.recording is not None:
         context.recording.abandon()
-    text = f"Recording: {str(error).rstrip('.')}. What was saved before is safe."
-    reason = StationError.from_data(ErrorData(error.code, text))
+    remedy = "What is saved is safe. Free space or mend the disk, then go on."
+    reason = StationError.from_data(ErrorData(error.code, error.text, remedy))
     if context.store.state is StationState.STOPPED:
         context.store.update(reason=f"{context.store.status.reason} — {reason}")
     else:

@@ -40,7 +40,7 @@ def board(
     ] = None,
     square_px: Annotated[int, typer.Option(min=4, max=1000, help="png, ppm: pixels a square")] = 100,
 ) -> None:
-    """Write a printable board (PDF or SVG, true scale), or one for a simulator (PNG or PPM).
+    """Write a board to print (PDF, SVG) or for a simulator (PNG, PPM).
 
     Unless told: 8 × 7 squares of 25 mm. With a bar to measure on the paper, and the lines for the
     station's configuration. A PNG or PPM is a texture: the board alone, with a white border of one square.

@@ -61,7 +61,7 @@ def recover_command(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Rebuild an unfinished, cut or damaged recording. Exit 3: it had to."""
+    """Rebuild an unfinished, cut or damaged recording. Exit 3: rebuilt."""
     results = recover_recording(recording, output)
     if as_json:
         print_json(results)

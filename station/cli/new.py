@@ -119,9 +119,9 @@ def new_command(
 
     Robot, camera, board, four views guided by hand, limits; then it writes a configuration. Your hand
     moves the arm, by the pendant's own Freedrive. Every step can be left and taken up again. For an arm
-    that is no UR type `posted` and its name: a program will post its pose.
+    that is no UR, type `posted` and its name: a program will post its pose.
 
-    At the end F9 rehearses the whole job in simulation, and Enter opens the cell.
+    At the end Enter writes the file and opens the cell; F9 rehearses the whole job in simulation first.
     """
     if not sys.stdout.isatty() or not sys.stdin.isatty():
         raise StationError(

@@ -45,7 +45,7 @@ def serve_command(
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
 ) -> None:
-    """Own the cell and serve it on a Unix socket.
+    """Run the daemon that owns a real, simulated or replayed cell.
 
     Nothing moves without a person's approval. Runs until Ctrl-C or SIGTERM, which stop the arm, finish the
     recording, and end the daemon.

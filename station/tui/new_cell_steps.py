@@ -144,7 +144,7 @@ def _board_typed(setup: CellSetup, text: str) -> Action:
         board = typed_board(text)
     except CodedError:
         if setup.counts is not None and text == typed(setup, CellStep.BOARD).strip():
-            return Action("", "Type the size of a square in mm", "The corners were counted in the image.")
+            return Action("", "Type the size of a square in mm", "The corners are counted.")
         return Action("", "Type the board", "then Enter.")
     tiny = board.square_m < _TINY_M
     why = "So small? Centimetres are typed as 2.3cm." if tiny else "Measure one square."

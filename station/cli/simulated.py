@@ -12,5 +12,5 @@ from station.simulation.truth import NoiseLevel, SceneName
 Seed = Annotated[int, typer.Option(help="Simulated: seed of camera pose, board pose, intrinsics, noise")]
 Scene = Annotated[SceneName, typer.Option(help="Simulated: board and camera; paper-binned: 640×512 pixels")]
 Noise = Annotated[NoiseLevel, typer.Option(help="Simulated: errors of robot and camera")]
-Mounting = Annotated[Mount, typer.Option("--mount", help="Simulated: camera on the flange, or beside the arm")]
+Mounting = Annotated[Mount, typer.Option("--mount", help="Simulated: camera on flange or beside")]
 GigE = Annotated[bool, typer.Option("--gige", help="Simulated: the camera over GigE Vision packets")]

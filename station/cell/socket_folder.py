@@ -25,7 +25,10 @@ def default_socket() -> Path:
     if runtime := os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]:
         return Path(runtime) / "control.sock"
     system = Path("/run/station/control.sock")
-    if system.exists():
+    try:
+        if system.exists():
+            return system
+    except PermissionError:  # the folder is the operators' alone
         return system
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     if runtime and _is_own(Path(runtime)):  # after `su` it may still be the other user's

@@ -47,7 +47,7 @@ LINE_BYTES = 2048
 STATES_KEPT = 20_000
 """Of `HISTORY_S` at most, whatever times are posted."""
 LINKS = 8
-"""Programs connected at once, of which one has the arm; more are refused at once."""
+"""Programs connected at once to the socket, and to the port; one has the arm, more are refused at once."""
 DECLARED_S = 3.0
 """Longest wait for a program's first line, in which it keeps others away."""
 WRONG_S = 1.0
@@ -186,11 +186,13 @@ class PostedArm:
     async def _serve(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, token: bytes = b""
     ) -> None:
-        poster, holds = _name_of(writer.get_extra_info("socket")), False
+        link, holds = writer.get_extra_info("socket"), False
+        poster, family = _name_of(link), link.family
         if (serving := asyncio.current_task()) is not None:
             self._links[writer] = serving
         try:
-            if len(self._links) > LINKS:
+            # Each door has its own, or strangers at the port would keep the socket's programs out.
+            if sum(one.get_extra_info("socket").family == family for one in self._links) > LINKS:
                 raise RobotError("post-refused", poster=poster, reason=f"{LINKS} programs are connected")
             if token and not await _gives(token, reader):
                 raise RobotError("post-token", file=self.token_file)
@@ -199,7 +201,8 @@ class PostedArm:
             self._poster, holds = poster, True
             await self._take(reader)
         except (StationError, OSError) as error:
-            self._tell(str(error))
+            if link.family is socket.AF_UNIX or holds or not self._poster:
+                self._tell(str(error))
             answer = {"code": getattr(error, "code", "socket"), "text": str(error)}
             with contextlib.suppress(OSError):
                 writer.write(msgspec.json.encode(answer) + b"\n")

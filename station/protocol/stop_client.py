@@ -9,6 +9,7 @@ filling a queue.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import stat
@@ -149,11 +150,11 @@ def stop(control: Path) -> tuple[Outcome, str]:
         )
     try:
         page = open_page(motion_page(control), owners)
-    except FileNotFoundError:
-        page = None
     except OSError as error:
-        send_stop(control)
-        return Outcome.UNTRUSTED, f"{error.filename}: {error.strerror}."
+        if error.errno not in (errno.ENOENT, errno.EACCES):
+            send_stop(control)
+            return Outcome.UNTRUSTED, f"{error.filename}: {error.strerror}."
+        page = None
     try:
         return _stop(control, page), ""
     finally:
@@ -172,6 +173,8 @@ def _stop(control: Path, page: int | None) -> Outcome:
         return Outcome.NO_DAEMON
     except PermissionError:
         return Outcome.DENIED
+    except OSError:  # a name too long, another kind of socket
+        return Outcome.SILENT
     while page is not None and time.monotonic() < give_up_s:
         now = read_page(page)
         if before is not None and now is not None and now.stops > before.stops:

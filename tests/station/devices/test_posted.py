@@ -266,13 +266,18 @@ async def test_a_program_by_tcp_gives_the_token_first_and_is_one_as_any_other(
     assert not arm.token_file.exists()
 
 
-async def test_programs_that_give_no_token_do_not_pile_up(
+async def test_programs_that_give_no_token_do_not_pile_up_nor_keep_others_out(
     arm: PostedArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(posted, "DECLARED_S", PATIENCE_S)
     door = ("127.0.0.1", arm._tcp_port)
-    *_, last = [Poster(*await asyncio.open_connection(*door)) for _ in range(posted.LINKS + 1)]
+    *_others, last = [Poster(*await asyncio.open_connection(*door)) for _ in range(posted.LINKS + 1)]
     assert await last.refused() == "post-refused"
+    await (await Poster.at(arm)).rest(3)
+    await until(lambda: trouble(arm) == "")
+    arm.notice = ""
+    assert await Poster(*await asyncio.open_connection(*door)).refused() == "post-refused"
+    assert not arm.notice, "strangers say nothing on the screen where a program has the arm"
 
 
 async def test_a_port_that_another_program_has_is_named_at_every_attempt(tmp_path: Path) -> None:

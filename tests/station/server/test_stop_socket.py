@@ -269,6 +269,34 @@ def test_a_strangers_link_to_a_good_folder_is_not_followed(tmp_path: Path) -> No
         folder_owner(link)
 
 
+@ONLY_ROOT
+def test_who_is_no_operator_is_told_so(tmp_path: Path) -> None:
+    """`station stop` of a user outside the group, beside a daemon of systemd's."""
+    folder = Path("/run") / f"station-test-{os.getpid()}"
+    folder.mkdir(mode=0o750)
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setgroups([])
+            os.setgid(NOBODY)
+            os.setuid(NOBODY)
+            os._exit(stop(folder / "control.sock")[0] is not Outcome.DENIED)
+        finally:
+            os._exit(2)
+    try:
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    finally:
+        folder.rmdir()
+
+
+def test_what_cannot_be_a_stop_socket_was_not_heard(tmp_path: Path) -> None:
+    assert stop(tmp_path / ("x" * 200))[0] is Outcome.SILENT
+    with socket.socket(socket.AF_UNIX) as stream:
+        stream.bind(str(stop_socket(tmp_path / "c.sock")))
+        stream.listen()
+        assert stop(tmp_path / "c.sock")[0] is Outcome.SILENT
+
+
 @pytest.mark.parametrize("mode", [0o777, 0o1777, 0o772])
 def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path, mode: int) -> None:
     folder = tmp_path / "open"

@@ -6,7 +6,7 @@ import tempfile
 import time
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import msgspec
 import typer
@@ -85,21 +85,21 @@ def drift_check(
         prepared = prepare_views(
             recording, options, progress, fewest=1 if production else FEWEST_FOR_DRIFT_CHECK
         )
-    info = prepared.recording.info
+    info, noted = prepared.recording.info, None if held is None else _Noted(root, camera, held.version)
     own, trend, validity, before = False, None, None, list[bool]()
     if production:
         result = _check_pictures(source, prepared, calibration)
         text = production_text(result, len(prepared.views))
-        if held is not None and not result.passed:  # no alarm is no proof
-            validity = _judge(result, source.name, datetime.now(UTC), root, camera, held.version)
+        if noted is not None and not result.passed:  # no alarm is no proof
+            validity = _judge(noted, result, source.name, datetime.now(UTC))
     else:
-        _require_this_cell(source, info, calibration, root, camera, held)
+        _require_this_cell(source, info, calibration, root, noted)
         result = check_drift(prepared.views, calibration, prepared.loaded.board)
         text = check_text(result, calibration)
         own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
-        if held is not None and not own:
-            before, trend = _log(result, calibration, info, root, camera, held.version)
-            validity = _judge(result, info.name, _taken(info), root, camera, held.version)
+        if noted is not None and not own:
+            before, trend = _log(noted, result, calibration, info)
+            validity = _judge(noted, result, info.name, _taken(info))
     proves_nothing = own and result.passed
     if as_json:
         said = {"passed": result.passed and not own, "own_views": own, "validity": validity}
@@ -122,6 +122,27 @@ def drift_check(
         raise typer.Exit(BadViewsError.exit_code)
 
 
+class _Noted(NamedTuple):
+    """The installed version of a camera, which the check judges."""
+
+    root: Path | None
+    camera: str
+    version: int
+
+    def judge(self, reason: ValidityReason, passed: bool, proves: bool, when: datetime) -> Validity:
+        """Record what follows for it; `proves` and `when` as in `Validity.after_check`."""
+        return note_check(
+            self.root,
+            "drift-check",
+            reason,
+            passed=passed,
+            proves=proves,
+            when=when,
+            camera=self.camera,
+            version=self.version,
+        )
+
+
 def _check_pictures(folder: Path, prepared: PreparedViews, calibration: Calibration) -> DriftCheck:
     mount = prepared.recording.info.mount
     if mount != calibration.mount:
@@ -130,19 +151,14 @@ def _check_pictures(folder: Path, prepared: PreparedViews, calibration: Calibrat
 
 
 def _log(
-    result: DriftCheck,
-    calibration: Calibration,
-    info: SessionInfo,
-    root: Path | None,
-    camera: str,
-    version: int,
+    noted: _Noted, result: DriftCheck, calibration: Calibration, info: SessionInfo
 ) -> tuple[list[bool], Trend | None]:
     """Log the check: results of the earlier ones of the installed calibration, and the trend with it."""
-    before = read_checks(root, camera)
-    entry = entry_of(result, _taken(info).timestamp(), version, info.name)
-    trend = find_trend([*before, entry], version, known_cell(calibration))
-    append_check(msgspec.structs.replace(entry, trend=trend), root, camera)
-    return earlier_results(before, version), trend
+    before = read_checks(noted.root, noted.camera)
+    entry = entry_of(result, _taken(info).timestamp(), noted.version, info.name)
+    trend = find_trend([*before, entry], noted.version, known_cell(calibration))
+    append_check(msgspec.structs.replace(entry, trend=trend), noted.root, noted.camera)
+    return earlier_results(before, noted.version), trend
 
 
 def _taken(info: SessionInfo) -> datetime:
@@ -150,9 +166,7 @@ def _taken(info: SessionInfo) -> datetime:
     return datetime.fromtimestamp(info.created_wall_ns / 1e9 or time.time(), UTC)
 
 
-def _judge(
-    result: DriftCheck, recording: str, taken: datetime, root: Path | None, camera: str, version: int
-) -> Validity:
+def _judge(noted: _Noted, result: DriftCheck, recording: str, taken: datetime) -> Validity:
     """Let the check put the installed calibration in doubt, or clear it."""
     verdict = "PASS" if result.passed else "FAIL"
     reason = ValidityReason(
@@ -167,44 +181,21 @@ def _judge(
             "power": round(result.power, 4),
         },
     )
-    return note_check(
-        root,
-        "drift-check",
-        reason,
-        passed=result.passed,
-        proves=result.power >= POWER if result.passed else result.arm_known,
-        when=taken,
-        camera=camera,
-        version=version,
-    )
+    proves = result.power >= POWER if result.passed else result.arm_known
+    return noted.judge(reason, result.passed, proves, taken)
 
 
 def _require_this_cell(
-    recording: Path,
-    info: SessionInfo,
-    calibration: Calibration,
-    root: Path | None,
-    camera: str,
-    held: Validity | None,
+    recording: Path, info: SessionInfo, calibration: Calibration, root: Path | None, noted: _Noted | None
 ) -> None:
     """Refuse views of another cell; a session of this cell with another device doubts what is installed."""
     try:
         require_same_cell(str(recording), calibration, CellIdentity.of(info))
     except OtherCellError as other:
         own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
-        if held is not None and own and other.device:
+        if noted is not None and own and other.device:
             reason = ValidityReason(f"{other.device}-changed", other.text, dict(other.values))
-            when = _taken(info)
-            note_check(
-                root,
-                "drift-check",
-                reason,
-                passed=False,
-                proves=True,
-                when=when,
-                camera=camera,
-                version=held.version,
-            )
+            noted.judge(reason, False, True, _taken(info))
         raise
 
 
